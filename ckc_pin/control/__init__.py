@@ -1,0 +1,17 @@
+"""Controllers, desired trajectories, gains and actuation."""
+
+from ckc_pin.control.actuation import Actuation, Effort
+from ckc_pin.control.controllers import Controller, Model, SetPoint, Tracking
+from ckc_pin.control.desired import Desired, Harmonics, Table
+
+__all__ = [
+    "Actuation",
+    "Controller",
+    "Desired",
+    "Effort",
+    "Harmonics",
+    "Model",
+    "SetPoint",
+    "Table",
+    "Tracking",
+]

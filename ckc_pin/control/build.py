@@ -1,0 +1,62 @@
+"""A controller from the `[controller]` table of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ckc_pin.control.controllers import Model, SetPoint, Tracking
+from ckc_pin.control.desired import Table, read_desired
+from ckc_pin.control.gains import gain_matrix
+from ckc_pin.control.spec import ControllerSpec, SetPointSpec
+from ckc_pin.dynamics.formulations import CoriolisVelocity
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sources import Sources
+
+__all__ = ["make_controller"]
+
+
+def make_controller(
+    spec: ControllerSpec,
+    plant: Mechanism,
+    convention: CoriolisVelocity,
+    t_end: float,
+    sources: Sources,
+    load_model: Callable[[str], Mechanism],
+) -> SetPoint | Tracking:
+    """Build and check a controller.
+
+    Parameters
+    ----------
+    spec : ControllerSpec
+    plant : Mechanism
+    convention : "rho" or "actual"
+        Where C takes its velocity, plant and controller alike.
+    t_end : float
+        A tabulated trajectory must last as long, s.
+    sources : Sources
+        Where the scene's files come from.
+    load_model : callable
+        Loads the controller's own mechanism file, when it has one.
+
+    Raises
+    ------
+    InputError, MechanismError
+        Bad gains, an unreachable target, an unusable trajectory or model.
+    """
+    names = plant.independent
+    model = Model(load_model(spec.model), plant, convention) if spec.model is not None else None
+    if isinstance(spec, SetPointSpec):
+        return SetPoint(
+            model.mechanism if model else plant,
+            gain_matrix(spec.K_P, names, "K_P"),
+            gain_matrix(spec.K_V, names, "K_V"),
+            plant.vector(spec.q_d, names, "controller.q_d"),
+        )
+    desired = read_desired(spec.desired, names, sources)
+    if isinstance(desired, Table) and desired.end < t_end:
+        raise InputError(
+            f"{spec.desired['file']}: ends at t = {desired.end:g} s, the scene at t_end = {t_end:g} s; "
+            "lengthen the trajectory or shorten the run"
+        )
+    return Tracking(gain_matrix(spec.Lambda, names, "Lambda"), gain_matrix(spec.K_D, names, "K_D"), desired, model)

@@ -1,0 +1,51 @@
+"""Gains as a scalar, a table by joint, or a matrix in the order of `independent`; checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ckc_pin.control.spec import Gain
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["gain_matrix", "require_positive_definite"]
+
+
+def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
+    """Return a gain as a (d, d) matrix.
+
+    Raises
+    ------
+    InputError
+        Wrong shape, an unknown or missing joint, or a number that is not finite.
+    """
+    d = len(names)
+    if isinstance(gain, dict):
+        unknown = [name for name in gain if name not in names]
+        missing = [name for name in names if name not in gain]
+        if unknown or missing:
+            problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
+            raise InputError(f"controller: {what} as a table needs the joints {', '.join(names)}; {problem}")
+        matrix = np.diag([float(gain[name]) for name in names])
+    elif isinstance(gain, list):
+        if len(gain) != d or any(len(row) != d for row in gain):
+            raise InputError(f"controller: {what} as a matrix must be {d} x {d}, rows in the order {', '.join(names)}")
+        matrix = np.array(gain, dtype=float)
+    else:
+        matrix = float(gain) * np.eye(d)
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"controller: {what} has an entry that is not a finite number")
+    return matrix
+
+
+def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:
+    """Raise InputError unless a matrix is symmetric positive definite (or semi-definite)."""
+    size = float(np.abs(matrix).max(initial=0.0))
+    if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-12 * size:
+        raise InputError(f"controller: {what} is not symmetric; the stability proof needs it symmetric")
+    least = float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 1.0
+    if least < 0 or (least == 0 and not semi):
+        kind = "positive semi-definite" if semi else "positive definite"
+        raise InputError(f"controller: {what} is not {kind}: its least eigenvalue is {least:g}")

@@ -1,0 +1,90 @@
+"""The stable equilibrium that a mechanism falls to, and the Hessian of its potential in q."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["h_gradient", "stable_equilibrium"]
+
+
+def h_gradient(mechanism: Mechanism, at: Kinematics) -> Array:
+    """d h / d q of the reduced gravity vector, by the chain rule through sigma, shape (d, d).
+
+    h = rho^T h'. With multipliers phi_z^T y = -h'_z it is h'_q + phi_q^T y, so that along column k of
+    rho its derivative is rho^T (dh'/dq' rho_k + Jdot(rho_k)^T y): symmetric, as a Hessian is.
+    """
+    terms = Terms(mechanism, at, np.zeros(mechanism.n))
+    h_tree_gradient = _h_tree_gradient(terms)
+    y = at.phi_z_factor.solve_transposed(-terms.h_tree[at.partition.z])
+    columns = [at.rho.T @ (h_tree_gradient @ at.rho[:, k] + at.J_dot(at.rho[:, k]).T @ y) for k in range(mechanism.d)]
+    return np.array(columns).reshape(mechanism.d, mechanism.d).T
+
+
+def _h_tree_gradient(terms: Terms) -> Array:
+    tree, springs = terms.mechanism.tree, terms.mechanism.springs
+    gradient = np.array(pin.computeGeneralizedGravityDerivatives(tree.model, tree.data, terms.q_tree))
+    return gradient + springs.elastic_gradient(terms.q_tree) if springs.any else gradient
+
+
+def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
+    """Return the minimum of the potential energy reached from the assembled configuration by descent.
+
+    Newton's steps on h(q) = 0, with the Hessian shifted until it is positive definite and the step
+    shortened until the energy falls, along sigma all the way: the branch is kept.
+
+    Raises
+    ------
+    NumericalError
+        The descent runs into a singular configuration, or does not end.
+    """
+    at = mechanism.assembled
+    terms = Terms(mechanism, at, np.zeros(mechanism.n))
+    scale = 1e-13 * (1.0 + _weight(mechanism))
+    for _ in range(300):
+        if np.abs(terms.h).max(initial=0.0) <= scale:
+            return at
+        values, vectors = np.linalg.eigh((hessian := h_gradient(mechanism, at)) / 2 + hessian.T / 2)
+        floor = 1e-3 * np.abs(values).max()
+        step = -vectors @ ((vectors.T @ terms.h) / np.maximum(np.abs(values), floor))
+        step *= min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
+        moved = _downhill(mechanism, terms, step)
+        if moved is None:
+            if np.abs(terms.h).max() <= 1e3 * scale:  # energy differences are rounding here
+                return at
+            raise NumericalError(
+                f"no stable equilibrium of {mechanism.name!r} was reached from q_guess: the descent ends at a "
+                "singular configuration; give [initial.q] instead",
+                q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
+            )
+        at, terms = moved.at, moved
+    raise NumericalError(f"no stable equilibrium of {mechanism.name!r} was reached from q_guess in 300 steps")
+
+
+def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> Terms | None:
+    """Shorten a step until the potential energy falls, or |h| does where the energy is flat."""
+    fraction = 1.0
+    while fraction > 1e-8:
+        outcome = mechanism.sigma(terms.q + fraction * step, terms.at)
+        if outcome.verdict == "converged":
+            trial = Terms(mechanism, outcome.at, np.zeros(mechanism.n))
+            flat = 1e-14 * abs(terms.potential_energy)
+            falls = trial.potential_energy < terms.potential_energy - flat
+            calmer = np.abs(trial.h).max() < np.abs(terms.h).max()
+            if falls or (calmer and trial.potential_energy <= terms.potential_energy + flat):
+                return trial
+        fraction /= 2
+    return None
+
+
+def _weight(mechanism: Mechanism) -> float:
+    """Scale of h: what the whole weight does on the arm of the mechanism's size, N m."""
+    mass = sum(inertia.mass for inertia in list(mechanism.tree.model.inertias)[1:])
+    gravity = float(np.linalg.norm(mechanism.tree.model.gravity.linear))
+    return float(mass) * gravity * mechanism.size

@@ -1,0 +1,131 @@
+"""The three formulations as functions of `Terms`: the DAE (eq. 1), the reduced model (eq. 6), the SPF (eq. 8).
+
+In every one of them u' is the generalized force of the actuators on the tree; u = rho^T u'.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.linear import Factorization, null_space
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+
+__all__ = [
+    "CoriolisVelocity",
+    "dae_acceleration",
+    "multipliers",
+    "reduced_acceleration",
+    "spf_terms",
+    "spf_z_dot",
+    "tangent_basis",
+]
+
+CoriolisVelocity = Literal["rho", "actual"]
+
+SINGULAR = 1e-12  # relative size of the last pivot of J^T at which its rank counts as lost
+
+
+def reduced_acceleration(terms: Terms, u_tree: Array, q_dot: Array | None = None) -> Array:
+    """Solve eq. 6 (and the first line of eq. 8) for the acceleration of q.
+
+    Parameters
+    ----------
+    terms : Terms
+        At v' = rho q_dot; or, with `q_dot` given, at any v' that C is to be evaluated at.
+    u_tree : (n,) array
+        Generalized forces of the actuators.
+    q_dot : (d,) array, optional
+        Needed when v' is not rho q_dot (the SPF off its manifold, eq. 16's convention).
+
+    Returns
+    -------
+    (d,) array
+    """
+    force = u_tree - terms.bias_tree
+    if q_dot is None:
+        # rho^T (D' rho_dot q_dot + C' v' + h') needs neither C' nor the matrix rho_dot
+        force -= terms.D_tree @ terms.rho_dot_times(terms.q_dot)
+        right = terms.rho.T @ force
+    else:
+        right = terms.rho.T @ (u_tree - terms.h_tree) - terms.C_times(q_dot)
+    if terms.mechanism.springs.any_damping:
+        right += terms.rho.T @ terms.damping_force
+    return terms.D_factor.solve(right)
+
+
+def spf_z_dot(at: Kinematics, q_dot: Array, epsilon: float, w: Array) -> Array:
+    """Second line of eq. 8: z_dot = -phi_z^-1 (phi_q q_dot + w / epsilon), shape (n - d,)."""
+    return at.rho[at.partition.z] @ q_dot - at.phi_z_factor.solve(w) / epsilon
+
+
+def spf_terms(
+    mechanism: Mechanism, at: Kinematics, q_dot: Array, epsilon: float, w: Array, convention: CoriolisVelocity
+) -> Terms:
+    """Terms of the SPF at (q, z, q_dot).
+
+    Eq. 8 writes C(q, z, q_dot): the velocity inside C is rho q_dot ("rho"). Eq. 16 writes
+    C(q, q_dot, z, z_dot), with the actual z_dot ("actual"), which contains w / epsilon.
+    """
+    v_tree = at.rho @ q_dot
+    if convention == "actual":
+        v_tree[at.partition.z] = spf_z_dot(at, q_dot, epsilon, w)
+    return Terms(mechanism, at, v_tree)
+
+
+def tangent_basis(terms: Terms) -> tuple[Array, Array]:
+    """Return an orthonormal basis of the allowed velocities, (n, d), and the acceleration J a = -J_dot v, (n,).
+
+    Raises
+    ------
+    NumericalError
+        J has lost rank.
+    """
+    mechanism = terms.mechanism
+    rank = mechanism.rank.rank
+    normal, tangent, r, rows = null_space(terms.at.J, rank)
+    if rank == 0:
+        return tangent, np.zeros(mechanism.n)
+    pivots = np.abs(np.diagonal(r))
+    if not pivots[-1] > SINGULAR * pivots[0]:
+        raise NumericalError(
+            "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
+            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.q_tree)),
+        )
+    drift = (terms.J_dot @ terms.v_tree)[rows]
+    return tangent, normal @ np.linalg.solve(r.T, -drift)
+
+
+def dae_acceleration(terms: Terms, u_tree: Array) -> Array:
+    """Solve eq. 1 with its closure differentiated twice, J a + J_dot v' = 0, for a = dv'/dt, shape (n,).
+
+    The motion is projected on the tangent space of the closure, so no choice of q is involved,
+    redundant rows do no harm, and massless links do none as long as D' is regular on that space.
+
+    Raises
+    ------
+    NumericalError
+        J has lost rank.
+    """
+    tangent, particular = tangent_basis(terms)
+    force = u_tree - terms.bias_tree - terms.D_tree @ particular
+    if terms.mechanism.springs.any_damping:
+        force += terms.damping_force
+    inertia = tangent.T @ terms.D_tree @ tangent
+    return particular + tangent @ Factorization(inertia).solve(tangent.T @ force)
+
+
+def multipliers(terms: Terms, u_tree: Array, acceleration: Array) -> Array:
+    """Multipliers of eq. 1, D' a + C' v' + h' = u' + J^T lambda, of minimum norm, shape (rows,).
+
+    For point rows they are the force that the loop exerts on frame A, in newtons.
+    """
+    force = terms.D_tree @ acceleration + terms.bias_tree - u_tree
+    if terms.mechanism.springs.any_damping:
+        force -= terms.damping_force
+    return np.asarray(np.linalg.lstsq(terms.at.J.T, force, rcond=1e-9)[0])

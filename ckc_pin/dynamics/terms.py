@@ -1,0 +1,208 @@
+"""All terms at one state, each computed when first asked for.
+
+Everything that the formulations, the controllers and the monitors need at one state (q', v') is a
+property here under the paper's name. An acceleration asks for D', the bias and J, never for C'; a
+controller that needs C' asks for it, and it is computed then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.lazy import lazy
+from ckc_pin.mechanism.linear import Factorization
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Terms", "terms"]
+
+
+class Terms:
+    """Dynamics of a mechanism at one state.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    at : Kinematics
+        The closure's terms at q'.
+    v_tree : (n,) array
+        Velocity v' in tangent coordinates; what C', rho_dot and the bias are evaluated at.
+
+    Notes
+    -----
+    Pinocchio's workspace is shared, so results are copied. Units are SI; D' is (n, n), D is (d, d).
+    """
+
+    def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array) -> None:
+        self.mechanism = mechanism
+        self.tally = mechanism.tree.tally
+        self.at = at
+        self.q_tree = at.q_tree
+        self.v_tree = v_tree
+        self._model, self._data = mechanism.tree.model, mechanism.tree.data
+
+    # --- the tree, eq. 1 -------------------------------------------------------------------------
+
+    @lazy
+    def D_tree(self) -> Array:
+        """D', inertia of the open chains, shape (n, n)."""
+        return np.array(pin.crba(self._model, self._data, self.q_tree))
+
+    @lazy
+    def C_tree(self) -> Array:
+        """C', the Christoffel matrix, shape (n, n)."""
+        return np.array(pin.computeCoriolisMatrix(self._model, self._data, self.q_tree, self.v_tree))
+
+    @lazy
+    def h_tree(self) -> Array:
+        """h', gravity of the tree and its springs, whatever has a potential: shape (n,)."""
+        h = np.array(pin.computeGeneralizedGravity(self._model, self._data, self.q_tree))
+        return h - self.spring_force if self.mechanism.springs.any else h
+
+    @lazy
+    def bias_tree(self) -> Array:
+        """C' v' + h' without the matrix C', shape (n,)."""
+        bias = np.array(pin.nonLinearEffects(self._model, self._data, self.q_tree, self.v_tree))
+        return bias - self.spring_force if self.mechanism.springs.any else bias
+
+    @lazy
+    def spring_force(self) -> Array:
+        """Generalized force of the springs, shape (n,)."""
+        return self.mechanism.springs.elastic_force(self.q_tree)
+
+    @lazy
+    def damping_force(self) -> Array:
+        """Generalized force of dampers and of the URDF's viscous joint damping, shape (n,)."""
+        return self.mechanism.springs.damping_force(self.q_tree, self.v_tree)
+
+    @lazy
+    def energy(self) -> float:
+        """Kinetic energy of the tree at v', potential energy and what springs store, joules."""
+        kinetic = 0.5 * float(self.v_tree @ self.D_tree @ self.v_tree)
+        return kinetic + self.potential_energy
+
+    @lazy
+    def potential_energy(self) -> float:
+        """V(q'), joules, zero at the world's origin."""
+        gravity = float(pin.computePotentialEnergy(self._model, self._data, self.q_tree))
+        return gravity + self.mechanism.springs.energy(self.q_tree)
+
+    @property
+    def q(self) -> Array:
+        """Independent coordinates q, shape (d,)."""
+        return self.q_tree[self.mechanism.tree.place[self.at.partition.q]]
+
+    @property
+    def q_dot(self) -> Array:
+        """Their rates, shape (d,)."""
+        return self.v_tree[self.at.partition.q]
+
+    # --- the closure, eqs. 1 to 5 ----------------------------------------------------------------
+
+    @property
+    def phi(self) -> Array:
+        """Residual of the closure, shape (rows,)."""
+        return self.at.phi
+
+    @property
+    def rho(self) -> Array:
+        """Rho of eq. 5, shape (n, d)."""
+        return self.at.rho
+
+    @lazy
+    def J_dot(self) -> Array:
+        """Time derivative of J along v', shape (rows, n)."""
+        return self.at.J_dot(self.v_tree)
+
+    @lazy
+    def rho_dot(self) -> Array:
+        """Time derivative of rho along v', shape (n, d): J rho = 0 gives phi_z rho_dot_z = -J_dot rho."""
+        rho_dot = np.zeros_like(self.rho)
+        rho_dot[self.at.partition.z] = -self.at.phi_z_factor.solve(self.J_dot @ self.rho)
+        return rho_dot
+
+    def rho_dot_times(self, x: Array) -> Array:
+        """Return rho_dot x, shape (n,), without the matrix."""
+        product = np.zeros(len(self.rho))
+        product[self.at.partition.z] = -self.at.phi_z_factor.solve(self.J_dot @ (self.rho @ x))
+        return product
+
+    # --- the reduced model, eq. 6 ----------------------------------------------------------------
+
+    @lazy
+    def D(self) -> Array:
+        """Inertia of the reduced model, rho^T D' rho, shape (d, d)."""
+        return self.rho.T @ self.D_tree @ self.rho
+
+    @lazy
+    def D_factor(self) -> Factorization:
+        """Factorization of D."""
+        return Factorization(self.D)
+
+    @lazy
+    def C(self) -> Array:
+        """C = rho^T (D' rho_dot + C' rho), shape (d, d)."""
+        return self.rho.T @ (self.D_tree @ self.rho_dot + self.C_tree @ self.rho)
+
+    @lazy
+    def h(self) -> Array:
+        """Reduced gravity vector, rho^T h', shape (d,)."""
+        return self.rho.T @ self.h_tree
+
+    def C_times(self, x: Array) -> Array:
+        """Return C x, shape (d,), without the matrix C."""
+        return self.rho.T @ (self.D_tree @ self.rho_dot_times(x) + self.C_tree @ (self.rho @ x))
+
+
+def terms(mechanism: Mechanism, q: Mapping[str, float], v: Mapping[str, float] | None = None) -> Terms:
+    """Return all terms at one state.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    q : {coordinate: value}
+        The independent coordinates alone: sigma closes the loops, on the assembled branch. All
+        coordinates: taken as they are, on the closure or off it.
+    v : {coordinate: value}, optional
+        The independent rates alone (absent ones are zero): v' = rho q_dot. All: as they are.
+
+    Raises
+    ------
+    InputError
+        Unknown or missing coordinates, values that are not finite, q out of reach.
+    NumericalError
+        q is singular.
+    """
+    at = _kinematics_at(mechanism, q)
+    v = v or {}
+    if set(v) >= set(mechanism.coordinates) and mechanism.dependent:
+        return Terms(mechanism, at, mechanism.vector(v, mechanism.coordinates, "v"))
+    q_dot = mechanism.vector(v, mechanism.independent, "v", fill=0.0)
+    if at.phi_z_factor.singular:
+        raise NumericalError("phi_z is singular here: rho does not exist", q_tree=dict(q))
+    return Terms(mechanism, at, at.rho @ q_dot)
+
+
+def _kinematics_at(mechanism: Mechanism, q: Mapping[str, float]) -> Kinematics:
+    if set(q) >= set(mechanism.coordinates):
+        numbers = mechanism.vector(q, mechanism.coordinates, "q")
+        return mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
+    partly = [name for name in q if name in mechanism.dependent]
+    if partly:
+        raise InputError(
+            f"q: give the independent coordinates alone ({', '.join(mechanism.independent)}) or all of them "
+            f"({', '.join(mechanism.coordinates)}); {partly[0]!r} alone does not fit"
+        )
+    wanted = mechanism.vector(q, mechanism.independent, "q")
+    found = mechanism.sigma(wanted)
+    if found.verdict == "converged":
+        return found.at
+    where = ", ".join(f"{name} = {x:g}" for name, x in zip(mechanism.independent, wanted, strict=True))
+    if found.verdict == "singular":
+        raise NumericalError(f"q: {where} is singular: {found.reason}", q_tree=dict(q))
+    raise InputError(f"q: {where} is out of reach: {found.reason}")

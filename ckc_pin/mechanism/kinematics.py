@@ -1,0 +1,117 @@
+"""The closure at one configuration, split into q and z: phi, phi_q, phi_z and rho of eqs. 1 to 5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.lazy import lazy
+from ckc_pin.mechanism.linear import Factorization
+from ckc_pin.mechanism.pose import Pose, Rate
+from ckc_pin.mechanism.tree import Array, IntArray, Tree
+
+__all__ = ["Kinematics", "Partition", "Psi"]
+
+
+@dataclass(frozen=True)
+class Partition:
+    """The split q' = [q; z] of eq. 2: where the independent and the dependent coordinates stand."""
+
+    q: IntArray
+    z: IntArray
+
+
+class Kinematics:
+    """phi and its first derivatives at one configuration; each computed when first asked for.
+
+    Parameters
+    ----------
+    tree : Tree
+    closure : Closure
+    partition : Partition
+    q_tree : (nq,) array
+    """
+
+    def __init__(self, tree: Tree, closure: Closure, partition: Partition, q_tree: Array) -> None:
+        self.tree = tree
+        self.tally = tree.tally
+        self.closure = closure
+        self.partition = partition
+        self.q_tree = q_tree
+        self.pose = Pose(tree, closure.anchors, q_tree)
+
+    @lazy
+    def phi(self) -> Array:
+        """Residual phi(q') of the loop closure, shape (rows,)."""
+        return self.closure.phi(self.pose)
+
+    @lazy
+    def J(self) -> Array:
+        """d phi / d q', shape (rows, n), the tree's order."""
+        return self.closure.jacobian(self.pose)
+
+    @property
+    def phi_q(self) -> Array:
+        """Columns of J of the independent coordinates, shape (rows, d)."""
+        return self.J[:, self.partition.q]
+
+    @property
+    def phi_z(self) -> Array:
+        """Columns of J of the dependent coordinates, shape (rows, n - d)."""
+        return self.J[:, self.partition.z]
+
+    @lazy
+    def phi_z_factor(self) -> Factorization:
+        """The factorization that sigma's Newton step, rho and rho_dot share."""
+        return Factorization(self.phi_z)
+
+    @lazy
+    def rho(self) -> Array:
+        """Rho of eq. 5, shape (n, d): v' = rho q_dot keeps phi constant."""
+        rho = np.zeros((self.tree.n, len(self.partition.q)))
+        rho[self.partition.q, np.arange(len(self.partition.q))] = 1.0
+        rho[self.partition.z] = -self.phi_z_factor.solve(self.phi_q)
+        return rho
+
+    def J_dot(self, v: Array) -> Array:
+        """Time derivative of J along a tangent velocity v, shape (rows, n)."""
+        return self.closure.jacobian_dot(self.pose, Rate(self.pose, v))
+
+    def sigma_min(self) -> float:
+        """Smallest singular value of phi_z (its distance to a singular configuration); inf when z is empty."""
+        if not len(self.partition.z):
+            return float("inf")
+        return float(np.linalg.svd(self.phi_z, compute_uv=False)[len(self.partition.z) - 1])
+
+    def moved(self, step: Array) -> Kinematics:
+        """Return the kinematics at the configuration a tangent step away."""
+        return Kinematics(self.tree, self.closure, self.partition, self.tree.integrate(self.q_tree, step))
+
+
+class Psi:
+    """Psi(q', q) = [phi(q'); S q' - q] of eq. 3, for people who want to see it whole.
+
+    sigma solves Psi = 0 for q'. Since its last d rows are solved by putting q in its place, the program
+    iterates on z alone with phi_z, which is the Schur complement of Psi's Jacobian.
+
+    Parameters
+    ----------
+    at : Kinematics
+        At q'; its tree must consist of joints of one freedom (S q' needs numbers).
+    """
+
+    def __init__(self, at: Kinematics) -> None:
+        self.at = at
+
+    def value(self, q: Array) -> Array:
+        """Psi(q', q), shape (rows + d,)."""
+        return np.concatenate([self.at.phi, self.at.q_tree[self.at.tree.place[self.at.partition.q]] - q])
+
+    @property
+    def jacobian(self) -> Array:
+        """d Psi / d q', shape (rows + d, n)."""
+        select = np.zeros((len(self.at.partition.q), self.at.tree.n))
+        select[np.arange(len(self.at.partition.q)), self.at.partition.q] = 1.0
+        return np.vstack([self.at.J, select])

@@ -1,0 +1,114 @@
+"""Factorizations of small dense matrices, through LAPACK without the overhead of checks.
+
+SciPy's `linalg` takes 0.3 s to import, more than Pinocchio itself, so it is loaded at first use.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Factorization", "null_space"]
+
+Array = NDArray[np.float64]
+
+_lapack: Any = None
+
+
+def _routines() -> Any:
+    global _lapack
+    if _lapack is None:
+        from scipy.linalg import lapack
+
+        _lapack = lapack
+    return _lapack
+
+
+class Factorization:
+    """LU of a square matrix, QR of a tall one, with solves by either.
+
+    A tall matrix is what redundant loops give: its least-squares solution is the exact one where the
+    right-hand side is consistent, as it is for every motion that the loops allow.
+
+    Parameters
+    ----------
+    matrix : (m, k) array, m >= k
+        Finite entries; full column rank unless `singular` says otherwise.
+    """
+
+    __slots__ = ("_lu", "_pivots", "_q", "_r", "shape", "singular")
+
+    def __init__(self, matrix: Array) -> None:
+        self.shape = matrix.shape
+        lapack = _routines()
+        if matrix.shape[0] == matrix.shape[1]:
+            self._q = None
+            if matrix.shape[0]:
+                self._lu, self._pivots, info = lapack.dgetrf(matrix)
+            else:
+                self._lu, self._pivots, info = matrix, np.zeros(0, np.int32), 0
+            self.singular = info > 0
+        else:
+            self._q, self._r = np.linalg.qr(matrix)
+            self.singular = not bool(np.all(np.diagonal(self._r)))
+
+    def solve(self, right: Array) -> Array:
+        """Solve A x = right (least squares when tall), right of shape (m,) or (m, p)."""
+        if self.shape[1] == 0:
+            return np.zeros((0, *right.shape[1:]))
+        if self._q is None:
+            x, _ = _routines().dgetrs(self._lu, self._pivots, right)
+        else:
+            x, _ = _routines().dtrtrs(self._r, self._q.T @ right)
+        return np.asarray(x)
+
+    def solve_transposed(self, right: Array) -> Array:
+        """Solve A^T x = right (minimum norm when tall), right of shape (k,) or (k, p)."""
+        if self.shape[1] == 0:
+            return np.zeros((self.shape[0], *right.shape[1:]))
+        if self._q is None:
+            x, _ = _routines().dgetrs(self._lu, self._pivots, right, trans=1)
+            return np.asarray(x)
+        y, _ = _routines().dtrtrs(self._r, right, trans=1)
+        return np.asarray(self._q @ y)
+
+    def determinant(self) -> float:
+        """Return the determinant; a tall matrix has none (ValueError)."""
+        if self._q is not None:
+            raise ValueError("a tall matrix has no determinant")
+        swaps = int(np.sum(self._pivots != np.arange(len(self._pivots))))
+        return float(np.prod(np.diagonal(self._lu))) * (-1.0) ** swaps
+
+
+def null_space(jacobian: Array, rank: int) -> tuple[Array, Array, Array, Array]:
+    """Split the tangent space by a pivoted QR of J^T: J^T P = Q R.
+
+    Parameters
+    ----------
+    jacobian : (m, n) array
+    rank : int
+        The rank of J, known from the assembled configuration.
+
+    Returns
+    -------
+    normal : (n, rank) array
+        Orthonormal basis of the range of J^T.
+    tangent : (n, n - rank) array
+        Orthonormal basis of the velocities that the loops allow.
+    r : (rank, rank) array
+        Upper triangular; `normal @ r` are the rows of J named by `rows`, as columns.
+    rows : (rank,) int array
+        The rows of J that the pivoting chose.
+    """
+    lapack = _routines()
+    n = jacobian.shape[1]
+    if jacobian.shape[0] == 0:
+        return np.zeros((n, 0)), np.eye(n), np.zeros((0, 0)), np.zeros(0, np.intp)
+    factored, pivots, tau, _, _ = lapack.dgeqp3(jacobian.T)
+    q = np.zeros((n, n), order="F")
+    columns = min(n, factored.shape[1])
+    q[:, :columns] = factored[:, :columns]
+    q, _, _ = lapack.dorgqr(q, tau)
+    return q[:, :rank], q[:, rank:], np.triu(factored[:rank, :rank]), pivots[:rank] - 1

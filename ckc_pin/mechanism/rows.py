@@ -1,0 +1,216 @@
+"""The primitives that every closure is a table of: phi, J and J's time derivative, once each.
+
+A primitive is a group of rows evaluated with array operations, whatever the number of loops. Groups
+refer to a closure's `Anchors` by number and read them from a `Pose` and a `Rate`.
+
+==============  ===============================================  ==================================
+primitive       phi                                              used by
+==============  ===============================================  ==================================
+`Component`     e . (p_A - p_B), e fixed in a link or the world  point, hinge, prismatic, weld, ...
+`Dot`           a . b, two directions fixed in links             hinge, cylindrical, universal
+`Distance`      (r . r - L^2) / (2 L), r = p_A - p_B             distance
+`Affine`        A q' - c                                         couplings, mimic joints
+`RelativeLog`   log(R_A^T R_B), three rows                       prismatic, weld
+==============  ===============================================  ==================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.mechanism.pose import Pose, Rate, cross
+from ckc_pin.mechanism.tree import Array, IntArray
+
+__all__ = ["Affine", "Component", "Distance", "Dot", "RelativeLog", "Rows"]
+
+
+class Rows(Protocol):
+    """A group of rows of one kind; `out` says which rows of phi they are."""
+
+    @property
+    def out(self) -> IntArray:
+        """Places of the rows in phi."""
+
+    def phi(self, pose: Pose) -> Array:
+        """Residual, shape (rows,)."""
+
+    def jacobian(self, pose: Pose) -> Array:
+        """Derivative of phi along the tangent coordinates, shape (rows, n)."""
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        """Time derivative of the Jacobian along the rate's velocity, shape (rows, n)."""
+
+
+def _along(e: Array, jacobian: Array) -> Array:
+    """Rows e_i . J_i of directions (k, 3) and Jacobians (k, 3, n)."""
+    return (e[:, None, :] @ jacobian)[:, 0, :]
+
+
+@dataclass(frozen=True)
+class Component:
+    """e . r, the component of a point difference along a direction; `turning` unless e is the world's."""
+
+    out: IntArray
+    pair: IntArray
+    direction: IntArray
+    turning: bool
+
+    def phi(self, pose: Pose) -> Array:
+        return np.sum(pose.e[self.direction] * pose.r[self.pair], axis=1)
+
+    def jacobian(self, pose: Pose) -> Array:
+        e = pose.e[self.direction]
+        jacobian = _along(e, pose.r_jacobian[self.pair])
+        if self.turning:  # e_dot . r = (omega x e) . r = omega . (e x r)
+            jacobian += _along(cross(e, pose.r[self.pair]), pose.e_angular[self.direction])
+        return jacobian
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        e = pose.e[self.direction]
+        jacobian_dot = _along(e, rate.r_jacobian_dot[self.pair])
+        if self.turning:
+            r, r_dot, e_dot = pose.r[self.pair], rate.r_dot[self.pair], rate.e_dot[self.direction]
+            jacobian_dot += _along(e_dot, pose.r_jacobian[self.pair])
+            jacobian_dot += _along(cross(e_dot, r) + cross(e, r_dot), pose.e_angular[self.direction])
+            jacobian_dot += _along(cross(e, r), rate.e_angular_dot[self.direction])
+        return jacobian_dot
+
+
+@dataclass(frozen=True)
+class Dot:
+    """a . b of two directions: zero when they are perpendicular."""
+
+    out: IntArray
+    a: IntArray
+    b: IntArray
+
+    def phi(self, pose: Pose) -> Array:
+        return np.sum(pose.e[self.a] * pose.e[self.b], axis=1)
+
+    def jacobian(self, pose: Pose) -> Array:
+        # (omega_a x a) . b + a . (omega_b x b) = (omega_a - omega_b) . (a x b)
+        turned = cross(pose.e[self.a], pose.e[self.b])
+        return _along(turned, pose.e_angular[self.a] - pose.e_angular[self.b])
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        a, b = pose.e[self.a], pose.e[self.b]
+        turned_dot = cross(rate.e_dot[self.a], b) + cross(a, rate.e_dot[self.b])
+        return _along(turned_dot, pose.e_angular[self.a] - pose.e_angular[self.b]) + _along(
+            cross(a, b), rate.e_angular_dot[self.a] - rate.e_angular_dot[self.b]
+        )
+
+
+@dataclass(frozen=True)
+class Distance:
+    """(r . r - L^2) / (2 L): to first order the error of the distance itself, in metres."""
+
+    out: IntArray
+    pair: IntArray
+    length: Array
+
+    def phi(self, pose: Pose) -> Array:
+        r = pose.r[self.pair]
+        return (np.sum(r * r, axis=1) - self.length**2) / (2 * self.length)
+
+    def jacobian(self, pose: Pose) -> Array:
+        return _along(pose.r[self.pair] / self.length[:, None], pose.r_jacobian[self.pair])
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        length = self.length[:, None]
+        return _along(rate.r_dot[self.pair] / length, pose.r_jacobian[self.pair]) + _along(
+            pose.r[self.pair] / length, rate.r_jacobian_dot[self.pair]
+        )
+
+
+@dataclass(frozen=True)
+class Affine:
+    """A q' - c in the coordinates of one-freedom joints, whose places in q the tree knows."""
+
+    out: IntArray
+    matrix: Array  # (rows, n)
+    offset: Array  # (rows,)
+
+    def phi(self, pose: Pose) -> Array:
+        return self.matrix @ pose.q_tree[pose.tree.place] - self.offset
+
+    def jacobian(self, pose: Pose) -> Array:
+        return self.matrix
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        return np.zeros_like(self.matrix)
+
+
+@dataclass(frozen=True)
+class RelativeLog:
+    """log(R_A^T R_B): three rows for each pair of frames, zero when they are parallel."""
+
+    out: IntArray  # (3 pairs,)
+    joint_a: IntArray
+    rotation_a: Array  # (pairs, 3, 3), frame A in its joint
+    joint_b: IntArray
+    rotation_b: Array
+
+    def _relative(self, pose: Pose) -> tuple[Array, Array, Array]:
+        """Return u = log(R_A^T R_B), R_B^T, and the Jacobian of omega_B - omega_A in world axes."""
+        r_a = pose.rotation[self.joint_a] @ self.rotation_a
+        r_b_transposed = np.swapaxes(pose.rotation[self.joint_b] @ self.rotation_b, 1, 2)
+        relative = np.swapaxes(r_b_transposed @ r_a, 1, 2)
+        u = np.array([pin.log3(np.ascontiguousarray(r)) for r in relative])
+        return u, r_b_transposed, pose.angular(self.joint_b) - pose.angular(self.joint_a)
+
+    def phi(self, pose: Pose) -> Array:
+        return self._relative(pose)[0].ravel()
+
+    def jacobian(self, pose: Pose) -> Array:
+        u, r_b_transposed, angular = self._relative(pose)
+        return (_log_jacobian(u) @ r_b_transposed @ angular).reshape(self.out.size, -1)
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        u, r_b_transposed, angular = self._relative(pose)
+        body, j_log = r_b_transposed @ angular, _log_jacobian(u)
+        u_dot = (j_log @ body) @ rate.v
+        omega_b = pose.angular(self.joint_b) @ rate.v
+        # d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
+        body_dot = r_b_transposed @ (
+            rate.angular_dot(self.joint_b) - rate.angular_dot(self.joint_a) - _skew(omega_b) @ angular
+        )
+        return (_log_jacobian_dot(u, u_dot) @ body + j_log @ body_dot).reshape(self.out.size, -1)
+
+
+def _skew(a: Array) -> Array:
+    """Cross-product matrices of vectors (k, 3)."""
+    m = np.zeros((len(a), 3, 3))
+    m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -a[:, 2], a[:, 1], -a[:, 0]
+    return m - np.swapaxes(m, 1, 2)
+
+
+def _log_coefficient(u: Array) -> tuple[Array, Array]:
+    """Return c(theta) of Jlog(u) = 1 + [u]/2 + c [u]^2, and c'(theta)/theta; series near zero."""
+    square = np.sum(u * u, axis=1)
+    near = square < 0.01
+    t = np.where(near, 1.0, np.sqrt(square))
+    cotangent, sine = 1 / np.tan(t / 2), np.sin(t / 2)
+    c = 1 / t**2 - cotangent / (2 * t)
+    c_rate = (-2 / t**3 + cotangent / (2 * t**2) + 1 / (4 * t * sine**2)) / t
+    series = 1 / 12 + square / 720 + square**2 / 30240 + square**3 / 1209600 + square**4 / 47900160
+    series_rate = 1 / 360 + square / 7560 + square**2 / 201600 + square**3 / 5987520
+    return np.where(near, series, c), np.where(near, series_rate, c_rate)
+
+
+def _log_jacobian(u: Array) -> Array:
+    """Inverse right Jacobian of SO(3), shape (k, 3, 3): u_dot = Jlog(u) omega, omega in body axes."""
+    c, _ = _log_coefficient(u)
+    s = _skew(u)
+    return np.eye(3) + s / 2 + c[:, None, None] * (s @ s)
+
+
+def _log_jacobian_dot(u: Array, u_dot: Array) -> Array:
+    """Time derivative of `_log_jacobian` along u_dot."""
+    c, c_rate = _log_coefficient(u)
+    c_dot = c_rate * np.sum(u * u_dot, axis=1)
+    s, s_dot = _skew(u), _skew(u_dot)
+    return s_dot / 2 + c_dot[:, None, None] * (s @ s) + c[:, None, None] * (s_dot @ s + s @ s_dot)

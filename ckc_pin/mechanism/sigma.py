@@ -1,0 +1,169 @@
+"""The map q' = sigma(q) of eq. 4, by Newton with step control, on any level set phi = w.
+
+Two uses. Inside an integration a good prediction is at hand: `newton` alone, one or two iterations.
+From anywhere else: `sigma` follows the straight line from a closed configuration to the wanted q and
+says how that ended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Newton", "Sigma", "Verdict", "newton", "predict", "sigma"]
+
+Verdict = Literal["converged", "out of reach", "singular"]
+
+MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
+MAX_ITERATIONS = 12
+SMALLEST_PIECE = 1e-9  # of the straight line in q
+
+
+@dataclass(frozen=True)
+class Newton:
+    """Outcome of Newton's iteration on z: the last iterate, how many corrections, whether it closed."""
+
+    at: Kinematics
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Sigma:
+    """Outcome of following sigma to a wanted q.
+
+    Attributes
+    ----------
+    verdict : "converged", "out of reach" or "singular"
+    at : Kinematics
+        At sigma(q) when converged, else at the last closed configuration of the way.
+    reached : float
+        How much of the way was possible, 1 when converged.
+    miss : float
+        Largest |phi - w| that remains at q when out of reach, metres or radians.
+    iterations : int
+        Newton corrections over the whole way.
+    reason : str
+        The verdict as half a sentence.
+    """
+
+    verdict: Verdict
+    at: Kinematics
+    reached: float
+    miss: float
+    iterations: int
+    reason: str = ""
+
+
+def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
+    """Close phi(q, z) = w by Newton on z from a start near the solution.
+
+    Parameters
+    ----------
+    start : Kinematics
+        Its q is kept, its z corrected.
+    w : (rows,) array or 0.0
+        The level set.
+    tolerance : float
+        Largest |phi - w| that counts as closed.
+
+    Returns
+    -------
+    Newton
+        Not converged when a step is not local, does not contract, or phi_z is singular.
+    """
+    at = start
+    residual = at.phi - w
+    size = float(np.abs(residual).max(initial=0.0))
+    for iteration in range(MAX_ITERATIONS):
+        if size <= tolerance:
+            return Newton(at, iteration, True)
+        if not np.isfinite(size) or at.phi_z_factor.singular:
+            return Newton(at, iteration, False)
+        step = np.zeros(at.tree.n)
+        step[at.partition.z] = -at.phi_z_factor.solve(residual)
+        if not np.abs(step).max() <= MAX_STEP:
+            return Newton(at, iteration, False)
+        at = at.moved(step)
+        residual = at.phi - w
+        previous, size = size, float(np.abs(residual).max(initial=0.0))
+        if not size <= max(0.5 * previous, tolerance):
+            return Newton(at, iteration + 1, False)
+    return Newton(at, MAX_ITERATIONS, False)
+
+
+def predict(at: Kinematics, dq: Array) -> Kinematics:
+    """Move q by dq and z along with it to first order, z + rho_z dq."""
+    return at.moved(at.rho @ dq)
+
+
+def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float) -> Sigma:
+    """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq.
+
+    Each piece is predicted along rho and corrected by Newton; a piece that fails is halved. Following
+    the line is what keeps the assembly branch: Newton from far away may close on another one.
+    """
+    at, done, piece, iterations = start, 0.0, 1.0, 0
+    while done < 1.0:
+        piece = min(piece, 1.0 - done)
+        trial = newton(predict(at, piece * dq), w, tolerance)
+        iterations += trial.iterations
+        if trial.converged and _same_branch(at, trial.at):
+            at, done, piece = trial.at, done + piece if piece < 1.0 - done else 1.0, 2.0 * piece
+        else:
+            piece /= 2.0
+            if piece < SMALLEST_PIECE:
+                return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+    return Sigma("converged", at, 1.0, 0.0, iterations)
+
+
+def _same_branch(before: Kinematics, after: Kinematics) -> bool:
+    """Whether det phi_z keeps its sign: between branches there is a singular configuration."""
+    if before.phi_z.shape[0] != before.phi_z.shape[1]:
+        return True
+    return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
+
+
+def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
+    """Say why the way ended: by the nearest miss at q itself, and what phi_z is like there."""
+    target = np.zeros(at.tree.n)
+    target[at.partition.q] = dq
+    nearest = _least_squares(at.moved(target), w, tolerance)
+    miss = float(np.abs(nearest.phi - w).max(initial=0.0))
+    singular = nearest.sigma_min() <= 1e-6 * np.linalg.norm(nearest.J)
+    if miss > (1e-8 if singular else tolerance):
+        reason = f"the loops cannot close there (nearest miss {miss:.3g})"
+        return Sigma("out of reach", at, done, miss, iterations, reason)
+    if singular:
+        return Sigma("singular", at, done, miss, iterations, "phi_z is singular there")
+    if _same_branch(at, nearest):
+        return Sigma("converged", nearest, 1.0, 0.0, iterations)
+    reason = "the loops close there on another assembly branch only, behind a singular configuration"
+    return Sigma("out of reach", at, done, miss, iterations, reason)
+
+
+def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinematics:
+    """Levenberg-Marquardt on |phi - w| over z, q kept."""
+    damping, z = 1e-3, at.partition.z
+    for _ in range(200):
+        residual = at.phi - w
+        if np.abs(residual).max(initial=0.0) <= tolerance:
+            break
+        gram, gradient = at.phi_z.T @ at.phi_z, at.phi_z.T @ residual
+        step = np.zeros(at.tree.n)
+        step[z] = -np.linalg.solve(gram + damping * np.eye(len(z)) * max(1e-30, np.trace(gram)), gradient)
+        trial = at.moved(step)
+        if np.linalg.norm(trial.phi - w) < np.linalg.norm(residual):
+            at, damping = trial, damping / 5
+            if np.abs(step).max() < 1e-12:
+                break
+        else:
+            damping *= 4
+            if damping > 1e12:
+                break
+    return at

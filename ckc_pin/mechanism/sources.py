@@ -1,0 +1,71 @@
+"""Where texts come from: a folder, a package of robots, or the texts that a saved run carries."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.toml import read_text
+
+__all__ = ["Sources", "resolve"]
+
+PACKAGE = "package://"
+
+
+class Sources:
+    """Texts by the name that a mechanism file gives them; what was read is kept, so a run can carry it.
+
+    Parameters
+    ----------
+    name : str
+        What messages call the mechanism file.
+    folder : Path or None
+        Relative names are resolved here. None: only `texts` exist.
+    texts : mapping, optional
+        Texts that are there already.
+    """
+
+    def __init__(self, name: str, folder: Path | None, texts: Mapping[str, str] | None = None) -> None:
+        self.name = name
+        self.folder = folder
+        self.texts = dict(texts or {})
+
+    def text(self, file: str) -> str:
+        """Return a file's text.
+
+        Raises
+        ------
+        InputError
+            No such file or package.
+        """
+        if file not in self.texts:
+            if self.folder is None:
+                raise InputError(f"{self.name}: the text of {file!r} is not part of it")
+            self.texts[file] = read_text(resolve(file, self.folder, self.name), "URDF")
+        return self.texts[file]
+
+
+def resolve(file: str, folder: Path, where: str) -> Path:
+    """Return the path of a file named relative to a folder, or as ``package://PACKAGE/PATH``."""
+    if not file.startswith(PACKAGE):
+        return folder / file
+    package, _, rest = file.removeprefix(PACKAGE).partition("/")
+    for share in _shares():
+        base = (share / package).resolve()
+        if base.is_dir():
+            path = (base / rest).resolve()
+            if not path.is_relative_to(base):
+                raise InputError(f"{where}: {file!r} leaves its package")
+            return path
+    raise InputError(f"{where}: {file!r}: no package {package!r} is installed; example-robot-data is one: "
+                     "pip install example-robot-data")  # fmt: skip
+
+
+def _shares() -> list[Path]:
+    """Folders that hold robot packages: beside Pinocchio's wheel, and the interpreter's own."""
+    import pinocchio
+
+    wheel = Path(pinocchio.__file__).resolve().parents[4] / "share"
+    return [wheel, Path(sys.prefix) / "share"]

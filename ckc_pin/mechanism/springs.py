@@ -1,0 +1,125 @@
+"""Springs and dampers between frames or on joints: forces on the tree, and what they store."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.frames import Frames
+from ckc_pin.mechanism.pose import Anchors, Pose, Rate
+from ckc_pin.mechanism.spec import SpringSpec
+from ckc_pin.mechanism.tree import Array, Tree
+
+__all__ = ["Springs"]
+
+
+class Springs:
+    """All springs and dampers of a mechanism, with the viscous damping of the URDF's joints.
+
+    Parameters
+    ----------
+    tree, frames : Tree, Frames
+    specs : sequence of SpringSpec
+
+    Raises
+    ------
+    MechanismError, InputError
+        An unknown frame or joint, or a spring that is neither of the two kinds.
+    """
+
+    def __init__(self, tree: Tree, frames: Frames, specs: Sequence[SpringSpec]) -> None:
+        self.tree = tree
+        ends_a, ends_b, lines = [], [], []
+        self.joint_stiffness, self.joint_rest = np.zeros(tree.n), np.zeros(tree.n)
+        self.joint_damping = np.array(tree.model.damping, dtype=float)
+        for k, spec in enumerate(specs):
+            where = f"spring {k + 1}"
+            if spec.joint is not None:
+                _forbid(where, "a spring on a joint", spec, ("frame_a", "frame_b", "rest_length"))
+                at = tree.indices((spec.joint,), where)[0]
+                self._add_joint(at, spec)
+            elif spec.frame_a is not None and spec.frame_b is not None:
+                _forbid(where, "a spring between frames", spec, ("rest",))
+                ends_a.append(frames.find(spec.frame_a, f"{where}, frame_a"))
+                ends_b.append(frames.find(spec.frame_b, f"{where}, frame_b"))
+                lines.append((spec.stiffness, spec.rest_length or 0.0, spec.damping))
+            else:
+                raise InputError(f"{where}: give either joint, or frame_a and frame_b")
+        ends = [*ends_a, *ends_b]
+        empty = np.zeros(0, np.intp)
+        self.anchors = Anchors(
+            np.array([f.joint for f in ends], np.intp),
+            np.array([f.translation for f in ends]).reshape(-1, 3),
+            empty,
+            np.zeros((0, 3)),
+        )
+        self.stiffness, self.rest_length, self.damping = np.array(lines).reshape(-1, 3).T
+        self.between_frames = bool(lines)
+        self.any = bool(self.stiffness.any()) or bool(self.joint_stiffness.any())
+        self.any_damping = bool(self.damping.any()) or bool(self.joint_damping.any())
+
+    def _add_joint(self, at: int, spec: SpringSpec) -> None:
+        if self.joint_stiffness[at]:
+            raise MechanismError(f"two springs on joint {spec.joint!r}; give one with their sum")
+        self.joint_stiffness[at] = spec.stiffness
+        self.joint_rest[at] = spec.rest or 0.0
+        self.joint_damping[at] += spec.damping
+
+    def elastic_force(self, q_tree: Array) -> Array:
+        """Generalized force of the springs on the tree, shape (n,): minus the gradient of `energy`."""
+        force = -self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest)
+        if self.between_frames:
+            length, length_jacobian = self._lengths(q_tree)
+            force -= (self.stiffness * (length - self.rest_length)) @ length_jacobian
+        return force
+
+    def elastic_gradient(self, q_tree: Array) -> Array:
+        """Minus the derivative of `elastic_force` along the tangent coordinates, shape (n, n).
+
+        The geometric part, d(length Jacobian)/dq, comes from the Jacobian's rate along each coordinate.
+        """
+        gradient = np.diag(self.joint_stiffness)
+        if not self.between_frames:
+            return gradient
+        pose = Pose(self.tree, self.anchors, q_tree)
+        length, length_jacobian = self._lengths(q_tree)
+        gradient += length_jacobian.T @ (self.stiffness[:, None] * length_jacobian)
+        pull = self.stiffness * (length - self.rest_length) / np.where(length > 0, length, 1.0)
+        for k in range(self.tree.n):
+            rate = Rate(pose, np.eye(self.tree.n)[k])
+            # d/dq_k of (r . r_jacobian / length), the stretching of length itself taken off
+            turned = (rate.r_dot[:, None, :] @ pose.r_jacobian + pose.r[:, None, :] @ rate.r_jacobian_dot)[:, 0, :]
+            gradient[:, k] += pull @ (turned - length_jacobian * length_jacobian[:, k : k + 1])
+        return gradient
+
+    def damping_force(self, q_tree: Array, v_tree: Array) -> Array:
+        """Generalized force of the dampers on the tree, shape (n,)."""
+        force = -self.joint_damping * v_tree
+        if self.damping.any():
+            _, length_jacobian = self._lengths(q_tree)
+            force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
+        return force
+
+    def energy(self, q_tree: Array) -> float:
+        """Energy stored, joules."""
+        stretch = q_tree[self.tree.place] - self.joint_rest
+        energy = 0.5 * float(self.joint_stiffness @ stretch**2)
+        if self.between_frames:
+            length = np.sqrt(np.sum(Pose(self.tree, self.anchors, q_tree).r ** 2, axis=1))
+            energy += 0.5 * float(self.stiffness @ (length - self.rest_length) ** 2)
+        return energy
+
+    def _lengths(self, q_tree: Array) -> tuple[Array, Array]:
+        """Lengths (k,) and their Jacobian (k, n); a spring of length zero has no direction to pull in."""
+        pose = Pose(self.tree, self.anchors, q_tree)
+        length = np.sqrt(np.sum(pose.r**2, axis=1))
+        along = pose.r / np.where(length > 0, length, 1.0)[:, None]
+        return length, (along[:, None, :] @ pose.r_jacobian)[:, 0, :]
+
+
+def _forbid(where: str, kind: str, spec: SpringSpec, keys: tuple[str, ...]) -> None:
+    for key in keys:
+        if getattr(spec, key) is not None:
+            raise InputError(f"{where}: {kind} has no key {key!r}")

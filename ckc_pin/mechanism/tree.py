@@ -1,0 +1,164 @@
+"""The tree: a Pinocchio model with names for its coordinates, and what its joints do in world axes.
+
+What bites in Pinocchio 4.1 and is dealt with here: `data.oMi`, `data.J` and `data.dJ` are live views
+of one workspace, so what is kept is copied; NaN passes through every algorithm in silence, so
+states are checked where they enter. The placements of all joints are read as one strided array instead
+of one Python object a joint; the stride is verified when the tree is made.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.lazy import Tally
+
+__all__ = ["Array", "IntArray", "Tree"]
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Tree:
+    """A Pinocchio model, one workspace for it, and the labels of its tangent coordinates.
+
+    Parameters
+    ----------
+    model : pinocchio.Model
+        Joints of one freedom, and free-flyers.
+
+    Attributes
+    ----------
+    coordinates : tuple of str
+        A label for each tangent coordinate, Pinocchio's order: the joint's name, or six of them
+        ``root.x ... root.rz`` for a free root.
+    n : int
+        Number of tangent coordinates.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.data = model.createData()
+        self.n: int = model.nv
+        self.nq: int = model.nq
+        self.flat = self.n == self.nq
+        self.coordinates = tuple(_labels(model))
+        self.index = {label: k for k, label in enumerate(self.coordinates)}
+        # where the coordinate of a one-freedom joint stands in q (a free root's: its position, then nothing)
+        self.place = np.array(_places(model), dtype=np.intp)
+        self.free = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
+        self.free_coordinates = {self.coordinates[v + k] for _, v in self.free for k in range(6)}
+        # support[joint, 0, k] is 1 where coordinate k moves the joint
+        self.support = np.zeros((model.njoints, 1, self.n))
+        for joint in range(1, model.njoints):
+            for ancestor in list(model.supports[joint])[1:]:
+                j = model.joints[ancestor]
+                self.support[joint, 0, j.idx_v : j.idx_v + j.nv] = 1.0
+        self._placement = _strided_placements(self.data)
+        self._jacobian, self._jacobian_dot = self.data.J, self.data.dJ
+        self.tally: Tally | None = None
+
+    def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
+        """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""
+        pin.computeJointJacobians(self.model, self.data, q_tree)
+        return self._placement.copy(), self._jacobian.copy()
+
+    def jacobian_dot(self, q_tree: Array, v_tree: Array) -> Array:
+        """Return d/dt of the world Jacobian (6, n) along v_tree."""
+        pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
+        return self._jacobian_dot.copy()
+
+    def integrate(self, q_tree: Array, step: Array) -> Array:
+        """Move a configuration by a tangent step."""
+        return q_tree + step if self.flat else np.asarray(pin.integrate(self.model, q_tree, step))
+
+    def difference(self, start: Array, end: Array) -> Array:
+        """Return the tangent step from one configuration to another."""
+        return end - start if self.flat else np.asarray(pin.difference(self.model, start, end))
+
+    def configuration_rate(self, q_tree: Array, v_tree: Array) -> Array:
+        """Time derivative of Pinocchio's q at a tangent velocity, shape (nq,)."""
+        if self.flat:
+            return v_tree
+        rate = np.empty(self.nq)
+        rate[self.place] = v_tree
+        for q_at, v_at in self.free:
+            x, y, z, w = q_tree[q_at + 3 : q_at + 7]
+            p, q, r = v_tree[v_at + 3 : v_at + 6]  # angular velocity in the body's axes
+            rotation = pin.Quaternion(np.array([x, y, z, w])).matrix()
+            rate[q_at : q_at + 3] = rotation @ v_tree[v_at : v_at + 3]
+            rate[q_at + 3 : q_at + 7] = 0.5 * np.array(
+                [w * p + y * r - z * q, w * q + z * p - x * r, w * r + x * q - y * p, -x * p - y * q - z * r]
+            )
+        return rate
+
+    def neutral(self) -> Array:
+        """Return the configuration with all coordinates zero."""
+        return np.asarray(pin.neutral(self.model))
+
+    def to_coordinates(self, q_tree: Array) -> Array:
+        """Return the n numbers that files and JSON carry (a free root: position, rotation vector)."""
+        if self.flat:
+            return np.array(q_tree)
+        numbers = np.array(q_tree[self.place])
+        for q_at, v_at in self.free:
+            rotation = pin.Quaternion(np.ascontiguousarray(q_tree[q_at + 3 : q_at + 7])).normalized()
+            numbers[v_at : v_at + 3] = q_tree[q_at : q_at + 3]
+            numbers[v_at + 3 : v_at + 6] = pin.log3(rotation.matrix())
+        return numbers
+
+    def from_coordinates(self, numbers: Array) -> Array:
+        """Inverse of `to_coordinates`."""
+        if self.flat:
+            return np.array(numbers, dtype=float)
+        q_tree = self.neutral()
+        q_tree[self.place] = numbers
+        for q_at, v_at in self.free:
+            q_tree[q_at : q_at + 3] = numbers[v_at : v_at + 3]
+            q_tree[q_at + 3 : q_at + 7] = pin.Quaternion(pin.exp3(numbers[v_at + 3 : v_at + 6])).coeffs()
+        return q_tree
+
+    def named(self, vector: Array) -> dict[str, float]:
+        """Return a tangent vector keyed by coordinate."""
+        return {label: float(x) for label, x in zip(self.coordinates, vector, strict=True)}
+
+    def indices(self, names: tuple[str, ...], what: str) -> IntArray:
+        """Return where coordinates stand; InputError names the valid ones."""
+        for name in names:
+            if name not in self.index:
+                raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
+        return np.array([self.index[name] for name in names], dtype=np.intp)
+
+
+def _labels(model: Any) -> list[str]:
+    labels: list[str] = []
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+        labels += [name] if joint.nv == 1 else [f"{name}.{axis}" for axis in _ROOT_AXES]
+    return labels
+
+
+def _places(model: Any) -> list[int]:
+    places: list[int] = []
+    for joint in list(model.joints)[1:]:
+        places += [joint.idx_q] if joint.nv == 1 else [joint.idx_q + k for k in (0, 1, 2, 3, 4, 5)]
+    return places
+
+
+def _strided_placements(data: Any) -> Array:
+    """View data.oMi as (joints, 12): rotation by columns, then translation.
+
+    Valid because Pinocchio keeps its placements in one contiguous vector; checked, not assumed.
+    """
+    rotations = [placement.rotation for placement in data.oMi]
+    starts = np.array([r.__array_interface__["data"][0] for r in rotations])
+    ends = np.array([m.translation.__array_interface__["data"][0] for m in data.oMi])
+    if np.any(np.diff(starts) != 96) or np.any(ends - starts != 72):
+        raise RuntimeError("this Pinocchio lays its placements out differently; ckc_pin needs pin 4.1")
+    first = rotations[0].T.reshape(-1)  # stored by columns: the transpose shares the memory
+    return np.lib.stride_tricks.as_strided(first, shape=(len(rotations), 12), strides=(96, 8))

@@ -1,0 +1,133 @@
+"""What there is to know about a mechanism or a scene before running it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.mechanism.library import is_path, load
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
+from ckc_pin.simulation.simulate import scene_controller, scene_mechanism
+from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
+
+__all__ = ["Check", "check"]
+
+MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
+
+
+@dataclass(frozen=True)
+class Check:
+    """Findings on a mechanism, and on a scene's desired trajectory.
+
+    Attributes
+    ----------
+    n, d, rows, rank : int
+        Coordinates, freedoms, rows of phi, rank of J at the assembled configuration.
+    redundant : tuple of str
+        Rows that the others imply, one admissible choice.
+    independent, dependent, coordinates : tuple of str
+    q_tree : (n,) array
+        The assembled configuration.
+    det_phi_z : float or None
+        None unless phi_z is square.
+    sigma_min_phi_z, cond_phi_z : float
+    warnings : tuple of str
+    desired : DesiredCheck or None
+        For a scene with a controller.
+    """
+
+    n: int
+    d: int
+    rows: int
+    rank: int
+    redundant: tuple[str, ...]
+    independent: tuple[str, ...]
+    dependent: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    q_tree: Array
+    det_phi_z: float | None
+    sigma_min_phi_z: float
+    cond_phi_z: float
+    warnings: tuple[str, ...]
+    desired: DesiredCheck | None = None
+
+
+def check(what: Mechanism | Scene | str | Path) -> Check:
+    """Check a mechanism, or a scene with its mechanism.
+
+    Parameters
+    ----------
+    what : Mechanism, Scene, str or Path
+        "five_bar" is a mechanism, "five_bar/tracking" and "x.scene.toml" are scenes.
+
+    Raises
+    ------
+    InputError, MechanismError
+        It cannot exist as described. Findings about one that can are not errors.
+    """
+    if isinstance(what, str | Path):
+        what = load_scene(what) if _names_a_scene(str(what)) else load(what)
+    if isinstance(what, Mechanism):
+        return _mechanism_check(what, None, [])
+    mechanism = scene_mechanism(what)
+    desired = _desired(what, mechanism)
+    return _mechanism_check(mechanism, desired, _desired_warnings(mechanism, desired))
+
+
+def _names_a_scene(name: str) -> bool:
+    if is_path(name):
+        return name.endswith(SUFFIX)
+    return "/" in name
+
+
+def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str]) -> Check:
+    at = mechanism.assembled
+    values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
+    square = at.phi_z.shape[0] == at.phi_z.shape[1]
+    return Check(
+        n=mechanism.n,
+        d=mechanism.d,
+        rows=mechanism.closure.rows,
+        rank=mechanism.rank.rank,
+        redundant=mechanism.redundant,
+        independent=mechanism.independent,
+        dependent=mechanism.dependent,
+        coordinates=mechanism.coordinates,
+        q_tree=mechanism.tree.to_coordinates(mechanism.q_tree),
+        det_phi_z=float(np.linalg.det(at.phi_z)) if square else None,
+        sigma_min_phi_z=float(values[-1]),
+        cond_phi_z=float(values[0] / values[-1]),
+        warnings=(*mechanism.warnings, *warnings),
+        desired=desired,
+    )
+
+
+def _desired(scene: Scene, mechanism: Mechanism) -> DesiredCheck | None:
+    controller = scene_controller(scene, mechanism)
+    if isinstance(controller, Tracking):
+        return follow_desired(mechanism, controller.desired, scene.spec.t_end)
+    if isinstance(controller, SetPoint):
+        return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
+    return None
+
+
+def _desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None) -> list[str]:
+    if desired is None:
+        return []
+    if desired.leaves_at is not None:
+        return [
+            f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s: "
+            f"{', '.join(mechanism.independent)} cannot follow it from there"
+        ]
+    usual = mechanism.assembled.sigma_min()
+    if desired.sigma_min < MARGIN * usual:
+        return [
+            f"the desired trajectory comes close to a singular configuration at t = {desired.closest_t:.5f} s: "
+            f"sigma_min(phi_z) = {desired.sigma_min:.3g} there, {usual:.3g} as assembled"
+        ]
+    return []

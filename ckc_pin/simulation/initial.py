@@ -1,0 +1,104 @@
+"""Where a scene starts: q, q_dot, and for the SPF w."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.dynamics.equilibrium import stable_equilibrium
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sigma import newton
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.scene import Scene
+
+__all__ = ["Start", "find_start"]
+
+
+@dataclass(frozen=True)
+class Start:
+    """A state to start from: the closure's terms at q' (on phi = w), q_dot, and w."""
+
+    at: Kinematics
+    q_dot: Array
+    w: Array
+
+
+def find_start(mechanism: Mechanism, scene: Scene) -> Start:
+    """Assemble the initial state of a scene.
+
+    Raises
+    ------
+    InputError
+        Unknown coordinates, a wrong shape, a start out of reach.
+    NumericalError
+        A start that is singular.
+    """
+    initial = scene.spec.initial
+    rows = mechanism.closure.rows
+    w = np.zeros(rows)
+    if initial.w is not None:
+        if len(initial.w) != rows:
+            names = ", ".join(".".join(name) for name in mechanism.closure.names)
+            raise InputError(f"initial.w: {len(initial.w)} numbers, the closure has {rows} rows: {names}")
+        w = np.array(initial.w, dtype=float)
+    q_dot = mechanism.vector(initial.q_dot, mechanism.independent, "initial.q_dot", fill=0.0)
+    if initial.at == "equilibrium":
+        at = stable_equilibrium(mechanism)
+        return Start(_close(mechanism, mechanism.independent_part(at.q_tree), at, w), q_dot, w)
+    q = mechanism.vector(
+        {k: x for k, x in initial.q.items() if k not in mechanism.dependent},
+        mechanism.independent,
+        "initial.q",
+    )
+    return Start(_close(mechanism, q, _branch(mechanism, initial.q), w), q_dot, w)
+
+
+def _branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
+    """Return the assembled configuration, or the one that given dependent coordinates pick."""
+    if not any(name in mechanism.dependent for name in given):
+        return mechanism.assembled
+    numbers = mechanism.tree.to_coordinates(mechanism.q_tree)
+    for name, value in given.items():
+        numbers[mechanism.tree.index[name]] = value
+    if not np.all(np.isfinite(numbers)):
+        raise InputError("initial.q: a value is not finite")
+    closed = newton(mechanism.kinematics(mechanism.tree.from_coordinates(numbers)), 0.0, mechanism.tolerance)
+    if not closed.converged:
+        miss = np.abs(mechanism.kinematics(mechanism.tree.from_coordinates(numbers)).phi).max()
+        raise InputError(
+            f"initial.q: the loops do not close near the given {', '.join(mechanism.dependent)} "
+            f"(|phi| = {miss:.3g} there); leave them out, or give a nearly closed configuration"
+        )
+    return closed.at
+
+
+def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinematics:
+    found = mechanism.sigma(q, start, w)
+    if found.verdict == "converged" and not np.any(w):
+        _refuse_singular(mechanism, found.at)
+        return found.at
+    if found.verdict == "converged":
+        return found.at
+    where = ", ".join(f"{name} = {x:.6g}" for name, x in zip(mechanism.independent, q, strict=True))
+    level = f" on phi = w = {w.tolist()}" if np.any(w) else ""
+    if found.verdict == "singular":
+        raise NumericalError(
+            f"the start {where}{level} is singular: {', '.join(mechanism.independent)} do not determine "
+            f"{', '.join(mechanism.dependent)} there; start elsewhere or choose other independent coordinates",
+            t=0.0,
+            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(found.at.q_tree)),
+        )
+    raise InputError(f"initial: the start {where}{level} is out of reach: {found.reason}")
+
+
+def _refuse_singular(mechanism: Mechanism, at: Kinematics) -> None:
+    if len(mechanism.dependent) and at.sigma_min() <= 1e-9 * np.linalg.norm(at.J):
+        raise NumericalError(
+            f"the start is singular: phi_z has the singular value {at.sigma_min():.3g}; start elsewhere or choose "
+            "other independent coordinates",
+            t=0.0,
+            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
+        )

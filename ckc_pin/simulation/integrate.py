@@ -1,0 +1,212 @@
+"""The step loop: SciPy's solvers, one accepted step at a time.
+
+What the loop adds to a solver: states where the right-hand side does not exist are offered to it as NaN,
+so that it shortens its step instead of failing; the closure is projected between steps; budgets; and an
+interpolant good enough for output between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.scene import SolverSpec
+from ckc_pin.simulation.systems import System
+
+__all__ = ["BudgetError", "Step", "Stepper"]
+
+ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
+
+
+class BudgetError(Exception):
+    """A budget of the scene is used up."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted step and y in between."""
+
+    t_old: float
+    t: float
+    interpolant: Callable[[float], Array]
+
+
+class Stepper:
+    """A SciPy solver on a system, with the counts that a run reports.
+
+    Parameters
+    ----------
+    system : System
+    method : str
+        A class of `scipy.integrate`.
+    spec : SolverSpec
+    t_end : float
+
+    Raises
+    ------
+    InputError
+        Projection with a multistep method, whose history it would corrupt.
+    """
+
+    def __init__(self, system: System, method: str, spec: SolverSpec, t_end: float) -> None:
+        import scipy.integrate
+
+        if system.projects and method not in ONE_STEP:
+            raise InputError(
+                f"solver: {method} is a multistep method, and projection edits the state between steps, which "
+                f"corrupts its history; take one of {', '.join(ONE_STEP)}, or projection = false"
+            )
+        self.system = system
+        self.method = method
+        self.spec = spec
+        self.rhs_count = self.steps = self.rejected = 0
+        self.t_failed: float | None = None
+        self.failure: NumericalError | None = None
+        self._deadline = perf_counter() + spec.max_wall_s if spec.max_wall_s else np.inf
+        self._times: set[float] = set()
+        atol = spec.atol if spec.atol is not None else spec.rtol / 100
+        options: dict[str, Any] = {"max_step": spec.max_step} if spec.max_step else {}
+        self.y = system.start()
+        self._rhs(0.0, self.y, at_start=True)
+        self.solver = getattr(scipy.integrate, method)(
+            self._rhs, 0.0, self.y, t_end, rtol=spec.rtol, atol=atol, **options
+        )
+
+    @property
+    def t(self) -> float:
+        """Time reached."""
+        return float(self.solver.t)
+
+    def step(self) -> Step:
+        """Advance by one accepted step.
+
+        Raises
+        ------
+        NumericalError
+            The solver cannot go on; the message says why.
+        BudgetError
+            A budget is used up.
+        """
+        solver = self.solver
+        t_old, y_old, f_old = self.t, solver.y.copy(), getattr(solver, "f", None)
+        before = self.rhs_count
+        self._times.clear()
+        message = solver.step()
+        if solver.status == "failed":
+            raise self._explain(message)
+        self.steps += 1
+        self.rejected += self._attempts(self.rhs_count - before) - 1
+        if solver.t - t_old < self.spec.min_step and solver.status == "running":
+            raise self._explain(f"the step fell below min_step = {self.spec.min_step:g} s")
+        self.failure = None
+        step = Step(t_old, self.t, self._interpolant(t_old, y_old, f_old))
+        projected = self.system.accept(self.t, solver.y)
+        if projected is not None:
+            solver.y = projected
+            solver.f = self._rhs(self.t, projected)
+        return step
+
+    def stats(self) -> dict[str, int]:
+        """Return the counts so far."""
+        solver, counts = self.solver, self.system.counts
+        return {
+            "rhs": self.rhs_count,
+            "steps": self.steps,
+            "rejected": self.rejected,
+            "newton": counts.newton,
+            "factorizations": counts.factorizations + int(solver.nlu),
+            "jacobians": int(solver.njev),
+        }
+
+    def _rhs(self, t: float, y: Array, at_start: bool = False) -> Array:
+        self.rhs_count += 1
+        self._times.add(t)
+        if self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
+            raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
+        if perf_counter() > self._deadline:
+            raise BudgetError(f"the budget of max_wall_s = {self.spec.max_wall_s:g} s is used up")
+        try:
+            with np.errstate(all="ignore"):
+                derivative = self.system.rhs(t, y) if np.all(np.isfinite(y)) else np.full_like(y, np.nan)
+        except NumericalError as error:
+            if at_start:
+                raise
+            self.failure = error
+            return np.full_like(y, np.nan)
+        if not np.all(np.isfinite(derivative)):
+            self.failure = NumericalError("the right-hand side is not finite", t=t)
+            if at_start:
+                raise self.failure
+        return derivative
+
+    def _explain(self, message: str) -> NumericalError:
+        """Say why the solver gave up: the closure's own verdict where there is one."""
+        if self.failure is not None:
+            return NumericalError(str(self.failure), t=self.t, q_tree=self.failure.q_tree)
+        return NumericalError(message[0].lower() + message[1:].rstrip("."), t=self.t)
+
+    def _attempts(self, evaluations: int) -> int:
+        """How many steps were tried in one accepted step, from what was evaluated."""
+        if self.method in ("RK23", "RK45", "DOP853"):
+            return max(1, evaluations // int(self.solver.n_stages))
+        stages = 3 if self.method == "Radau" else 1
+        distinct = len(self._times - {self.solver.t_old})
+        return max(1, -(-distinct // stages))
+
+    def _interpolant(self, t_old: float, y_old: Array, f_old: Array | None) -> Callable[[float], Array]:
+        """Radau's own interpolant is of order 3 only, so its end derivatives are used; else the solver's."""
+        solver = self.solver
+        if self.method != "Radau" or f_old is None:
+            dense: list[Callable[[float], Array]] = []
+
+            def own(t: float) -> Array:
+                if not dense:
+                    dense.append(_frozen_dense_output(solver))
+                return np.asarray(dense[0](t))
+
+            return own
+        n = self.system.positions
+        return _hermite(t_old, y_old, f_old, float(solver.t), solver.y.copy(), solver.f.copy(), n)
+
+
+def _frozen_dense_output(solver: Any) -> Callable[[float], Array]:
+    output: Callable[[float], Array] = solver.dense_output()
+    return output
+
+
+def _hermite(
+    t0: float, y0: Array, f0: Array, t1: float, y1: Array, f1: Array, positions: int
+) -> Callable[[float], Array]:
+    """Cubic Hermite interpolation of y; of fifth degree for positions, whose second derivatives are in f.
+
+    y = (positions, their rates, rest): rates are the derivative of the positions' quintic.
+    """
+    h, n = t1 - t0, positions
+
+    def at(t: float) -> Array:
+        s = (t - t0) / h
+        y = (
+            (1 + 2 * s) * (1 - s) ** 2 * y0
+            + s * (1 - s) ** 2 * h * f0
+            + s**2 * (3 - 2 * s) * y1
+            + s**2 * (s - 1) * h * f1
+        )
+        if n:
+            q0, v0, a0 = y0[:n], h * f0[:n], h * h * f0[n : 2 * n]
+            q1, v1, a1 = y1[:n], h * f1[:n], h * h * f1[n : 2 * n]
+            # p(s) = q0 + v0 s + a0 s^2 / 2 + c3 s^3 + c4 s^4 + c5 s^5
+            gap, slope, bend = q1 - q0 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
+            c3 = 10 * gap - 4 * slope + bend / 2
+            c4 = -15 * gap + 7 * slope - bend
+            c5 = 6 * gap - 3 * slope + bend / 2
+            y[:n] = q0 + s * (v0 + s * (a0 / 2 + s * (c3 + s * (c4 + s * c5))))
+            y[n : 2 * n] = (v0 + s * (a0 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h
+        return y
+
+    return at

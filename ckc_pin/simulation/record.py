@@ -1,0 +1,71 @@
+"""What a run keeps at its output instants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ckc_pin.control.actuation import Effort
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.systems import System
+
+__all__ = ["Recorder"]
+
+
+class Recorder:
+    """Collects rows of a `Run`, one an output instant.
+
+    Parameters
+    ----------
+    system : System
+    effort : callable
+        (t, terms) to the actuators' effort.
+    lyapunov : callable or None
+        (t, terms, w) to the controller's Lyapunov function.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        effort: Callable[[float, Terms], Effort],
+        lyapunov: Callable[[float, Terms, Array], float] | None,
+    ) -> None:
+        self.system, self.effort, self.lyapunov = system, effort, lyapunov
+        self.rows: dict[str, list[Array | float]] = {
+            name: [] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
+        }
+        if lyapunov is not None:
+            self.rows["lyapunov"] = []
+        self.max_phi = self.max_phi_dot = 0.0
+
+    def add(self, t: float, y: Array) -> None:
+        """Record the state at an instant; instants not after the last one are passed over."""
+        if self.rows["t"] and t <= self.rows["t"][-1]:
+            return
+        system = self.system
+        terms = system.terms(t, y)
+        velocity, w = system.velocity(t, terms), system.w(t)
+        effort = self.effort(t, terms)
+        values: dict[str, Array | float] = {
+            "t": t,
+            "q_tree": system.mechanism.tree.to_coordinates(terms.q_tree),
+            "v_tree": velocity,
+            "u": effort.u,
+            "tau": effort.tau,
+            "phi": terms.phi,
+            "w": w,
+            "energy": terms.energy,
+        }
+        if self.lyapunov is not None:
+            values["lyapunov"] = self.lyapunov(t, terms, terms.phi)
+        for name, value in values.items():
+            self.rows[name].append(value)
+        self.max_phi = max(self.max_phi, float(np.abs(terms.phi - w).max(initial=0.0)))
+        drift_rate = terms.at.J @ velocity - system.w_dot(t)
+        self.max_phi_dot = max(self.max_phi_dot, float(np.abs(drift_rate).max(initial=0.0)))
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the rows as arrays."""
+        return {name: np.array(values, dtype=float) for name, values in self.rows.items()}

@@ -1,0 +1,113 @@
+"""Findings as plain data (the JSON of design.md) and as tables for a terminal."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.check import Check
+from ckc_pin.simulation.run import Run
+
+__all__ = ["check_plain", "check_table", "run_table", "terms_plain", "terms_table"]
+
+TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
+
+
+def check_plain(found: Check) -> dict[str, Any]:
+    """Return a check as JSON-ready data."""
+    return {**asdict(found), "q_tree": found.q_tree.tolist()}
+
+
+def check_table(found: Check) -> Group:
+    """Return a check for people."""
+    table = _plain_table("", "")
+    table.add_row("coordinates n", str(found.n))
+    table.add_row("freedoms d", str(found.d))
+    redundant = f", redundant: {', '.join(found.redundant)}" if found.redundant else ""
+    table.add_row("closure rows, rank", f"{found.rows}, {found.rank}{redundant}")
+    table.add_row("independent q", ", ".join(found.independent) or "none")
+    table.add_row("dependent z", ", ".join(found.dependent) or "none")
+    assembled = "  ".join(f"{k} = {x:.6f}" for k, x in zip(found.coordinates, found.q_tree, strict=True))
+    table.add_row("assembled at", assembled)
+    if found.det_phi_z is not None:
+        table.add_row("det phi_z", f"{found.det_phi_z:.6g}")
+    table.add_row("sigma_min(phi_z), cond", f"{found.sigma_min_phi_z:.6g}, {found.cond_phi_z:.4g}")
+    if found.desired is not None and found.desired.leaves_at is None:
+        closest = f"stays inside; closest to singular at t = {found.desired.closest_t:.4f} s"
+        table.add_row("desired", f"{closest}, sigma_min(phi_z) = {found.desired.sigma_min:.4g}")
+    elif found.desired is not None:
+        table.add_row("desired", f"leaves the workspace at t = {found.desired.leaves_at:.5f} s")
+    return Group(table, *(Text(f"warning: {warning}") for warning in found.warnings))
+
+
+def terms_plain(found: Terms) -> dict[str, Any]:
+    """Return all terms at a state as JSON-ready data."""
+    mechanism = found.mechanism
+    plain: dict[str, Any] = {
+        "coordinates": mechanism.coordinates,
+        "independent": mechanism.independent,
+        "dependent": mechanism.dependent,
+        "q_tree": mechanism.tree.to_coordinates(found.q_tree).tolist(),
+        "v_tree": found.v_tree.tolist(),
+        "phi_q": found.at.phi_q.tolist(),
+        "phi_z": found.at.phi_z.tolist(),
+    }
+    return plain | {name: np.asarray(getattr(found, name)).tolist() for name in TERMS}
+
+
+def terms_table(found: Terms) -> Group:
+    """Return all terms at a state for people."""
+    mechanism = found.mechanism
+    state = _plain_table("coordinate", "q_tree", "v_tree", "h_tree")
+    numbers = mechanism.tree.to_coordinates(found.q_tree)
+    for k, name in enumerate(mechanism.coordinates):
+        state.add_row(name, *(f"{x:.8g}" for x in (numbers[k], found.v_tree[k], found.h_tree[k])))
+    parts: list[Any] = [state, Text(f"energy {found.energy:.8g} J")]
+    for name in ("phi", "h"):
+        parts.append(Text(f"{name}  {_row(np.asarray(getattr(found, name)))}"))
+    for name in ("D_tree", "C_tree", "rho", "rho_dot", "D", "C"):
+        parts += [Text(name), *(Text("  " + _row(row)) for row in getattr(found, name))]
+    parts += [Text("phi_q | phi_z"), *(Text(f"  {_row(a)} | {_row(b)}") for a, b in _rows_of_jacobian(found))]
+    return Group(*parts)
+
+
+def run_table(run: Run) -> Table:
+    """Return the outcome of a run for people."""
+    table = _plain_table("", "")
+    table.add_row("status", f"{run.status}: {run.message}")
+    formulation = run.scene["formulation"]
+    with_epsilon = f", epsilon = {run.scene['epsilon']:g}" if formulation == "spf" else ""
+    table.add_row("formulation", f"{formulation}{with_epsilon}")
+    last = "  ".join(f"{k} = {x:.8f}" for k, x in zip(run.coordinates, run.q_tree[-1], strict=True))
+    table.add_row(f"q_tree at {run.t[-1]:g} s", last)
+    if "controller" in run.scene:
+        table.add_row("largest |u|, |tau|", f"{np.abs(run.u).max():.4g}, {np.abs(run.tau).max():.4g}")
+    table.add_row("energy start, end", f"{run.energy[0]:.9g}, {run.energy[-1]:.9g} J")
+    table.add_row("largest |phi - w|", f"{run.max_phi:.2g} (its rate {run.max_phi_dot:.2g})")
+    stats = run.stats
+    table.add_row("method", f"{stats['method']}, {stats['steps']} steps, {stats['rejected']} rejected")
+    work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
+    table.add_row("work", f"{work}, {stats['factorizations']} factorizations, {stats['wall_s']:.2f} s")
+    return table
+
+
+def _rows_of_jacobian(found: Terms) -> zip[tuple[Array, Array]]:
+    return zip(found.at.phi_q, found.at.phi_z, strict=True)
+
+
+def _row(values: Array) -> str:
+    return " ".join(f"{x:>14.8g}" for x in values)
+
+
+def _plain_table(*titles: str) -> Table:
+    table = Table(*titles, box=None, show_header=any(titles), pad_edge=False)
+    for column in table.columns[1:]:
+        column.overflow = "fold"
+    return table

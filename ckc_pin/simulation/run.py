@@ -1,0 +1,226 @@
+"""The `Run`: what a simulation gives, as one value that can be saved, loaded and replayed anywhere."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.library import MECHANISM_FILE, build
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Run", "Status"]
+
+Status = Literal["done", "stopped", "interrupted"]
+
+FORMAT = 1
+MAX_BYTES = 2**31  # of one array in a run file, before it is expanded
+ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated motion; a row of each array is an output instant.
+
+    Attributes
+    ----------
+    status : "done", "stopped" or "interrupted"
+    message : str
+        Why, in one sentence.
+    t : (m,) array
+        Output instants, s.
+    q_tree, v_tree : (m, n) arrays
+        By coordinate, in the order of `coordinates`.
+    u, tau : (m, d) and (m, actuators) arrays
+        Eq. 6's force in the order of `independent`; the actuators' efforts in the order of `actuated`.
+    phi, w : (m, rows) arrays
+        The closure's residual, and what it should be (zero but for the SPF started off its manifold).
+    energy : (m,) array
+        Kinetic and potential energy, J.
+    lyapunov : (m,) array or None
+        The controller's Lyapunov function.
+    max_phi, max_phi_dot : float
+        Largest |phi - w| and |phi_dot - w_dot| over the output instants.
+    events : list of dict
+        Events that were met: t, coordinate, of, value.
+    stats : dict
+        rhs, steps, rejected, newton, factorizations, jacobians, switches, wall_s, method, backend.
+    scene : dict
+        The scene as resolved.
+    texts : dict of str to str
+        The mechanism file and every file that it or the scene names.
+    profile : dict
+        Terms evaluated, how often and for how long, when asked for.
+    """
+
+    status: Status
+    message: str
+    coordinates: tuple[str, ...]
+    independent: tuple[str, ...]
+    actuated: tuple[str, ...]
+    t: Array
+    q_tree: Array
+    v_tree: Array
+    u: Array
+    tau: Array
+    phi: Array
+    w: Array
+    energy: Array
+    lyapunov: Array | None
+    max_phi: float
+    max_phi_dot: float
+    events: list[dict[str, Any]]
+    stats: dict[str, Any]
+    scene_name: str
+    scene: dict[str, Any]
+    texts: dict[str, str]
+    profile: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every text."""
+        return {name: sha256(text.encode()).hexdigest() for name, text in sorted(self.texts.items())}
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The mechanism, built again from the run's own texts."""
+        return build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts))
+
+    def column(self, coordinate: str) -> int:
+        """Return the column of a coordinate; InputError names the valid ones."""
+        if coordinate not in self.coordinates:
+            raise InputError(f"no coordinate {coordinate!r} in this run; there are {', '.join(self.coordinates)}")
+        return self.coordinates.index(coordinate)
+
+    def at(self, t: float) -> int:
+        """Return the row of the output instant nearest to t."""
+        return int(np.argmin(np.abs(self.t - t)))
+
+    @cached_property
+    def points(self) -> dict[str, Array]:
+        """World positions of the mechanism's points along the run, {name: (m, 3) array}."""
+        mechanism = self.mechanism
+        paths = {name: np.empty((len(self.t), 3)) for name in mechanism.points}
+        for k, numbers in enumerate(self.q_tree):
+            for name, p in mechanism.point_positions(mechanism.tree.from_coordinates(numbers)).items():
+                paths[name][k] = p
+        return paths
+
+    def loop_forces(self) -> dict[str, Array]:
+        """Multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
+
+        For a point row: the force that the loop exerts on frame A, along the row's axis.
+        """
+        from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
+        from ckc_pin.dynamics.terms import Terms
+
+        mechanism = self.mechanism
+        forces = np.empty_like(self.phi)
+        for k, numbers in enumerate(self.q_tree):
+            at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
+            terms = Terms(mechanism, at, self.v_tree[k])
+            u_tree = np.zeros(mechanism.n)
+            u_tree[mechanism.actuated_at] = self.tau[k]
+            forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
+        loops = [loop for loop, _ in mechanism.closure.names]
+        return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}
+
+    def summary(self) -> dict[str, Any]:
+        """Return what `ckc run --json` prints (design.md): scalars, and the last instant by name."""
+        last = {name: path[-1].tolist() for name, path in self.points.items()}
+        return {
+            "status": self.status,
+            "message": self.message,
+            "t": float(self.t[-1]),
+            "coordinates": list(self.coordinates),
+            "q_tree": self.q_tree[-1].tolist(),
+            "v_tree": self.v_tree[-1].tolist(),
+            "u": self.u[-1].tolist(),
+            "tau": self.tau[-1].tolist(),
+            "points": last,
+            "max_abs_u": float(np.abs(self.u).max(initial=0.0)),
+            "max_abs_tau": float(np.abs(self.tau).max(initial=0.0)),
+            "max_phi": self.max_phi,
+            "max_phi_dot": self.max_phi_dot,
+            "energy_start": float(self.energy[0]),
+            "energy_end": float(self.energy[-1]),
+            "formulation": self.scene["formulation"],
+            "epsilon": self.scene["epsilon"] if self.scene["formulation"] == "spf" else None,
+            "events": self.events,
+            "stats": self.stats,
+        }
+
+    # --- files -----------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> Path:
+        """Write the run to a file: whole or not at all, also when the machine goes down meanwhile."""
+        path = Path(path)
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
+        if self.lyapunov is not None:
+            arrays["lyapunov"] = self.lyapunov
+        arrays["coordinates"] = np.array(self.coordinates)
+        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays and f.name != "lyapunov"}
+        arrays["meta"] = np.frombuffer(
+            msgspec.json.encode({"format": FORMAT, "hashes": self.hashes, **rest}), dtype=np.uint8
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez_compressed(file, **arrays)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Run:
+        """Read a run file.
+
+        Raises
+        ------
+        InputError
+            No such file, not a run file, damaged, too large, or of another version.
+        """
+        path = Path(path)
+        if path.is_dir():
+            path = path / "run.npz"
+        if not path.is_file():
+            raise InputError(f"{path}: no such run file")
+        try:
+            with zipfile.ZipFile(path) as archive:
+                largest = max((entry.file_size for entry in archive.infolist()), default=0)
+            if largest > MAX_BYTES:
+                raise InputError(f"{path}: an array of {largest} bytes; a run has at most {MAX_BYTES}")
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+            meta = msgspec.json.decode(arrays.pop("meta").tobytes())
+            version = meta.pop("format")
+            if version != FORMAT:
+                raise InputError(f"{path}: a run of format {version}; this program reads format {FORMAT}")
+            hashes = meta.pop("hashes")
+            arrays["coordinates"] = tuple(str(x) for x in arrays["coordinates"])
+            meta |= {key: tuple(meta[key]) for key in ("independent", "actuated")}
+            run = cls(**{"lyapunov": None, **arrays, **meta})
+            if run.hashes != hashes:
+                raise InputError(f"{path}: damaged: its texts do not match their hashes")
+            return run
+        except InputError:
+            raise
+        except Exception as error:  # whatever a damaged archive makes NumPy, zlib or msgspec raise
+            raise InputError(f"{path}: not a run file, or damaged ({type(error).__name__})") from None

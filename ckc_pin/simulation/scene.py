@@ -1,0 +1,222 @@
+"""Scenes: what to run, as a typed structure, by shipped name or by path, with keys changed on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from ckc_pin.control.spec import ControllerSpec
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.library import MECHANISM_FILE, is_path, library, shipped
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.toml import convert, read_text, read_toml
+
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
+
+SUFFIX = ".scene.toml"
+DEFAULT = "default"
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+Method = Literal["auto", "RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"]
+
+
+class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class InitialSpec(_Spec, frozen=True):
+    """Where a run starts."""
+
+    at: Literal["equilibrium"] | None = None
+    q: dict[str, float] = {}
+    q_dot: dict[str, float] = {}
+    w: list[float] | None = None
+
+
+class SolverSpec(_Spec, frozen=True):
+    """How a run is integrated.
+
+    `spf_equation`: the SPF in the coordinates of eq. 17 (what "auto" takes) or eq. 8 as printed (what a
+    named method is for, unless this says otherwise).
+    """
+
+    method: Method = "auto"
+    spf_equation: Literal[8, 17] | None = None
+    rtol: Positive = 1e-8
+    atol: Positive | None = None
+    max_step: Positive | None = None
+    min_step: NonNegative = 0.0
+    max_rhs: Annotated[int, msgspec.Meta(gt=0)] | None = None
+    max_wall_s: Positive | None = None
+    output_dt: Positive | None = None
+    projection: bool = True
+    backend: Literal["auto", "python"] = "auto"
+
+
+class EventSpec(_Spec, frozen=True):
+    """A coordinate or its rate crossing a value."""
+
+    coordinate: str
+    of: Literal["q", "q_dot"] = "q"
+    value: float = 0.0
+    direction: Literal[-1, 0, 1] = 0
+    stop: bool = False
+
+
+class SceneSpec(_Spec, frozen=True):
+    """The whole file."""
+
+    mechanism: str
+    formulation: Literal["reduced", "spf", "dae"]
+    t_end: Positive
+    epsilon: Positive = 1e-3
+    coriolis_velocity: Literal["rho", "actual"] = "rho"
+    initial: InitialSpec = InitialSpec()
+    solver: SolverSpec = SolverSpec()
+    controller: ControllerSpec | None = None
+    event: list[EventSpec] = []
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A checked scene and where its files are.
+
+    Attributes
+    ----------
+    spec : SceneSpec
+    name : str
+        As the user called it.
+    sources : Sources
+        For the mechanism file, trajectories and models that the scene names.
+    """
+
+    spec: SceneSpec
+    name: str
+    sources: Sources
+
+    def plain(self) -> dict[str, Any]:
+        """Return the scene as resolved, as plain data without absent values."""
+        return _present(msgspec.to_builtins(self.spec))
+
+
+def scene_names(mechanism: str) -> list[str]:
+    """Names of a shipped mechanism's scenes."""
+    return sorted(p.name.removesuffix(SUFFIX) for p in (library() / mechanism).glob(f"*{SUFFIX}"))
+
+
+def scene_file(name: str | Path) -> Path:
+    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE or a path.
+
+    Raises
+    ------
+    InputError
+        No such scene; the message lists those there are.
+    """
+    if isinstance(name, Path) or is_path(name):
+        path = Path(name)
+        if path.is_dir() or path.name == MECHANISM_FILE:
+            path = (path if path.is_dir() else path.parent) / f"{DEFAULT}{SUFFIX}"
+        return path
+    mechanism, _, scene = name.partition("/")
+    if mechanism not in shipped():
+        raise InputError(
+            f"no mechanism {mechanism!r}; shipped: {', '.join(shipped())}; or give the path of a *{SUFFIX} file"
+        )
+    if (scene or DEFAULT) not in scene_names(mechanism):
+        raise InputError(f"{mechanism} has no scene {scene!r}; it has {', '.join(scene_names(mechanism))}")
+    return library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
+
+
+def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scene:
+    """Load a scene by shipped name or path.
+
+    Parameters
+    ----------
+    name : str or Path
+        ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path.
+    changes : mapping, optional
+        Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``.
+
+    Raises
+    ------
+    InputError
+        A missing file, malformed TOML, an unknown key, a wrong type or value.
+    """
+    path = scene_file(name)
+    data = read_toml(read_text(path, "scene"), str(path))
+    return make_scene(with_changes(data, changes or {}), str(name), Sources(str(path), path.parent))
+
+
+def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
+    """Check parsed data; where msgspec's checks end, ours begin."""
+    spec = convert(data, SceneSpec, sources.name)
+    for key, value in _numbers("", msgspec.to_builtins(spec)):
+        if not math.isfinite(value):
+            raise InputError(f"{sources.name}: {key} = {value} is not a finite number")
+    if spec.initial.at is not None and spec.initial.q:
+        raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
+    if spec.initial.at is None and not spec.initial.q:
+        raise InputError(f'{sources.name}: initial: give q (a table by coordinate) or at = "equilibrium"')
+    if spec.initial.w is not None and spec.formulation != "spf":
+        raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
+    return Scene(spec, name, sources)
+
+
+def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a scene's data with values replaced by dotted key; None removes a key."""
+    changed = msgspec.json.decode(msgspec.json.encode(data))
+    for key, value in changes.items():
+        *tables, last = key.split(".")
+        at = changed
+        for table in tables:
+            at = at.setdefault(table, {})
+            if not isinstance(at, dict):
+                raise InputError(f"--set {key}: {table!r} is a value, not a table")
+        if value is None:
+            at.pop(last, None)
+        else:
+            at[last] = value
+    return dict(changed)
+
+
+def _numbers(key: str, value: Any) -> list[tuple[str, float]]:
+    if isinstance(value, dict):
+        return [x for k, v in value.items() for x in _numbers(f"{key}.{k}" if key else str(k), v)]
+    if isinstance(value, list | tuple):
+        return [x for k, v in enumerate(value) for x in _numbers(f"{key}[{k}]", v)]
+    return [(key, value)] if isinstance(value, float) else []
+
+
+def _present(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _present(v) for k, v in value.items() if v is not None}
+    return [_present(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def catalogue() -> list[tuple[str, str, dict[str, str]]]:
+    """Return (name, what it is, {scene: what it shows}) of each shipped mechanism.
+
+    What a file is about is its first comment, so that the list cannot drift from the files.
+    """
+    return [
+        (
+            name,
+            _first_comment(library() / name / MECHANISM_FILE),
+            {scene: _first_comment(library() / name / f"{scene}{SUFFIX}") for scene in scene_names(name)},
+        )
+        for name in shipped()
+    ]
+
+
+def _first_comment(path: Path) -> str:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            return line.lstrip("# ").strip()
+    return ""

@@ -1,0 +1,295 @@
+"""The three formulations as first-order systems y' = f(t, y) for an integrator.
+
+============== ==================== =====================================================
+system         y                    equations
+============== ==================== =====================================================
+`LevelSet`     q, q_dot             eq. 6 on the level set phi = w(0) exp(-t / epsilon): with
+                                    w(0) = 0 the reduced model, else the SPF in eq. 17's
+                                    coordinates, whose w is known in closed form
+`PrintedSpf`   q, q_dot, z          eq. 8 as printed
+`Dae`          q', v'               eq. 1, its closure differentiated twice, projected
+============== ==================== =====================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.dynamics.formulations import (
+    CoriolisVelocity,
+    dae_acceleration,
+    reduced_acceleration,
+    spf_terms,
+    spf_z_dot,
+)
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sigma import newton, predict
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System"]
+
+Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
+
+
+@dataclass
+class Counts:
+    """Work done by a system: Newton corrections and factorizations."""
+
+    newton: int = 0
+    factorizations: int = 0
+
+
+class System(Protocol):
+    """What the step loop needs of a formulation.
+
+    Attributes
+    ----------
+    positions : int
+        How many leading entries of y are positions whose rates are the next as many; 0 when they are not.
+    projects : bool
+        Whether `accept` edits the state.
+    """
+
+    mechanism: Mechanism
+    counts: Counts
+
+    @property
+    def positions(self) -> int: ...
+
+    @property
+    def projects(self) -> bool: ...
+
+    def start(self) -> Array:
+        """Initial y."""
+
+    def rhs(self, t: float, y: Array) -> Array:
+        """f(t, y); NumericalError where it does not exist."""
+
+    def terms(self, t: float, y: Array) -> Terms:
+        """Terms at a state, on the closure if the formulation holds it."""
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        """Take note of an accepted step; return y projected, or None when it stays as it is."""
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
+
+    def w(self, t: float) -> Array:
+        """What phi should be at t, shape (rows,)."""
+
+    def w_dot(self, t: float) -> Array:
+        """What its rate should be, shape (rows,)."""
+
+
+@dataclass
+class LevelSet:
+    """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
+
+    z is found on the level set by Newton from where the last evaluated state, moved along rho, leads.
+    """
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    epsilon: float = 1.0
+    convention: CoriolisVelocity = "rho"
+    w0: Array | None = None
+    counts: Counts = field(default_factory=Counts)
+    projects: bool = False
+
+    def __post_init__(self) -> None:
+        self.positions = self.mechanism.d
+        self._last = self.initial
+        self._place = self.mechanism.tree.place[self.mechanism.partition.q]
+        self._d = self.mechanism.d
+        self._on_manifold = self.w0 is None or not np.any(self.w0)
+        self._zero = np.zeros(self.mechanism.closure.rows)
+
+    def start(self) -> Array:
+        return np.concatenate([self.initial.q_tree[self._place], self.q_dot])
+
+    def w(self, t: float) -> Array:
+        """Eq. 17's second line, exact."""
+        if self._on_manifold or self.w0 is None:
+            return self._zero
+        return self.w0 * np.exp(-t / self.epsilon)
+
+    def w_dot(self, t: float) -> Array:
+        return -self.w(t) / self.epsilon
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        if self._on_manifold:
+            return terms.v_tree
+        return _spf_velocity(terms, self.epsilon, self.w(t))
+
+    def terms(self, t: float, y: Array) -> Terms:
+        q, q_dot = y[: self._d], y[self._d :]
+        w = self.w(t)
+        guess = predict(self._last, q - self._last.q_tree[self._place])
+        outcome = newton(guess, w, self.mechanism.tolerance)
+        self.counts.newton += outcome.iterations
+        self.counts.factorizations += outcome.iterations
+        if not outcome.converged:
+            found = self.mechanism.sigma(q, self._last, w)
+            self.counts.newton += found.iterations
+            self.counts.factorizations += found.iterations
+            if found.verdict != "converged":
+                raise NumericalError(
+                    f"sigma(q) is {found.verdict}: {found.reason}",
+                    t=t,
+                    q_tree=self.mechanism.tree.named(self.mechanism.tree.to_coordinates(found.at.q_tree)),
+                )
+            outcome = type(outcome)(found.at, found.iterations, True)
+        self._last = outcome.at
+        if self._on_manifold:
+            return Terms(self.mechanism, outcome.at, outcome.at.rho @ q_dot)
+        return spf_terms(self.mechanism, outcome.at, q_dot, self.epsilon, w, self.convention)
+
+    def rhs(self, t: float, y: Array) -> Array:
+        terms = self.terms(t, y)
+        self.counts.factorizations += 2  # phi_z and D
+        q_dot = y[self._d :]
+        with_actual = self.convention == "actual" and not self._on_manifold
+        q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if with_actual else None)
+        return np.concatenate([q_dot, q_ddot])
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        return None
+
+
+@dataclass
+class PrintedSpf:
+    """Eq. 8 as printed: y = (q, q_dot, z)."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    epsilon: float
+    convention: CoriolisVelocity = "rho"
+    counts: Counts = field(default_factory=Counts)
+    projects: bool = False
+
+    def __post_init__(self) -> None:
+        self.positions = self.mechanism.d
+        tree, partition = self.mechanism.tree, self.mechanism.partition
+        self._d = self.mechanism.d
+        self._q, self._z = tree.place[partition.q], tree.place[partition.z]
+        self._w0 = self.initial.phi
+
+    def start(self) -> Array:
+        q_tree = self.initial.q_tree
+        return np.concatenate([q_tree[self._q], self.q_dot, q_tree[self._z]])
+
+    def w(self, t: float) -> Array:
+        return self._w0 * np.exp(-t / self.epsilon)
+
+    def w_dot(self, t: float) -> Array:
+        return -self.w(t) / self.epsilon
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        return _spf_velocity(terms, self.epsilon, terms.phi)
+
+    def terms(self, t: float, y: Array) -> Terms:
+        d = self._d
+        q_tree = np.empty(self.mechanism.tree.nq)
+        q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
+        at = self.mechanism.kinematics(q_tree)
+        return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
+
+    def rhs(self, t: float, y: Array) -> Array:
+        d = self._d
+        terms = self.terms(t, y)
+        self.counts.factorizations += 2
+        q_dot = y[d : 2 * d]
+        q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if self.convention == "actual" else None)
+        return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        return None
+
+
+@dataclass
+class Dae:
+    """Eq. 1: y = (q', v'), position and velocity put back on the closure after each step if `projects`."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    v_tree: Array
+    force: Force
+    projects: bool = True
+    counts: Counts = field(default_factory=Counts)
+
+    def __post_init__(self) -> None:
+        self.positions = self.mechanism.n if self.mechanism.tree.flat else 0
+
+    def start(self) -> Array:
+        return np.concatenate([self.initial.q_tree, self.v_tree])
+
+    def w(self, t: float) -> Array:
+        return np.zeros(self.mechanism.closure.rows)
+
+    def w_dot(self, t: float) -> Array:
+        return np.zeros(self.mechanism.closure.rows)
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        return terms.v_tree
+
+    def _split(self, y: Array) -> tuple[Array, Array]:
+        tree = self.mechanism.tree
+        return (y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])), y[tree.nq :]
+
+    def terms(self, t: float, y: Array) -> Terms:
+        q_tree, v_tree = self._split(y)
+        at = self.mechanism.kinematics(q_tree)
+        return self._projected(at, v_tree) if self.projects else Terms(self.mechanism, at, v_tree)
+
+    def rhs(self, t: float, y: Array) -> Array:
+        q_tree, v_tree = self._split(y)
+        terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
+        self.counts.factorizations += 2
+        rate = self.mechanism.tree.configuration_rate(q_tree, v_tree)
+        return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms))])
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        if not self.projects:
+            return None
+        q_tree, v_tree = self._split(y)
+        at = self.mechanism.kinematics(q_tree)
+        drift = np.abs(at.phi).max(initial=0.0)
+        drift_rate = np.abs(at.J @ v_tree).max(initial=0.0) / (1.0 + np.abs(v_tree).max(initial=0.0))
+        if max(drift, drift_rate) <= self.mechanism.tolerance:
+            return None
+        terms = self._projected(at, v_tree)
+        return np.concatenate([terms.q_tree, terms.v_tree])
+
+    def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
+        """Put a state on the closure by the shortest steps in the coordinates."""
+        for _ in range(10):
+            if np.abs(at.phi).max(initial=0.0) <= self.mechanism.tolerance:
+                break
+            at = at.moved(-_shortest(at.J, at.phi))
+            self.counts.newton += 1
+            self.counts.factorizations += 1
+        else:
+            raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
+        return Terms(self.mechanism, at, v_tree - _shortest(at.J, at.J @ v_tree))
+
+
+def _spf_velocity(terms: Terms, epsilon: float, w: Array) -> Array:
+    velocity = terms.v_tree.copy()
+    velocity[terms.at.partition.z] = spf_z_dot(terms.at, terms.q_dot, epsilon, w)
+    return velocity
+
+
+def _shortest(jacobian: Array, residual: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-10)[0])
