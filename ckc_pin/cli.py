@@ -126,7 +126,7 @@ def run(
         if out is not None:
             print(f"written to {out}")
     if finished.status == "stopped":
-        errors.print(f"stopped: {finished.message}", markup=False)
+        errors.print(finished.message, markup=False)
         raise typer.Exit(STOPPED)
     if finished.status == "interrupted":
         errors.print(finished.message, markup=False)
@@ -161,10 +161,9 @@ def play(
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
     as_json = "--json" in sys.argv
+    code = DONE
     try:
-        app(standalone_mode=False)
-    except typer.Exit as outcome:
-        sys.exit(outcome.exit_code)
+        code = app(standalone_mode=False) or DONE  # the code of a typer.Exit, None without one
     except (InputError, MechanismError) as error:
         _fail(str(error), WRONG_INPUT, as_json)
     except NumericalError as error:
@@ -181,11 +180,11 @@ def main() -> NoReturn:
         if usage is None:
             raise
         _fail(usage(), WRONG_INPUT, as_json)
-    sys.exit(DONE)
+    sys.exit(code)
 
 
 def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoReturn:
-    errors.print(f"error: {message}" if status == "error" else f"stopped: {message}", markup=False)
+    errors.print(f"{status}: {message}", markup=False)
     if as_json:
         _print_json({"status": status, "message": message})
     sys.exit(code)

@@ -17,7 +17,7 @@ import numpy as np
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import SolverSpec
-from ckc_pin.simulation.systems import System
+from ckc_pin.simulation.systems import System, nearly_singular
 
 __all__ = ["BudgetError", "Step", "Stepper"]
 
@@ -149,7 +149,9 @@ class Stepper:
         """Say why the solver gave up: the closure's own verdict where there is one."""
         if self.failure is not None:
             return NumericalError(str(self.failure), t=self.t, q_tree=self.failure.q_tree)
-        return NumericalError(message[0].lower() + message[1:].rstrip("."), t=self.t)
+        reason = message[0].lower() + message[1:].rstrip(".")
+        nearly = nearly_singular(self.system.terms(self.t, self.solver.y).at, 1e-3)
+        return NumericalError(f"{nearly}; {reason}" if nearly else reason, t=self.t)
 
     def _attempts(self, evaluations: int) -> int:
         """How many steps were tried in one accepted step, from what was evaluated."""

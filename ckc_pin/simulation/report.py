@@ -81,7 +81,7 @@ def terms_table(found: Terms) -> Group:
 def run_table(run: Run) -> Table:
     """Return the outcome of a run for people."""
     table = _plain_table("", "")
-    table.add_row("status", f"{run.status}: {run.message}")
+    table.add_row("status", run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}")
     formulation = run.scene["formulation"]
     with_epsilon = f", epsilon = {run.scene['epsilon']:g}" if formulation == "spf" else ""
     table.add_row("formulation", f"{formulation}{with_epsilon}")
@@ -108,6 +108,4 @@ def _row(values: Array) -> str:
 
 def _plain_table(*titles: str) -> Table:
     table = Table(*titles, box=None, show_header=any(titles), pad_edge=False)
-    for column in table.columns[1:]:
-        column.overflow = "fold"
     return table

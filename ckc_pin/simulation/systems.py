@@ -34,7 +34,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton, predict
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System"]
+__all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System", "nearly_singular"]
+
+CHART_MARGIN = 1e-5  # of |J|: phi_z's least singular value at which q has stopped to be a chart
 
 Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
 
@@ -163,6 +165,7 @@ class LevelSet:
         return np.concatenate([q_dot, q_ddot])
 
     def accept(self, t: float, y: Array) -> Array | None:
+        _require_chart(self._last)
         return None
 
 
@@ -215,6 +218,7 @@ class PrintedSpf:
         return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
 
     def accept(self, t: float, y: Array) -> Array | None:
+        _require_chart(self.terms(t, y).at)
         return None
 
 
@@ -283,6 +287,27 @@ class Dae:
         else:
             raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
         return Terms(self.mechanism, at, v_tree - _shortest(at.J, at.J @ v_tree))
+
+
+def nearly_singular(at: Kinematics, margin: float) -> str | None:
+    """Say that phi_z is singular within a margin relative to J; None when it is not."""
+    sigma_min = at.sigma_min()
+    if not sigma_min <= margin * np.linalg.norm(at.J):
+        return None
+    names = at.tree.coordinates
+    q, z = ([names[k] for k in part] for part in (at.partition.q, at.partition.z))
+    return (
+        f"phi_z is singular (its least singular value is {sigma_min:.2g}): "
+        f"{', '.join(q)} do not determine {', '.join(z)} here"
+    )
+
+
+def _require_chart(at: Kinematics) -> None:
+    """Stop where q is no chart any more: results beyond would be rounding errors."""
+    problem = nearly_singular(at, CHART_MARGIN)
+    if problem:
+        q_tree = at.tree.named(at.tree.to_coordinates(at.q_tree))
+        raise NumericalError(problem, q_tree=q_tree)
 
 
 def _spf_velocity(terms: Terms, epsilon: float, w: Array) -> Array:
