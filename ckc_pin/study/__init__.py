@@ -1,0 +1,1 @@
+"""Questions over many runs: the paper's claims, each answered with numbers."""
