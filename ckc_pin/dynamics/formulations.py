@@ -87,7 +87,7 @@ def tangent_basis(terms: Terms) -> tuple[Array, Array]:
         J has lost rank.
     """
     mechanism = terms.mechanism
-    rank = mechanism.rank.rank
+    rank = mechanism.rank
     normal, tangent, r, rows = null_space(terms.at.J, rank)
     if rank == 0:
         return tangent, np.zeros(mechanism.n)

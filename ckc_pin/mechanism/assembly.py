@@ -25,7 +25,9 @@ class Assembly:
     misses: dict[str, float]
 
 
-def assemble(tree: Tree, closure: Closure, q_tree: Array, free: Array, tolerance: float) -> Assembly:
+def assemble(
+    tree: Tree, closure: Closure, q_tree: Array, free: Array, tolerance: float, restarts: int = RESTARTS
+) -> Assembly:
     """Close the loops from a guess by damped Gauss-Newton, moving as little as it takes.
 
     Parameters
@@ -37,6 +39,8 @@ def assemble(tree: Tree, closure: Closure, q_tree: Array, free: Array, tolerance
         Coordinates that may move. All others keep their guess.
     tolerance : float
         Largest |phi| that counts as closed.
+    restarts : int
+        How many perturbed starts to try when the guess itself does not lead there.
 
     Returns
     -------
@@ -54,7 +58,7 @@ def assemble(tree: Tree, closure: Closure, q_tree: Array, free: Array, tolerance
 
     random = np.random.default_rng(0)  # the same answer every time
     best = outcome(_gauss_newton(tree, q_tree, at, tolerance))
-    for attempt in range(RESTARTS):
+    for attempt in range(restarts):
         if best.residual <= tolerance:
             break
         spread = 0.1 * 1.4**attempt

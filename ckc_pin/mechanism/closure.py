@@ -12,7 +12,7 @@ from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Closure", "ClosureBuilder", "perpendicular"]
 
@@ -65,6 +65,19 @@ class Closure:
             jacobian_dot[group.out] = group.jacobian_dot(pose, rate)
         return jacobian_dot
 
+    def in_metres(self, tree: Tree) -> Array:
+        """Which rows of phi are lengths (the others are angles or cosines), shape (rows,) of bool."""
+        metres = np.zeros(len(self.names), dtype=bool)
+        for group in self.groups:
+            metres[group.out] = group.in_metres(tree)
+        return metres
+
+    def only(self, loop: str) -> Closure:
+        """Return the closure with the rows of one loop alone, the others replaced by nothing."""
+        keep = np.array([k for k, (name, _) in enumerate(self.names) if name == loop], np.intp)
+        rows = Selected(self.groups, len(self.names), keep)
+        return Closure(self.anchors, (rows,), tuple(self.names[k] for k in keep), ())
+
     def misses(self, phi: Array) -> dict[str, float]:
         """Largest |phi| of each loop."""
         worst: dict[str, float] = {}
@@ -75,6 +88,42 @@ class Closure:
     def reversed_hinges(self, pose: Pose) -> list[str]:
         """Loops whose axes point against each other, which their rows alone cannot tell."""
         return [loop for loop, a, b in self.aligned if pose.e[a] @ pose.e[b] <= 0]
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Some rows of a closure, as a group of its own."""
+
+    groups: tuple[Rows, ...]
+    rows: int
+    keep: IntArray
+
+    @property
+    def out(self) -> IntArray:
+        """Places of the rows in phi."""
+        return np.arange(len(self.keep))
+
+    def _gather(self, parts: list[Array]) -> Array:
+        whole = np.empty((self.rows, *parts[0].shape[1:]))
+        for group, part in zip(self.groups, parts, strict=True):
+            whole[group.out] = part
+        return whole[self.keep]
+
+    def in_metres(self, tree: Tree) -> Array | bool:
+        """Whether the rows are lengths."""
+        return self._gather([np.broadcast_to(g.in_metres(tree), len(g.out)) for g in self.groups]).astype(bool)
+
+    def phi(self, pose: Pose) -> Array:
+        """Residual, shape (rows,)."""
+        return self._gather([group.phi(pose) for group in self.groups])
+
+    def jacobian(self, pose: Pose) -> Array:
+        """Derivative of phi, shape (rows, n)."""
+        return self._gather([group.jacobian(pose) for group in self.groups])
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        """Time derivative of the Jacobian, shape (rows, n)."""
+        return self._gather([group.jacobian_dot(pose, rate) for group in self.groups])
 
 
 def perpendicular(axis: Array) -> tuple[Array, Array]:

@@ -11,9 +11,10 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.assembly import Assembly, assemble
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
+from ckc_pin.mechanism.freedoms import count_freedoms, idle_coordinates
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows
+from ckc_pin.mechanism.rank import rank_of
 from ckc_pin.mechanism.sigma import Sigma, sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
@@ -25,7 +26,6 @@ __all__ = ["Mechanism"]
 
 EXACT = 1e-10  # |phi| in units of the mechanism's size that a closed mechanism of exact data reaches
 ROUNDED = 1e-6  # the same when the numbers in the files are rounded to six digits
-RANK_TOLERANCE = 1e-7
 
 
 class Mechanism:
@@ -55,6 +55,8 @@ class Mechanism:
         The assembled configuration (Pinocchio's q).
     redundant : tuple of str
         Rows that the others imply, one admissible choice, as "loop.row".
+    freedoms : Freedoms
+        How d and rank were found.
     tolerance : float
         Largest |phi| that counts as closed.
     warnings : list of str
@@ -78,7 +80,7 @@ class Mechanism:
         self.closure: Closure = builder.build()
         self.springs = Springs(self.tree, self.frames, spec.spring)
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
-        self.size = _size(self.tree)
+        self.size = _size(self.tree, self.closure)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
         self._assemble()
@@ -106,7 +108,13 @@ class Mechanism:
             The independent coordinates, rad or m.
         """
         start = start or self.assembled
-        return sigma(start, q - self.independent_part(start.q_tree), w, self.tolerance)
+        if self.tree.flat:
+            step = q - start.q_tree[self.tree.place[self.partition.q]]
+        else:
+            numbers = self.tree.to_coordinates(start.q_tree)
+            numbers[self.partition.q] = q
+            step = self.tree.difference(start.q_tree, self.tree.from_coordinates(numbers))[self.partition.q]
+        return sigma(start, step, w, self.tolerance)
 
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
@@ -153,27 +161,22 @@ class Mechanism:
 
     def _assemble(self) -> None:
         guess = self.vector(self.spec.q_guess, self.coordinates, "q_guess", fill=0.0)
-        start = self.tree.from_coordinates(guess)
-        closed = self._close(start)
+        closed = self._close(self.tree.from_coordinates(guess))
         self.q_tree = closed.q_tree
         self.residual = closed.residual
-        self.tolerance = max(1e-13 * max(self.size, 1.0), 2.0 * closed.residual if closed.residual > EXACT else 0.0)
-        pose = Pose(self.tree, self.closure.anchors, self.q_tree)
-        jacobian = self.closure.jacobian(pose)
-        self.rank: RankReport = rank_of(jacobian, max(RANK_TOLERANCE, 10 * self.residual))
-        self.d = self.n - self.rank.rank
-        self.redundant = tuple(".".join(self.closure.names[k]) for k in redundant_rows(jacobian, self.rank.rank))
-        self._split(jacobian)
-        names = self.spec.actuated if self.spec.actuated is not None else list(self.independent)
-        self.actuated = tuple(names)
-        self.actuated_at: IntArray = self.tree.indices(self.actuated, "actuated")
-        if len(set(names)) != len(names):
-            raise MechanismError(f"actuated: a joint is named twice in {names}")
+        rounding = 1e-13 * max(self.size, 1.0)
+        self.tolerance = rounding if closed.residual <= EXACT * self.size else 10 * closed.residual
+        self.freedoms = count_freedoms(self.tree, self.closure, self.q_tree, self.size, max(self.tolerance, rounding))
+        self.d, self.rank = self.freedoms.d, self.freedoms.rank.rank
+        self.redundant = tuple(".".join(name) for name in self.freedoms.redundant)
+        self.warnings += self.freedoms.warnings
+        self._split()
+        self._actuate()
 
     def _close(self, start: Array) -> Assembly:
         """Assemble with the independent coordinates held at their guess; if that fails, with all free."""
         closed: Assembly | None = None
-        scale = max(self.size, 1e-12)
+        scale = self.size
         if self.spec.independent is not None:
             free = np.ones(self.n)
             free[self.tree.indices(tuple(self.spec.independent), "independent")] = 0.0
@@ -181,11 +184,7 @@ class Mechanism:
         if closed is None or closed.residual > ROUNDED * scale:
             closed = assemble(self.tree, self.closure, start, np.ones(self.n), EXACT * scale)
         if closed.residual > ROUNDED * scale:
-            loop, miss = max(closed.misses.items(), key=lambda item: item[1])
-            raise MechanismError(
-                f"{self.sources.name}: not closed: nearest miss {miss:.3g} at loop {loop}; "
-                "check the loop's frames, or give a [q_guess] nearer to a closed configuration"
-            )
+            raise MechanismError(f"{self.sources.name}: {self._why_not_closed(closed, start)}")
         reversed_ = self.closure.reversed_hinges(Pose(self.tree, self.closure.anchors, closed.q_tree))
         if reversed_:
             raise MechanismError(
@@ -199,28 +198,80 @@ class Mechanism:
             )
         return closed
 
-    def _split(self, jacobian: Array) -> None:
-        chosen = choose_dependent(jacobian, self.rank.rank)
-        best = [name for k, name in enumerate(self.coordinates) if k not in set(chosen.tolist())]
+    def _why_not_closed(self, best: Assembly, start: Array) -> str:
+        """Name the loop with the largest miss, loops that cannot close even alone, and what to do."""
+        loop, miss = max(best.misses.items(), key=lambda item: item[1])
+        message = f"not closed: nearest miss {miss:.3g} m at loop {loop}"
+        if miss > 1000 * self.size:
+            return f"{message}, {miss / self.size:.0f} times the mechanism's size of {self.size:.3g} m: units?"
+        alone = []
+        for name in dict.fromkeys(name for name, _ in self.closure.names):
+            single = self.closure.only(name)
+            closed = assemble(self.tree, single, start, np.ones(self.n), EXACT * self.size)
+            if closed.residual > ROUNDED * self.size:
+                alone.append(f"{name} (miss {closed.residual:.3g})")
+        if alone:
+            message += f"; cannot close even alone: {', '.join(alone)}"
+        elif len(best.misses) > 1:
+            others = ", ".join(f"{k} {x:.3g}" for k, x in best.misses.items() if x > ROUNDED * self.size)
+            message += f"; each loop closes alone, together they contradict each other ({others})"
+        return f"{message}. Check the loops' frames and types, or give a [q_guess] nearer to a closed configuration"
+
+    def _split(self) -> None:
+        """Choose q and z, or check the choice made."""
+        every = set(range(self.n))
+        chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
+        best = [self.coordinates[k] for k in sorted(every - (chosen or set()))]
+        remedy = f"; {', '.join(best) or 'none'} would do" if chosen is not None else ""
+        if self.spec.independent is None and chosen is None:
+            raise MechanismError(
+                f"{self.sources.name}: no choice of q keeps the six coordinates of a free root together; "
+                "weld the root, or let the loops hold it entirely or not at all"
+            )
         names = list(self.spec.independent) if self.spec.independent is not None else best
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
             raise MechanismError(f"independent: a coordinate is named twice in {names}")
         if len(names) != self.d:
             raise MechanismError(
-                f"independent: {len(names)} coordinates ({', '.join(names)}) but the mechanism has d = {self.d} "
-                f"freedoms; {', '.join(best) or 'none'} would do"
+                f"independent: {len(names)} coordinates ({', '.join(names) or 'none'}) but the mechanism has "
+                f"d = {self.d} freedoms{remedy}"
             )
-        z = np.setdiff1d(np.arange(self.n), at)
-        phi_z = jacobian[:, z]
-        if rank_of(phi_z, RANK_TOLERANCE).rank < len(z):
+        z = np.array(sorted(every - set(at.tolist())), dtype=np.intp)
+        if rank_of(self.freedoms.jacobian[:, z]).rank < len(z):
             raise MechanismError(
-                f"independent: {', '.join(names)} cannot parametrise the mechanism at its assembled configuration "
-                f"(phi_z is singular there); {', '.join(best)} would do"
+                f"independent: {', '.join(names)} cannot parametrise the mechanism where it is assembled "
+                f"(phi_z is singular there){remedy}"
             )
+        for _, v_at in self.tree.free:
+            inside = sum(v_at <= k < v_at + 6 for k in at)
+            if 0 < inside < 6:
+                raise MechanismError(
+                    f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
+                )
         self.independent = tuple(names)
         self.dependent = tuple(self.coordinates[k] for k in z)
-        self.partition = Partition(at, z.astype(np.intp))
+        self.partition = Partition(at, z)
+
+    def _actuate(self) -> None:
+        joints = [name for name in self.independent if name not in self.tree.free_coordinates]
+        self.actuated = tuple(self.spec.actuated if self.spec.actuated is not None else joints)
+        self.actuated_at: IntArray = self.tree.indices(self.actuated, "actuated")
+        if len(set(self.actuated)) != len(self.actuated):
+            raise MechanismError(f"actuated: a joint is named twice in {list(self.actuated)}")
+        rooted = [name for name in self.actuated if name in self.tree.free_coordinates]
+        if rooted:
+            raise MechanismError(f"actuated: {rooted[0]!r} belongs to a free root, which has no motor")
+        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, self.actuated_at)
+        if idle:
+            self.warnings.append(
+                f"idle freedoms, bodies that spin about themselves and move nothing: {', '.join(idle)}"
+            )
+
+    def _tangent(self) -> Array:
+        if self.freedoms.singular or not self.d:
+            return np.zeros((self.n, 0))
+        return self.assembled.rho
 
 
 def _build_model(text: str, source: str) -> pin.Model:
@@ -230,7 +281,8 @@ def _build_model(text: str, source: str) -> pin.Model:
         raise MechanismError(f"{source}: Pinocchio cannot build this tree: {error}") from None
 
 
-def _size(tree: Tree) -> float:
-    """Characteristic length: the largest offset from one joint to the next, metres."""
-    offsets = [float(np.linalg.norm(placement.translation)) for placement in tree.model.jointPlacements]
-    return max(offsets, default=0.0) or 1.0
+def _size(tree: Tree, closure: Closure) -> float:
+    """Characteristic length: the largest offset between joints, or from a joint to a loop's point, metres."""
+    offsets = [placement.translation for placement in tree.model.jointPlacements]
+    lengths = np.linalg.norm(np.array([*offsets, *closure.anchors.point_local]).reshape(-1, 3), axis=1)
+    return float(lengths.max(initial=0.0)) or 1.0

@@ -1,14 +1,19 @@
-"""Freedoms: the rank of J by singular values, redundant rows, and which coordinates can serve as q."""
+"""The rank of J: scaled to be free of units, by singular values, with the gap that makes it sure."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
-__all__ = ["RankReport", "choose_dependent", "rank_of", "redundant_rows"]
+__all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled"]
+
+RANK_TOLERANCE = 1e-5  # relative; files are rounded to six digits
+SURE = 1e-9  # singular values between this and the tolerance are neither zero nor not
 
 
 @dataclass(frozen=True)
@@ -18,42 +23,81 @@ class RankReport:
     Attributes
     ----------
     rank : int
-    singular_values : (min(rows, n),) array
-        Of the scaled J, descending.
-    gap : (above, below)
-        The singular values on both sides of the cut; below is 0 when there is none.
+    above, below : float
+        The singular values on both sides of the cut, relative to the largest; below is 0 at full rank.
     """
 
     rank: int
-    singular_values: Array
-    gap: tuple[float, float]
+    above: float
+    below: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether nothing lies between rounding errors and the tolerance."""
+        return self.below < SURE
 
 
-def rank_of(jacobian: Array, tolerance: float) -> RankReport:
-    """Rank of a scaled J: singular values above tolerance times the largest."""
-    if min(jacobian.shape) == 0:
-        return RankReport(0, np.zeros(0), (0.0, 0.0))
-    values: Array = np.linalg.svd(jacobian, compute_uv=False).astype(float)
-    rank = int(np.sum(values > tolerance * max(values[0], 1e-300)))
+def scaled(jacobian: Array, tree: Tree, closure: Closure, size: float) -> Array:
+    """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
+    rows = np.where(closure.in_metres(tree), 1.0 / size, 1.0)
+    columns = np.where(tree.in_metres, size, 1.0)
+    return rows[:, None] * jacobian * columns
+
+
+def rank_of(scaled_jacobian: Array) -> RankReport:
+    """Count singular values above the tolerance times the largest."""
+    if min(scaled_jacobian.shape) == 0:
+        return RankReport(0, 0.0, 0.0)
+    values = np.linalg.svd(scaled_jacobian, compute_uv=False)
+    values = values / max(float(values[0]), 1e-300)
+    rank = int(np.sum(values > RANK_TOLERANCE))
     below = float(values[rank]) if rank < len(values) else 0.0
-    return RankReport(rank, values, (float(values[rank - 1]) if rank else 0.0, below))
+    return RankReport(rank, float(values[rank - 1]) if rank else 0.0, below)
 
 
-def redundant_rows(jacobian: Array, rank: int) -> IntArray:
+def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
     """Return one admissible choice of rows that the others imply, in the order of phi."""
-    if jacobian.shape[0] == rank:
+    if scaled_jacobian.shape[0] == rank:
         return np.zeros(0, np.intp)
     from scipy.linalg import qr
 
-    _, _, pivots = qr(jacobian.T, mode="economic", pivoting=True)
+    _, _, pivots = qr(scaled_jacobian.T, mode="economic", pivoting=True)
     return np.sort(pivots[rank:]).astype(np.intp)
 
 
-def choose_dependent(jacobian: Array, rank: int) -> IntArray:
-    """Choose z: the coordinates whose columns make phi_z best conditioned, by a pivoted QR."""
+def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = ()) -> IntArray | None:
+    """Choose z so that phi_z is well conditioned, by a pivoted QR.
+
+    Parameters
+    ----------
+    scaled_jacobian : (rows, n) array
+    rank : int
+    blocks : sequence of index arrays
+        Coordinates of free roots. Each is tried as dependent as a whole, then as independent as a whole.
+
+    Returns
+    -------
+    (rank,) int array, or None when a block would have to be split.
+    """
     if rank == 0:
         return np.zeros(0, np.intp)
     from scipy.linalg import qr
 
-    _, _, pivots = qr(jacobian, mode="economic", pivoting=True)
-    return np.sort(pivots[:rank]).astype(np.intp)
+    inside = np.concatenate([*blocks, np.zeros(0, np.intp)]).astype(np.intp)
+    if len(inside):
+        _, r, _ = qr(scaled_jacobian[:, inside], mode="economic", pivoting=True)
+        pivots = np.abs(np.diagonal(r))
+        if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
+            # take the blocks as dependent and choose the rest in what they leave over
+            q, _ = np.linalg.qr(scaled_jacobian[:, inside])
+            rest = np.setdiff1d(np.arange(scaled_jacobian.shape[1]), inside)
+            left = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
+            _, _, order = qr(left, mode="economic", pivoting=True)
+            return np.sort(np.concatenate([inside, rest[order[: rank - len(inside)]]])).astype(np.intp)
+        rest = np.setdiff1d(np.arange(scaled_jacobian.shape[1]), inside)
+        if rank_of(scaled_jacobian[:, rest]).rank < rank:
+            return None
+        _, _, order = qr(scaled_jacobian[:, rest], mode="economic", pivoting=True)
+        return np.sort(rest[order[:rank]]).astype(np.intp)
+    _, _, order = qr(scaled_jacobian, mode="economic", pivoting=True)
+    return np.sort(order[:rank]).astype(np.intp)

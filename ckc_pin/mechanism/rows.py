@@ -23,7 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.mechanism.pose import Pose, Rate, cross
-from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Affine", "Component", "Distance", "Dot", "RelativeLog", "Rows"]
 
@@ -34,6 +34,9 @@ class Rows(Protocol):
     @property
     def out(self) -> IntArray:
         """Places of the rows in phi."""
+
+    def in_metres(self, tree: Tree) -> Array | bool:
+        """Whether the rows are lengths."""
 
     def phi(self, pose: Pose) -> Array:
         """Residual, shape (rows,)."""
@@ -58,6 +61,9 @@ class Component:
     pair: IntArray
     direction: IntArray
     turning: bool
+
+    def in_metres(self, tree: Tree) -> Array | bool:
+        return True
 
     def phi(self, pose: Pose) -> Array:
         return np.sum(pose.e[self.direction] * pose.r[self.pair], axis=1)
@@ -88,6 +94,9 @@ class Dot:
     a: IntArray
     b: IntArray
 
+    def in_metres(self, tree: Tree) -> Array | bool:
+        return False
+
     def phi(self, pose: Pose) -> Array:
         return np.sum(pose.e[self.a] * pose.e[self.b], axis=1)
 
@@ -112,6 +121,9 @@ class Distance:
     pair: IntArray
     length: Array
 
+    def in_metres(self, tree: Tree) -> Array | bool:
+        return True
+
     def phi(self, pose: Pose) -> Array:
         r = pose.r[self.pair]
         return (np.sum(r * r, axis=1) - self.length**2) / (2 * self.length)
@@ -134,6 +146,9 @@ class Affine:
     matrix: Array  # (rows, n)
     offset: Array  # (rows,)
 
+    def in_metres(self, tree: Tree) -> Array | bool:
+        return np.any((self.matrix != 0) & tree.in_metres, axis=1)
+
     def phi(self, pose: Pose) -> Array:
         return self.matrix @ pose.q_tree[pose.tree.place] - self.offset
 
@@ -153,6 +168,9 @@ class RelativeLog:
     rotation_a: Array  # (pairs, 3, 3), frame A in its joint
     joint_b: IntArray
     rotation_b: Array
+
+    def in_metres(self, tree: Tree) -> Array | bool:
+        return False
 
     def _relative(self, pose: Pose) -> tuple[Array, Array, Array]:
         """Return u = log(R_A^T R_B), R_B^T, and the Jacobian of omega_B - omega_A in world axes."""

@@ -54,6 +54,7 @@ class Tree:
         self.place = np.array(_places(model), dtype=np.intp)
         self.free = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
         self.free_coordinates = {self.coordinates[v + k] for _, v in self.free for k in range(6)}
+        self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         for joint in range(1, model.njoints):
@@ -73,6 +74,18 @@ class Tree:
         """Return d/dt of the world Jacobian (6, n) along v_tree."""
         pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
         return self._jacobian_dot.copy()
+
+    def centre_jacobians(self, q_tree: Array) -> Array:
+        """Jacobians of the centres of mass of all moving bodies that have mass, stacked: (3 bodies, n)."""
+        pin.computeJointJacobians(self.model, self.data, q_tree)
+        rows = [np.zeros((0, self.n))]
+        for joint in range(1, self.model.njoints):
+            inertia = self.model.inertias[joint]
+            if inertia.mass > 0:
+                lever = self.data.oMi[joint].act(inertia.lever)
+                angular = self._jacobian[3:] * self.support[joint, 0]
+                rows.append(self._jacobian[:3] * self.support[joint, 0] + np.cross(angular.T, lever).T)
+        return np.vstack(rows)
 
     def integrate(self, q_tree: Array, step: Array) -> Array:
         """Move a configuration by a tangent step."""
@@ -134,6 +147,14 @@ class Tree:
             if name not in self.index:
                 raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
         return np.array([self.index[name] for name in names], dtype=np.intp)
+
+
+def _in_metres(model: Any, label: str) -> bool:
+    """Whether a coordinate is a length: a prismatic joint, or a free root's position."""
+    joint, _, axis = label.rpartition(".")
+    if model.existJointName(label):
+        return model.joints[model.getJointId(label)].shortname().startswith("JointModelP")
+    return bool(joint) and axis in ("x", "y", "z")
 
 
 def _labels(model: Any) -> list[str]:

@@ -93,7 +93,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         n=mechanism.n,
         d=mechanism.d,
         rows=mechanism.closure.rows,
-        rank=mechanism.rank.rank,
+        rank=mechanism.rank,
         redundant=mechanism.redundant,
         independent=mechanism.independent,
         dependent=mechanism.dependent,

@@ -29,9 +29,10 @@ from ckc_pin.dynamics.formulations import (
 )
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.chart import Chart
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sigma import newton, predict
+from ckc_pin.mechanism.sigma import newton, predict, sigma
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System", "nearly_singular"]
@@ -109,15 +110,18 @@ class LevelSet:
     projects: bool = False
 
     def __post_init__(self) -> None:
-        self.positions = self.mechanism.d
+        tree = self.mechanism.tree
         self._last = self.initial
-        self._place = self.mechanism.tree.place[self.mechanism.partition.q]
         self._d = self.mechanism.d
         self._on_manifold = self.w0 is None or not np.any(self.w0)
         self._zero = np.zeros(self.mechanism.closure.rows)
+        self._chart = Chart(tree, self.mechanism.partition.q, self.initial.q_tree)
+        # a free root among q is charted by rotation vectors, and the chart moves along between steps
+        self.projects = not self._chart.plain
+        self.positions = self._d if self._chart.plain else 0
 
     def start(self) -> Array:
-        return np.concatenate([self.initial.q_tree[self._place], self.q_dot])
+        return np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
 
     def w(self, t: float) -> Array:
         """Eq. 17's second line, exact."""
@@ -134,14 +138,14 @@ class LevelSet:
         return _spf_velocity(terms, self.epsilon, self.w(t))
 
     def terms(self, t: float, y: Array) -> Terms:
-        q, q_dot = y[: self._d], y[self._d :]
-        w = self.w(t)
-        guess = predict(self._last, q - self._last.q_tree[self._place])
+        q_dot, w = y[self._d :], self.w(t)
+        dq = self._chart.step(self._last.q_tree, y[: self._d])
+        guess = predict(self._last, dq)
         outcome = newton(guess, w, self.mechanism.tolerance)
         self.counts.newton += outcome.iterations
         self.counts.factorizations += outcome.iterations
         if not outcome.converged:
-            found = self.mechanism.sigma(q, self._last, w)
+            found = sigma(self._last, dq, w, self.mechanism.tolerance)
             self.counts.newton += found.iterations
             self.counts.factorizations += found.iterations
             if found.verdict != "converged":
@@ -162,11 +166,15 @@ class LevelSet:
         q_dot = y[self._d :]
         with_actual = self.convention == "actual" and not self._on_manifold
         q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if with_actual else None)
-        return np.concatenate([q_dot, q_ddot])
+        return np.concatenate([self._chart.rate(terms.q_tree, q_dot), q_ddot])
 
     def accept(self, t: float, y: Array) -> Array | None:
         _require_chart(self._last)
-        return None
+        if self._chart.plain:
+            return None
+        q_tree = self.terms(t, y).q_tree
+        self._chart = Chart(self.mechanism.tree, self.mechanism.partition.q, q_tree)
+        return np.concatenate([self._chart.numbers(q_tree), y[self._d :]])
 
 
 @dataclass

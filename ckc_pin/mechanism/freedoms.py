@@ -1,0 +1,132 @@
+"""How many freedoms a closed mechanism has, and of what kind: redundant rows, singular starts, idle spins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.mechanism.assembly import assemble
+from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
+from ckc_pin.mechanism.tree import Array, IntArray, Tree
+
+__all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
+
+PERTURBATION = 0.02  # rad, or of the mechanism's size: how far along the tangent a singular start is looked at
+PERTURBATIONS = 2
+
+
+@dataclass(frozen=True)
+class Freedoms:
+    """What the rank of J says.
+
+    Attributes
+    ----------
+    d : int
+        Freedoms, n - rank.
+    rank : RankReport
+        The rank that J has around the assembled configuration.
+    singular : bool
+        J has a smaller rank at the assembled configuration itself.
+    redundant : tuple of (loop, row)
+        Rows that the others imply, one admissible choice.
+    dependent : (rank,) int array or None
+        The best-conditioned choice of z; None when it would split a free root.
+    jacobian : (rows, n) array
+        The scaled J that all this is about.
+    warnings : tuple of str
+    """
+
+    d: int
+    rank: RankReport
+    singular: bool
+    redundant: tuple[tuple[str, str], ...]
+    dependent: IntArray | None
+    jacobian: Array
+    warnings: tuple[str, ...]
+
+
+def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, size: float, accept: float) -> Freedoms:
+    """Count the freedoms at a closed configuration, and around it.
+
+    A change point or a collinear start has a smaller rank than every configuration nearby, so J is
+    also looked at a little way along its tangent space.
+
+    Parameters
+    ----------
+    q_tree : (nq,) array
+        Closed.
+    size, accept : float
+        Characteristic length, and the residual that counts as closed, metres.
+    """
+    jacobian = _scaled_at(tree, closure, q_tree, size)
+    here = there = rank_of(jacobian)
+    for nearby in _nearby(tree, closure, q_tree, size, accept, jacobian, here.rank):
+        candidate = _scaled_at(tree, closure, nearby, size)
+        report = rank_of(candidate)
+        if report.rank > there.rank:
+            there, jacobian = report, candidate
+    warnings: list[str] = []
+    if there.rank > here.rank:
+        warnings.append(
+            f"the assembled configuration is singular: rank J is {here.rank} there and {there.rank} nearby; "
+            f"d = {tree.n - there.rank} is what the mechanism has nearby"
+        )
+    if not there.sure:
+        warnings.append(
+            f"the rank is not certain: relative singular values {there.above:.1e} | {there.below:.1e} around the cut "
+            f"at {there.rank}; numbers rounded in the files, or nearly singular"
+        )
+    blocks = [np.arange(v, v + 6) for _, v in tree.free]
+    return Freedoms(
+        d=tree.n - there.rank,
+        rank=there,
+        singular=there.rank > here.rank,
+        redundant=tuple(closure.names[k] for k in redundant_rows(jacobian, there.rank)),
+        dependent=choose_dependent(jacobian, there.rank, blocks),
+        jacobian=jacobian,
+        warnings=tuple(warnings),
+    )
+
+
+def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, actuated: IntArray) -> list[str]:
+    """Name coordinates that only spin a body about itself: no centre of mass moves, no actuator turns.
+
+    Parameters
+    ----------
+    tangent : (n, d) array
+        Basis of the velocities that the loops allow.
+    """
+    if tangent.shape[1] == 0:
+        return []
+    moves = np.vstack([tree.centre_jacobians(q_tree), np.eye(tree.n)[actuated]]) @ tangent
+    _, values, directions = np.linalg.svd(moves, full_matrices=True)
+    still = directions[int(np.sum(values > 1e-8 * max(values[0], 1e-300))) :]
+    names: list[str] = []
+    for direction in still:
+        motion = np.abs(tangent @ direction)
+        names.append(tree.coordinates[int(np.argmax(motion))])
+    return list(dict.fromkeys(names))
+
+
+def _scaled_at(tree: Tree, closure: Closure, q_tree: Array, size: float) -> Array:
+    return scaled(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure, size)
+
+
+def _nearby(
+    tree: Tree, closure: Closure, q_tree: Array, size: float, accept: float, jacobian: Array, rank: int
+) -> list[Array]:
+    """Closed configurations a small step along the tangent space, where there are any."""
+    _, _, directions = np.linalg.svd(jacobian, full_matrices=True)
+    tangent = directions[rank:]
+    random = np.random.default_rng(0)
+    found = []
+    for _ in range(PERTURBATIONS if len(tangent) else 0):
+        step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
+        step *= PERTURBATION / np.abs(step).max() * np.where(tree.in_metres, size, 1.0)
+        closed = assemble(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
+        if closed.residual <= 10 * accept:
+            found.append(closed.q_tree)
+    return found
