@@ -1,0 +1,151 @@
+"""Psi of eq. 3, and sigma of eq. 4 against the intersection of two circles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ckc_pin.mechanism import Psi
+from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
+from tests.conftest import Pair, assert_close
+
+TYPE_1 = np.array([0.993865, 2.147728])  # coincident elbows on `five_bar`, six digits
+
+
+def elbow_distance(reference: FiveBar, q: Array) -> float:
+    left, right = (reference.l[k] * np.exp(1j * angle) for k, angle in zip((0, 2), q, strict=True))
+    return abs(right + reference.base - left)
+
+
+def random_q(seed: int, count: int) -> Array:
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 2))
+
+
+def turned(angles: Array) -> Array:
+    """Angles within (-pi, pi]: sigma follows joints over whole turns, circles do not."""
+    return np.angle(np.exp(1j * angles))
+
+
+def test_psi_and_its_jacobian(pair: Pair) -> None:
+    mechanism, reference = pair
+    for q_tree in np.random.default_rng(0).uniform(-np.pi, np.pi, (100, 4)):
+        q = np.array([0.3, -0.2])
+        psi = Psi(mechanism.kinematics(q_tree))
+        assert_close(psi.value(q), [*reference.phi(q_tree), *(q_tree[Q] - q)], 1e-14)
+        slope = complex_step(lambda x: np.concatenate([reference.phi(x), x[Q]]), q_tree)
+        assert_close(psi.jacobian, slope, 1e-14)
+
+
+def test_rho_is_eq_5(pair: Pair) -> None:
+    """rho = -(d Psi / d q')^-1 d Psi / d q, the square system as the paper writes it."""
+    mechanism, reference = pair
+    for q_tree in np.random.default_rng(1).uniform(-np.pi, np.pi, (100, 4)):
+        if abs(reference.s(q_tree)) < 0.1:
+            continue
+        at = mechanism.kinematics(q_tree)
+        rho = -np.linalg.solve(Psi(at).jacobian, np.vstack([np.zeros((2, 2)), -np.eye(2)]))
+        assert_close(at.rho, rho, 1e-12, relative=True)
+
+
+def test_sigma_is_the_two_circles_on_the_branch_of_the_start(pair: Pair) -> None:
+    """Wherever the circles meet, over the whole torus of q: det phi_z > 0 everywhere, as assembled."""
+    mechanism, reference = pair
+    nearest, reach = abs(reference.l[1] - reference.l[3]), reference.l[1] + reference.l[3]
+    for q in random_q(2, 200):
+        if nearest + 1e-3 < elbow_distance(reference, q) < reach - 1e-3:
+            found = mechanism.sigma(q)
+            assert found.verdict == "converged", f"sigma({q}): {found.reason}"
+            assert_close(turned(found.at.q_tree - reference.sigma(q)), 0, 1e-11)
+            assert_close(found.at.q_tree[Q], q, 1e-14)
+            assert_close(found.at.phi, 0, 1e-12)
+
+
+def test_sigma_on_a_moved_level_set(pair: Pair) -> None:
+    """phi = w is the same linkage with its right base moved by w."""
+    mechanism, reference = pair
+    w = np.array([0.01, -0.006])
+    for q in mechanism.q_tree[Q] + np.random.default_rng(3).uniform(-0.5, 0.5, (50, 2)):
+        found = mechanism.sigma(q, w=w)
+        assert found.verdict == "converged"
+        assert_close(reference.phi(found.at.q_tree), w, 1e-12)
+        assert reference.s(found.at.q_tree) > 0
+
+
+def test_sigma_from_the_other_branch_stays_there(pair: Pair) -> None:
+    mechanism, reference = pair
+    start = mechanism.kinematics(reference.sigma(mechanism.q_tree[Q], branch=-1))
+    for q in mechanism.q_tree[Q] + np.random.default_rng(4).uniform(-0.5, 0.5, (50, 2)):
+        found = mechanism.sigma(q, start)
+        assert found.verdict == "converged"
+        assert_close(turned(found.at.q_tree - reference.sigma(q, branch=-1)), 0, 1e-11)
+
+
+def test_out_of_reach_is_said_with_the_miss(pair: Pair) -> None:
+    """Beyond l2 + l4 the nearest miss of the tips is what the distal links are too short by."""
+    mechanism, reference = pair
+    reach, seen = reference.l[1] + reference.l[3], 0
+    for q in random_q(5, 200):
+        gap = elbow_distance(reference, q) - reach
+        if gap > 1e-3:
+            found = mechanism.sigma(q)
+            seen += 1
+            assert found.verdict == "out of reach"
+            assert 0 < found.reached < 1
+            assert_close(found.at.phi, 0, mechanism.tolerance)
+            assert gap / np.sqrt(2) * (1 - 1e-6) <= found.miss <= gap * (1 + 1e-6)
+            with pytest.raises(ValueError, match="out of reach"):
+                reference.sigma(q)
+    assert seen > 20
+
+
+@pytest.mark.parametrize("inside", [1e-2, 1e-4, 1e-6, 1e-8])
+def test_sigma_close_to_the_outer_singularity(pair: Pair, inside: float) -> None:
+    """Type 2: links 2 and 4 all but in line; z is then as the square root of the distance, and sigma finds it."""
+    mechanism, reference = pair
+    q = near_type_2(pair, inside)
+    found = mechanism.sigma(q)
+    assert found.verdict == "converged"
+    closed = reference.sigma(q)
+    assert_close(turned(found.at.q_tree - closed), 0, 1e-12 / abs(reference.s(closed)))
+
+
+@pytest.mark.parametrize("outside", [1e-3, 1e-5, 1e-7])
+def test_just_outside_is_out_of_reach(pair: Pair, outside: float) -> None:
+    mechanism, _ = pair
+    assert mechanism.sigma(near_type_2(pair, -outside)).verdict == "out of reach"
+
+
+def test_coincident_elbows_are_singular(five_bar: Pair) -> None:
+    """Type 1, at (theta_1, theta_3) = +-(0.993865, 2.147728): any z closes the loop, phi_z has lost rank."""
+    mechanism, reference = five_bar
+    for sign in (1, -1):
+        q = sign * coincident_elbows(reference)
+        assert_close(q, sign * TYPE_1, 5.1e-7)
+        assert mechanism.sigma(q).verdict == "singular"
+
+
+def test_elbows_cannot_coincide_as_printed(pair: Pair) -> None:
+    """Erratum 3: with |l2 - l4| = 0.0254 the same q is out of reach."""
+    mechanism, reference = pair
+    if reference.l[1] != reference.l[3]:
+        assert mechanism.sigma(coincident_elbows(reference)).verdict == "out of reach"
+
+
+def near_type_2(pair: Pair, inside: float) -> Array:
+    """q on the way outwards from the equilibrium, whose elbows are `inside` metres nearer than l2 + l4."""
+    mechanism, reference = pair
+    start, direction = mechanism.q_tree[Q], np.array([-1.0, 1.0])
+    near, far = 0.0, 1.5
+    for _ in range(100):
+        middle = (near + far) / 2
+        too_far = elbow_distance(reference, start + middle * direction) > reference.l[1] + reference.l[3] - inside
+        near, far = (near, middle) if too_far else (middle, far)
+    return start + near * direction
+
+
+def coincident_elbows(reference: FiveBar) -> Array:
+    """Apex of the triangle over the base whose sides are the proximal links."""
+    l1, l3, base = reference.l[0], reference.l[2], reference.base
+    cosine = (l1**2 + base**2 - l3**2) / (2 * l1 * base)
+    apex = l1 * np.exp(1j * np.arccos(cosine))
+    return np.angle([apex, apex - base])

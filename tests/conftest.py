@@ -1,0 +1,61 @@
+"""What all tests share: a deterministic hypothesis profile, the two five-bars, and runs that are made once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+
+from ckc_pin import Mechanism, Run, load, simulate
+from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
+
+settings.register_profile(
+    "ckc_pin",
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=20,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("ckc_pin")
+
+REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
+
+Pair = tuple[Mechanism, FiveBar]
+
+
+def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = False) -> None:
+    """Largest difference of two arrays within a tolerance; `relative` to the largest entry of the second."""
+    ours, theirs = np.broadcast_arrays(np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float))
+    limit = tolerance * np.abs(theirs).max(initial=0.0) if relative else tolerance
+    worst = np.abs(ours - theirs).max(initial=0.0)
+    assert worst <= limit, f"off by {worst:.3g}, allowed {limit:.3g}\nours:\n{ours}\ntheirs:\n{theirs}"
+
+
+@pytest.fixture(scope="session", params=REFERENCES)
+def pair(request: pytest.FixtureRequest) -> Pair:
+    """A shipped five-bar, and the same in numpy: each reading of Table I in turn."""
+    return load(request.param), REFERENCES[request.param]
+
+
+@pytest.fixture(scope="session")
+def five_bar() -> Pair:
+    """The default reading of Table I."""
+    return load("five_bar"), FIVE_BAR
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Run]:
+    """`simulate` with a memory: run(scene, formulation="dae", solver__rtol=1e-10) is computed once."""
+    done: dict[tuple[Any, ...], Run] = {}
+
+    def run(scene: str, **changes: Any) -> Run:
+        key = (scene, *sorted((name, repr(value)) for name, value in changes.items()))
+        if key not in done:
+            done[key] = simulate(scene, {name.replace("__", "."): value for name, value in changes.items()})
+        return done[key]
+
+    return run
