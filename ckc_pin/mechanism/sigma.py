@@ -22,6 +22,8 @@ Verdict = Literal["converged", "out of reach", "singular"]
 MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
 MAX_ITERATIONS = 12
 SMALLEST_PIECE = 1e-9  # of the straight line in q
+STARTS = 20  # of z, when the line does not lead to q
+ROUNDING = 1e-9  # of |J|: below that, phi_z is singular to working precision
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Sigma:
     at : Kinematics
         At sigma(q) when converged, else at the last closed configuration of the way.
     reached : float
-        How much of the way was possible, 1 when converged.
+        How much of the straight line could be followed; less than 1 also for a q that was found converged
+        without the line, on the same branch by the sign of det phi_z alone.
     miss : float
         Largest |phi - w| that remains at q when out of reach, metres or radians.
     iterations : int
@@ -130,7 +133,13 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float) -> S
             piece /= 2.0
             if piece < SMALLEST_PIECE:
                 return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+    if _is_singular(at, ROUNDING):
+        return Sigma("singular", at, 1.0, 0.0, iterations, "phi_z is singular there")
     return Sigma("converged", at, 1.0, 0.0, iterations)
+
+
+def _is_singular(at: Kinematics, margin: float) -> bool:
+    return len(at.partition.z) > 0 and at.sigma_min() <= margin * float(np.linalg.norm(at.J))
 
 
 def _same_branch(before: Kinematics, after: Kinematics) -> bool:
@@ -141,21 +150,33 @@ def _same_branch(before: Kinematics, after: Kinematics) -> bool:
 
 
 def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
-    """Say why the way ended: by the nearest miss at q itself, and what phi_z is like there."""
+    """Where the straight line ends, look at q itself: from z at its end, then from z anywhere.
+
+    A q behind an unreachable region may still lie on this branch; told by the sign of det phi_z.
+    """
     target = np.zeros(at.tree.n)
     target[at.partition.q] = dq
-    nearest = _least_squares(at.moved(target), w, tolerance)
-    miss = float(np.abs(nearest.phi - w).max(initial=0.0))
-    singular = nearest.sigma_min() <= 1e-6 * np.linalg.norm(nearest.J)
-    if miss > (1e-8 if singular else tolerance):
-        reason = f"the loops cannot close there (nearest miss {miss:.3g})"
-        return Sigma("out of reach", at, done, miss, iterations, reason)
+    start, random = at.moved(target), np.random.default_rng(0)
+    least, singular, other = np.inf, False, False
+    for attempt in range(STARTS):
+        spread = np.zeros(at.tree.n)
+        spread[at.partition.z] = random.uniform(-np.pi, np.pi, len(at.partition.z)) if attempt else 0.0
+        nearest = _least_squares(start.moved(spread), w, tolerance)
+        miss = float(np.abs(nearest.phi - w).max(initial=0.0))
+        least = min(least, miss)
+        flat = _is_singular(nearest, 1e-6)
+        if miss <= tolerance and not flat:
+            if _same_branch(at, nearest):
+                return Sigma("converged", nearest, done, 0.0, iterations)
+            other = True
+        singular = singular or (flat and miss <= 1e-8)
     if singular:
-        return Sigma("singular", at, done, miss, iterations, "phi_z is singular there")
-    if _same_branch(at, nearest):
-        return Sigma("converged", nearest, 1.0, 0.0, iterations)
-    reason = "the loops close there on another assembly branch only, behind a singular configuration"
-    return Sigma("out of reach", at, done, miss, iterations, reason)
+        return Sigma("singular", at, done, least, iterations, "phi_z is singular there")
+    if other:
+        reason = "the loops close there on another assembly branch only, behind a singular configuration"
+    else:
+        reason = f"the loops cannot close there (nearest miss {least:.3g})"
+    return Sigma("out of reach", at, done, least, iterations, reason)
 
 
 def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinematics:

@@ -148,9 +148,11 @@ class LevelSet:
             found = sigma(self._last, dq, w, self.mechanism.tolerance)
             self.counts.newton += found.iterations
             self.counts.factorizations += found.iterations
-            if found.verdict != "converged":
+            if found.verdict != "converged" or found.reached < 1.0:
                 raise NumericalError(
-                    f"sigma(q) is {found.verdict}: {found.reason}",
+                    f"sigma(q) is {found.verdict}: {found.reason}"
+                    if found.reason
+                    else "sigma(q) cannot be followed: a singular configuration is in between",
                     t=t,
                     q_tree=self.mechanism.tree.named(self.mechanism.tree.to_coordinates(found.at.q_tree)),
                 )
