@@ -61,12 +61,16 @@ def list_(as_json: Json = False) -> None:
 
 
 @app.command()
-def check(what: Annotated[str, typer.Argument(help="A mechanism or a scene.")], as_json: Json = False) -> None:
+def check(
+    what: Annotated[str, typer.Argument(help="A mechanism or a scene.")],
+    branches: Annotated[bool, typer.Option("--branches", help="List the assembly branches too.")] = False,
+    as_json: Json = False,
+) -> None:
     """Freedoms, rank, redundant rows, partition; for a scene whether its trajectory stays in the workspace.
 
     Example: ckc check five_bar_as_printed/tracking
     """
-    found = ckc_pin.check(what)
+    found = ckc_pin.check(what, branches=branches)
     if as_json:
         for warning in found.warnings:
             errors.print(f"warning: {warning}", markup=False)

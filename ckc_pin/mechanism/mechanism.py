@@ -83,6 +83,7 @@ class Mechanism:
         self.size = _size(self.tree, self.closure)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
+        self.warnings += self.tree.unmodelled()
         self._assemble()
 
     def __repr__(self) -> str:

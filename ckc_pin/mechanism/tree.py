@@ -75,6 +75,29 @@ class Tree:
         pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
         return self._jacobian_dot.copy()
 
+    def unmodelled(self) -> list[str]:
+        """Say what the URDF has and the dynamics leave out: dry friction, and limits as walls."""
+        says = []
+        rubbing = [c for c, friction in zip(self.coordinates, self.model.friction, strict=True) if friction]
+        if rubbing:
+            says.append(f"dry friction is not modelled: {', '.join(rubbing)}")
+        lower, upper = self.limits()
+        limited = [c for k, c in enumerate(self.coordinates) if np.isfinite(lower[k]) or np.isfinite(upper[k])]
+        if limited:
+            names = ", ".join(limited if len(limited) <= 6 else [*limited[:5], f"{len(limited) - 5} more"])
+            says.append(f"joint limits are no walls, a run may pass them: {names}")
+        return says
+
+    def limits(self) -> tuple[Array, Array]:
+        """Lower and upper limits by coordinate, infinite where there is none, shape (n,) each."""
+        lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        for k, label in enumerate(self.coordinates):
+            if label not in self.free_coordinates:
+                low, high = self.model.lowerPositionLimit[self.place[k]], self.model.upperPositionLimit[self.place[k]]
+                lower[k] = low if low > -1e300 else -np.inf
+                upper[k] = high if high < 1e300 else np.inf
+        return lower, upper
+
     def centre_jacobians(self, q_tree: Array) -> Array:
         """Jacobians of the centres of mass of all moving bodies that have mass, stacked: (3 bodies, n)."""
         pin.computeJointJacobians(self.model, self.data, q_tree)

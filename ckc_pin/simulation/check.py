@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.mechanism.branches import assembly_branches
 from ckc_pin.mechanism.library import is_path, load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -36,9 +37,15 @@ class Check:
     det_phi_z : float or None
         None unless phi_z is square.
     sigma_min_phi_z, cond_phi_z : float
+    gap : (above, below)
+        Relative singular values of the scaled J around the cut that the rank is.
+    backend : str
+        What computes the dynamics.
     warnings : tuple of str
     desired : DesiredCheck or None
         For a scene with a controller.
+    branches : (k, n) array or None
+        Closed configurations at the assembled q, when asked for; the assembled one first.
     """
 
     n: int
@@ -53,17 +60,22 @@ class Check:
     det_phi_z: float | None
     sigma_min_phi_z: float
     cond_phi_z: float
+    gap: tuple[float, float]
+    backend: str
     warnings: tuple[str, ...]
     desired: DesiredCheck | None = None
+    branches: Array | None = None
 
 
-def check(what: Mechanism | Scene | str | Path) -> Check:
+def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Check:
     """Check a mechanism, or a scene with its mechanism.
 
     Parameters
     ----------
     what : Mechanism, Scene, str or Path
         "five_bar" is a mechanism, "five_bar/tracking" and "x.scene.toml" are scenes.
+    branches : bool
+        List the assembly branches too (small mechanisms).
 
     Raises
     ------
@@ -73,10 +85,17 @@ def check(what: Mechanism | Scene | str | Path) -> Check:
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        return _mechanism_check(what, None, [])
+        found = _mechanism_check(what, None, [])
+        return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     desired = _desired(what, mechanism)
-    return _mechanism_check(mechanism, desired, _desired_warnings(mechanism, desired))
+    found = _mechanism_check(mechanism, desired, _desired_warnings(mechanism, desired))
+    return replace(found, branches=_branches(mechanism)) if branches else found
+
+
+def _branches(mechanism: Mechanism) -> Array:
+    found = assembly_branches(mechanism)
+    return np.array([mechanism.tree.to_coordinates(at.q_tree) for at in found])
 
 
 def _names_a_scene(name: str) -> bool:
@@ -101,7 +120,9 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         q_tree=mechanism.tree.to_coordinates(mechanism.q_tree),
         det_phi_z=float(np.linalg.det(at.phi_z)) if square else None,
         sigma_min_phi_z=float(values[-1]),
-        cond_phi_z=float(values[0] / values[-1]),
+        cond_phi_z=float(values[0] / values[-1]) if values[-1] > 0 else float("inf"),
+        gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
+        backend="python",
         warnings=(*mechanism.warnings, *warnings),
         desired=desired,
     )

@@ -22,7 +22,8 @@ TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "
 
 def check_plain(found: Check) -> dict[str, Any]:
     """Return a check as JSON-ready data."""
-    return {**asdict(found), "q_tree": found.q_tree.tolist()}
+    branches = None if found.branches is None else found.branches.tolist()
+    return {**asdict(found), "q_tree": found.q_tree.tolist(), "branches": branches}
 
 
 def check_table(found: Check) -> Group:
@@ -32,6 +33,7 @@ def check_table(found: Check) -> Group:
     table.add_row("freedoms d", str(found.d))
     redundant = f", redundant: {', '.join(found.redundant)}" if found.redundant else ""
     table.add_row("closure rows, rank", f"{found.rows}, {found.rank}{redundant}")
+    table.add_row("singular values", f"{found.gap[0]:.2e} | {found.gap[1]:.2e} around the cut (relative, scaled J)")
     table.add_row("independent q", ", ".join(found.independent) or "none")
     table.add_row("dependent z", ", ".join(found.dependent) or "none")
     assembled = "  ".join(f"{k} = {x:.6f}" for k, x in zip(found.coordinates, found.q_tree, strict=True))
@@ -39,6 +41,9 @@ def check_table(found: Check) -> Group:
     if found.det_phi_z is not None:
         table.add_row("det phi_z", f"{found.det_phi_z:.6g}")
     table.add_row("sigma_min(phi_z), cond", f"{found.sigma_min_phi_z:.6g}, {found.cond_phi_z:.4g}")
+    for k, numbers in enumerate(found.branches if found.branches is not None else ()):
+        shown = "  ".join(f"{c} = {x:.6f}" for c, x in zip(found.coordinates, numbers, strict=True))
+        table.add_row(f"branch {k + 1}", shown)
     if found.desired is not None and found.desired.leaves_at is None:
         closest = f"stays inside; closest to singular at t = {found.desired.closest_t:.4f} s"
         table.add_row("desired", f"{closest}, sigma_min(phi_z) = {found.desired.sigma_min:.4g}")
