@@ -193,7 +193,7 @@ class ClosureBuilder:
         """Add the row joint - ratio * other - offset = 0."""
         name = f"{coupling.joint}~{coupling.other}"
         where = f"coupling {name!r}"
-        joint, other = (self._one_freedom(x, where) for x in (coupling.joint, coupling.other))
+        joint, other = (self.tree.one_freedom(x, where) for x in (coupling.joint, coupling.other))
         if joint == other:
             raise MechanismError(f"{where}: a joint cannot be coupled to itself")
         coefficients = np.zeros(self.tree.n)
@@ -241,12 +241,6 @@ class ClosureBuilder:
     def _direction(self, frame: Frame, e: Array) -> int:
         self._directions.append((frame.joint, frame.rotation @ e))
         return len(self._directions) - 1
-
-    def _one_freedom(self, name: str, where: str) -> int:
-        if name not in self.tree.index or name in self.tree.free_coordinates:
-            single = ", ".join(c for c in self.tree.coordinates if c not in self.tree.free_coordinates)
-            raise MechanismError(f"{where}: no joint of one freedom called {name!r}; there are {single}")
-        return self.tree.index[name]
 
 
 def _label(e: Array, otherwise: str) -> str:

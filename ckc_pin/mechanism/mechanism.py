@@ -78,7 +78,7 @@ class Mechanism:
         for coupling in [*spec.coupling, *mimic]:
             builder.add_coupling(coupling)
         self.closure: Closure = builder.build()
-        self.springs = Springs(self.tree, self.frames, spec.spring)
+        self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
         self.size = _size(self.tree, self.closure)
         self.coordinates = self.tree.coordinates

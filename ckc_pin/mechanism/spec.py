@@ -8,6 +8,7 @@ import msgspec
 
 __all__ = [
     "CouplingSpec",
+    "ForceSpec",
     "FrameSpec",
     "LoopSpec",
     "LoopType",
@@ -86,6 +87,16 @@ class SpringSpec(_Spec, frozen=True):
     damping: NonNegative = 0.0
 
 
+class ForceSpec(_Spec, frozen=True):
+    """A constant force or torque on a joint, N or N m: part of the mechanism, with potential -value * coordinate.
+
+    A motor's fixed drive torque, a weight on a string: what pushes a joint without being a controller.
+    """
+
+    joint: Name
+    value: float
+
+
 class PointSpec(_Spec, frozen=True):
     """A point to report and to trace."""
 
@@ -106,6 +117,7 @@ class MechanismSpec(_Spec, frozen=True):
     loop: list[LoopSpec] = []
     coupling: list[CouplingSpec] = []
     spring: list[SpringSpec] = []
+    force: list[ForceSpec] = []
     point: list[PointSpec] = []
 
     def plain(self) -> dict[str, Any]:

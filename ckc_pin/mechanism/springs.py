@@ -1,4 +1,4 @@
-"""Springs and dampers between frames or on joints: forces on the tree, and what they store."""
+"""Springs and dampers between frames or on joints, constant forces: forces on the tree, and what they store."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.pose import Anchors, Pose, Rate
-from ckc_pin.mechanism.spec import SpringSpec
+from ckc_pin.mechanism.spec import ForceSpec, SpringSpec
 from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Springs"]
 
 
 class Springs:
-    """All springs and dampers of a mechanism, with the viscous damping of the URDF's joints.
+    """All springs, dampers and constant forces of a mechanism, with the viscous damping of the URDF's joints.
 
     Parameters
     ----------
     tree, frames : Tree, Frames
     specs : sequence of SpringSpec
+    forces : sequence of ForceSpec
 
     Raises
     ------
@@ -29,7 +30,9 @@ class Springs:
         An unknown frame or joint, or a spring that is neither of the two kinds.
     """
 
-    def __init__(self, tree: Tree, frames: Frames, specs: Sequence[SpringSpec]) -> None:
+    def __init__(
+        self, tree: Tree, frames: Frames, specs: Sequence[SpringSpec], forces: Sequence[ForceSpec] = ()
+    ) -> None:
         self.tree = tree
         ends_a, ends_b, lines = [], [], []
         self.joint_stiffness, self.joint_rest = np.zeros(tree.n), np.zeros(tree.n)
@@ -38,8 +41,7 @@ class Springs:
             where = f"spring {k + 1}"
             if spec.joint is not None:
                 _forbid(where, "a spring on a joint", spec, ("frame_a", "frame_b", "rest_length"))
-                at = tree.indices((spec.joint,), where)[0]
-                self._add_joint(at, spec)
+                self._add_joint(tree.one_freedom(spec.joint, where), spec)
             elif spec.frame_a is not None and spec.frame_b is not None:
                 _forbid(where, "a spring between frames", spec, ("rest",))
                 ends_a.append(frames.find(spec.frame_a, f"{where}, frame_a"))
@@ -47,6 +49,9 @@ class Springs:
                 lines.append((spec.stiffness, spec.rest_length or 0.0, spec.damping))
             else:
                 raise InputError(f"{where}: give either joint, or frame_a and frame_b")
+        self.constant = np.zeros(tree.n)
+        for k, force in enumerate(forces):
+            self.constant[tree.one_freedom(force.joint, f"force {k + 1}")] += force.value
         ends = [*ends_a, *ends_b]
         empty = np.zeros(0, np.intp)
         self.anchors = Anchors(
@@ -57,7 +62,7 @@ class Springs:
         )
         self.stiffness, self.rest_length, self.damping = np.array(lines).reshape(-1, 3).T
         self.between_frames = bool(lines)
-        self.any = bool(self.stiffness.any()) or bool(self.joint_stiffness.any())
+        self.any = any(bool(x.any()) for x in (self.stiffness, self.joint_stiffness, self.constant))
         self.any_damping = bool(self.damping.any()) or bool(self.joint_damping.any())
 
     def _add_joint(self, at: int, spec: SpringSpec) -> None:
@@ -68,8 +73,8 @@ class Springs:
         self.joint_damping[at] += spec.damping
 
     def elastic_force(self, q_tree: Array) -> Array:
-        """Generalized force of the springs on the tree, shape (n,): minus the gradient of `energy`."""
-        force = -self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest)
+        """Generalized force of springs and constant forces, shape (n,): minus the gradient of `energy`."""
+        force = self.constant - self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest)
         if self.between_frames:
             length, length_jacobian = self._lengths(q_tree)
             force -= (self.stiffness * (length - self.rest_length)) @ length_jacobian
@@ -102,10 +107,19 @@ class Springs:
             force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
         return force
 
+    def damping_matrix(self, q_tree: Array) -> Array:
+        """Minus the derivative of `damping_force` along v', shape (n, n)."""
+        matrix = np.diag(self.joint_damping)
+        if self.damping.any():
+            _, length_jacobian = self._lengths(q_tree)
+            matrix += length_jacobian.T @ (self.damping[:, None] * length_jacobian)
+        return matrix
+
     def energy(self, q_tree: Array) -> float:
-        """Energy stored, joules."""
-        stretch = q_tree[self.tree.place] - self.joint_rest
-        energy = 0.5 * float(self.joint_stiffness @ stretch**2)
+        """Energy stored, joules; what a constant force has left to give counts, zero at coordinate zero."""
+        coordinates = q_tree[self.tree.place]
+        energy = 0.5 * float(self.joint_stiffness @ (coordinates - self.joint_rest) ** 2)
+        energy -= float(self.constant @ coordinates)
         if self.between_frames:
             length = np.sqrt(np.sum(Pose(self.tree, self.anchors, q_tree).r ** 2, axis=1))
             energy += 0.5 * float(self.stiffness @ (length - self.rest_length) ** 2)

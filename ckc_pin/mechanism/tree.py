@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.lazy import Tally
 
 __all__ = ["Array", "IntArray", "Tree"]
@@ -170,6 +170,13 @@ class Tree:
             if name not in self.index:
                 raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
         return np.array([self.index[name] for name in names], dtype=np.intp)
+
+    def one_freedom(self, joint: str, where: str) -> int:
+        """Return where a joint of one freedom stands; MechanismError names those there are."""
+        if joint not in self.index or joint in self.free_coordinates:
+            single = ", ".join(c for c in self.coordinates if c not in self.free_coordinates)
+            raise MechanismError(f"{where}: no joint of one freedom called {joint!r}; there are {single}")
+        return self.index[joint]
 
 
 def _in_metres(model: Any, label: str) -> bool:
