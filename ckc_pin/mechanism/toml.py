@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from pathlib import Path
@@ -54,12 +55,25 @@ def convert(data: Any, kind: type[T], source: str) -> T:
     Raises
     ------
     InputError
-        An unknown key (the valid ones are listed), a wrong type, or a missing value.
+        An unknown key (the valid ones are listed), a wrong type, a missing value, or a number that is
+        not finite (TOML knows nan and inf).
     """
     try:
-        return msgspec.convert(data, kind)
+        converted = msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_explain(str(error), data, kind)}") from None
+    for key, value in _numbers("", data):
+        if not math.isfinite(value):
+            raise InputError(f"{source}: {key} = {value} is not a finite number")
+    return converted
+
+
+def _numbers(key: str, value: Any) -> list[tuple[str, float]]:
+    if isinstance(value, dict):
+        return [x for k, v in value.items() for x in _numbers(f"{key}.{k}" if key else str(k), v)]
+    if isinstance(value, list | tuple):
+        return [x for k, v in enumerate(value) for x in _numbers(f"{key}[{k}]", v)]
+    return [(key, value)] if isinstance(value, float) else []
 
 
 def _explain(message: str, data: Any, kind: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,9 +156,6 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     """Check parsed data; where msgspec's checks end, ours begin."""
     spec = convert(data, SceneSpec, sources.name)
-    for key, value in _numbers("", msgspec.to_builtins(spec)):
-        if not math.isfinite(value):
-            raise InputError(f"{sources.name}: {key} = {value} is not a finite number")
     if spec.initial.at is not None and spec.initial.q:
         raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
     if spec.initial.at is None and not spec.initial.q:
@@ -184,14 +180,6 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
         else:
             at[last] = value
     return dict(changed)
-
-
-def _numbers(key: str, value: Any) -> list[tuple[str, float]]:
-    if isinstance(value, dict):
-        return [x for k, v in value.items() for x in _numbers(f"{key}.{k}" if key else str(k), v)]
-    if isinstance(value, list | tuple):
-        return [x for k, v in enumerate(value) for x in _numbers(f"{key}[{k}]", v)]
-    return [(key, value)] if isinstance(value, float) else []
 
 
 def _present(value: Any) -> Any:
