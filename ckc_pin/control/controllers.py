@@ -92,6 +92,10 @@ class SetPoint:
         """Eq. 14."""
         return -self.K_P @ (terms.q - self.q_d) - self.K_V @ terms.q_dot + self.target.h
 
+    def u_rate_gradient(self, t: float, terms: Terms) -> Array:
+        """d u / d q_dot, shape (d, d)."""
+        return -self.K_V
+
     def lyapunov(self, t: float, terms: Terms, w: Array) -> float:
         """The function of section II-B minus its value at q_d, joules."""
         error = terms.q - self.q_d
@@ -133,6 +137,14 @@ class Tracking:
         r = terms.q_dot - v
         own = self.model(terms) if self.model else terms
         return own.D @ a + own.C_times(v) + own.h - self.K_D @ r
+
+    def u_rate_gradient(self, t: float, terms: Terms) -> Array:
+        """d u / d q_dot, shape (d, d); C is linear in its velocity and C(x) y = C(y) x."""
+        q_d, q_d_dot, _ = self.desired(t)
+        v = q_d_dot - self.Lambda @ (terms.q - q_d)
+        own = self.model(terms) if self.model else terms
+        along_v = Terms(own.mechanism, own.at, own.rho @ v)
+        return along_v.C - own.D @ self.Lambda - self.K_D
 
     def lyapunov(self, t: float, terms: Terms, w: Array) -> float:
         """Eq. 18 with d1 = d2 = 1 and M = I, joules (w's part: square metres)."""

@@ -73,7 +73,9 @@ class Stepper:
         atol = spec.atol if spec.atol is not None else spec.rtol / 100
         options: dict[str, Any] = {"max_step": spec.max_step} if spec.max_step else {}
         self.y = system.start()
-        self._rhs(0.0, self.y, at_start=True)
+        self._last = (0.0, self.y.copy(), self._rhs(0.0, self.y, at_start=True))
+        if method in ("Radau", "BDF") and self._jacobian(0.0, self.y) is not None:
+            options["jac"] = self._jacobian
         self.solver = getattr(scipy.integrate, method)(
             self._rhs, 0.0, self.y, t_end, rtol=spec.rtol, atol=atol, **options
         )
@@ -143,7 +145,21 @@ class Stepper:
             self.failure = NumericalError("the right-hand side is not finite", t=t)
             if at_start:
                 raise self.failure
+        self._last = (t, y.copy(), derivative)
         return derivative
+
+    def _jacobian(self, t: float, y: Array) -> Array | None:
+        """The system's Jacobian; the right-hand side that the solver has just evaluated is not evaluated again."""
+
+        def rhs(t: float, y: Array) -> Array:
+            known_t, known_y, known = self._last
+            return known if t == known_t and np.array_equal(y, known_y) else self._rhs(t, y)
+
+        try:
+            return self.system.jacobian(t, y, rhs)
+        except NumericalError as error:
+            self.failure = error
+            return np.full((len(y), len(y)), np.nan)
 
     def _explain(self, message: str) -> NumericalError:
         """Say why the solver gave up: the closure's own verdict where there is one."""

@@ -25,7 +25,7 @@ from ckc_pin.simulation.integrate import BudgetError, Stepper
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.simulation.systems import Dae, Force, LevelSet, PrintedSpf, System
+from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
 
 __all__ = ["Progress", "scene_controller", "scene_mechanism", "simulate"]
 
@@ -91,7 +91,7 @@ def simulate(
     tally = Tally() if profile else None
     mechanism.tree.tally = tally
     try:
-        system = _system(mechanism, scene, start, plant.force)
+        system = _system(mechanism, scene, start, plant)
         stepper = Stepper(system, _method(scene, system), scene.spec.solver, scene.spec.t_end)
         recorder = Recorder(system, plant.effort, getattr(controller, "lyapunov", None))
         recorder.add(0.0, stepper.y)
@@ -122,8 +122,9 @@ def simulate(
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
-    """Load the mechanism that a scene names, relative to its own folder or by shipped name."""
-    return load(_beside(scene, scene.spec.mechanism))
+    """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
+    mechanism = scene.spec.mechanism
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism)
 
 
 def _beside(scene: Scene, name: str) -> str | Path:
@@ -170,17 +171,36 @@ class _Plant:
     def force(self, t: float, terms: Terms) -> Array:
         return self.effort(t, terms).u_tree
 
+    def u_rate_gradient(self, t: float, terms: Terms) -> Array | None:
+        """d u / d q_dot: nothing acts, or the controller knows its own; None for a controller that does not."""
+        if self.controller is None:
+            return np.zeros((len(terms.q), len(terms.q)))
+        gradient = getattr(self.controller, "u_rate_gradient", None)
+        if gradient is None or not self.actuation.direct:
+            return None
+        free = self.actuation.unlimited(self.effort(t, terms).tau)
+        return free[:, None] * gradient(t, terms)
 
-def _system(mechanism: Mechanism, scene: Scene, start: Start, force: Force) -> System:
-    spec = scene.spec
+
+def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: _Plant) -> System:
+    spec, force = scene.spec, plant.force
     if spec.formulation == "dae":
         return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, spec.solver.projection)
     if spec.formulation == "reduced":
-        return LevelSet(mechanism, start.at, start.q_dot, force)
+        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient)
     equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
     if equation == 8:
         return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
-    return LevelSet(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity, start.w)
+    return LevelSet(
+        mechanism,
+        start.at,
+        start.q_dot,
+        force,
+        spec.epsilon,
+        spec.coriolis_velocity,
+        start.w,
+        plant.u_rate_gradient,
+    )
 
 
 def _method(scene: Scene, system: System) -> str:

@@ -37,6 +37,10 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System", "nearly_singular"]
 
+Gradient = Callable[[float, Terms], Array | None]  # d u / d q_dot at (t, terms); None where it is not known
+Rhs = Callable[[float, Array], Array]
+
+DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
 CHART_MARGIN = 1e-5  # of |J|: phi_z's least singular value at which q has stopped to be a chart
 
 Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
@@ -82,6 +86,9 @@ class System(Protocol):
     def accept(self, t: float, y: Array) -> Array | None:
         """Take note of an accepted step; return y projected, or None when it stays as it is."""
 
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        """d rhs / d y, shape (len(y), len(y)); None when nothing is known that differences would not find."""
+
     def velocity(self, t: float, terms: Terms) -> Array:
         """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
 
@@ -106,6 +113,7 @@ class LevelSet:
     epsilon: float = 1.0
     convention: CoriolisVelocity = "rho"
     w0: Array | None = None
+    u_rate_gradient: Gradient | None = None
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
 
@@ -170,6 +178,26 @@ class LevelSet:
         q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if with_actual else None)
         return np.concatenate([self._chart.rate(terms.q_tree, q_dot), q_ddot])
 
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        """Exact along q_dot, where a closed loop is stiff; forward differences along q."""
+        terms = self.terms(t, y)
+        gradient = self.u_rate_gradient(t, terms) if self.u_rate_gradient else None
+        if gradient is None or not self._chart.plain:
+            return None
+        d, f = self._d, rhs(t, y)
+        # C(x) y = C(y) x, so that d(C q_dot)/d q_dot = 2 C
+        gradient = gradient - 2 * terms.C
+        if self.mechanism.springs.any_damping:
+            gradient -= terms.rho.T @ self.mechanism.springs.damping_matrix(terms.q_tree) @ terms.rho
+        jacobian = np.zeros((2 * d, 2 * d))
+        jacobian[:d, d:] = np.eye(d)
+        jacobian[d:, d:] = terms.D_factor.solve(gradient)
+        for k in range(d):
+            moved = y.copy()
+            moved[k] += DIFFERENCE
+            jacobian[d:, k] = (rhs(t, moved)[d:] - f[d:]) / (moved[k] - y[k])
+        return jacobian
+
     def accept(self, t: float, y: Array) -> Array | None:
         _require_chart(self._last)
         if self._chart.plain:
@@ -227,6 +255,9 @@ class PrintedSpf:
         q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if self.convention == "actual" else None)
         return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
 
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        return None
+
     def accept(self, t: float, y: Array) -> Array | None:
         _require_chart(self.terms(t, y).at)
         return None
@@ -273,6 +304,9 @@ class Dae:
         self.counts.factorizations += 2
         rate = self.mechanism.tree.configuration_rate(q_tree, v_tree)
         return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms))])
+
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        return None
 
     def accept(self, t: float, y: Array) -> Array | None:
         if not self.projects:
