@@ -1,0 +1,126 @@
+"""Random spatial mechanisms that close: a loop of a given type, put where a random configuration closes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ckc_pin.dynamics import Terms
+from ckc_pin.mechanism import Mechanism
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType, MechanismSpec, SpringSpec, TreeSpec
+from tests.analytic.five_bar import Array
+from tests.property.worlds import Numbers, World, random_world, rotation, slope
+
+LENGTH = 0.4  # of a distance loop
+LARGEST_RHO, LEAST_SIGMA = 10.0, 0.01  # nearer to a singular phi_z differences lose their digits
+SPRINGS = [
+    SpringSpec(joint="a_j4", rest=0.3, stiffness=5.0, damping=0.2),
+    SpringSpec(joint="b_j2", rest=-0.1, stiffness=20.0),
+    SpringSpec(frame_a="a_4", frame_b=FrameSpec(link="b_4", xyz=(0.1, 0.2, 0.3)), rest_length=0.5, stiffness=30.0),
+    SpringSpec(frame_a="world", frame_b="b_3", rest_length=0.2, stiffness=10.0, damping=1.5),
+]
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A mechanism, the world it was made of, and the configuration that closes it."""
+
+    mechanism: Mechanism
+    world: World
+    q: Numbers
+
+    @property
+    def regular(self) -> bool:
+        """Whether the assembled configuration is far from singular."""
+        at = self.mechanism.assembled
+        return bool(np.abs(at.rho).max() < LARGEST_RHO / 2 and at.sigma_min() > 2 * LEAST_SIGMA)
+
+    def near(self, spread: float = 0.1) -> Terms:
+        """A random state on the closure, not far from the assembled configuration."""
+        random, mechanism = self.world.random, self.mechanism
+        at = mechanism.assembled
+        while spread > 1e-3:
+            step = at.rho @ random.uniform(-spread, spread, mechanism.d)
+            found = mechanism.sigma(mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
+            near = np.abs(found.at.rho).max() < LARGEST_RHO and found.at.sigma_min() > LEAST_SIGMA
+            if found.verdict == "converged" and near:
+                return Terms(mechanism, found.at, found.at.rho @ random.uniform(-1, 1, mechanism.d))
+            spread /= 2
+        raise AssertionError(f"no regular configuration near the assembled one: {found}")
+
+    def u_tree(self) -> Array:
+        """Random generalized forces on the tree."""
+        return self.world.random.uniform(-5, 5, self.mechanism.n)
+
+
+def closed_mechanism(
+    kind: LoopType, seed: int, *, free: bool = True, redundant: bool = False, turn: Array | None = None
+) -> Closed:
+    """A world with a loop between the links a_3 and b_3, a coupling, springs and dampers.
+
+    Parameters
+    ----------
+    kind, seed, free
+        The loop's type, the world's seed, whether the tree "b" has a free root.
+    redundant
+        Close the same loop twice.
+    turn
+        Rotation of everything, gravity included, about the world's origin.
+    """
+    world = random_world(seed, free=free)
+    q = world.configuration()
+    loop = _closing_loop(kind, world, q)
+    turn = np.eye(3) if turn is None else turn
+    trees = [
+        TreeSpec(file=prefix, prefix=prefix, root="free" if prefix == "b_" and free else "fixed",
+                 xyz=_triple(turn @ xyz), rpy=_rpy(turn @ rotation(rpy)))
+        for prefix, (xyz, rpy) in world.stands.items()
+    ]  # fmt: skip
+    again = [LoopSpec(**{name: getattr(loop, name) for name in loop.__struct_fields__} | {"name": "again"})]
+    spec = MechanismSpec(
+        name=kind,
+        tree=trees,
+        gravity=_triple(turn @ world.gravity),
+        q_guess=q,
+        loop=[loop, *(again if redundant else [])],
+        coupling=[CouplingSpec(joint="a_j1", other="b_j4", ratio=0.7, offset=q["a_j1"] - 0.7 * q["b_j4"])],
+        spring=SPRINGS,
+    )
+    texts = {prefix: world.urdf(prefix) for prefix in world.stands}
+    return Closed(Mechanism(spec, Sources("a random world", None, texts)), world, q)
+
+
+def _closing_loop(kind: LoopType, world: World, q: Numbers) -> LoopSpec:
+    """A loop whose frame B is where its frame A is at q, apart from what its type leaves free."""
+    random = world.random
+    inside, axis = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
+    across = np.cross(axis, random.normal(size=3))
+    (R_A, p_A), (R_B, p_B) = world.placement("a_3", q), world.placement("b_3", q)
+    apart = LENGTH * across / np.linalg.norm(across) if kind == "distance" else np.zeros(3)
+    return LoopSpec(
+        name="loop",
+        type=kind,
+        frame_a=FrameSpec(link="a_3", xyz=_triple(inside)),
+        frame_b=FrameSpec(link="b_3", xyz=_triple(R_B.T @ (p_A + R_A @ (inside + apart) - p_B)), rpy=_rpy(R_B.T @ R_A)),
+        axis_a=_triple(axis),
+        axis_b=_triple(across if kind == "universal" else axis),
+        length=LENGTH if kind == "distance" else None,
+    )
+
+
+def along(mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array]) -> Array:
+    """Derivative of f(q') along a tangent velocity, by differences."""
+    return slope(lambda t: f(mechanism.tree.integrate(q_tree, t * v_tree)))
+
+
+def _triple(vector: Array) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _rpy(R: Array) -> tuple[float, float, float]:
+    return _triple(Rotation.from_matrix(R).as_euler("xyz"))

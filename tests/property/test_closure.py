@@ -1,0 +1,172 @@
+"""Every loop type: phi is the table of design.md, J its derivative, J_dot the derivative of J. Off the manifold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ckc_pin.mechanism.closure import ClosureBuilder
+from ckc_pin.mechanism.frames import Frames
+from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType
+from ckc_pin.mechanism.tree import Tree
+from ckc_pin.mechanism.urdf import TreeText, merge
+from tests.analytic.five_bar import Array
+from tests.conftest import assert_close
+from tests.property.strategies import TYPES, loops, seeds
+from tests.property.worlds import Numbers, Placement, World, compose, random_world, rotation, slope
+
+
+class Closed:
+    """The program's view of a world with some loops."""
+
+    def __init__(self, world: World, *specs: LoopSpec | CouplingSpec) -> None:
+        texts = [
+            TreeText(world.urdf(prefix), f"{prefix}.urdf", prefix, "free" if free else "fixed", xyz=xyz, rpy=rpy)
+            for (prefix, (xyz, rpy)), free in zip(world.stands.items(), (False, world.free), strict=True)
+        ]
+        self.tree = Tree(pin.buildModelFromXML(merge(texts)[0]))
+        builder = ClosureBuilder(self.tree, Frames(self.tree.model))
+        for spec in specs:
+            builder.add_loop(spec) if isinstance(spec, LoopSpec) else builder.add_coupling(spec)
+        self.closure = builder.build()
+
+    def vector(self, values: Numbers) -> Array:
+        return np.array([values[name] for name in self.tree.coordinates])
+
+    def at(self, q: Numbers) -> Kinematics:
+        everything = np.arange(self.tree.n)
+        split = Partition(everything[:0], everything)
+        return Kinematics(self.tree, self.closure, split, self.tree.from_coordinates(self.vector(q)))
+
+
+def placed(world: World, q: Numbers, frame: str | FrameSpec) -> Placement:
+    if isinstance(frame, str):
+        return world.placement(frame, q)
+    return compose(world.placement(frame.link, q), (rotation(np.array(frame.rpy)), np.array(frame.xyz)))
+
+
+def table(loop: LoopSpec, A: Placement, B: Placement) -> Array:
+    """phi as design.md's table has it."""
+    (R_A, p_A), (R_B, p_B) = A, B
+    resolve = R_A.T if loop.rows_in == "a" else np.eye(3)
+    r = resolve @ (p_A - p_B)
+    a, b = (np.array(axis) / np.linalg.norm(axis) for axis in (loop.axis_a, loop.axis_b))
+    e1, e2 = right_handed(a)
+    b = R_A.T @ R_B @ b  # in frame A, like a, e1 and e2
+    log = Rotation.from_matrix(R_A.T @ R_B).as_rotvec()
+    rows: dict[str, Any] = {
+        "point": lambda: r,
+        "point_2d": lambda: [e1 @ r, e2 @ r],
+        "hinge": lambda: [*r, e1 @ b, e2 @ b],
+        "cylindrical": lambda: [e1 @ r, e2 @ r, e1 @ b, e2 @ b],
+        "universal": lambda: [*r, a @ b],
+        "prismatic": lambda: [e1 @ r, e2 @ r, *log],
+        "weld": lambda: [*r, *log],
+        "distance": lambda: [(r @ r - loop.length**2) / (2 * loop.length)],
+    }
+    return np.array(rows[loop.type]())
+
+
+def right_handed(a: Array) -> tuple[Array, Array]:
+    """e1, e2 of a right-handed (e1, e2, a)."""
+    axes = np.eye(3)
+    for k in range(3):
+        if np.array_equal(a, axes[k]):
+            return axes[(k + 1) % 3], axes[(k + 2) % 3]
+    e1 = np.cross(a, axes[np.argmin(np.abs(a))])
+    return e1 / np.linalg.norm(e1), np.cross(a, e1 / np.linalg.norm(e1))
+
+
+def half_turn_away(loop: LoopSpec, A: Placement, B: Placement) -> bool:
+    """Whether the log of the relative rotation, where there is one, is far from its cut at half a turn."""
+    return loop.type not in ("weld", "prismatic") or Rotation.from_matrix(A[0].T @ B[0]).magnitude() < 2.9
+
+
+every_type = pytest.mark.parametrize("kind", TYPES)
+
+
+@every_type
+@given(seed=seeds, data=st.data())
+def test_phi_is_the_table(kind: LoopType, seed: int, data: st.DataObject) -> None:
+    world, loop = random_world(seed), data.draw(loops(kind))
+    q = world.configuration()
+    A, B = placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)
+    assert_close(Closed(world, loop).at(q).phi, table(loop, A, B), 1e-12)
+
+
+@every_type
+@given(seed=seeds, data=st.data())
+def test_J_is_the_derivative_of_phi(kind: LoopType, seed: int, data: st.DataObject) -> None:
+    """phi_dot = J v along any velocity, by differences of the table."""
+    world, loop = random_world(seed), data.draw(loops(kind))
+    q, v = world.configuration(), world.velocity()
+    assume(half_turn_away(loop, placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)))
+
+    def phi(t: float) -> Array:
+        moved = world.moved(q, v, t)
+        return table(loop, placed(world, moved, loop.frame_a), placed(world, moved, loop.frame_b))
+
+    closed = Closed(world, loop)
+    assert_close(closed.at(q).J @ closed.vector(v), slope(phi), 1e-8)
+
+
+@every_type
+@given(seed=seeds, data=st.data())
+def test_J_dot_is_the_derivative_of_J(kind: LoopType, seed: int, data: st.DataObject) -> None:
+    world, loop = random_world(seed), data.draw(loops(kind))
+    q, v = world.configuration(), world.velocity()
+    assume(half_turn_away(loop, placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)))
+    closed = Closed(world, loop)
+    J_dot = slope(lambda t: closed.at(world.moved(q, v, t)).J)
+    assert_close(closed.at(q).J_dot(closed.vector(v)), J_dot, 1e-7)
+
+
+@given(seed=seeds, ratio=st.floats(-3, 3), offset=st.floats(-1, 1), prismatic=st.booleans())
+def test_a_coupling_is_affine(seed: int, ratio: float, offset: float, prismatic: bool) -> None:
+    world = random_world(seed)
+    joint, other = ("a_j2" if prismatic else "a_j3"), "b_j4"
+    closed = Closed(world, CouplingSpec(joint=joint, other=other, ratio=ratio, offset=offset))
+    q, v = world.configuration(), world.velocity()
+    at = closed.at(q)
+    assert_close(at.phi, [q[joint] - ratio * q[other] - offset], 1e-14)
+    assert_close(at.J @ closed.vector(v), [v[joint] - ratio * v[other]], 1e-13)
+    assert_close(at.J_dot(closed.vector(v)), 0, 0)
+
+
+@given(seed=seeds, data=st.data())
+def test_rows_keep_the_order_of_the_file(seed: int, data: st.DataObject) -> None:
+    """Loops of all types and a coupling at once: grouping rows by primitive must not show."""
+    world = random_world(seed)
+    specs = [data.draw(loops(kind)) for kind in data.draw(st.permutations(TYPES))]
+    named = [LoopSpec(**{f: getattr(s, f) for f in s.__struct_fields__} | {"name": s.type}) for s in specs]
+    coupling = CouplingSpec(joint="b_j1", other="a_j1", ratio=2.0)
+    closed, q, v = Closed(world, *named, coupling), world.configuration(), world.velocity()
+    at = closed.at(q)
+    alone = [Closed(world, spec).at(q) for spec in (*named, coupling)]
+    loops_of_rows = [spec.name for spec, k in zip(named, alone[:-1], strict=True) for _ in k.phi]
+    assert [name for name, _ in closed.closure.names] == [*loops_of_rows, "b_j1~a_j1"]
+    assert_close(at.phi, np.concatenate([k.phi for k in alone]), 1e-14)
+    assert_close(at.J, np.vstack([k.J for k in alone]), 1e-13)
+    assert_close(at.J_dot(closed.vector(v)), np.vstack([k.J_dot(closed.vector(v)) for k in alone]), 1e-12)
+
+
+@given(seed=seeds, turn=st.floats(2.9, np.pi - 1e-6))
+def test_a_weld_off_by_almost_half_a_turn(seed: int, turn: float) -> None:
+    """The log is exact up to its cut: its angle does not lose digits near pi."""
+    world = random_world(seed)
+    q = world.configuration()
+    axis = world.random.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    R_A, _ = world.placement("a_3", q)
+    R_B, _ = world.placement("b_3", q)
+    inside = R_B.T @ R_A @ Rotation.from_rotvec(turn * axis).as_matrix()
+    rpy = tuple(Rotation.from_matrix(inside).as_euler("xyz").tolist())
+    loop = LoopSpec(name="loop", type="weld", frame_a="a_3", frame_b=FrameSpec(link="b_3", rpy=rpy))
+    assert_close(Closed(world, loop).at(q).phi[3:], turn * axis, 1e-9)

@@ -1,0 +1,236 @@
+"""What the terms and the formulations of any closed mechanism obey, whatever its loop: random spatial mechanisms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ckc_pin.dynamics import Terms, dae_acceleration, h_gradient, multipliers, reduced_acceleration, tangent_basis
+from ckc_pin.mechanism import Kinematics
+from ckc_pin.mechanism.kinematics import Partition
+from tests.analytic.five_bar import Array
+from tests.conftest import assert_close
+from tests.property.mechanisms import Closed, along, closed_mechanism
+from tests.property.strategies import TYPES, angles, seeds
+from tests.property.worlds import rotation, slope
+
+every_mechanism = st.builds(
+    closed_mechanism, st.sampled_from(TYPES), seeds, free=st.booleans(), redundant=st.booleans()
+).filter(lambda closed: closed.regular)
+many = settings(max_examples=60)
+
+
+@many
+@given(every_mechanism)
+def test_energy_is_that_of_the_bodies(closed: Closed) -> None:
+    """1/2 v D' v + V against a sum over bodies that are placed in numpy."""
+    mechanism, world = closed.mechanism, closed.world
+    q, v = world.configuration(), world.velocity()
+    q_tree, v_tree = (np.array([x[name] for name in mechanism.coordinates]) for x in (q, v))
+    terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q_tree)), v_tree)
+    assert_close(terms.energy - mechanism.springs.energy(terms.q_tree), world.energy(q, v), 1e-8)
+
+
+@many
+@given(every_mechanism)
+def test_rho_spans_the_null_space_of_J(closed: Closed) -> None:
+    mechanism, at = closed.mechanism, closed.near().at
+    rank = np.linalg.matrix_rank(at.J, tol=1e-8)
+    assert at.rho.shape == (mechanism.n, mechanism.n - rank)
+    assert_close(at.rho[mechanism.partition.q], np.eye(mechanism.d), 0)
+    assert_close(at.J @ at.rho, 0, 1e-12 * np.abs(at.rho).max())
+
+
+@many
+@given(every_mechanism)
+def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
+    at = closed.near().at
+    again = closed.mechanism.sigma(closed.mechanism.independent_part(at.q_tree))
+    assert again.verdict == "converged"
+    assert_close(at.phi, 0, closed.mechanism.tolerance)
+    assert_close(closed.mechanism.tree.difference(again.at.q_tree, at.q_tree), 0, 1e-9)
+
+
+@many
+@given(every_mechanism)
+def test_rho_dot_is_the_derivative_of_rho(closed: Closed) -> None:
+    terms = closed.near()
+    rho_dot = along(closed.mechanism, terms.q_tree, terms.v_tree, lambda q: closed.mechanism.kinematics(q).rho)
+    assert_close(terms.rho_dot, rho_dot, 1e-7 * max(1, np.abs(rho_dot).max()))
+    assert_close(terms.rho_dot_times(terms.q_dot), terms.rho_dot @ terms.q_dot, 1e-10 * max(1, np.abs(rho_dot).max()))
+
+
+@many
+@given(every_mechanism)
+def test_D_dot_minus_two_C_is_skew(closed: Closed) -> None:
+    """Eq. 19 needs it."""
+    terms, mechanism = closed.near(), closed.mechanism
+
+    def D(q_tree: Array) -> Array:
+        return Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).D
+
+    skew = along(mechanism, terms.q_tree, terms.v_tree, D) - 2 * terms.C
+    assert_close(skew, -skew.T, 1e-7 * max(1, np.abs(terms.C).max()))
+    assert_close(terms.C_times(terms.q_dot), terms.C @ terms.q_dot, 1e-11 * max(1, np.abs(terms.C).max()))
+
+
+@many
+@given(every_mechanism)
+def test_D_is_symmetric_positive_definite(closed: Closed) -> None:
+    terms = closed.near()
+    assert_close(terms.D, terms.D.T, 1e-13, relative=True)
+    assert np.linalg.eigvalsh(terms.D)[0] > 0
+
+
+@many
+@given(every_mechanism)
+def test_the_bias_is_C_v_and_h(closed: Closed) -> None:
+    terms = closed.near()
+    assert_close(terms.bias_tree, terms.C_tree @ terms.v_tree + terms.h_tree, 1e-11)
+
+
+@many
+@given(every_mechanism)
+def test_h_is_the_gradient_of_the_potential(closed: Closed) -> None:
+    """Gravity and springs, along each column of rho."""
+    terms, mechanism = closed.near(), closed.mechanism
+
+    def V(q_tree: Array) -> Array:
+        return np.array(Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).potential_energy)
+
+    slopes = [along(mechanism, terms.q_tree, column, V) for column in terms.rho.T]
+    assert_close(terms.h, slopes, 1e-8 * max(1, np.abs(terms.h).max()))
+
+
+@many
+@given(every_mechanism)
+def test_dae_is_the_reduced_model(closed: Closed) -> None:
+    """J a + J_dot v = 0, and a = rho q_ddot + rho_dot q_dot with eq. 6's q_ddot."""
+    terms, u_tree = closed.near(), closed.u_tree()
+    a = dae_acceleration(terms, u_tree)
+    size = max(1, np.abs(a).max())
+    assert_close(terms.at.J @ a + terms.J_dot @ terms.v_tree, 0, 1e-10 * size)
+    q_ddot = reduced_acceleration(terms, u_tree)
+    assert_close(a, terms.rho @ q_ddot + terms.rho_dot @ terms.q_dot, 1e-9 * size)
+
+
+@many
+@given(every_mechanism)
+def test_both_ways_to_eq_6_agree_on_the_manifold(closed: Closed) -> None:
+    """Without the matrix C', and with it at a given q_dot."""
+    terms, u_tree = closed.near(), closed.u_tree()
+    q_ddot = reduced_acceleration(terms, u_tree)
+    assert_close(reduced_acceleration(terms, u_tree, terms.q_dot), q_ddot, 1e-9 * max(1, np.abs(q_ddot).max()))
+
+
+@many
+@given(every_mechanism)
+def test_multipliers_satisfy_eq_1(closed: Closed) -> None:
+    terms, u_tree = closed.near(), closed.u_tree()
+    a = dae_acceleration(terms, u_tree)
+    force = terms.at.J.T @ multipliers(terms, u_tree, a)
+    left = terms.D_tree @ a + terms.C_tree @ terms.v_tree + terms.h_tree
+    assert_close(left, u_tree + terms.damping_force + force, 1e-9 * max(1, np.abs(left).max()))
+
+
+@many
+@given(every_mechanism)
+def test_energy_changes_by_the_power_of_actuators_and_dampers(closed: Closed) -> None:
+    """The loops do no work."""
+    terms, u_tree, mechanism = closed.near(), closed.u_tree(), closed.mechanism
+    a = dae_acceleration(terms, u_tree)
+
+    def energy(t: float) -> Array:
+        q_tree = mechanism.tree.integrate(terms.q_tree, t * terms.v_tree)
+        return np.array(Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree + t * a).energy)
+
+    power = terms.v_tree @ (u_tree + terms.damping_force)
+    assert_close(slope(energy), power, 1e-8 * max(1, abs(power), np.abs(a).max()))
+
+
+@many
+@given(every_mechanism)
+def test_dampers_dissipate(closed: Closed) -> None:
+    terms = closed.near()
+    assert terms.v_tree @ terms.damping_force < 0
+
+
+@many
+@given(every_mechanism)
+def test_the_motion_does_not_depend_on_the_choice_of_q(closed: Closed) -> None:
+    """Any regular split gives the same acceleration of the tree, and D congruent by d q / d q_other."""
+    terms, u_tree, mechanism = closed.near(), closed.u_tree(), closed.mechanism
+    assume(np.abs(terms.rho[mechanism.partition.z]).max() > 0.2)  # else no other coordinate will do
+    other = other_partition(terms.at)
+    at = Kinematics(mechanism.tree, mechanism.closure, other, terms.q_tree)
+    theirs = Terms(mechanism, at, terms.v_tree)
+    change = terms.rho[other.q]  # d q_other / d q
+    assert_close(terms.D, change.T @ theirs.D @ change, 1e-9, relative=True)
+    assert_close(terms.h, change.T @ theirs.h, 1e-9 * max(1, np.abs(terms.h).max()))
+    a, b = (t.rho @ reduced_acceleration(t, u_tree) + t.rho_dot @ t.q_dot for t in (terms, theirs))
+    assert_close(a, b, 1e-8 * max(1, np.abs(a).max()))
+
+
+def other_partition(at: Kinematics) -> Partition:
+    """A split that exchanges one independent coordinate with a dependent one, where that is least singular."""
+    q, z, rho_z = at.partition.q.copy(), at.partition.z.copy(), np.abs(at.rho[at.partition.z])
+    row, column = np.unravel_index(np.argmin(np.abs(np.log(np.maximum(rho_z, 1e-300)))), rho_z.shape)
+    q[column], z[row] = z[row], q[column]
+    return Partition(q, z)
+
+
+@given(kind=st.sampled_from(TYPES), seed=seeds, rpy=angles, free=st.booleans())
+def test_the_dynamics_do_not_depend_on_where_the_world_looks(
+    kind: str, seed: int, rpy: tuple[float, float, float], free: bool
+) -> None:
+    """Everything turned, gravity too: the same phi and J in frame A's axes, the same D', C', h' and motion."""
+    one = closed_mechanism(kind, seed, free=free)  # type: ignore[arg-type]
+    two = closed_mechanism(kind, seed, free=free, turn=rotation(np.array(rpy)))  # type: ignore[arg-type]
+    ours = one.near()
+    theirs = Terms(two.mechanism, two.mechanism.kinematics(ours.q_tree), ours.v_tree)
+    u_tree = one.u_tree()
+    for name in ("D_tree", "C_tree", "h_tree", "J_dot", "energy"):
+        assert_close(getattr(ours, name), getattr(theirs, name), 1e-11 * max(1, np.abs(getattr(ours, name)).max()))
+    assert_close(ours.at.phi, theirs.at.phi, 1e-12)
+    assert_close(ours.at.J, theirs.at.J, 1e-12)
+    a = dae_acceleration(ours, u_tree)
+    assert_close(a, dae_acceleration(theirs, u_tree), 1e-9 * max(1, np.abs(a).max()))
+
+
+@many
+@given(every_mechanism)
+def test_the_tangent_basis(closed: Closed) -> None:
+    """Orthonormal, what J annihilates, as many columns as freedoms; the particular part takes up J_dot v."""
+    terms = closed.near()
+    tangent, particular = tangent_basis(terms)
+    assert_close(tangent.T @ tangent, np.eye(closed.mechanism.d), 1e-13)
+    assert_close(terms.at.J @ tangent, 0, 1e-12)
+    drift = terms.J_dot @ terms.v_tree
+    assert_close(terms.at.J @ particular, -drift, 1e-10 * max(1, np.abs(drift).max()))
+
+
+@settings(max_examples=30)
+@given(every_mechanism.filter(lambda closed: not closed.world.free))
+def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None:
+    mechanism, at = closed.mechanism, closed.near().at
+    q = mechanism.independent_part(at.q_tree)
+
+    def h(x: Array) -> Array:
+        found = mechanism.sigma(x, at)
+        assert found.verdict == "converged"
+        return Terms(mechanism, found.at, np.zeros(mechanism.n)).h
+
+    hessian = h_gradient(mechanism, at)
+    slopes = np.array([slope(lambda t, e=e: h(q + t * e)) for e in np.eye(mechanism.d)]).T
+    assert_close(hessian, slopes, 1e-6 * max(1, np.abs(slopes).max()))
+    assert_close(hessian, hessian.T, 1e-10 * max(1, np.abs(hessian).max()))
+
+
+@pytest.mark.parametrize("redundant", [False, True])
+def test_rows_of_a_loop_closed_twice_are_redundant(redundant: bool) -> None:
+    """The freedoms do not change, and the superfluous rows are as many as the loop has."""
+    closed = closed_mechanism("hinge", 1, redundant=redundant)
+    assert (closed.mechanism.d, closed.mechanism.rank) == (14 - 6, 6)
+    assert len(closed.mechanism.redundant) == (5 if redundant else 0)
