@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.generators import GENERATORS, GeneratorSpec, generate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import convert, read_text, read_toml
 
-__all__ = ["build", "is_path", "library", "load", "mechanism_file", "shipped"]
+__all__ = ["about", "build", "first_comment", "is_path", "library", "load", "mechanism_file", "shipped"]
 
 MECHANISM_FILE = "mechanism.toml"
 
@@ -23,8 +24,8 @@ def library() -> Path:
 
 
 def shipped() -> list[str]:
-    """Names of the shipped mechanisms."""
-    return sorted(p.parent.name for p in library().glob(f"*/{MECHANISM_FILE}"))
+    """Names of the shipped mechanisms, those of files and those made by rule."""
+    return sorted([*(p.parent.name for p in library().glob(f"*/{MECHANISM_FILE}")), *GENERATORS])
 
 
 def is_path(name: str) -> bool:
@@ -50,13 +51,14 @@ def mechanism_file(name: str | Path) -> Path:
     return library() / name / MECHANISM_FILE
 
 
-def load(name: str | Path) -> Mechanism:
+def load(name: str | Path | GeneratorSpec) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
     Parameters
     ----------
-    name : str or Path
-        For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``.
+    name : str, Path or GeneratorSpec
+        For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
+        usual number of links.
 
     Raises
     ------
@@ -65,8 +67,26 @@ def load(name: str | Path) -> Mechanism:
     MechanismError
         A mechanism that cannot exist as described.
     """
+    return build(*_text(name))
+
+
+def about(name: str) -> str:
+    """What a shipped mechanism is, in a sentence: the first comment of its file, so that the two cannot drift apart."""
+    return first_comment(_text(name)[0])
+
+
+def first_comment(text: str) -> str:
+    """Return the first line of a TOML text that is a comment, without its mark."""
+    return next((line.lstrip("# ").strip() for line in text.splitlines() if line.startswith("#")), "")
+
+
+def _text(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
+    if isinstance(name, GeneratorSpec):
+        return generate(name)
+    if name in GENERATORS and not is_path(str(name)):
+        return generate(convert({"generator": name}, GeneratorSpec, str(name)))
     path = mechanism_file(name)
-    return build(read_text(path, "mechanism file"), Sources(str(path), path.parent))
+    return read_text(path, "mechanism file"), Sources(str(path), path.parent)
 
 
 def build(text: str, sources: Sources) -> Mechanism:

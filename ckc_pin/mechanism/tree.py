@@ -22,6 +22,8 @@ __all__ = ["Array", "IntArray", "Tree"]
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+MOST = 300  # coordinates; Pinocchio's workspace takes about 100 n^3 bytes whatever it is used for, 2.6 GB here
+
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -40,9 +42,16 @@ class Tree:
         ``root.x ... root.rz`` for a free root.
     n : int
         Number of tangent coordinates.
+
+    Raises
+    ------
+    MechanismError
+        More coordinates than a workspace is made for.
     """
 
     def __init__(self, model: Any) -> None:
+        if model.nv > MOST:
+            raise MechanismError(f"{model.nv} coordinates in the tree; at most {MOST} are taken")
         self.model = model
         self.data = model.createData()
         self.n: int = model.nv

@@ -11,7 +11,8 @@ import msgspec
 
 from ckc_pin.control.spec import ControllerSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.library import MECHANISM_FILE, is_path, library, shipped
+from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert, read_text, read_toml
 
@@ -72,7 +73,7 @@ class EventSpec(_Spec, frozen=True):
 class SceneSpec(_Spec, frozen=True):
     """The whole file."""
 
-    mechanism: str
+    mechanism: str | GeneratorSpec
     formulation: Literal["reduced", "spf", "dae"]
     t_end: Positive
     epsilon: Positive = 1e-3
@@ -194,17 +195,10 @@ def catalogue() -> list[tuple[str, str, dict[str, str]]]:
     What a file is about is its first comment, so that the list cannot drift from the files.
     """
     return [
-        (
-            name,
-            _first_comment(library() / name / MECHANISM_FILE),
-            {scene: _first_comment(library() / name / f"{scene}{SUFFIX}") for scene in scene_names(name)},
-        )
+        (name, about(name), {scene: first_comment(_scene_text(name, scene)) for scene in scene_names(name)})
         for name in shipped()
     ]
 
 
-def _first_comment(path: Path) -> str:
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if line.startswith("#"):
-            return line.lstrip("# ").strip()
-    return ""
+def _scene_text(mechanism: str, scene: str) -> str:
+    return read_text(library() / mechanism / f"{scene}{SUFFIX}", "scene")
