@@ -83,6 +83,8 @@ class Kinematics:
         """Smallest singular value of phi_z (its distance to a singular configuration); inf when z is empty."""
         if not len(self.partition.z):
             return float("inf")
+        if not np.all(np.isfinite(self.phi_z)):
+            return float("nan")
         return float(np.linalg.svd(self.phi_z, compute_uv=False)[len(self.partition.z) - 1])
 
     def moved(self, step: Array) -> Kinematics:

@@ -76,9 +76,10 @@ class Stepper:
         self._last = (0.0, self.y.copy(), self._rhs(0.0, self.y, at_start=True))
         if method in ("Radau", "BDF") and self._jacobian(0.0, self.y) is not None:
             options["jac"] = self._jacobian
-        self.solver = getattr(scipy.integrate, method)(
-            self._rhs, 0.0, self.y, t_end, rtol=spec.rtol, atol=atol, **options
-        )
+        self._options = {"rtol": spec.rtol, "atol": atol, **options}
+        self._class = getattr(scipy.integrate, method)
+        self.solver = self._class(self._rhs, 0.0, self.y, t_end, **self._options)
+        self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
 
     @property
     def t(self) -> float:
@@ -86,7 +87,7 @@ class Stepper:
         return float(self.solver.t)
 
     def step(self) -> Step:
-        """Advance by one accepted step.
+        """Advance by one accepted step; to be followed by `settle` once the step has been looked at.
 
         Raises
         ------
@@ -107,12 +108,31 @@ class Stepper:
         if solver.t - t_old < self.spec.min_step and solver.status == "running":
             raise self._explain(f"the step fell below min_step = {self.spec.min_step:g} s")
         self.failure = None
-        step = Step(t_old, self.t, self._interpolant(t_old, y_old, f_old))
+        return Step(t_old, self.t, self._interpolant(t_old, y_old, f_old))
+
+    def settle(self) -> None:
+        """Let the system take note of the step, project its state, or change its coordinates.
+
+        Raises
+        ------
+        NumericalError
+            The system's coordinates end here.
+        """
+        solver, switches = self.solver, self.system.counts.switches
         projected = self.system.accept(self.t, solver.y)
-        if projected is not None:
+        if self.system.counts.switches > switches and solver.status == "running":
+            self._restart(projected)
+        elif projected is not None:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
-        return step
+
+    def _restart(self, y: Array | None) -> None:
+        """Go on in other coordinates: a new solver, no memory but the step size."""
+        old = self.solver
+        self._retired = {name: count + int(getattr(old, name)) for name, count in self._retired.items()}
+        self.solver = self._class(
+            self._rhs, old.t, y, old.t_bound, first_step=min(old.step_size, old.t_bound - old.t), **self._options
+        )
 
     def stats(self) -> dict[str, int]:
         """Return the counts so far."""
@@ -122,8 +142,9 @@ class Stepper:
             "steps": self.steps,
             "rejected": self.rejected,
             "newton": counts.newton,
-            "factorizations": counts.factorizations + int(solver.nlu),
-            "jacobians": int(solver.njev),
+            "factorizations": counts.factorizations + int(solver.nlu) + self._retired["nlu"],
+            "jacobians": int(solver.njev) + self._retired["njev"],
+            "switches": counts.switches,
         }
 
     def _rhs(self, t: float, y: Array, at_start: bool = False) -> Array:

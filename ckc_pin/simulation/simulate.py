@@ -98,7 +98,7 @@ def simulate(
         status, message = _steps(stepper, recorder, times, events, scene.spec.t_end, progress)
     finally:
         mechanism.tree.tally = None
-    stats = {**stepper.stats(), "switches": 0, "wall_s": perf_counter() - started,
+    stats = {**stepper.stats(), "wall_s": perf_counter() - started,
              "method": stepper.method, "backend": "python"}  # fmt: skip
     texts = {**mechanism.sources.texts, **scene.sources.texts, **model_texts}
     run = Run(
@@ -184,10 +184,11 @@ class _Plant:
 
 def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: _Plant) -> System:
     spec, force = scene.spec, plant.force
+    free = plant.controller is None  # of a controller that lives in the mechanism's own q
     if spec.formulation == "dae":
         return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, spec.solver.projection)
     if spec.formulation == "reduced":
-        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient)
+        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
     equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
     if equation == 8:
         return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
@@ -200,6 +201,7 @@ def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: _Plant) -> 
         spec.coriolis_velocity,
         start.w,
         plant.u_rate_gradient,
+        free,
     )
 
 
@@ -247,6 +249,8 @@ def _steps(
             if halt is not None:
                 recorder.add(halt, step.interpolant(halt))
                 return "done", f"stopped by the event at t = {halt:.9g} s"
+            if stepper.solver.status == "running":
+                stepper.settle()
     except NumericalError as error:
         recorder.add(stepper.t, stepper.solver.y)
         return "stopped", _sentence(error, stepper.t)

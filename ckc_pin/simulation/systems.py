@@ -30,8 +30,9 @@ from ckc_pin.dynamics.formulations import (
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.chart import Chart
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rank import choose_dependent, scaled
 from ckc_pin.mechanism.sigma import newton, predict, sigma
 from ckc_pin.mechanism.tree import Array
 
@@ -41,6 +42,7 @@ Gradient = Callable[[float, Terms], Array | None]  # d u / d q_dot at (t, terms)
 Rhs = Callable[[float, Array], Array]
 
 DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
+SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
 CHART_MARGIN = 1e-5  # of |J|: phi_z's least singular value at which q has stopped to be a chart
 
 Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
@@ -48,10 +50,11 @@ Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
 
 @dataclass
 class Counts:
-    """Work done by a system: Newton corrections and factorizations."""
+    """Work done by a system: Newton corrections, factorizations, changes of the partition."""
 
     newton: int = 0
     factorizations: int = 0
+    switches: int = 0
 
 
 class System(Protocol):
@@ -104,6 +107,8 @@ class LevelSet:
     """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
 
     z is found on the level set by Newton from where the last evaluated state, moved along rho, leads.
+    With `may_switch` the split into q and z is changed where phi_z comes near to singular; a controller,
+    which lives in the mechanism's own q, forbids that.
     """
 
     mechanism: Mechanism
@@ -114,6 +119,7 @@ class LevelSet:
     convention: CoriolisVelocity = "rho"
     w0: Array | None = None
     u_rate_gradient: Gradient | None = None
+    may_switch: bool = False
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
 
@@ -199,12 +205,32 @@ class LevelSet:
         return jacobian
 
     def accept(self, t: float, y: Array) -> Array | None:
+        margin = self._last.sigma_min() / max(float(np.linalg.norm(self._last.J)), 1e-300)
+        if margin < SWITCH_MARGIN and self.may_switch:
+            better = self._better_partition(margin)
+            if better is not None:
+                terms = self.terms(t, y)
+                self._last = Kinematics(terms.at.tree, terms.at.closure, better, terms.q_tree)
+                self._chart = Chart(terms.at.tree, better.q, terms.q_tree)
+                self.counts.switches += 1
+                return np.concatenate([self._chart.numbers(terms.q_tree), terms.v_tree[better.q]])
         _require_chart(self._last)
         if self._chart.plain:
             return None
         q_tree = self.terms(t, y).q_tree
-        self._chart = Chart(self.mechanism.tree, self.mechanism.partition.q, q_tree)
+        self._chart = Chart(self.mechanism.tree, self._last.partition.q, q_tree)
         return np.concatenate([self._chart.numbers(q_tree), y[self._d :]])
+
+    def _better_partition(self, margin: float) -> Partition | None:
+        """Return a split whose phi_z is clearly further from singular here, if there is one."""
+        tree, closure, at = self.mechanism.tree, self.mechanism.closure, self._last
+        jacobian = scaled(at.J, tree, closure, self.mechanism.size)
+        z = choose_dependent(jacobian, self.mechanism.rank, [np.arange(v, v + 6) for _, v in tree.free])
+        if z is None:
+            return None
+        split = Partition(np.setdiff1d(np.arange(tree.n), z), z)
+        gained = Kinematics(tree, closure, split, at.q_tree).sigma_min() / float(np.linalg.norm(at.J))
+        return split if gained > 2 * margin else None
 
 
 @dataclass
