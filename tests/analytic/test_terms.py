@@ -85,23 +85,23 @@ def test_D_dot_minus_two_C_is_skew_on_and_off_the_manifold(pair: Pair) -> None:
         D_dot = pair[1].D(q + 1e-200j * (rho @ v[:2])).imag / 1e-200
         C = terms_at(pair, q, rho @ v[:2]).C
         skew = D_dot - 2 * C
-        assert_close(skew, -skew.T, 1e-11 * np.abs(C).max())
+        assert_close(skew, -skew.T, 1e-12 * np.abs(C).max())
 
 
 def test_rho_and_rho_dot_along_any_velocity(pair: Pair) -> None:
     reference = pair[1]
     for q, v in regular_states(pair, 7):
         terms = terms_at(pair, q, v)
-        assert_equal(terms.rho, reference.rho(q), 1e-11)
-        assert_equal(terms.rho_dot, reference.rho_dot(q, v), 1e-11)
-        assert_equal(terms.rho_dot_times(v[:2]), reference.rho_dot(q, v) @ v[:2], 1e-11)
+        assert_equal(terms.rho, reference.rho(q))
+        assert_equal(terms.rho_dot, reference.rho_dot(q, v))
+        assert_equal(terms.rho_dot_times(v[:2]), reference.rho_dot(q, v) @ v[:2])
 
 
 def test_reduced_terms_are_eq_6(pair: Pair) -> None:
     reference = pair[1]
     for q, v in regular_states(pair, 8):
         terms = terms_at(pair, q, v)
-        assert_equal(terms.D, reference.D(q), 1e-11)
-        assert_equal(terms.C, reference.C(q, v), 1e-11)
-        assert_equal(terms.h, reference.h(q), 1e-11)
-        assert_equal(terms.C_times(v[:2]), reference.C(q, v) @ v[:2], 1e-10)
+        assert_equal(terms.D, reference.D(q))
+        assert_equal(terms.C, reference.C(q, v))
+        assert_equal(terms.h, reference.h(q))
+        assert_equal(terms.C_times(v[:2]), reference.C(q, v) @ v[:2])

@@ -16,7 +16,7 @@ from tests.analytic.five_bar import Array
 from tests.property.worlds import Numbers, World, random_world, rotation, slope
 
 LENGTH = 0.4  # of a distance loop
-LARGEST_RHO, LEAST_SIGMA = 10.0, 0.01  # nearer to a singular phi_z differences lose their digits
+LARGEST_RHO, LEAST_SIGMA = 10.0, 0.05  # nearer to a singular phi_z differences lose their digits
 SPRINGS = [
     SpringSpec(joint="a_j4", rest=0.3, stiffness=5.0, damping=0.2),
     SpringSpec(joint="b_j2", rest=-0.1, stiffness=20.0),
@@ -48,7 +48,8 @@ class Closed:
             found = mechanism.sigma(mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
             near = np.abs(found.at.rho).max() < LARGEST_RHO and found.at.sigma_min() > LEAST_SIGMA
             if found.verdict == "converged" and near:
-                return Terms(mechanism, found.at, found.at.rho @ random.uniform(-1, 1, mechanism.d))
+                v_tree = found.at.rho @ random.uniform(-1, 1, mechanism.d)
+                return Terms(mechanism, found.at, v_tree / max(1.0, np.abs(v_tree).max()))
             spread /= 2
         raise AssertionError(f"no regular configuration near the assembled one: {found}")
 

@@ -114,7 +114,7 @@ def test_J_is_the_derivative_of_phi(kind: LoopType, seed: int, data: st.DataObje
         return table(loop, placed(world, moved, loop.frame_a), placed(world, moved, loop.frame_b))
 
     closed = Closed(world, loop)
-    assert_close(closed.at(q).J @ closed.vector(v), slope(phi), 1e-8)
+    assert_close(closed.at(q).J @ closed.vector(v), slope(phi), 1e-9)
 
 
 @every_type
@@ -125,7 +125,7 @@ def test_J_dot_is_the_derivative_of_J(kind: LoopType, seed: int, data: st.DataOb
     assume(half_turn_away(loop, placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)))
     closed = Closed(world, loop)
     J_dot = slope(lambda t: closed.at(world.moved(q, v, t)).J)
-    assert_close(closed.at(q).J_dot(closed.vector(v)), J_dot, 1e-7)
+    assert_close(closed.at(q).J_dot(closed.vector(v)), J_dot, 1e-9)
 
 
 @given(seed=seeds, ratio=st.floats(-3, 3), offset=st.floats(-1, 1), prismatic=st.booleans())

@@ -19,7 +19,7 @@ from tests.property.worlds import rotation, slope
 every_mechanism = st.builds(
     closed_mechanism, st.sampled_from(TYPES), seeds, free=st.booleans(), redundant=st.booleans()
 ).filter(lambda closed: closed.regular)
-many = settings(max_examples=60)
+many = settings(max_examples=25)
 
 
 @many
@@ -30,7 +30,7 @@ def test_energy_is_that_of_the_bodies(closed: Closed) -> None:
     q, v = world.configuration(), world.velocity()
     q_tree, v_tree = (np.array([x[name] for name in mechanism.coordinates]) for x in (q, v))
     terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q_tree)), v_tree)
-    assert_close(terms.energy - mechanism.springs.energy(terms.q_tree), world.energy(q, v), 1e-8)
+    assert_close(terms.energy - mechanism.springs.energy(terms.q_tree), world.energy(q, v), 1e-9)
 
 
 @many
@@ -50,7 +50,7 @@ def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
     again = closed.mechanism.sigma(closed.mechanism.independent_part(at.q_tree))
     assert again.verdict == "converged"
     assert_close(at.phi, 0, closed.mechanism.tolerance)
-    assert_close(closed.mechanism.tree.difference(again.at.q_tree, at.q_tree), 0, 1e-9)
+    assert_close(closed.mechanism.tree.difference(again.at.q_tree, at.q_tree), 0, 1e-11)
 
 
 @many
@@ -58,8 +58,8 @@ def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
 def test_rho_dot_is_the_derivative_of_rho(closed: Closed) -> None:
     terms = closed.near()
     rho_dot = along(closed.mechanism, terms.q_tree, terms.v_tree, lambda q: closed.mechanism.kinematics(q).rho)
-    assert_close(terms.rho_dot, rho_dot, 1e-7 * max(1, np.abs(rho_dot).max()))
-    assert_close(terms.rho_dot_times(terms.q_dot), terms.rho_dot @ terms.q_dot, 1e-10 * max(1, np.abs(rho_dot).max()))
+    assert_close(terms.rho_dot, rho_dot, 1e-8 * max(1, np.abs(rho_dot).max()))
+    assert_close(terms.rho_dot_times(terms.q_dot), terms.rho_dot @ terms.q_dot, 1e-12 * max(1, np.abs(rho_dot).max()))
 
 
 @many
@@ -72,8 +72,8 @@ def test_D_dot_minus_two_C_is_skew(closed: Closed) -> None:
         return Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).D
 
     skew = along(mechanism, terms.q_tree, terms.v_tree, D) - 2 * terms.C
-    assert_close(skew, -skew.T, 1e-7 * max(1, np.abs(terms.C).max()))
-    assert_close(terms.C_times(terms.q_dot), terms.C @ terms.q_dot, 1e-11 * max(1, np.abs(terms.C).max()))
+    assert_close(skew, -skew.T, 1e-8 * max(1, np.abs(terms.C).max()))
+    assert_close(terms.C_times(terms.q_dot), terms.C @ terms.q_dot, 1e-12 * max(1, np.abs(terms.C).max()))
 
 
 @many
@@ -101,7 +101,7 @@ def test_h_is_the_gradient_of_the_potential(closed: Closed) -> None:
         return np.array(Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).potential_energy)
 
     slopes = [along(mechanism, terms.q_tree, column, V) for column in terms.rho.T]
-    assert_close(terms.h, slopes, 1e-8 * max(1, np.abs(terms.h).max()))
+    assert_close(terms.h, slopes, 1e-9 * max(1, np.abs(terms.h).max()))
 
 
 @many
@@ -111,9 +111,9 @@ def test_dae_is_the_reduced_model(closed: Closed) -> None:
     terms, u_tree = closed.near(), closed.u_tree()
     a = dae_acceleration(terms, u_tree)
     size = max(1, np.abs(a).max())
-    assert_close(terms.at.J @ a + terms.J_dot @ terms.v_tree, 0, 1e-10 * size)
+    assert_close(terms.at.J @ a + terms.J_dot @ terms.v_tree, 0, 1e-12 * size)
     q_ddot = reduced_acceleration(terms, u_tree)
-    assert_close(a, terms.rho @ q_ddot + terms.rho_dot @ terms.q_dot, 1e-9 * size)
+    assert_close(a, terms.rho @ q_ddot + terms.rho_dot @ terms.q_dot, 1e-11 * size)
 
 
 @many
@@ -122,7 +122,7 @@ def test_both_ways_to_eq_6_agree_on_the_manifold(closed: Closed) -> None:
     """Without the matrix C', and with it at a given q_dot."""
     terms, u_tree = closed.near(), closed.u_tree()
     q_ddot = reduced_acceleration(terms, u_tree)
-    assert_close(reduced_acceleration(terms, u_tree, terms.q_dot), q_ddot, 1e-9 * max(1, np.abs(q_ddot).max()))
+    assert_close(reduced_acceleration(terms, u_tree, terms.q_dot), q_ddot, 1e-11 * max(1, np.abs(q_ddot).max()))
 
 
 @many
@@ -132,7 +132,7 @@ def test_multipliers_satisfy_eq_1(closed: Closed) -> None:
     a = dae_acceleration(terms, u_tree)
     force = terms.at.J.T @ multipliers(terms, u_tree, a)
     left = terms.D_tree @ a + terms.C_tree @ terms.v_tree + terms.h_tree
-    assert_close(left, u_tree + terms.damping_force + force, 1e-9 * max(1, np.abs(left).max()))
+    assert_close(left, u_tree + terms.damping_force + force, 1e-11 * max(1, np.abs(left).max()))
 
 
 @many
@@ -147,7 +147,7 @@ def test_energy_changes_by_the_power_of_actuators_and_dampers(closed: Closed) ->
         return np.array(Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree + t * a).energy)
 
     power = terms.v_tree @ (u_tree + terms.damping_force)
-    assert_close(slope(energy), power, 1e-8 * max(1, abs(power), np.abs(a).max()))
+    assert_close(slope(energy), power, 1e-9 * max(1, abs(power), np.abs(a).max()))
 
 
 @many
@@ -167,10 +167,10 @@ def test_the_motion_does_not_depend_on_the_choice_of_q(closed: Closed) -> None:
     at = Kinematics(mechanism.tree, mechanism.closure, other, terms.q_tree)
     theirs = Terms(mechanism, at, terms.v_tree)
     change = terms.rho[other.q]  # d q_other / d q
-    assert_close(terms.D, change.T @ theirs.D @ change, 1e-9, relative=True)
-    assert_close(terms.h, change.T @ theirs.h, 1e-9 * max(1, np.abs(terms.h).max()))
+    assert_close(terms.D, change.T @ theirs.D @ change, 1e-12, relative=True)
+    assert_close(terms.h, change.T @ theirs.h, 1e-12 * max(1, np.abs(terms.h).max()))
     a, b = (t.rho @ reduced_acceleration(t, u_tree) + t.rho_dot @ t.q_dot for t in (terms, theirs))
-    assert_close(a, b, 1e-8 * max(1, np.abs(a).max()))
+    assert_close(a, b, 1e-11 * max(1, np.abs(a).max()))
 
 
 def other_partition(at: Kinematics) -> Partition:
@@ -192,11 +192,11 @@ def test_the_dynamics_do_not_depend_on_where_the_world_looks(
     theirs = Terms(two.mechanism, two.mechanism.kinematics(ours.q_tree), ours.v_tree)
     u_tree = one.u_tree()
     for name in ("D_tree", "C_tree", "h_tree", "J_dot", "energy"):
-        assert_close(getattr(ours, name), getattr(theirs, name), 1e-11 * max(1, np.abs(getattr(ours, name)).max()))
+        assert_close(getattr(ours, name), getattr(theirs, name), 1e-12 * max(1, np.abs(getattr(ours, name)).max()))
     assert_close(ours.at.phi, theirs.at.phi, 1e-12)
     assert_close(ours.at.J, theirs.at.J, 1e-12)
     a = dae_acceleration(ours, u_tree)
-    assert_close(a, dae_acceleration(theirs, u_tree), 1e-9 * max(1, np.abs(a).max()))
+    assert_close(a, dae_acceleration(theirs, u_tree), 1e-11 * max(1, np.abs(a).max()))
 
 
 @many
@@ -204,11 +204,11 @@ def test_the_dynamics_do_not_depend_on_where_the_world_looks(
 def test_the_tangent_basis(closed: Closed) -> None:
     """Orthonormal, what J annihilates, as many columns as freedoms; the particular part takes up J_dot v."""
     terms = closed.near()
-    tangent, particular = tangent_basis(terms)
+    tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree)
     assert_close(tangent.T @ tangent, np.eye(closed.mechanism.d), 1e-13)
     assert_close(terms.at.J @ tangent, 0, 1e-12)
     drift = terms.J_dot @ terms.v_tree
-    assert_close(terms.at.J @ particular, -drift, 1e-10 * max(1, np.abs(drift).max()))
+    assert_close(terms.at.J @ particular, -drift, 1e-12 * max(1, np.abs(drift).max()))
 
 
 @settings(max_examples=30)
@@ -225,7 +225,7 @@ def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None
     hessian = h_gradient(mechanism, at)
     slopes = np.array([slope(lambda t, e=e: h(q + t * e)) for e in np.eye(mechanism.d)]).T
     assert_close(hessian, slopes, 1e-6 * max(1, np.abs(slopes).max()))
-    assert_close(hessian, hessian.T, 1e-10 * max(1, np.abs(hessian).max()))
+    assert_close(hessian, hessian.T, 1e-12 * max(1, np.abs(hessian).max()))
 
 
 @pytest.mark.parametrize("redundant", [False, True])
