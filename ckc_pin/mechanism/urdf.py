@@ -20,9 +20,11 @@ import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
 
-__all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse"]
+__all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse", "strict_xml"]
 
 WORLD = "ckc_pin_world"  # the common root of several trees
+
+MAX_DEPTH = 300  # of nested elements; ElementTree writes by recursion
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 
@@ -70,7 +72,7 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     MechanismError
         A tree that is none, or a body that cannot be.
     """
-    root = _strict_xml(text, source)
+    root = strict_xml(text, source)
     if root.tag != "robot":
         raise InputError(f"{source}: the root element is <{root.tag}>, a URDF's is <robot>")
     if prefix:
@@ -150,12 +152,32 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(x)) for x in values)
 
 
-def _strict_xml(text: str, source: str) -> ElementTree.Element:
+def strict_xml(text: str, source: str) -> ElementTree.Element:
+    """Parse XML from a stranger: no recovery, no document type, hence no entities, no abyss of nested elements.
+
+    Raises
+    ------
+    InputError
+        With the line, where expat has one.
+    """
+    depth = 0
+
     def refuse(name: str, *_: object) -> None:
-        raise InputError(f"{source}: a document type declaration ({name}) is not accepted in a URDF")
+        raise InputError(f"{source}: a document type declaration ({name}) is not accepted")
+
+    def enter(*_: object) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > MAX_DEPTH:
+            raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
+
+    def leave(_: str) -> None:
+        nonlocal depth
+        depth -= 1
 
     checker = expat.ParserCreate()
     checker.StartDoctypeDeclHandler = refuse
+    checker.StartElementHandler, checker.EndElementHandler = enter, leave
     try:
         checker.Parse(text.encode(), True)
         return ElementTree.fromstring(text.encode())
