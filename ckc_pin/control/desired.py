@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -16,6 +15,8 @@ from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Desired", "Harmonics", "Table", "read_desired"]
+
+FEWEST = 6  # rows that a quintic spline needs
 
 
 class Desired(Protocol):
@@ -93,29 +94,38 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
     if unknown or missing:
         problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
         raise InputError(f"{where}: needs a table for each of {', '.join(names)} (or file); {problem}")
-    specs = [convert(desired[name], HarmonicsSpec, f"{where}.{name}") for name in names]
-    harmonics = Harmonics(specs)
-    if not all(np.all(np.isfinite(x)) for x in (harmonics.offset, harmonics.amplitude, harmonics.frequency,
-                                                harmonics.phase)):  # fmt: skip
-        raise InputError(f"{where}: a number is not finite")
-    return harmonics
+    return Harmonics(
+        [convert(desired[name], HarmonicsSpec, sources.name, f"controller.desired.{name}") for name in names]
+    )
 
 
 def _read_table(text: str, names: Sequence[str], file: str) -> Table:
-    rows = [row for row in csv.reader(io.StringIO(text)) if row]
+    """Read `t` and a column for each name, in any order, empty lines passed over."""
+    lines = [(number, line.split(",")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     wanted = ["t", *names]
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    header = [cell.strip() for cell in lines[0][1]] if lines else []
     if sorted(header) != sorted(wanted):
-        raise InputError(f"{file}: its header is {','.join(header)!r}; needed are the columns {', '.join(wanted)}")
-    table = np.empty((len(rows) - 1, len(wanted)))
-    for k, row in enumerate(rows[1:]):
-        try:
-            table[k] = [float(cell) for cell in row]
-        except ValueError:
-            raise InputError(f"{file}, row {k + 2}: not {len(wanted)} numbers") from None
+        found = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
+        raise InputError(f"{file}: {found}; the first line names the columns {', '.join(wanted)}")
+    if len(lines) - 1 < FEWEST:
+        raise InputError(f"{file}: {len(lines) - 1} rows; a smooth trajectory needs at least {FEWEST}")
+    table = np.array([_row(cells, len(wanted), f"{file}, line {number}") for number, cells in lines[1:]])
     table = table[:, [header.index(name) for name in wanted]]
-    if len(table) < 6 or not np.all(np.isfinite(table)) or np.any(np.diff(table[:, 0]) <= 0):
-        raise InputError(f"{file}: needs at least 6 rows of finite numbers with increasing t")
-    if table[0, 0] > 0:
-        raise InputError(f"{file}: starts at t = {table[0, 0]:g}; a run starts at 0")
-    return Table(table[:, 0], table[:, 1:])
+    t = table[:, 0]
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back):
+        number = lines[back[0] + 2][0]
+        raise InputError(f"{file}, line {number}: t = {t[back[0] + 1]:g} after t = {t[back[0]]:g}; t must increase")
+    if t[0] > 0:
+        raise InputError(f"{file}: starts at t = {t[0]:g} s; a run starts at 0")
+    return Table(t, table[:, 1:])
+
+
+def _row(cells: Sequence[str], count: int, where: str) -> list[float]:
+    try:
+        row = [float(cell) for cell in cells]
+    except ValueError:
+        row = []
+    if len(row) != count or not all(map(math.isfinite, row)):
+        raise InputError(f"{where}: {','.join(cells)[:80]!r} is not {count} finite numbers")
+    return row

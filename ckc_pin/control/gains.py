@@ -27,25 +27,29 @@ def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
         missing = [name for name in names if name not in gain]
         if unknown or missing:
             problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
-            raise InputError(f"controller: {what} as a table needs the joints {', '.join(names)}; {problem}")
+            raise InputError(f"controller.{what}: a table needs the joints {', '.join(names)}; {problem}")
         matrix = np.diag([float(gain[name]) for name in names])
     elif isinstance(gain, list):
         if len(gain) != d or any(len(row) != d for row in gain):
-            raise InputError(f"controller: {what} as a matrix must be {d} x {d}, rows in the order {', '.join(names)}")
+            raise InputError(f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}")
         matrix = np.array(gain, dtype=float)
     else:
         matrix = float(gain) * np.eye(d)
     if not np.all(np.isfinite(matrix)):
-        raise InputError(f"controller: {what} has an entry that is not a finite number")
+        raise InputError(f"controller.{what}: an entry is not a finite number")
     return matrix
 
 
 def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:
     """Raise InputError unless a matrix is symmetric positive definite (or semi-definite)."""
     size = float(np.abs(matrix).max(initial=0.0))
-    if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-12 * size:
-        raise InputError(f"controller: {what} is not symmetric; the stability proof needs it symmetric")
+    skew = np.abs(matrix - matrix.T)
+    if skew.max(initial=0.0) > 1e-12 * size:
+        i, j = np.unravel_index(int(np.argmax(skew)), skew.shape)
+        entries = f"[{i}][{j}] = {matrix[i, j]:g} and [{j}][{i}] = {matrix[j, i]:g}"
+        raise InputError(f"controller: {what} is not symmetric: its entries {entries} differ")
     least = float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 1.0
-    if least < 0 or (least == 0 and not semi):
+    rounding = 1e-14 * size  # [[1, 1], [1, 1]] is semi-definite whichever way its zero eigenvalue is rounded
+    if least < -rounding or (least <= rounding and not semi):
         kind = "positive semi-definite" if semi else "positive definite"
-        raise InputError(f"controller: {what} is not {kind}: its least eigenvalue is {least:g}")
+        raise InputError(f"controller: {what} is not {kind}: its least eigenvalue is {least:.3g}")
