@@ -1,0 +1,129 @@
+"""The language that meshcat's viewer speaks: drawing commands as MessagePack (meshcat's viewer/Readme.md).
+
+They are written here, not by meshcat's Python package: its import brings a ZeroMQ context, IPython and a server that
+listens on every interface, and its commands are a few dictionaries of three.js's own format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.view.visuals import Colour
+
+__all__ = ["Command", "Stage", "body", "material", "polyline", "set_animation", "set_property", "set_transform"]
+
+Command = dict[str, Any]
+
+_FLOAT32 = 0x17  # msgpack-lite's extension type of a Float32Array
+_TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # three.js's cylinders lie along y
+
+
+class Stage:
+    """The scene as drawn so far, in the messages that draw it again for a viewer that comes later."""
+
+    def __init__(self) -> None:
+        self._messages: dict[tuple[str, str], bytes] = {}
+        self._animation: bytes | None = None
+
+    def apply(self, command: Command) -> bytes:
+        """Take a command into account; return its message."""
+        message = msgspec.msgpack.encode(command)
+        kind, path = command["type"], command["path"]
+        if kind == "set_animation":
+            self._animation = message
+        else:
+            self._messages[f"{kind} {command.get('property', '')}", path] = message
+        return message
+
+    def messages(self) -> list[bytes]:
+        """Return the messages that draw the scene from nothing; the animation needs its objects and comes last."""
+        return [*self._messages.values(), *([] if self._animation is None else [self._animation])]
+
+
+def material(colour: Colour, opacity: float = 1.0, on_top: bool = False) -> dict[str, Any]:
+    """Return a material; a translucent one lies on opaque ones at the same place, `on_top` on everything."""
+    red, green, blue = (round(255 * x) for x in colour)
+    plain = {"type": "MeshPhongMaterial", "color": red << 16 | green << 8 | blue, "shininess": 20, "side": 0}
+    if opacity < 1:
+        plain |= {"transparent": True, "opacity": opacity, "depthWrite": False}
+        plain |= {"polygonOffset": True, "polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
+    return plain | ({"transparent": True, "depthTest": False} if on_top else {})
+
+
+def body(path: str, shape: str, size: Iterable[float], placement: Array, look: dict[str, Any]) -> Command:
+    """Draw a box (x, y, z), a cylinder along z (radius, length) or a sphere (radius)."""
+    size = [float(x) for x in size]
+    if shape == "box":
+        geometry = dict(zip(("type", "width", "height", "depth"), ("BoxGeometry", *size), strict=True))
+    elif shape == "cylinder":
+        geometry = {"type": "CylinderGeometry", "radiusTop": size[0], "radiusBottom": size[0], "height": size[1],
+                    "radialSegments": 40}  # fmt: skip
+        placement = placement @ _TURN
+    else:
+        geometry = {"type": "SphereGeometry", "radius": size[0], "widthSegments": 24, "heightSegments": 16}
+    return _object(path, "Mesh", geometry, look, placement)
+
+
+def polyline(path: str, points: Array, colour: Colour, opacity: float = 1.0) -> Command:
+    """Draw a line through points (m, 3)."""
+    position = {"itemSize": 3, "type": "Float32Array", "array": _floats(points), "normalized": False}
+    normal = position | {"array": _floats(np.tile([0.0, 0.0, 1.0], (len(points), 1)))}  # else the viewer makes them up
+    geometry = {"type": "BufferGeometry", "data": {"attributes": {"position": position, "normal": normal}}}
+    look = {key: x for key, x in material(colour, opacity).items() if key in ("color", "transparent", "opacity")}
+    return _object(path, "Line", geometry, {"type": "LineBasicMaterial", **look}, np.eye(4))
+
+
+def set_transform(path: str, matrix: Array) -> Command:
+    """Place what is at a path, and everything below it, in its parent."""
+    return {"type": "set_transform", "path": path, "matrix": _columns(matrix)}
+
+
+def set_property(path: str, name: str, value: Any) -> Command:
+    """Set a property of a three.js object."""
+    return {"type": "set_property", "path": path, "property": name, "value": value}
+
+
+def set_animation(tracks: Iterable[tuple[str, Array, Array, Array]]) -> Command:
+    """Make the viewer move things by itself, once, with a time slider.
+
+    Parameters
+    ----------
+    tracks : iterable of (path, times, positions, quaternions)
+        (m,), (m, 3) and (m, 4) arrays; seconds of playback; x, y, z, w.
+    """
+    animations = []
+    for path, times, positions, quaternions in tracks:
+        ways = (("position", "vector3", positions), ("quaternion", "quaternion", quaternions))
+        clip_tracks = [
+            {"name": f".{name}", "type": kind, "times": _floats(times), "values": _floats(values)}
+            for name, kind, values in ways
+        ]
+        animations.append({"path": path, "clip": {"fps": 1, "name": "run", "tracks": clip_tracks}})
+    options = {"play": True, "repetitions": 1, "clampWhenFinished": True}
+    return {"type": "set_animation", "path": "", "animations": animations, "options": options}
+
+
+def _object(path: str, kind: str, geometry: dict[str, Any], look: dict[str, Any], placement: Array) -> Command:
+    names = {part: f"{part} of {path}" for part in ("object", "geometry", "material")}  # any unique strings will do
+    whole = {
+        "metadata": {"version": 4.5, "type": "Object"},
+        "geometries": [{"uuid": names["geometry"], **geometry}],
+        "materials": [{"uuid": names["material"], **look}],
+        "object": {"uuid": names["object"], "type": kind, "geometry": names["geometry"],
+                   "material": names["material"], "matrix": _columns(placement)},
+    }  # fmt: skip
+    return {"type": "set_object", "path": path, "object": whole}
+
+
+def _columns(matrix: Array) -> list[float]:
+    columns: list[float] = matrix.T.ravel().tolist()
+    return columns
+
+
+def _floats(values: Array) -> msgspec.msgpack.Ext:
+    return msgspec.msgpack.Ext(_FLOAT32, np.ascontiguousarray(values, dtype="<f4").tobytes())

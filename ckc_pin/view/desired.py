@@ -1,0 +1,51 @@
+"""What a run's controller wanted, rebuilt from the scene and the texts that the run carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.control.desired import Desired, read_desired
+from ckc_pin.control.spec import ControllerSpec, SetPointSpec
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.toml import convert
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.run import Run
+
+__all__ = ["Wanted", "desired_along"]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """q_d along a run.
+
+    Attributes
+    ----------
+    kind : "set_point" or "tracking"
+    q, q_dot : (m, d) arrays
+        At the run's output instants, in the order of `independent`.
+    """
+
+    kind: str
+    q: Array
+    q_dot: Array
+
+
+def desired_along(run: Run) -> Wanted | None:
+    """Return q_d and its rate at the run's output instants, or None where the scene has no controller.
+
+    Raises
+    ------
+    InputError
+        The run's own scene does not say what was wanted.
+    """
+    if "controller" not in run.scene:
+        return None
+    spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
+    if isinstance(spec, SetPointSpec):
+        q_d = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
+        return Wanted("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
+    desired: Desired = read_desired(spec.desired, run.independent, Sources(run.scene_name, None, run.texts))
+    sampled = np.array([desired(float(t))[:2] for t in run.t])
+    return Wanted("tracking", sampled[:, 0], sampled[:, 1])

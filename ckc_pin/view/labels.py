@@ -1,0 +1,65 @@
+"""Symbols, units and names as a person reads them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.simulation.run import Run
+
+__all__ = ["is_length", "run_labels", "symbol", "units"]
+
+GREEK = (
+    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
+    "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega",
+)  # fmt: skip
+_PAPER = re.compile(rf"({'|'.join(GREEK)})(?:_?(\d+))?")
+_NAMES = {"reduced": "reduced", "spf": "SPF", "dae": "DAE"}
+
+
+def symbol(coordinate: str) -> str:
+    """Return a coordinate as matplotlib's mathtext: theta_1 as the paper prints it, any other name as it is."""
+    letter = _PAPER.fullmatch(coordinate)
+    if letter is None:
+        return coordinate.replace("$", r"\$")
+    return rf"$\{letter[1]}_{{{letter[2]}}}$" if letter[2] else rf"$\{letter[1]}$"
+
+
+def is_length(mechanism: Mechanism, coordinate: str) -> bool:
+    """Whether a coordinate is a length (a slide, a free root's position) and not an angle."""
+    if coordinate in mechanism.tree.free_coordinates:
+        return not coordinate.rpartition(".")[2].startswith("r")
+    _, jacobian = mechanism.tree.kinematics(mechanism.q_tree)
+    return not np.any(jacobian[3:, mechanism.tree.index[coordinate]])
+
+
+def units(mechanism: Mechanism, coordinates: Sequence[str], angle: str, length: str) -> str:
+    """Return the unit of several coordinates, or both: units(m, names, "N m", "N")."""
+    lengths = {is_length(mechanism, name) for name in coordinates}
+    return " or ".join([angle] * (False in lengths) + [length] * (True in lengths)) or angle
+
+
+def run_labels(runs: Sequence[Run]) -> list[str]:
+    """Return a name for each run that tells it from the others: its formulation, epsilon, scene."""
+    labels = []
+    for run in runs:
+        formulation = run.scene["formulation"]
+        epsilon = f", ε = {_power(run.scene['epsilon'])}" if formulation == "spf" else ""
+        labels.append(f"{_NAMES[formulation]}{epsilon}")
+    if len({run.scene_name for run in runs}) > 1:
+        labels = [f"{run.scene_name}: {label}" for run, label in zip(runs, labels, strict=True)]
+    if len(set(labels)) < len(labels):
+        labels = [f"{k}. {label}" for k, label in enumerate(labels, 1)]
+    return labels
+
+
+def _power(x: float) -> str:
+    """Return 0.0001 as 10⁻⁴, anything that is no power of ten as it is."""
+    exponent = round(math.log10(x))
+    if not math.isclose(x, 10.0**exponent, rel_tol=1e-9):
+        return f"{x:g}"
+    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

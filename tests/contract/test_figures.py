@@ -1,0 +1,313 @@
+"""Figures: what is drawn where, against closed forms; manners towards the user's matplotlib and disk."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+import ckc_pin
+from ckc_pin.errors import InputError
+from ckc_pin.view.figures import draw, plot
+from ckc_pin.view.labels import run_labels, symbol
+from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
+
+BLUE, VERMILLION = to_rgb("#0072B2"), to_rgb("#D55E00")
+L_PROXIMAL, L_DISTAL, BASE = 0.2794, 0.3048, 0.3048  # of five_bar
+
+
+@pytest.fixture(scope="session")
+def tracking(run: Callable[..., ckc_pin.Run]) -> list[ckc_pin.Run]:
+    return [run("five_bar/tracking", formulation=name) for name in ("spf", "reduced")]
+
+
+@pytest.fixture(scope="session")
+def set_point(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
+    return run("five_bar/set_point")
+
+
+@pytest.fixture(scope="session")
+def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
+    return run("five_bar/swing")
+
+
+def lines(ax, colour=None, style=None):
+    """Lines of an axes with their (x, y), by colour and line style."""
+    found = [
+        line
+        for line in ax.get_lines()
+        if (colour is None or np.allclose(to_rgb(line.get_color()), to_rgb(colour)))
+        and (style is None or line.get_linestyle() == style)
+    ]
+    return [np.array(line.get_data(), dtype=float) for line in found]
+
+
+# --- Fig. 4 --------------------------------------------------------------------------------------
+
+
+def test_fig_4_has_the_papers_panels(tracking):
+    figure = draw(tracking)["tracking"]
+    space, torques, angles, velocities = figure.axes
+    assert [ax.get_title(loc="left")[:2] for ax in figure.axes] == ["a)", "b)", "c)", "d)"]
+    assert (space.get_xlabel(), space.get_ylabel()) == (r"$\theta_{1}$, rad", r"$\theta_{3}$, rad")
+    assert torques.get_ylabel() == "$u$, N m"
+    assert angles.get_ylabel() == "$q$, rad"
+    assert velocities.get_ylabel() == r"$\dot q$, rad/s"
+
+
+def test_desired_ellipse_and_dots_are_equation_21(tracking):
+    space, _, angles, velocities = draw(tracking)["tracking"].axes
+    (ellipse,) = lines(space, "black", ":")
+    theta_1, theta_3 = ellipse
+    np.testing.assert_allclose((theta_1 / (np.pi / 3)) ** 2 + ((np.pi / 4 - theta_3) / (np.pi / 4)) ** 2, 1, atol=1e-12)
+    dots_1, dots_3 = lines(angles, "black", "None")
+    np.testing.assert_allclose(dots_1[1], np.pi / 3 * np.sin(dots_1[0]), atol=1e-12)
+    np.testing.assert_allclose(dots_3[1], np.pi / 4 * (1 - np.cos(dots_3[0])), atol=1e-12)
+    rates_1, rates_3 = lines(velocities, "black", "None")
+    np.testing.assert_allclose(rates_1[1], np.pi / 3 * np.cos(rates_1[0]), atol=1e-12)
+    np.testing.assert_allclose(rates_3[1], np.pi / 4 * np.sin(rates_3[0]), atol=1e-12)
+
+
+def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking):
+    spf, reduced = tracking
+    ax = draw(tracking)["tracking"].axes[2]
+    drawn = [line for line in ax.get_lines() if line.get_linestyle() != "None"]
+    assert [line.get_linestyle() for line in drawn] == ["-", "-", "--", "--"]  # later ones lie on earlier ones
+    assert [to_rgb(line.get_color()) for line in drawn] == [BLUE, VERMILLION, BLUE, VERMILLION]
+    for line, run, column in zip(drawn, (reduced, reduced, spf, spf), (0, 2, 0, 2), strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), run.q_tree[:, column])
+
+
+def test_torque_maxima_stand_beside_the_papers(tracking):
+    ax = draw(tracking)["tracking"].axes[1]
+    title = ax.get_title(loc="left")
+    assert "24.8 N m (paper: at most 30)" in title
+    assert "1.35 N m (paper: at most 5)" in title
+    (inset,) = ax.child_axes  # what the peak at the start would hide
+    top = max(float(np.nanmax(line.get_ydata())) for line in inset.get_lines())
+    assert 1.3 < top < 1.5
+
+
+def test_legend_covers_no_panel(tracking, set_point, swing):
+    for name, figure in draw([*tracking, set_point, swing]).items():
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        box = legend.get_window_extent()
+        assert not [ax for ax in figure.axes if ax.get_tightbbox().overlaps(box)], name
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1, name
+        own = [ax.get_legend().get_window_extent() for ax in figure.axes if ax.get_legend()]
+        assert not [1 for ax in figure.axes for box in own if ax.get_window_extent().shrunk(0.99, 0.99).overlaps(box)]
+
+
+def test_trajectory_from_a_csv_is_rebuilt_from_the_saved_run_alone(tmp_path):
+    t = np.linspace(0.0, 0.3, 31)
+    table = np.column_stack([t, -1.43 + 0.1 * np.sin(t), -1.70 + 0.1 * t**2])
+    name = "desired.csv"
+    folder = Path(str(tmp_path / "model"))
+    folder.mkdir()
+    np.savetxt(folder / name, table, delimiter=",", header="t,theta_1,theta_3", comments="")
+    (folder / "x.scene.toml").write_text(
+        'mechanism = "five_bar"\nformulation = "reduced"\nt_end = 0.3\n[initial]\nat = "equilibrium"\n'
+        f'[controller]\ntype = "tracking"\nLambda = 1.0\nK_D = 10.0\n[controller.desired]\nfile = "{name}"\n'
+    )
+    saved = ckc_pin.simulate(folder / "x.scene.toml").save(tmp_path / "run.npz")
+    (folder / name).unlink()
+    dots_1, dots_3 = lines(draw(ckc_pin.Run.load(saved))["tracking"].axes[2], "black", "None")
+    np.testing.assert_allclose(dots_1[1], -1.43 + 0.1 * np.sin(dots_1[0]), atol=1e-9)
+    np.testing.assert_allclose(dots_3[1], -1.70 + 0.1 * dots_3[0] ** 2, atol=1e-9)
+
+
+# --- Fig. 3 --------------------------------------------------------------------------------------
+
+
+def elbows_and_tip(theta_1: float, theta_3: float) -> np.ndarray:
+    """Joint positions of the five-bar from its two angles, the tip on the side that det phi_z > 0 has."""
+    left = L_PROXIMAL * np.array([np.cos(theta_1), np.sin(theta_1)])
+    right = np.array([BASE, 0.0]) + L_PROXIMAL * np.array([np.cos(theta_3), np.sin(theta_3)])
+    between = right - left
+    gap = np.linalg.norm(between)
+    below = np.array([between[1], -between[0]]) / gap
+    return np.array([left, right, 0.5 * (left + right) + below * np.sqrt(L_DISTAL**2 - 0.25 * gap**2)])
+
+
+@pytest.mark.parametrize(
+    ("colour", "angles"),
+    [(BLUE, (-1.43430851, -1.70733217)), (VERMILLION, (np.pi / 4, np.pi / 4))],
+    ids=["initial", "desired"],
+)
+def test_linkages_of_fig_3a(set_point, colour, angles):
+    ax = draw(set_point)["set_point"].axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x, m", "y, m")
+    ends = np.hstack(lines(ax, colour)).T
+    for joint in [[0.0, 0.0], [BASE, 0.0], *elbows_and_tip(*angles)]:
+        assert np.linalg.norm(ends - joint, axis=1).min() < 1e-7
+    lengths = [np.linalg.norm(line[:, 1] - line[:, 0]) for line in lines(ax, colour, "-")]
+    np.testing.assert_allclose(sorted(lengths), [L_PROXIMAL, L_PROXIMAL, L_DISTAL, L_DISTAL], atol=1e-12)
+
+
+def test_fig_3_errors_are_q_minus_q_d(set_point):
+    _, _, errors, rates = draw(set_point)["set_point"].axes
+    assert errors.get_ylabel() == "$q - q_d$, rad"
+    np.testing.assert_array_equal(lines(errors, BLUE)[0][1], set_point.q_tree[:, 0] - np.pi / 4)
+    np.testing.assert_array_equal(lines(rates, VERMILLION)[0][1], set_point.v_tree[:, 2])
+
+
+def test_checks_show_residual_energy_and_lyapunov_function(set_point):
+    residual, energy, lyapunov = draw(set_point)["set_point_checks"].axes
+    assert residual.get_yscale() == lyapunov.get_yscale() == "log"
+    drawn = lines(residual)[0][1]
+    expected = np.abs(set_point.phi - set_point.w).max(axis=1)
+    np.testing.assert_array_equal(drawn[expected > 0], expected[expected > 0])
+    np.testing.assert_array_equal(lines(energy)[0][1], set_point.energy)
+    shown = lines(lyapunov)[0][1]
+    np.testing.assert_array_equal(shown[:30], set_point.lyapunov[:30])
+
+
+# --- anything else -------------------------------------------------------------------------------
+
+
+def test_motion_without_control(swing):
+    (name,) = figures = draw(swing)
+    assert name == "motion"
+    joints, rates, drift, residual = figures[name].axes
+    assert len(lines(joints)) == len(lines(rates)) == 4
+    power = int(drift.get_ylabel().split("{")[1].split("}")[0])
+    np.testing.assert_allclose(lines(drift)[0][1] * 10.0**power, swing.energy - swing.energy[0], rtol=1e-12)
+    assert residual.get_yscale() == "log"
+
+
+def test_one_freedom_gets_a_phase_plane(tmp_path):
+    control = """
+[initial.q]
+alpha = -0.5
+[controller]
+type = "tracking"
+Lambda = 2.0
+K_D = 5.0
+[controller.desired.alpha]
+offset = 0.5
+harmonics = [[0.3, 5.0, 0.0]]
+"""
+    run = ckc_pin.simulate(write_scene(tmp_path / "four_bar", FOUR_BAR, FOUR_BAR_LOOP, control))
+    space = draw(run)["tracking"].axes[0]
+    assert "phase plane" in space.get_title(loc="left")
+    assert (space.get_xlabel(), space.get_ylabel()) == (r"$\alpha$, rad", r"$\dot q$, rad/s")
+    (wanted,) = lines(space, "black", ":")
+    np.testing.assert_allclose(((wanted[0] - 0.5) / 0.3) ** 2 + (wanted[1] / 1.5) ** 2, 1.0, atol=1e-12)
+
+
+def test_three_freedoms_with_a_slide_have_mixed_units(tmp_path):
+    control = """
+[initial.q]
+turn = 0.3
+lift = -0.2
+"reach$/1" = 0.05
+[controller]
+type = "set_point"
+K_P = 60.0
+K_V = 9.0
+[controller.q_d]
+turn = 0.6
+lift = 0.1
+"reach$/1" = 0.1
+"""
+    run = ckc_pin.simulate(write_scene(tmp_path / "arm", ARM, "", control))
+    linkage, efforts, errors, _ = draw(run)["set_point"].axes
+    assert efforts.get_ylabel() == "$u$, N m or N"
+    assert "torques and forces" in efforts.get_title(loc="left")
+    assert errors.get_ylabel() == "$q - q_d$, rad or m"
+    assert len(lines(linkage, VERMILLION, "-")) == 4  # a, b, c to its centre of mass, and the slide's way
+    written = plot(run, tmp_path / "out", ("png", "svg"))  # the residual of no loop is zero: no logarithm
+    assert {path.stem for path in written} == {"set_point", "set_point_checks"}
+
+
+def test_a_controller_of_ones_own(tmp_path):
+    class Damper:
+        def u(self, t, terms):
+            return -0.2 * terms.q_dot
+
+    run = ckc_pin.simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, controller=Damper())
+    figures = draw(run)
+    assert list(figures) == ["own", "own_checks"]
+    assert len(figures["own_checks"].axes) == 2  # it has no Lyapunov function
+    np.testing.assert_array_equal(lines(figures["own"].axes[1], BLUE)[0][1], run.tau[:, 0])
+
+
+def test_runs_of_two_mechanisms_get_a_figure_each(swing, tmp_path):
+    other = ckc_pin.simulate("five_bar_as_printed/swing", {"t_end": 0.1})
+    assert list(draw([swing, other])) == ["five_bar_motion", "five_bar_as_printed_motion"]
+
+
+def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
+    run = tracking[0]
+    rows = {name: getattr(run, name)[:1] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
+    stopped = replace(run, status="stopped", lyapunov=run.lyapunov[:1], **rows)
+    assert len(plot(stopped, tmp_path)) == 2
+    texts = [text.get_text() for text in draw(stopped)["tracking"].legends[0].get_texts()]
+    assert "SPF, ε = 10⁻⁴ (stopped at 0 s)" in texts
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("theta_1", r"$\theta_{1}$"),
+        ("phi", r"$\phi$"),
+        ("left_knee", "left_knee"),
+        ("a$b", r"a\$b"),
+        ("thetas", "thetas"),
+    ],
+)
+def test_symbols_of_the_paper_and_names_as_they_are(name, shown):
+    assert symbol(name) == shown
+
+
+def test_run_labels_tell_runs_apart(tracking, swing):
+    spf, reduced = tracking
+    assert run_labels([reduced, spf]) == ["reduced", "SPF, ε = 10⁻⁴"]
+    assert run_labels([reduced, swing]) == ["five_bar/tracking: reduced", "five_bar/swing: DAE"]
+    assert run_labels([reduced, reduced]) == ["1. reduced", "2. reduced"]
+
+
+# --- manners -------------------------------------------------------------------------------------
+
+
+def test_files_are_the_same_whatever_the_user_has_set(swing, tmp_path):
+    formats = ("png", "svg")
+    plain = [path.read_bytes() for path in plot(swing, tmp_path / "plain", formats)]
+    assert plain[0].startswith(b"\x89PNG")
+    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
+        before = dict(mpl.rcParams)
+        styled = [path.read_bytes() for path in plot(swing, tmp_path / "styled", formats)]
+        assert dict(mpl.rcParams) == before
+    assert styled == plain
+
+
+def test_pyplot_stays_out(tmp_path):
+    code = (
+        "import sys, ckc_pin; from ckc_pin.view.figures import plot\n"
+        "run = ckc_pin.simulate('five_bar/swing', {'t_end': 0.05})\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        f"plot(run, {str(tmp_path)!r}, ('png', 'svg', 'pdf'))\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["motion.pdf", "motion.png", "motion.svg"]
+
+
+def test_bad_input(swing, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="no run given"):
+        plot([], tmp_path)
+    with pytest.raises(InputError, match="format 'gif'; valid: png, svg, pdf"):
+        plot(swing, tmp_path, ("png", "gif"))
+    with pytest.raises(InputError, match="format 'missing'"):
+        plot(swing, tmp_path, ())
+    with pytest.raises(InputError, match=r"file.*cannot be written"):
+        plot(swing, tmp_path / "file")

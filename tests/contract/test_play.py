@@ -1,0 +1,490 @@
+"""Playback: what the viewer is told, who may listen, and that nothing stays behind."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.client import HTTPConnection
+from pathlib import Path
+from urllib.request import urlopen
+
+import msgspec
+import numpy as np
+import pytest
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+import ckc_pin
+from ckc_pin.errors import InputError
+from ckc_pin.view import commands
+from ckc_pin.view.player import KEYFRAMES, play, scene
+from ckc_pin.view.server import ViewServer
+from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
+
+L_PROXIMAL, BASE = 0.2794, 0.3048  # of five_bar
+
+Server = Callable[..., ViewServer]
+
+
+@pytest.fixture(scope="session")
+def tracking(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
+    return run("five_bar/tracking", formulation="reduced")
+
+
+@pytest.fixture(scope="session")
+def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
+    return run("five_bar/swing")
+
+
+@pytest.fixture
+def serve() -> Iterator[Server]:
+    """play(..., block=False), stopped at the end of the test."""
+    started: list[ViewServer] = []
+
+    def start(*runs: ckc_pin.Run, **options: float) -> ViewServer:
+        server = play(runs, block=False, **options)
+        assert server is not None
+        started.append(server)
+        return server
+
+    yield start
+    for server in started:
+        server.stop()
+
+
+def watch(server: ViewServer, count: int, **headers: str) -> list[dict]:
+    """What a viewer that connects now is told in its first messages."""
+
+    async def listen() -> list[bytes]:
+        url = server.url.replace("http", "ws")
+        connection = await websocket_connect(HTTPRequest(url, headers=headers), max_message_size=2**26)
+        messages = [await asyncio.wait_for(connection.read_message(), 20) for _ in range(count)]
+        await leave(connection)
+        return messages
+
+    return [msgspec.msgpack.decode(message) for message in asyncio.run(listen())]
+
+
+async def leave(connection: WebSocketClientConnection) -> None:
+    connection.close()
+    while await connection.read_message() is not None:
+        pass
+
+
+def floats(value: msgspec.msgpack.Ext, columns: int) -> np.ndarray:
+    """A Float32Array of the viewer as rows."""
+    assert value.code == 0x17
+    return np.frombuffer(value.data, dtype="<f4").reshape(-1, columns).astype(float)
+
+
+def objects(drawing: list[dict]) -> dict[str, dict]:
+    return {c["path"]: c["object"] for c in drawing if c["type"] == "set_object"}
+
+
+def tracks(drawing: list[dict]) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Times, positions and quaternions by path."""
+    (animation,) = [c for c in drawing if c["type"] == "set_animation"]
+    found = {}
+    for one in animation["animations"]:
+        position, quaternion = one["clip"]["tracks"]
+        assert (position["name"], quaternion["name"]) == (".position", ".quaternion")
+        assert one["clip"]["fps"] == 1  # times are seconds
+        times = floats(position["times"], 1)[:, 0]
+        found[one["path"]] = times, floats(position["values"], 3), floats(quaternion["values"], 4)
+    return found
+
+
+def matrix(columns: list[float]) -> np.ndarray:
+    return np.array(columns).reshape(4, 4).T
+
+
+def rotated(quaternions: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """A point turned by quaternions x, y, z, w."""
+    vector, w = quaternions[:, :3], quaternions[:, 3:]
+    return point + 2 * np.cross(vector, np.cross(vector, point) + w * point)
+
+
+# --- what the viewer is told ---------------------------------------------------------------------
+
+
+def test_page_and_viewer_are_served(serve, swing):
+    server = serve(swing)
+    with urlopen(server.url) as answer:
+        page = answer.read().decode()
+        policy = answer.headers["Content-Security-Policy"]
+    assert "<title>five_bar/swing</title>" in page
+    assert "http" not in page.replace("http-equiv", "")  # it names no other place
+    assert "default-src 'none'" in policy
+    assert f"ws://127.0.0.1:{server.port}" in policy
+    for name, start in (("main.min.js", b"/*! For license"), ("start.js", b'"use strict"')):
+        with urlopen(server.url + name) as answer:
+            assert answer.read().startswith(start)
+            assert answer.headers["Content-Type"].startswith("text/javascript")
+
+
+def test_elbows_of_the_animation_agree_with_forward_kinematics(serve, tracking):
+    server = serve(tracking)
+    moved = tracks(watch(server, len(server.stage.messages())))
+    for proximal, distal, foot, column in (("theta_1", "theta_2", 0.0, 0), ("theta_3", "theta_4", BASE, 2)):
+        times, elbow, _ = moved[f"/world/1: reduced/joint:{distal}"]
+        rows = np.searchsorted(tracking.t, times - 1e-4)
+        np.testing.assert_allclose(tracking.t[rows], times, atol=1e-6)
+        angle = tracking.q_tree[rows, column]
+        expected = np.column_stack([foot + L_PROXIMAL * np.cos(angle), L_PROXIMAL * np.sin(angle), 0 * angle])
+        np.testing.assert_allclose(elbow, expected, atol=1e-6)
+        times, hinge, turn = moved[f"/world/1: reduced/joint:{proximal}"]
+        np.testing.assert_allclose(hinge, np.tile([foot, 0.0, 0.0], (len(times), 1)), atol=1e-6)
+        np.testing.assert_allclose(rotated(turn, np.array([L_PROXIMAL, 0, 0])) + hinge, expected, atol=1e-6)
+
+
+def test_loop_frames_meet_and_follow_the_traced_point(serve, tracking):
+    server = serve(tracking)
+    drawing = watch(server, len(server.stage.messages()))
+    drawn, moved = objects(drawing), tracks(drawing)
+    root = "/world/1: reduced"
+    ends = {}
+    for side, joint in (("A", "theta_2"), ("B", "theta_4")):
+        sphere = drawn[f"{root}/joint:{joint}/loop:elbow:{side}"]
+        assert sphere["geometries"][0]["type"] == "SphereGeometry"
+        local = matrix(sphere["object"]["matrix"])[:3, 3]
+        times, position, quaternion = moved[f"{root}/joint:{joint}"]
+        ends[side] = position + rotated(quaternion, local)
+    np.testing.assert_allclose(ends["A"], ends["B"], atol=1e-6)
+    trace = drawn[f"{root}/trace:tip"]
+    assert trace["object"]["type"] == "Line"
+    path = floats(trace["geometries"][0]["data"]["attributes"]["position"]["array"], 3)
+    np.testing.assert_allclose(path, tracking.points["tip"], atol=1e-6)
+    np.testing.assert_allclose(ends["A"], path[np.searchsorted(tracking.t, times - 1e-4)], atol=1e-6)
+
+
+def test_links_have_their_shapes_and_are_told_apart_by_colour(tracking):
+    drawn = objects(scene([tracking]))
+    root = "/world/1: reduced/joint:theta_1/link:link_1"
+    shapes = {path: obj["geometries"][0] for path, obj in drawn.items() if path.startswith(root)}
+    box = next(g for g in shapes.values() if g["type"] == "BoxGeometry")
+    assert (box["width"], box["height"], box["depth"]) == (0.2794, 0.018, 0.018)
+    pins = [path for path, g in shapes.items() if g.get("radiusTop") == 0.005]
+    (pin,) = pins
+    assert shapes[pin]["height"] == 0.042
+    placement = matrix(drawn[pin]["object"]["matrix"])
+    np.testing.assert_allclose(placement[:3, 3], [0.2794, 0.0, -0.02], atol=1e-15)
+    np.testing.assert_allclose(placement[:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-15)  # three.js's axis y along URDF's z
+    colours = {
+        joint: next(o["materials"][0]["color"] for path, o in drawn.items() if f"joint:{joint}/link:" in path)
+        for joint in ("theta_1", "theta_2", "theta_3", "theta_4")
+    }
+    assert colours["theta_1"] == 0x1F4C99  # the URDF's blue, 0.12 0.30 0.60
+    assert len(set(colours.values())) == 4
+
+
+def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
+    drawing = scene([tracking, swing])
+    opacity = {path: obj["materials"][0].get("opacity", 1) for path, obj in objects(drawing).items()}
+    first, second = "/world/1: five_bar%2Ftracking: reduced", "/world/2: five_bar%2Fswing: DAE"
+    assert {opacity[path] for path in opacity if path.startswith(first)} == {1}
+    assert {opacity[path] for path in opacity if path.startswith(second)} == {0.4}
+    assert {path.split("/")[2] for path in opacity} == {first.split("/")[2], second.split("/")[2]}
+    moved = tracks(drawing)
+    assert moved[f"{first}/joint:theta_1"][0][-1] == pytest.approx(9.5)
+    assert moved[f"{second}/joint:theta_1"][0][-1] == pytest.approx(2.0)
+
+
+def test_keyframes_are_thinned_to_the_speed(swing):
+    for speed in (0.25, 1.0, 10.0):
+        times = tracks(scene([swing], speed))["/world/1: DAE/joint:theta_1"][0]
+        assert times[0] == 0
+        assert times[-1] == pytest.approx(2.0 / speed)
+        assert len(times) <= min(len(swing.t), 2.0 / speed * KEYFRAMES + 2)
+        assert np.diff(times).max() < max(1.1 * 0.01 / speed, 2.0 / KEYFRAMES)
+
+
+def test_quaternions_are_continuous(tmp_path):
+    q = "[initial.q]\nalpha = -0.5\n[initial.q_dot]\nalpha = 40.0\n"  # several turns of the crank
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", FOUR_BAR, "gravity = [0, 0, 0]\n" + FOUR_BAR_LOOP, q, 1.0))
+    assert np.ptp(run.q_tree[:, run.column("alpha")]) > 4 * np.pi
+    for _, _, quaternions in tracks(scene([run])).values():
+        np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-6)
+        assert np.sum(quaternions[1:] * quaternions[:-1], axis=1).min() > 0.8
+
+
+# --- the side to look from -----------------------------------------------------------------------
+
+
+def placed(drawing: list[dict], path: str = "/world") -> np.ndarray:
+    (command,) = [c for c in drawing if c["type"] == "set_transform" and c["path"] == path]
+    return matrix(command["matrix"])
+
+
+def test_a_planar_mechanism_faces_the_viewer(swing, tmp_path):
+    # In the viewer's scene x is right, z is up, and the camera looks along +y.
+    five_bar = placed(scene([swing]))[:3, :3]
+    np.testing.assert_allclose(five_bar @ np.eye(3), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-12)
+    q = "[initial.q]\nalpha = -0.5\n"
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, q, 0.1))
+    np.testing.assert_allclose(placed(scene([run]))[:3, :3], np.eye(3), atol=1e-12)  # x-z plane, gravity along -z
+
+
+def test_all_of_the_motion_is_in_sight(tracking):
+    drawing = scene([tracking])
+    (distance,) = [c["value"][2] for c in drawing if c.get("property") == "position"]
+    (angle,) = [c["value"] for c in drawing if c.get("property") == "fov"]
+    world = placed(drawing)
+    tip = tracking.points["tip"] @ world[:3, :3].T + world[:3, 3]
+    depth = distance + tip[:, 1]
+    assert np.all(np.abs(tip[:, 2]) < depth * np.tan(np.radians(angle / 2)))
+    assert np.abs(tip[:, [0, 2]]).max() > 0.2 * distance * np.tan(np.radians(angle / 2))  # and not from afar
+
+
+# --- mechanisms without pictures -----------------------------------------------------------------
+
+
+def test_links_without_shapes_are_drawn_as_rods(tmp_path):
+    mesh = '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+    urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{mesh}')
+    q = "[initial.q]\nalpha = -0.5\n"
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, q, 0.1))
+    drawn = objects(scene([run]))
+    rods = {path.split("/")[3]: obj for path, obj in drawn.items() if "/rod:" in path}
+    lengths = {name: obj["geometries"][0]["height"] for name, obj in rods.items()}
+    assert lengths == pytest.approx({"base": 0.5, "joint:alpha": 0.2, "joint:beta": 0.5, "joint:gamma": 0.4})
+    placement = matrix(rods["joint:beta"]["object"]["matrix"])
+    np.testing.assert_allclose(placement @ [0, 0.25, 0, 1], [0.5, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(placement @ [0, -0.25, 0, 1], [0, 0, 0, 1], atol=1e-12)
+
+
+def test_links_of_one_colour_get_ours(tmp_path):
+    grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
+    ball = f'<visual><geometry><sphere radius="0.02"/></geometry>{grey}</visual>'
+    urdf = ARM.replace("<inertial>", f"{ball}<inertial>")
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, "", "[initial.q]\nturn = 0.1\nlift = 0.1\n"
+                                       '"reach$/1" = 0.1\n', 0.05))  # fmt: skip
+    drawn = {path: obj for path, obj in objects(scene([run])).items() if "/link:" in path}
+    assert {path.split("/")[3] for path in drawn} == {"joint:turn", "joint:lift", "joint:reach$%2F1"}
+    assert len({obj["materials"][0]["color"] for obj in drawn.values()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("visual", "message"),
+    [
+        ('<geometry><box size="1 2"/></geometry>', "a box needs size above zero"),
+        ('<geometry><sphere radius="-1"/></geometry>', "a sphere needs radius above zero"),
+        ('<geometry><cylinder radius="1"/></geometry>', "a cylinder needs radius and length above zero"),
+        ('<geometry><sphere radius="nan"/></geometry>', "radius='nan' is not made of finite numbers"),
+        ('<origin xyz="0 0"/><geometry><sphere radius="1"/></geometry>', "needs three numbers in xyz and in rpy"),
+        ('<geometry><sphere radius="1"/></geometry><material><color rgba="2 0 0 1"/></material>', "from 0 to 1"),
+    ],
+)
+def test_a_shape_that_cannot_be_is_named(tmp_path, visual, message):
+    urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank"><visual>{visual}</visual>')
+    q = "[initial.q]\nalpha = -0.5\n"
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, q, 0.01))
+    with pytest.raises(InputError, match="link 'crank'") as error:
+        scene([run])
+    assert message in str(error.value)
+
+
+def test_names_from_files_are_text_to_the_page(tmp_path):
+    path = write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, "[initial.q]\nalpha = -0.5\n", 0.01)
+    hostile = path.rename(path.with_name("<script>alert(1)<.scene.toml"))
+    with play(ckc_pin.simulate(hostile), block=False) as server, urlopen(server.url) as answer:
+        page = answer.read().decode()
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(1)&lt;" in page
+
+
+# --- the server ----------------------------------------------------------------------------------
+
+
+def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing):
+    server = serve(swing)
+    count = len(server.stage.messages())
+    first = watch(server, count)
+    server.send(commands.set_transform("/world", 2 * np.eye(4)))
+    second = watch(server, count)
+    assert [c["path"] for c in second] == [c["path"] for c in first]
+    np.testing.assert_array_equal(placed(second), 2 * np.eye(4))
+    assert second[-1]["type"] == "set_animation"
+    assert objects(second) == objects(first)
+
+
+def test_a_viewer_that_is_there_is_told_at_once(serve, swing):
+    server = serve(swing)
+
+    async def listen() -> dict:
+        connection = await websocket_connect(server.url.replace("http", "ws"), max_message_size=2**26)
+        for _ in server.stage.messages():
+            await connection.read_message()
+        server.send(commands.set_property("/Axes", "visible", True))
+        message = await asyncio.wait_for(connection.read_message(), 20)
+        await leave(connection)
+        return msgspec.msgpack.decode(message)
+
+    assert asyncio.run(listen()) == {"type": "set_property", "path": "/Axes", "property": "visible", "value": True}
+
+
+def status(server: ViewServer, path: str, **headers: str) -> int:
+    connection = HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status
+
+
+@pytest.mark.parametrize("path", ["/", "/main.min.js", "/start.js", "/nothing"])
+def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
+    server = serve(swing)
+    expected = 404 if path == "/nothing" else 200
+    for name in ("127.0.0.1", "localhost"):
+        assert status(server, path, Host=f"{name}:{server.port}") == expected
+        assert status(server, path, Origin=f"http://{name}:{server.port}") == expected
+    for host in ("evil.example", "127.0.0.1", f"127.0.0.1:{server.port + 1}", f"evil.example:{server.port}", ""):
+        assert status(server, path, Host=host) == 403
+    for origin in ("http://evil.example", "null", f"https://127.0.0.1:{server.port}", "http://localhost"):
+        assert status(server, path, Origin=origin) == 403
+
+
+def test_websockets_of_other_pages_are_refused(serve, swing):
+    server = serve(swing)
+    count = len(server.stage.messages())
+    assert len(watch(server, count, Origin=f"http://localhost:{server.port}")) == count
+    for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
+        with pytest.raises(HTTPClientError) as refused:
+            watch(server, 1, **headers)
+        assert refused.value.code == 403
+
+
+def listening() -> set[str]:
+    """Addresses that this process listens on, from the kernel's tables."""
+    own = {
+        os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{n}")
+    }
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if f"socket:[{fields[9]}]" in own and (table.startswith("udp") or fields[3] == "0A"):
+                found.add(fields[1])
+    return found
+
+
+def test_listens_on_loopback_only(serve, swing):
+    before = listening()
+    server = serve(swing)
+    assert listening() - before == {f"0100007F:{server.port:04X}"}
+
+
+def test_a_port_in_use_is_said(serve, swing):
+    taken = serve(swing).port
+    with pytest.raises(InputError, match=rf"port {taken} on 127.0.0.1: address already in use; choose another"):
+        serve(swing, port=taken)
+    for port in (-1, 65536):
+        with pytest.raises(InputError, match="choose one from 1 to 65535"):
+            serve(swing, port=port)
+
+
+def test_bad_input(swing):
+    with pytest.raises(InputError, match="no run given"):
+        play([], block=False)
+    for speed in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="speed"):
+            play(swing, speed=speed, block=False)
+
+
+def test_nothing_is_left_after_stop(swing):
+    threads, files = threading.enumerate(), len(os.listdir("/dev/fd"))
+    server = play(swing, block=False)
+    watch(server, 3)
+    server.stop()
+    server.stop()  # again is no harm
+    assert threading.enumerate() == threads
+    assert len(os.listdir("/dev/fd")) == files
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", server.port)) != 0
+    with play(swing, port=server.port, block=False) as again:  # the port is free at once
+        assert again.port == server.port
+
+
+def raw_viewer(server: ViewServer) -> socket.socket:
+    """A WebSocket opened by hand, which never answers anything."""
+    viewer = socket.create_connection(("127.0.0.1", server.port), timeout=20)
+    viewer.sendall(
+        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+    assert viewer.recv(12) == b"HTTP/1.1 101"
+    return viewer
+
+
+def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
+    server = serve(swing)
+    viewer = raw_viewer(server)
+    viewer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close resets the connection
+    viewer.close()
+    for _ in range(50):
+        server.send(commands.polyline("/world/line", np.zeros((5000, 3)), (0, 0, 0)))
+    deadline = time.monotonic() + 20
+    while server.viewers and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not server.viewers
+    assert len(watch(server, 3)) == 3
+    server.stop()
+    gc.collect()  # asyncio complains about forgotten errors only now
+    assert not caplog.records
+
+
+def test_stop_does_not_wait_for_a_viewer_that_hangs(swing):
+    server = play(swing, block=False)
+    with raw_viewer(server) as stalled:
+        server.stop()
+        assert not server._thread.is_alive()
+        while stalled.recv(2**16):  # what was under way, then the end
+            pass
+
+
+def test_play_prints_the_address_and_waits_for_ctrl_c(swing, tmp_path):
+    saved = swing.save(tmp_path / "run.npz")
+    code = f"import ckc_pin; ckc_pin.play(ckc_pin.Run.load({str(saved)!r}))"
+    command = [sys.executable, "-W", "error", "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[0]
+        with urlopen(url) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
+
+
+def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
+    saved = swing.save(tmp_path / "run.npz")
+    code = (
+        "import sys, ckc_pin\n"
+        "from ckc_pin.view.player import play, scene\n"
+        f"run = ckc_pin.Run.load({str(saved)!r})\n"
+        "scene([run])\n"
+        "assert not {'tornado', 'meshcat', 'matplotlib', 'yourdfpy'} & set(sys.modules)\n"
+        "play(run, block=False).stop()\n"
+        "assert not {'zmq', 'meshcat', 'IPython', 'matplotlib'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_a_browser_that_cannot_be_opened_is_said(swing, monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr("webbrowser.open", lambda url: bool(asked.append(url)))
+    with play(swing, open_browser=True, block=False) as server:
+        assert asked == [server.url]
+    assert f"open {server.url} in yours" in capsys.readouterr().err
