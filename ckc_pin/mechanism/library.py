@@ -9,7 +9,7 @@ from ckc_pin.mechanism.generators import GENERATORS, GeneratorSpec, generate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.toml import convert, read_text, read_toml
+from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 
 __all__ = ["about", "build", "first_comment", "is_path", "library", "load", "mechanism_file", "shipped"]
 
@@ -91,6 +91,8 @@ def _text(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
 
 def build(text: str, sources: Sources) -> Mechanism:
     """Build a mechanism from the text of its file; the text is kept among its sources."""
-    spec = convert(read_toml(text, sources.name), MechanismSpec, sources.name)
+    data = read_toml(text, sources.name)
+    by_coordinate(data, "q_guess")
+    spec = convert(data, MechanismSpec, sources.name)
     sources.texts[MECHANISM_FILE] = text
     return Mechanism(spec, sources)

@@ -14,11 +14,12 @@ import msgspec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.explain import explain, place_name
 
-__all__ = ["convert", "read_text", "read_toml"]
+__all__ = ["by_coordinate", "convert", "read_text", "read_toml"]
 
 T = TypeVar("T")
 
 MAX_BYTES = 16 * 2**20  # no mechanism, scene or URDF that a person wrote is larger
+DEEPEST = 50  # tables and lists inside each other; tomllib reads dotted keys to any depth, what follows recurses
 
 
 def read_text(path: Path, what: str) -> str:
@@ -51,12 +52,22 @@ def read_text(path: Path, what: str) -> str:
 def read_toml(text: str, source: str) -> dict[str, Any]:
     """Parse TOML; InputError carries the source and the line."""
     try:
-        return tomllib.loads(text)
+        data = tomllib.loads(text)
+        if _deeper_than(DEEPEST, data):
+            raise RecursionError
+        return data
     except RecursionError:
         raise InputError(f"{source}: malformed TOML: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError is one; so is a number of thousands of digits
         hint = "; this is XML: a URDF is named in a mechanism.toml" if text.lstrip().startswith("<") else ""
         raise InputError(f"{source}: malformed TOML: {error}{hint}") from None
+
+
+def _deeper_than(depth: int, data: Any) -> bool:
+    level = [data]
+    for _ in range(depth):
+        level = [x for v in level if isinstance(v, dict | list) for x in (v.values() if isinstance(v, dict) else v)]
+    return bool(level)
 
 
 def convert(data: Any, kind: type[T], source: str, at: str = "") -> T:
@@ -96,3 +107,29 @@ def _numbers(steps: tuple[str | int, ...], value: Any) -> Iterator[tuple[tuple[s
             yield from _numbers((*steps, index), inner)
     elif isinstance(value, float):
         yield steps, value
+
+
+def by_coordinate(data: dict[str, Any], *path: str) -> None:
+    """Join the tables inside a table into dotted keys, in place: TOML reads ``root.z = 1`` as {root: {z: 1}}.
+
+    Parameters
+    ----------
+    data : dict
+        Parsed TOML.
+    *path : str
+        Where the table is; nothing happens where there is none.
+    """
+    *tables, last = path
+    at: Any = data
+    for table in tables:
+        at = at.get(table) if isinstance(at, dict) else None
+    if isinstance(at, dict) and isinstance(at.get(last), dict):
+        at[last] = dict(_dotted("", at[last]))
+
+
+def _dotted(key: str, table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _dotted(f"{key}{name}.", value)
+        else:
+            yield f"{key}{name}", value

@@ -14,7 +14,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
 from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.toml import convert, read_text, read_toml
+from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
 
@@ -156,6 +156,8 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
 
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     """Check parsed data; where msgspec's checks end, ours begin."""
+    for table in (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d")):
+        by_coordinate(data, *table)
     spec = convert(data, SceneSpec, sources.name)
     if spec.initial.at is not None and spec.initial.q:
         raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
