@@ -4,13 +4,15 @@ XML is parsed strictly by expat, document types (and with them entities) are ref
 Pinocchio would accept in silence is checked here: negative or NaN masses, zero axes, duplicate names,
 unknown parents, two roots. `continuous` joints are loaded as revolute ones without limits, so that
 every joint is one number (Pinocchio would use a cosine and a sine); a `planar` joint is refused since
-Pinocchio ignores its axis. Several trees become one URDF under a common root before Pinocchio sees them.
+Pinocchio ignores its axis. An inertial without one of its numbers is refused too: urdfdom, which reads for
+Pinocchio, drops it with a line on stderr and the link has no mass. Several trees become one URDF under a
+common root, stripped to what dynamics need, before Pinocchio sees them.
 """
 
 from __future__ import annotations
 
-import copy
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
@@ -25,6 +27,12 @@ __all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse", "strict_xml"]
 WORLD = "ckc_pin_world"  # the common root of several trees
 
 MAX_DEPTH = 300  # of nested elements; ElementTree writes by recursion
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # what both Python and C read alike
+INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
+SHORTEST = 1e-9  # an axis that is not zero by mistake
+ROUNDING = 1e-18  # kg m^2: what is left of a zero tensor that was turned about
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 
@@ -108,7 +116,11 @@ def merge(trees: Sequence[TreeText]) -> tuple[str, UrdfTree]:
         Its checks' findings, over all trees.
     """
     parsed = [parse(t.text, t.source, t.prefix) for t in trees]
-    whole = parsed[0] if len(trees) == 1 and _stands_at_origin(trees[0]) else _common_world(trees, parsed)
+    if len(trees) == 1 and _stands_at_origin(trees[0]):
+        whole = UrdfTree(ElementTree.Element("robot", name="world"), parsed[0].base)
+        _append(whole, trees[0], parsed[0], set(), set())
+    else:
+        whole = _common_world(trees, parsed)
     return ElementTree.tostring(whole.root, encoding="unicode"), whole
 
 
@@ -129,19 +141,25 @@ def _common_world(trees: Sequence[TreeText], parsed: Sequence[UrdfTree]) -> Urdf
         ElementTree.SubElement(joint, "child", link=tree.base)
         ElementTree.SubElement(joint, "origin", xyz=_numbers(text.xyz), rpy=_numbers(text.rpy))
         joints.add(name)
-        for element in tree.root:
-            seen = {"link": links, "joint": joints}.get(element.tag)
-            if seen is not None:
-                if element.get("name") in seen:
-                    raise MechanismError(
-                        f"{text.source}: {element.tag} {element.get('name')!r} is already in an earlier tree; "
-                        "give this [[tree]] a prefix"
-                    )
-                seen.add(str(element.get("name")))
-            robot.append(copy.copy(element))
-        whole.mimic += tree.mimic
-        whole.warnings += tree.warnings
+        _append(whole, text, tree, links, joints)
     return whole
+
+
+def _append(whole: UrdfTree, text: TreeText, tree: UrdfTree, links: set[str], joints: set[str]) -> None:
+    """Append what dynamics need of a tree: no pictures, no controllers' data, nothing that is given twice."""
+    for element in tree.root:
+        if element.tag not in DYNAMIC:
+            continue
+        name, seen = element.attrib["name"], links if element.tag == "link" else joints
+        if name in seen:
+            raise MechanismError(
+                f"{text.source}: {element.tag} {name!r} is already in an earlier tree; give this [[tree]] a prefix"
+            )
+        seen.add(name)
+        bare = ElementTree.SubElement(whole.root, element.tag, element.attrib)
+        bare.extend(part for tag in DYNAMIC[element.tag] if (part := element.find(tag)) is not None)
+    whole.mimic += tree.mimic
+    whole.warnings += tree.warnings
 
 
 def _stands_at_origin(tree: TreeText) -> bool:
@@ -175,12 +193,13 @@ def strict_xml(text: str, source: str) -> ElementTree.Element:
         nonlocal depth
         depth -= 1
 
-    checker = expat.ParserCreate()
+    # The text is UTF-8, or it would not have been read, whatever its first line says.
+    checker = expat.ParserCreate("utf-8")
     checker.StartDoctypeDeclHandler = refuse
     checker.StartElementHandler, checker.EndElementHandler = enter, leave
     try:
         checker.Parse(text.encode(), True)
-        return ElementTree.fromstring(text.encode())
+        return ElementTree.fromstring(text.encode(), ElementTree.XMLParser(encoding="utf-8"))
     except (expat.ExpatError, ElementTree.ParseError) as error:
         raise InputError(f"{source}: malformed XML: {error}") from None
 
@@ -210,15 +229,22 @@ def _by_name(root: ElementTree.Element, tag: str, source: str) -> dict[str, Elem
     return found
 
 
-def _floats(element: ElementTree.Element | None, attribute: str, count: int, default: str, where: str) -> list[float]:
+def _floats(
+    element: ElementTree.Element | None, attribute: str, count: int, default: str | None, where: str
+) -> list[float]:
+    """Read an attribute's numbers; without a default it must be there."""
     text = default if element is None else element.get(attribute, default)
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        raise InputError(f"{where}: {attribute}={text!r} is not {count} numbers") from None
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: {attribute}={text!r} is not {count} finite numbers")
+    if text is None:
+        raise InputError(f"{where} has no {attribute}")
+    words = text.split()
+    values = [float(word) for word in words if NUMBER.fullmatch(word)]
+    if len(values) != count or len(words) != count or not all(map(math.isfinite, values)):
+        raise InputError(f"{where}: {attribute}={text!r} is not {_finite_numbers(count)}")
     return values
+
+
+def _finite_numbers(count: int) -> str:
+    return "a finite number" if count == 1 else f"{count} finite numbers"
 
 
 def _origin(element: ElementTree.Element, where: str) -> None:
@@ -227,22 +253,27 @@ def _origin(element: ElementTree.Element, where: str) -> None:
     _floats(origin, "rpy", 3, "0 0 0", f"{where}, <origin>")
 
 
+def _needed(element: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
+    found = element.find(tag)
+    if found is None:
+        raise InputError(f"{where} has no <{tag}>")
+    return found
+
+
 def _check_inertial(name: str, link: ElementTree.Element, source: str, warnings: list[str]) -> None:
     inertial = link.find("inertial")
     if inertial is None:
         return
     where = f"{source}: link {name!r}"
     _origin(inertial, where)
-    (mass,) = _floats(inertial.find("mass"), "value", 1, "0", f"{where}, <mass>")
+    (mass,) = _floats(_needed(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
     if mass < 0:
         raise MechanismError(f"{where}: negative mass {mass:g} kg")
-    tensor = inertial.find("inertia")
-    xx, yy, zz, xy, xz, yz = (
-        _floats(tensor, key, 1, "0", f"{where}, <inertia>")[0] for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    )
+    tensor = _needed(inertial, "inertia", f"{where}, <inertial>")
+    xx, yy, zz, xy, xz, yz = (_floats(tensor, key, 1, None, f"{where}, <inertia>")[0] for key in INERTIA)
     principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     size = float(np.abs(principal).max())
-    if principal[0] < -1e-9 * size:
+    if principal[0] < -(1e-9 * size + ROUNDING):
         raise MechanismError(f"{where}: its inertia has a negative principal moment, {principal[0]:g} kg m^2")
     if principal[2] > (principal[0] + principal[1]) * (1 + 1e-6) + 1e-12 * size:
         warnings.append(
@@ -257,27 +288,48 @@ def _check_joint(
     where = f"{source}: joint {name!r}"
     kind = joint.get("type")
     if kind not in JOINT_TYPES:
-        raise MechanismError(f"{where}: type {kind!r} is not supported; valid: {', '.join(JOINT_TYPES)}")
-    ends = {}
+        found = f"type {kind!r} is not supported" if kind else "it has no type"
+        raise MechanismError(f"{where}: {found}; valid: {', '.join(JOINT_TYPES)}")
     for tag in ("parent", "child"):
-        element = joint.find(tag)
-        link = None if element is None else element.get("link")
+        link = _needed(joint, tag, where).get("link")
         if link not in links:
-            raise MechanismError(f"{where}: its {tag} link {link!r} does not exist; there are {', '.join(links)}")
-        ends[tag] = str(link)
+            found = f"its {tag} link {link!r} does not exist" if link else f"its <{tag}> names no link"
+            raise MechanismError(f"{where}: {found}; there are {', '.join(links)}")
     _origin(joint, where)
     if kind in ("revolute", "continuous", "prismatic"):
-        axis = _floats(joint.find("axis"), "xyz", 3, "1 0 0", f"{where}, <axis>")
-        if not any(axis):
+        element = joint.find("axis")
+        axis = _floats(element, "xyz", 3, "1 0 0" if element is None else None, f"{where}, <axis>")
+        if math.hypot(*axis) < SHORTEST:
             raise MechanismError(f"{where}: its axis is zero")
         _limits(joint, kind, where)
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            (ratio,) = _floats(mimic, "multiplier", 1, "1", f"{where}, <mimic>")
-            (offset,) = _floats(mimic, "offset", 1, "0", f"{where}, <mimic>")
-            tree.mimic.append((name, mimic.get("joint", ""), ratio, offset))
-            joint.remove(mimic)
-    return ends["child"]
+        _damping(joint, where)
+        _mimic(name, joint, where, tree)
+    return joint.find("child").attrib["link"]  # type: ignore[union-attr]
+
+
+def _mimic(name: str, joint: ElementTree.Element, where: str, tree: UrdfTree) -> None:
+    """Take note of a coupling, which is a closure to us."""
+    mimic = joint.find("mimic")
+    if mimic is None:
+        return
+    other = mimic.get("joint")
+    if not other:
+        raise MechanismError(f"{where}: its <mimic> names no joint")
+    (ratio,) = _floats(mimic, "multiplier", 1, "1", f"{where}, <mimic>")
+    (offset,) = _floats(mimic, "offset", 1, "0", f"{where}, <mimic>")
+    tree.mimic.append((name, other, ratio, offset))
+
+
+def _damping(joint: ElementTree.Element, where: str) -> None:
+    """Damping and friction take energy away, they never give any; both absent is an error to urdfdom."""
+    dynamics = joint.find("dynamics")
+    if dynamics is None:
+        return
+    for key in ("damping", "friction"):
+        (value,) = _floats(dynamics, key, 1, "0", f"{where}, <dynamics>")
+        if value < 0:
+            raise MechanismError(f"{where}: negative {key} {value:g}")
+        dynamics.set(key, dynamics.get(key, "0"))
 
 
 def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
