@@ -22,7 +22,7 @@ from ckc_pin.simulation.run import Run
 from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.labels import run_labels
-from ckc_pin.view.skeleton import Motion, is_planar, motion, sticks, viewpoint
+from ckc_pin.view.skeleton import Motion, Stick, is_planar, motion, sticks, upward, viewpoint
 from ckc_pin.view.visuals import Colour, visuals
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def scene(runs: Sequence[Run], speed: float = 1.0) -> list[Command]:
     tracks: list[tuple[str, Array, Array, Array]] = []
     for k, (run, at, moved) in enumerate(zip(runs, rows, motions, strict=True)):
         root = _run_path(runs, k)
-        drawing += _bodies(run.mechanism, root, OPACITY if k else 1.0)
+        drawing += _bodies(run.mechanism, root, moved, OPACITY if k else 1.0)
         drawing += [commands.polyline(f"{root}/trace:{_safe(name)}", path, TRACE, OPACITY if k else 1.0)
                     for name, path in run.points.items()]  # fmt: skip
         for joint in range(1, run.mechanism.tree.model.njoints):
@@ -160,7 +160,7 @@ def _safe(name: str) -> str:
 # --- objects -------------------------------------------------------------------------------------
 
 
-def _bodies(mechanism: Mechanism, root: str, opacity: float) -> Iterator[Command]:
+def _bodies(mechanism: Mechanism, root: str, moved: Motion, opacity: float) -> Iterator[Command]:
     shapes = visuals(mechanism)
     colours = _colours(mechanism)
     own = {shape.joint: shape.colour for shape in reversed(shapes) if shape.joint}
@@ -169,7 +169,7 @@ def _bodies(mechanism: Mechanism, root: str, opacity: float) -> Iterator[Command
         colour = shape.colour if shape.colour and (told_apart or not shape.joint) else colours[shape.joint]
         path = f"{_body_path(mechanism, root, shape.joint)}/link:{_safe(shape.link)}/{k}"
         yield commands.body(path, shape.shape, shape.size, shape.placement, commands.material(colour, opacity))
-    yield from _sticks(mechanism, root, {shape.joint for shape in shapes}, opacity)
+    yield from _sticks(mechanism, root, moved, {shape.joint for shape in shapes}, opacity)
     yield from _loop_frames(mechanism, root, opacity)
 
 
@@ -177,8 +177,8 @@ def _colours(mechanism: Mechanism) -> list[Colour]:
     return [BASE, *(LINKS[k % len(LINKS)] for k in range(mechanism.tree.model.njoints - 1))]
 
 
-def _sticks(mechanism: Mechanism, root: str, drawn: set[int], opacity: float) -> Iterator[Command]:
-    """Draw bodies that have no shapes of their own as rods with a ball at their joint."""
+def _sticks(mechanism: Mechanism, root: str, moved: Motion, drawn: set[int], opacity: float) -> Iterator[Command]:
+    """Draw bodies that have no shapes of their own as rods with a ball at their joint, and rails of slides thinner."""
     thick = 0.03 * mechanism.size
     colours = _colours(mechanism)
     for joint in range(1, mechanism.tree.model.njoints):
@@ -186,12 +186,23 @@ def _sticks(mechanism: Mechanism, root: str, drawn: set[int], opacity: float) ->
             look = commands.material(colours[joint], opacity)
             yield commands.body(f"{_body_path(mechanism, root, joint)}/ball", "sphere", [1.4 * thick], np.eye(4), look)
     for k, stick in enumerate(sticks(mechanism)):
-        if stick.joint in drawn or stick.joint != stick.end_joint:
+        if stick.joint in drawn:
             continue
-        path = f"{_body_path(mechanism, root, stick.joint)}/rod:{k}"
-        length = float(np.linalg.norm(stick.end - stick.start))
-        look = commands.material(colours[stick.joint], opacity)
-        yield commands.body(path, "cylinder", [thick, length], _along(stick.start, stick.end), look)
+        rail = stick.joint != stick.end_joint
+        start, end = _rail(stick, moved) if rail else (stick.start, stick.end)
+        length = float(np.linalg.norm(end - start))
+        if length > 1e-9 * mechanism.size:
+            path = f"{_body_path(mechanism, root, stick.joint)}/{'rail' if rail else 'rod'}:{k}"
+            look = commands.material(colours[stick.joint], opacity)
+            yield commands.body(path, "cylinder", [0.5 * thick if rail else thick, length], _along(start, end), look)
+
+
+def _rail(stick: Stick, moved: Motion) -> tuple[Array, Array]:
+    """Ends of the line on which a slide moves, in the axes of the body that carries it."""
+    ways = moved.of(stick.end_joint, stick.end) - moved.translation[:, stick.joint]
+    points = np.vstack([stick.start, np.einsum("kji,kj->ki", moved.rotation[:, stick.joint], ways)])
+    along = points @ (points[np.argmax(np.linalg.norm(points - stick.start, axis=1))] - stick.start)
+    return points[np.argmin(along)], points[np.argmax(along)]
 
 
 def _along(start: Array, end: Array) -> Array:
@@ -222,9 +233,13 @@ def _surroundings(mechanism: Mechanism, motions: Sequence[Motion]) -> list[Comma
     """Face the mechanism, with all of its motion in sight, before or above a grid whose squares have a round size.
 
     The viewer always looks at the origin of its scene with z up, so the scene moves: `WORLD` is placed with the
-    middle of the motion at the origin, the viewpoint's up along z and its towards along -y, where the camera is.
+    middle of the motion at the origin, up along z and the viewer's side along -y. The camera is level with a planar
+    mechanism, and above any other.
     """
-    view = viewpoint(mechanism)
+    view, height = viewpoint(mechanism), 0.0
+    if not is_planar(mechanism):
+        up = upward(mechanism)
+        view, height = np.array([view[0], up, np.cross(view[0], up)]), float(view[2] @ up)
     low, high = _extent(mechanism, motions, view)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     reach = max(float(half[0]), float(half[1]), 0.5 * mechanism.size)
@@ -246,7 +261,7 @@ def _surroundings(mechanism: Mechanism, motions: Sequence[Motion]) -> list[Comma
         commands.set_property(camera, "fov", FIELD_OF_VIEW),
         commands.set_property(camera, "near", 0.01 * distance),
         commands.set_property(camera, "far", 100.0 * distance),
-        commands.set_property(camera, "position", [0.0, 0.0, distance]),
+        commands.set_property(camera, "position", [0.0, height * distance, math.sqrt(1 - height**2) * distance]),
     ]
 
 

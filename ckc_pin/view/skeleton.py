@@ -12,7 +12,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Motion", "Stick", "is_planar", "motion", "placements", "sticks", "viewpoint"]
+__all__ = ["Motion", "Stick", "is_planar", "motion", "placements", "sticks", "upward", "viewpoint"]
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
 
@@ -98,14 +98,19 @@ def is_planar(mechanism: Mechanism) -> bool:
     return _normal(mechanism) is not None
 
 
+def upward(mechanism: Mechanism) -> Array:
+    """Return the direction against gravity, z where there is none, shape (3,)."""
+    gravity = np.array(mechanism.spec.gravity)
+    return -gravity / np.linalg.norm(gravity) if np.any(gravity) else np.array([0.0, 0.0, 1.0])
+
+
 def viewpoint(mechanism: Mechanism) -> Array:
     """Return the viewer's axes in the world, rows right, up and towards the viewer, shape (3, 3).
 
     A planar mechanism is seen along the normal of its plane, with gravity pointing down where it lies in the
     plane; any other one from above and aside, with gravity pointing down.
     """
-    gravity = np.array(mechanism.spec.gravity)
-    up = -gravity / np.linalg.norm(gravity) if np.any(gravity) else np.array([0.0, 0.0, 1.0])
+    up = upward(mechanism)
     normal = _normal(mechanism)
     if normal is None:
         aside = np.eye(3)[int(np.argmin(np.abs(up)))]

@@ -32,6 +32,8 @@ from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
 
 L_PROXIMAL, BASE = 0.2794, 0.3048  # of five_bar
 
+START_OF_ARM = '[initial.q]\nturn = 0.1\nlift = 0.1\n"reach$/1" = 0.1\n'
+
 Server = Callable[..., ViewServer]
 
 
@@ -244,6 +246,20 @@ def test_all_of_the_motion_is_in_sight(tracking):
     assert np.abs(tip[:, [0, 2]]).max() > 0.2 * distance * np.tan(np.radians(angle / 2))  # and not from afar
 
 
+def test_any_other_mechanism_stands_upright_below_the_camera(tmp_path):
+    for k, (gravity, up) in enumerate(
+        [("[0, 0, -9.81]", [0, 0, 1]), ("[0, -9.81, 0]", [0, 1, 0]), ("[3, 0, 4]", None)]
+    ):
+        run = ckc_pin.simulate(write_scene(tmp_path / f"m{k}", ARM, f"gravity = {gravity}\n", START_OF_ARM, 0.05))
+        drawing = scene([run])
+        turn = placed(drawing)[:3, :3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(turn @ (up or [-0.6, 0, -0.8]), [0, 0, 1], atol=1e-12)
+        (position,) = [c["value"] for c in drawing if c.get("property") == "position"]
+        assert 0.2 < position[1] / np.linalg.norm(position) < 0.6
+        np.testing.assert_allclose(placed(drawing, "/Grid")[:2, 2], 0, atol=1e-12)  # the floor is level
+
+
 # --- mechanisms without pictures -----------------------------------------------------------------
 
 
@@ -261,12 +277,21 @@ def test_links_without_shapes_are_drawn_as_rods(tmp_path):
     np.testing.assert_allclose(placement @ [0, -0.25, 0, 1], [0, 0, 0, 1], atol=1e-12)
 
 
+def test_a_slide_runs_on_a_rail_as_long_as_its_way(tmp_path):
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", ARM, "", START_OF_ARM, 0.3))
+    way = run.q_tree[:, run.column("reach$/1")]
+    ((path, rail),) = [(path, obj) for path, obj in objects(scene([run])).items() if "/rail:" in path]
+    assert "/joint:lift/" in path
+    placement, length = matrix(rail["object"]["matrix"]), rail["geometries"][0]["height"]
+    ends = sorted((placement @ [0, side * length / 2, 0, 1])[0] for side in (-1, 1))
+    np.testing.assert_allclose(ends, [0.2 + min(0, way.min()), 0.2 + max(0, way.max())], atol=1e-9)
+
+
 def test_links_of_one_colour_get_ours(tmp_path):
     grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
     ball = f'<visual><geometry><sphere radius="0.02"/></geometry>{grey}</visual>'
     urdf = ARM.replace("<inertial>", f"{ball}<inertial>")
-    run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, "", "[initial.q]\nturn = 0.1\nlift = 0.1\n"
-                                       '"reach$/1" = 0.1\n', 0.05))  # fmt: skip
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, "", START_OF_ARM, 0.05))
     drawn = {path: obj for path, obj in objects(scene([run])).items() if "/link:" in path}
     assert {path.split("/")[3] for path in drawn} == {"joint:turn", "joint:lift", "joint:reach$%2F1"}
     assert len({obj["materials"][0]["color"] for obj in drawn.values()}) == 3

@@ -1,0 +1,146 @@
+"""The paper's five-bar under both controllers, each as the SPF and as the reduced model: runs, figures, a table."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from itertools import product
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+import ckc_pin
+from ckc_pin.view.figures import plot
+
+ROOT = Path(__file__).resolve().parent.parent
+CASES = ("set_point", "tracking")
+FORMULATIONS = ("spf", "reduced")
+STEADY = 4.0  # s: from here on tracking is in its steady state
+BOUND, BOUND_STEADY = 30.0, 5.0  # |u| in the paper's tracking, N m: at first, in steady state
+
+
+def main() -> int:
+    """Return the exit code: 0 only if all runs are done."""
+    out = parse_arguments()
+    runs: list[ckc_pin.Run] = []
+    for case, formulation in product(CASES, FORMULATIONS):
+        runs.append(simulate(f"five_bar/{case}", formulation))
+        if runs[-1].status == "interrupted":
+            raise KeyboardInterrupt
+    files: list[Path] = []
+    try:
+        for case in CASES:
+            pair = [run for run in runs if run.scene_name.endswith(case)]
+            files += [run.save(out / case / run.scene["formulation"] / "run.npz") for run in pair]
+            files += plot(pair, out / case)
+    except OSError as error:
+        fail(f"--out {out}: {error.strerror}")
+    except ckc_pin.InputError as error:
+        fail(f"--out {out}: {error}")
+    console = Console(highlight=False)
+    console.print(table(runs))
+    lines = ["Files:", *(f"  {shown(path)}" for path in files), f"Watch: {watch(out / 'tracking')}"]
+    console.print(*lines, sep="\n", markup=False, soft_wrap=True)
+    for run in runs:
+        if run.status != "done":
+            print(f"{run.scene_name}, {run.scene['formulation']}: {run.message}", file=sys.stderr)
+    return 0 if all(run.status == "done" for run in runs) else 3
+
+
+def parse_arguments() -> Path:
+    """Return the folder to write to."""
+    parser = argparse.ArgumentParser(prog="demo", description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "demo", metavar="DIR", help="folder for runs and figures")
+    out: Path = parser.parse_args().out
+    try:
+        out.mkdir(parents=True, exist_ok=True)  # before computing anything
+    except OSError as error:
+        fail(f"--out {out}: {error.strerror}")
+    return out
+
+
+def simulate(scene: str, formulation: str) -> ckc_pin.Run:
+    """Run a scene, with a bar on a terminal."""
+    errors = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("t = {task.completed:.2f} s"))
+    with Progress(*columns, TimeRemainingColumn(), console=errors, disable=not errors.is_terminal) as bar:
+        task = bar.add_task(f"{scene:<20} {formulation:<8}", total=None)
+        return ckc_pin.simulate(
+            scene,
+            {"formulation": formulation},
+            progress=lambda t, t_end: bar.update(task, completed=t, total=t_end),
+        )
+
+
+def table(runs: list[ckc_pin.Run]) -> Table:
+    """What was computed, a line for each run."""
+    found = Table(title="The paper's five-bar", box=box.SIMPLE_HEAD, padding=(0, 0), caption_justify="left")
+    found.caption = f"The paper's bounds in tracking: |u| <= {BOUND:g} N m, after {STEADY:g} s <= {BOUND_STEADY:g} N m."
+    found.add_column("\n\ncase", no_wrap=True)
+    found.add_column("\n\nmodel", no_wrap=True)
+    for heading in (
+        "\n\nε",
+        "\n\nstatus",
+        "final\nq - q_d,\nrad",
+        "largest\n|u|,\nN m",
+        f"after\n{STEADY:g} s,\nN m",
+        "largest\n|φ|,\nm",
+        "right-\nhand\nsides",
+        "\n\ns",
+    ):
+        found.add_column(heading, justify="right", no_wrap=True)
+    for run in runs:
+        columns = [run.column(name) for name in run.independent]
+        formulation = run.scene["formulation"]
+        error = run.q_tree[-1, columns] - desired(run)
+        late = np.abs(run.u[run.t >= STEADY])
+        found.add_row(
+            run.scene_name.rpartition("/")[2],
+            formulation,
+            f"{run.scene['epsilon']:.0e}" if formulation == "spf" else "",
+            run.status,
+            f"{np.abs(error).max():.1e}",
+            f"{np.abs(run.u).max():.2f}",
+            f"{late.max():.2f}" if len(late) else "",
+            f"{run.max_phi:.0e}",
+            f"{run.stats['rhs']}",
+            f"{run.stats['wall_s']:.1f}",
+        )
+    return found
+
+
+def desired(run: ckc_pin.Run) -> np.ndarray:
+    """q_d at the end of a run: the target, or eq. 21."""
+    controller = run.scene["controller"]
+    if controller["type"] == "set_point":
+        return np.array([controller["q_d"][name] for name in run.independent])
+    t = run.t[-1]
+    return np.array([np.pi / 3 * np.sin(t), np.pi / 4 * (1 - np.cos(t))])
+
+
+def shown(path: Path) -> Path:
+    """A path as short as it can be typed."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def watch(folder: Path) -> str:
+    """The command that plays a case, the SPF on the reduced model."""
+    return f"{shown(Path(sys.executable).parent / 'ckc')} play {shown(folder / 'reduced')} {shown(folder / 'spf')}"
+
+
+def fail(message: str) -> NoReturn:
+    """End with one message."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)
