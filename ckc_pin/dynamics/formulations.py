@@ -18,6 +18,7 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = [
     "CoriolisVelocity",
+    "closing_step",
     "dae_acceleration",
     "multipliers",
     "reduced_acceleration",
@@ -78,8 +79,20 @@ def spf_terms(
     return Terms(mechanism, at, v_tree)
 
 
-def tangent_basis(terms: Terms) -> tuple[Array, Array]:
-    """Return an orthonormal basis of the allowed velocities, (n, d), and the acceleration J a = -J_dot v, (n,).
+def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
+    """Split the tangent space and meet a condition on J.
+
+    Parameters
+    ----------
+    residual : (rows,) array
+        For example J_dot v'; with redundant rows consistent, as every motion makes it.
+
+    Returns
+    -------
+    tangent : (n, d) array
+        Orthonormal basis of the velocities that the loops allow.
+    particular : (n,) array
+        The shortest x with J x = -residual.
 
     Raises
     ------
@@ -97,8 +110,20 @@ def tangent_basis(terms: Terms) -> tuple[Array, Array]:
             "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.q_tree)),
         )
-    drift = (terms.J_dot @ terms.v_tree)[rows]
-    return tangent, normal @ np.linalg.solve(r.T, -drift)
+    return tangent, normal @ np.linalg.solve(r.T, -residual[rows])
+
+
+def closing_step(terms: Terms, residual: Array) -> Array:
+    """Return x with J x = -residual that is smallest in the metric of D', shape (n,).
+
+    Raises
+    ------
+    NumericalError
+        J has lost rank.
+    """
+    tangent, particular = tangent_basis(terms, residual)
+    inertia = tangent.T @ terms.D_tree @ tangent
+    return particular - tangent @ Factorization(inertia).solve(tangent.T @ (terms.D_tree @ particular))
 
 
 def dae_acceleration(terms: Terms, u_tree: Array) -> Array:
@@ -112,7 +137,7 @@ def dae_acceleration(terms: Terms, u_tree: Array) -> Array:
     NumericalError
         J has lost rank.
     """
-    tangent, particular = tangent_basis(terms)
+    tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree)
     force = u_tree - terms.bias_tree - terms.D_tree @ particular
     if terms.mechanism.springs.any_damping:
         force += terms.damping_force

@@ -116,11 +116,12 @@ def predict(at: Kinematics, dq: Array) -> Kinematics:
     return at.moved(at.rho @ dq)
 
 
-def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float) -> Sigma:
+def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
     """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq.
 
     Each piece is predicted along rho and corrected by Newton; a piece that fails is halved. Following
     the line is what keeps the assembly branch: Newton from far away may close on another one.
+    Where the line ends early, q is looked for from other starts, unless `anywhere` is False.
     """
     at, done, piece, iterations = start, 0.0, 1.0, 0
     while done < 1.0:
@@ -132,7 +133,9 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float) -> S
         else:
             piece /= 2.0
             if piece < SMALLEST_PIECE:
-                return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+                if anywhere:
+                    return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+                return _end_of_line(at, done, iterations)
     if _is_singular(at, ROUNDING):
         return Sigma("singular", at, 1.0, 0.0, iterations, "phi_z is singular there")
     return Sigma("converged", at, 1.0, 0.0, iterations)
@@ -147,6 +150,13 @@ def _same_branch(before: Kinematics, after: Kinematics) -> bool:
     if before.phi_z.shape[0] != before.phi_z.shape[1]:
         return True
     return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
+
+
+def _end_of_line(at: Kinematics, done: float, iterations: int) -> Sigma:
+    miss = float("nan")  # not looked for
+    if _is_singular(at, 1e-3):
+        return Sigma("singular", at, done, miss, iterations, "phi_z becomes singular on the way")
+    return Sigma("out of reach", at, done, miss, iterations, "the loops cannot be kept closed on the way")
 
 
 def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
@@ -191,7 +201,7 @@ def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinema
         step[z] = -np.linalg.solve(gram + damping * np.eye(len(z)) * max(1e-30, np.trace(gram)), gradient)
         trial = at.moved(step)
         if np.linalg.norm(trial.phi - w) < np.linalg.norm(residual):
-            at, damping = trial, damping / 5
+            at, damping = trial, max(damping / 5, 1e-12)
             if np.abs(step).max() < 1e-12:
                 break
         else:

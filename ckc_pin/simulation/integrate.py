@@ -103,6 +103,7 @@ class Stepper:
         message = solver.step()
         if solver.status == "failed":
             raise self._explain(message)
+        self._before = (t_old, y_old)
         self.steps += 1
         self.rejected += self._attempts(self.rhs_count - before) - 1
         if solver.t - t_old < self.spec.min_step and solver.status == "running":
@@ -120,19 +121,24 @@ class Stepper:
         """
         solver, switches = self.solver, self.system.counts.switches
         projected = self.system.accept(self.t, solver.y)
-        if self.system.counts.switches > switches and solver.status == "running":
-            self._restart(projected)
+        if self.system.counts.switches > switches and projected is not None:
+            self._restart(self.t, projected, solver.step_size)
         elif projected is not None:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
 
-    def _restart(self, y: Array | None) -> None:
-        """Go on in other coordinates: a new solver, no memory but the step size."""
-        old = self.solver
-        self._retired = {name: count + int(getattr(old, name)) for name, count in self._retired.items()}
-        self.solver = self._class(
-            self._rhs, old.t, y, old.t_bound, first_step=min(old.step_size, old.t_bound - old.t), **self._options
-        )
+    def take_back(self) -> None:
+        """Undo the last step; the next one starts at a quarter of its length."""
+        t_old, y_old = self._before
+        self.steps -= 1
+        self.rejected += 1
+        self._restart(t_old, y_old, (self.t - t_old) / 4)
+
+    def _restart(self, t: float, y: Array, first_step: float) -> None:
+        """Go on with a new solver that remembers nothing."""
+        self._retired = {name: count + int(getattr(self.solver, name)) for name, count in self._retired.items()}
+        t_end = self.solver.t_bound
+        self.solver = self._class(self._rhs, t, y, t_end, first_step=min(first_step, t_end - t), **self._options)
 
     def stats(self) -> dict[str, int]:
         """Return the counts so far."""
@@ -203,8 +209,11 @@ class Stepper:
         solver = self.solver
         if self.method != "Radau" or f_old is None:
             dense: list[Callable[[float], Array]] = []
+            t_new, y_new = float(solver.t), solver.y.copy()
 
             def own(t: float) -> Array:
+                if t in (t_old, t_new):  # no interpolation, which costs DOP853 three right-hand sides
+                    return np.array(y_old if t == t_old else y_new)
                 if not dense:
                     dense.append(_frozen_dense_output(solver))
                 return np.asarray(dense[0](t))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -22,6 +23,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Events
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.integrate import BudgetError, Stepper
+from ckc_pin.simulation.rank_guard import RankGuard
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import Scene, load_scene
@@ -235,10 +237,14 @@ def _steps(
     progress: Progress | None,
 ) -> tuple[Status, str]:
     """Step to the end, recording on the way; say how it ended."""
-    due = 1
+    due, guard = 1, RankGuard(stepper.system)
+    end = (0.0, stepper.y)  # the last state that is known to be good
     try:
         while stepper.solver.status == "running":
             step = stepper.step()
+            if not guard.resolves(step):
+                stepper.take_back()
+                continue
             halt = events.check(step, recorder.system)
             until = step.t if halt is None else halt
             while due < len(times) and (times[due] <= until or (until >= t_end and due == len(times) - 1)):
@@ -250,17 +256,21 @@ def _steps(
                 recorder.add(halt, step.interpolant(halt))
                 return "done", f"stopped by the event at t = {halt:.9g} s"
             if stepper.solver.status == "running":
+                end = (step.t, stepper.solver.y)
                 stepper.settle()
+                end = (step.t, stepper.solver.y)
     except NumericalError as error:
-        recorder.add(stepper.t, stepper.solver.y)
-        return "stopped", _sentence(error, stepper.t)
+        status: Status = "stopped"
+        message = _sentence(error, end[0])
     except BudgetError as error:
-        recorder.add(stepper.t, stepper.solver.y)
-        return "stopped", f"stopped at t = {stepper.t:.6g} s: {error}"
+        status, message = "stopped", f"stopped at t = {end[0]:.6g} s: {error}"
     except KeyboardInterrupt as signal:
-        recorder.add(stepper.t, stepper.solver.y)
-        return "interrupted", f"interrupted at t = {stepper.t:.6g} s{f' by {signal}' if str(signal) else ''}"
-    return "done", "reached t_end"
+        status, message = "interrupted", f"interrupted at t = {end[0]:.6g} s{f' by {signal}' if str(signal) else ''}"
+    else:
+        return "done", "reached t_end"
+    with suppress(NumericalError):  # where not even that state has terms, the last output instant is the end
+        recorder.add(*end)
+    return status, message
 
 
 def _sentence(error: NumericalError, t: float) -> str:

@@ -22,6 +22,7 @@ import pinocchio as pin
 
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
+    closing_step,
     dae_acceleration,
     reduced_acceleration,
     spf_terms,
@@ -85,6 +86,9 @@ class System(Protocol):
 
     def terms(self, t: float, y: Array) -> Terms:
         """Terms at a state, on the closure if the formulation holds it."""
+
+    def configuration(self, t: float, y: Array) -> Array:
+        """Pinocchio's q at a state, as near as it is known without closing the loops, shape (nq,)."""
 
     def accept(self, t: float, y: Array) -> Array | None:
         """Take note of an accepted step; return y projected, or None when it stays as it is."""
@@ -159,14 +163,12 @@ class LevelSet:
         self.counts.newton += outcome.iterations
         self.counts.factorizations += outcome.iterations
         if not outcome.converged:
-            found = sigma(self._last, dq, w, self.mechanism.tolerance)
+            found = sigma(self._last, dq, w, self.mechanism.tolerance, anywhere=False)
             self.counts.newton += found.iterations
             self.counts.factorizations += found.iterations
-            if found.verdict != "converged" or found.reached < 1.0:
+            if found.verdict != "converged":
                 raise NumericalError(
-                    f"sigma(q) is {found.verdict}: {found.reason}"
-                    if found.reason
-                    else "sigma(q) cannot be followed: a singular configuration is in between",
+                    f"sigma(q) is {found.verdict}: {found.reason}",
                     t=t,
                     q_tree=self.mechanism.tree.named(self.mechanism.tree.to_coordinates(found.at.q_tree)),
                 )
@@ -175,6 +177,9 @@ class LevelSet:
         if self._on_manifold:
             return Terms(self.mechanism, outcome.at, outcome.at.rho @ q_dot)
         return spf_terms(self.mechanism, outcome.at, q_dot, self.epsilon, w, self.convention)
+
+    def configuration(self, t: float, y: Array) -> Array:
+        return self.terms(t, y).q_tree
 
     def rhs(self, t: float, y: Array) -> Array:
         terms = self.terms(t, y)
@@ -273,6 +278,9 @@ class PrintedSpf:
         at = self.mechanism.kinematics(q_tree)
         return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
 
+    def configuration(self, t: float, y: Array) -> Array:
+        return self.terms(t, y).q_tree
+
     def rhs(self, t: float, y: Array) -> Array:
         d = self._d
         terms = self.terms(t, y)
@@ -324,6 +332,9 @@ class Dae:
         at = self.mechanism.kinematics(q_tree)
         return self._projected(at, v_tree) if self.projects else Terms(self.mechanism, at, v_tree)
 
+    def configuration(self, t: float, y: Array) -> Array:
+        return self._split(y)[0]
+
     def rhs(self, t: float, y: Array) -> Array:
         q_tree, v_tree = self._split(y)
         terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
@@ -347,16 +358,25 @@ class Dae:
         return np.concatenate([terms.q_tree, terms.v_tree])
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
-        """Put a state on the closure by the shortest steps in the coordinates."""
+        """Put a state on the closure by the shortest steps in the metric of the inertia.
+
+        That is the correction with the least work on the motion: its velocity part does not change the
+        momentum along the allowed directions, so the energy drifts less than with steps in coordinates.
+        """
         for _ in range(10):
             if np.abs(at.phi).max(initial=0.0) <= self.mechanism.tolerance:
                 break
-            at = at.moved(-_shortest(at.J, at.phi))
+            step = closing_step(Terms(self.mechanism, at, v_tree), at.phi)
             self.counts.newton += 1
-            self.counts.factorizations += 1
+            self.counts.factorizations += 2
+            closed = float(np.abs(at.J @ step).max()) <= self.mechanism.tolerance  # what else remains, rows contradict
+            at = at.moved(step)
+            if closed:
+                break
         else:
             raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
-        return Terms(self.mechanism, at, v_tree - _shortest(at.J, at.J @ v_tree))
+        correction = closing_step(Terms(self.mechanism, at, v_tree), at.J @ v_tree)
+        return Terms(self.mechanism, at, v_tree + correction)
 
 
 def nearly_singular(at: Kinematics, margin: float) -> str | None:
@@ -384,7 +404,3 @@ def _spf_velocity(terms: Terms, epsilon: float, w: Array) -> Array:
     velocity = terms.v_tree.copy()
     velocity[terms.at.partition.z] = spf_z_dot(terms.at, terms.q_dot, epsilon, w)
     return velocity
-
-
-def _shortest(jacobian: Array, residual: Array) -> Array:
-    return np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-10)[0])
