@@ -71,7 +71,8 @@ class Tree:
                 j = model.joints[ancestor]
                 self.support[joint, 0, j.idx_v : j.idx_v + j.nv] = 1.0
         self._placement = _strided_placements(self.data)
-        self._jacobian, self._jacobian_dot = self.data.J, self.data.dJ
+        # a matrix of one column would come as a vector
+        self._jacobian, self._jacobian_dot = self.data.J.reshape(6, self.n), self.data.dJ.reshape(6, self.n)
         self.tally: Tally | None = None
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:

@@ -80,6 +80,7 @@ def simulate(
     mechanism = scene_mechanism(scene)
     times = _output_instants(scene)
     model_texts: dict[str, str] = {}
+    own = controller is not None
     if controller is None:
         controller = scene_controller(scene, mechanism, model_texts)
     limit = scene.spec.controller.torque_limit if scene.spec.controller else None
@@ -114,13 +115,21 @@ def simulate(
         events=events.met,
         stats=stats,
         scene_name=scene.name,
-        scene=scene.plain(),
+        scene=_as_run(scene, own),
         texts=texts,
         profile=tally.plain() if tally else {},
         **{"lyapunov": None, **recorder.arrays()},  # type: ignore[arg-type]
     )
     run.__dict__["mechanism"] = mechanism
     return run
+
+
+def _as_run(scene: Scene, own_controller: bool) -> dict[str, Any]:
+    """Return the scene as it was run: without its controller where the caller's took its place."""
+    plain = scene.plain()
+    if own_controller:
+        plain.pop("controller", None)
+    return plain
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
