@@ -1,0 +1,88 @@
+"""URDFs of every origin: loops inside the file, in a robot.yaml beside it, or as pairs of frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.importing.closing_frames import take_closing_frames
+from ckc_pin.mechanism.importing.draft import Draft, safe_name
+from ckc_pin.mechanism.importing.rbda_loops import take_loops
+from ckc_pin.mechanism.importing.robot_yaml import take_yaml
+from ckc_pin.mechanism.importing.urdf_in import Names
+from ckc_pin.mechanism.toml import read_text
+from ckc_pin.mechanism.urdf import parse, strict_xml
+
+__all__ = ["read_urdf", "urdf_beside"]
+
+BESIDE = "robot.yaml"
+
+
+def read_urdf(text: str, path: Path) -> Draft:
+    """Read a URDF and what closes its loops.
+
+    Parameters
+    ----------
+    text : str
+    path : Path
+        Where the text is from; a robot.yaml in the same folder belongs to it.
+
+    Raises
+    ------
+    InputError, MechanismError
+        What is no URDF, or names something that is not there.
+    """
+    robot = strict_xml(text, str(path))
+    _refuse_xacro(robot, path)
+    parse(text, str(path))  # its checks, on a copy that it may change
+    draft = Draft(safe_name(path, robot.get("name", "")), f"{path.name}, a URDF", robot)
+    names = Names.of(robot)
+    if robot.find("loop") is not None or robot.find("coupling") is not None:
+        draft.origin = f"{path.name}, a URDF with <loop> and <coupling> as in generalized_rbda"
+    take_loops(draft, names, str(path))
+    beside = path.parent / BESIDE
+    if beside.is_file():
+        draft.origin = f"{path.name} and {BESIDE}, as in example-parallel-robots"
+        take_yaml(draft, names, read_text(beside, "YAML file"), BESIDE)
+    if not draft.loops:
+        take_closing_frames(draft, names)
+        if draft.loops:
+            draft.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
+    mimics = [name for name, joint in names.joints.items() if joint.find("mimic") is not None]
+    if mimics:
+        draft.guessed.append(f"the URDF's mimic joints are couplings, they stay in the URDF: {_some(mimics)}")
+    if not any(joint.get("type") == "floating" for joint in names.joints.values()):
+        base = next(name for name in names.links if name not in names.above)
+        draft.guessed.append(f'{base} stands fixed in the world; for a free base write [[tree]] with root = "free"')
+    draft.guessed.append("gravity is along -z, the file has none")
+    meshes = [mesh.get("filename", "") for mesh in robot.iter("mesh")]
+    if meshes:
+        draft.left_out.append(f"{len(meshes)} mesh files, such as {meshes[0]}: not copied to where the URDF is now")
+    return draft
+
+
+def urdf_beside(path: Path) -> Path:
+    """Return the URDF that a robot.yaml belongs to.
+
+    Raises
+    ------
+    InputError
+        None in its folder, or several and none of them robot.urdf.
+    """
+    found = sorted(path.parent.glob("*.urdf"))
+    named = [p for p in found if p.name == "robot.urdf"] or found
+    if len(named) != 1:
+        seen = ", ".join(p.name for p in found) or "none"
+        raise InputError(f"{path}: one URDF beside it is needed; found {seen}. Import the URDF instead")
+    return named[0]
+
+
+def _refuse_xacro(robot: Element, path: Path) -> None:
+    for element in robot.iter():
+        if "xacro" in element.tag or any("${" in value for value in element.attrib.values()):
+            raise InputError(f"{path}: a xacro, from which a URDF is made: expand it first (xacro FILE > robot.urdf)")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f", {len(names) - 5} more" if len(names) > 5 else "")

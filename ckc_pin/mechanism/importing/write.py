@@ -1,0 +1,112 @@
+"""Writing a draft down: `mechanism.toml`, to read and correct, and the URDF that it names."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.importing.draft import Draft
+from ckc_pin.mechanism.library import MECHANISM_FILE
+
+__all__ = ["mechanism_text", "write"]
+
+WIDTH = 116
+
+
+def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
+    """Write the files of a draft.
+
+    Parameters
+    ----------
+    draft : Draft
+    folder : Path
+        Is made if it is not there.
+    overwrite : bool
+        Whether files that are there may be replaced.
+
+    Raises
+    ------
+    InputError
+        A file is there already, or the folder cannot be written to.
+    """
+    texts = {folder / MECHANISM_FILE: mechanism_text(draft), folder / draft.urdf_file: draft.urdf()}
+    there = [str(path) for path in texts if path.exists()]
+    if there and not overwrite:
+        raise InputError(f"{' and '.join(there)}: there already; write elsewhere with --out DIR, or say --overwrite")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    return list(texts)
+
+
+def mechanism_text(draft: Draft) -> str:
+    """Return the text of ``mechanism.toml``, with what was guessed and left out as comments."""
+    lines = [*_comment(f"Imported from {draft.origin}. Read it, correct it, keep it."), ""]
+    for title, items in (("Guessed", draft.guessed), ("Left out", draft.left_out)):
+        if items:
+            lines += [f"# {title}:", *(line for item in items for line in _comment(item, "#   - ", "#     ")), ""]
+    spec = draft.spec()
+    lines += [f"name = {_value(spec.name)}", f"urdf = {_value(draft.urdf_file)}", f"gravity = {_value(spec.gravity)}"]
+    if draft.independent is not None:
+        lines += _comment(draft.why_independent) + _list("independent", draft.independent)
+    if draft.actuated is not None:
+        lines += _list("actuated", draft.actuated)
+    if draft.q_guess:
+        lines += ["", "[q_guess]", *(f"{_key(k)} = {_value(v)}" for k, v in draft.q_guess.items())]
+    for table, noted in (("loop", draft.loops), ("coupling", draft.couplings), ("spring", draft.springs)):
+        for entry, comment in noted:
+            lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
+    return "\n".join(lines) + "\n"
+
+
+def _entries(spec: msgspec.Struct) -> Iterator[str]:
+    """Yield the keys of a structure that differ from their defaults."""
+    for field in msgspec.structs.fields(spec):
+        value = getattr(spec, field.name)
+        if field.required or value != field.default:
+            yield f"{_key(field.encode_name)} = {_value(value)}"
+
+
+def _list(key: str, names: Iterable[str]) -> list[str]:
+    """Return a list of names, broken where it is long."""
+    whole = f"{key} = {_value(list(names))}"
+    if len(whole) <= WIDTH:
+        return [whole]
+    return [f"{key} = [", *(f"    {_value(name)}," for name in names), "]"]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, float | int):
+        return repr(float(value))
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(x) for x in value)}]"
+    keys = {f.encode_name: getattr(value, f.name) for f in msgspec.structs.fields(value)}
+    shown = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in keys.items() if isinstance(v, str) or any(v))
+    return f"{{{shown}}}"
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+
+
+def _comment(text: str, first: str = "# ", following: str = "# ") -> list[str]:
+    """Return a text as comment lines; control characters, which could end a comment, become spaces."""
+    lines, line = [], ""
+    for word in re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", text).split():
+        if line and len(line) + len(word) + len(following) > WIDTH:
+            lines.append(line)
+            line = ""
+        line = f"{line} {word}" if line else word
+    lines += [line] if line else []
+    return [f"{following if k else first}{line}" for k, line in enumerate(lines)]
