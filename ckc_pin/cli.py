@@ -162,6 +162,35 @@ def play(
     ckc_pin.play(*[ckc_pin.Run.load(path) for path in runs], speed=speed, port=port)
 
 
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="MuJoCo's MJCF, a URDF, or a robot.yaml beside its URDF.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write to; absent: one named after it.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write another format's robot as a mechanism.toml and a URDF, and say what was guessed and left out."""
+    from ckc_pin.mechanism import importing
+
+    draft = importing.read(file)
+    written = importing.write(draft, out or Path(draft.name), overwrite)
+    found, problem = None, ""
+    try:
+        found = ckc_pin.check(written[0])
+    except ckc_pin.MechanismError as error:  # a finding: what was written is there to be corrected
+        problem = str(error)
+    if as_json:
+        result = {"closed": True, **check_plain(found)} if found else {"closed": False, "message": problem}
+        paths = [str(path) for path in written]
+        said = {"left_out": draft.left_out, "guessed": draft.guessed}
+        _print_json({"status": "done", "written": paths, **said, "check": result})
+        return
+    for verb, items in (("written", written), ("guessed", draft.guessed), ("left out", draft.left_out)):
+        for item in items:
+            print(f"{verb}: {item}")
+    Console(highlight=False).print(check_table(found) if found else f"check: {problem}", markup=False)
+
+
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
     as_json = "--json" in sys.argv
