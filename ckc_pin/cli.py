@@ -6,48 +6,83 @@ With --json, standard output is one JSON object and everything else goes to stan
 
 from __future__ import annotations
 
+import io
 import json
-import math
+import os
 import signal
 import sys
-import tomllib
+import tempfile
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 
 import ckc_pin
-from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
-from ckc_pin.simulation.report import check_plain, check_table, run_table, terms_plain, terms_table
+from ckc_pin.errors import CkcError, InputError, NumericalError
+from ckc_pin.simulation.arguments import read_changes, read_table
+from ckc_pin.simulation.report import (
+    check_plain,
+    check_table,
+    profile_table,
+    run_table,
+    terms_plain,
+    terms_table,
+    to_json,
+)
 
 __all__ = ["main"]
 
 DONE, WRONG_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143
 
+EXTRAS = ("matplotlib", "meshcat", "yourdfpy")
+VIEW = "pip install 'ckc_pin[view]'"
+
 app = typer.Typer(
     add_completion=False,
-    no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Dynamics and control of closed kinematic chains. Begin with: ckc list; ckc run five_bar/tracking",
 )
 
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+BEGIN = """Dynamics and control of closed kinematic chains.
+
+\b
+Begin with
+  ckc list                                     what is shipped
+  ckc check five_bar                           freedoms, partition, assembled configuration
+  ckc run five_bar/tracking --out runs/first   simulate; run.npz and figures go to the folder
+  ckc play runs/first                          watch it in the browser
+"""
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
-Out = Annotated[Path | None, typer.Option("--out", help="Folder for run.npz, figures and the scene as resolved.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder for run.npz, figures and the scene as resolved.")
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the scene; may be given many times."),
+]
 Runs = Annotated[list[Path], typer.Argument(help="Run files, or folders that hold a run.npz.", metavar="RUN...")]
 
 
-@app.command("list")
-def list_(as_json: Json = False) -> None:
-    """Shipped mechanisms and scenes, a line each.
+def _examples(*lines: str) -> str:
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
-    Example: ckc list
-    """
+
+@app.callback(invoke_without_command=True, help=BEGIN)
+def begin(context: typer.Context) -> None:
+    """Say where to begin when no command is given."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command("list", epilog=_examples("ckc list"))
+def list_(as_json: Json = False) -> None:
+    """Shipped mechanisms and scenes, a line each."""
     from ckc_pin.simulation.scene import catalogue
 
     entries = catalogue()
@@ -60,109 +95,95 @@ def list_(as_json: Json = False) -> None:
             print(f"  {name + '/' + scene:<30} {says}")
 
 
-@app.command()
+@app.command(epilog=_examples("ckc check five_bar", "ckc check five_bar_as_printed/tracking"))
 def check(
-    what: Annotated[str, typer.Argument(help="A mechanism or a scene.")],
+    what: Annotated[str, typer.Argument(help="A mechanism or a scene.", metavar="MECHANISM|SCENE")],
     branches: Annotated[bool, typer.Option("--branches", help="List the assembly branches too.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Freedoms, rank, redundant rows, partition; for a scene whether its trajectory stays in the workspace.
-
-    Example: ckc check five_bar_as_printed/tracking
-    """
+    """Freedoms, rank, redundant rows, partition; for a scene whether its trajectory stays in the workspace."""
     found = ckc_pin.check(what, branches=branches)
     if as_json:
         for warning in found.warnings:
-            errors.print(f"warning: {warning}", markup=False)
+            errors.print(f"warning: {warning}")
         _print_json(check_plain(found))
     else:
-        Console(highlight=False).print(check_table(found))
+        _print_table(check_table(found))
 
 
-@app.command()
+@app.command(epilog=_examples('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\''))
 def terms(
-    mechanism: Annotated[str, typer.Argument(help="A mechanism.")],
-    q: Annotated[str, typer.Option(help='JSON table, e.g. \'{"theta_1": -1.2, "theta_3": -1.9}\'.')],
-    v: Annotated[str, typer.Option(help="JSON table of rates; absent: at rest.")] = "{}",
+    mechanism: Annotated[str, typer.Argument(help="A mechanism.", metavar="MECHANISM")],
+    q: Annotated[str, typer.Option("--q", metavar="JSON", help="Table of coordinates.")],
+    v: Annotated[str, typer.Option("--v", metavar="JSON", help="Table of rates; absent: at rest.")] = "{}",
     as_json: Json = False,
 ) -> None:
-    """All terms at one state. Independent coordinates alone: sigma closes the loops, v_tree = rho q_dot.
-
-    Example: ckc terms five_bar --q '{"theta_1": -1.2, "theta_3": -1.9}' --v '{"theta_1": 0.4}'
-    """
+    """All terms at one state. Independent coordinates alone: sigma closes the loops, v_tree = rho q_dot."""
     loaded = ckc_pin.load(mechanism)
-    found = ckc_pin.terms(loaded, _table(q, "--q"), _table(v, "--v"))
+    found = ckc_pin.terms(loaded, read_table("--q", q), read_table("--v", v))
     if as_json:
         _print_json(terms_plain(found))
     else:
-        Console(highlight=False).print(terms_table(found))
+        _print_table(terms_table(found))
 
 
-@app.command()
+@app.command(
+    epilog=_examples(
+        "ckc run five_bar/tracking --out runs/spf",
+        "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
+    )
+)
 def run(
     what: Annotated[str, typer.Argument(help="A scene, or a mechanism for its default scene.", metavar="SCENE")],
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the scene, e.g. solver.rtol=1e-10.")
-    ] = None,
+    changes: Set = None,
     out: Out = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print which terms were evaluated, how often.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate a scene.
-
-    Example: ckc run five_bar/tracking --set formulation=reduced --out runs/tracking
-    """
-    scene = ckc_pin.load_scene(what, _changes(changes or []))
+    """Simulate a scene."""
+    scene = ckc_pin.load_scene(what, read_changes("--set", changes or []))
     if scene.spec.controller is not None:
         for warning in ckc_pin.check(scene).warnings:
-            errors.print(f"warning: {warning}", markup=False)
-    signal.signal(signal.SIGTERM, _terminate)
+            errors.print(f"warning: {warning}")
+    if out is not None:
+        _make_folder(out)
     with _progress_bar(scene.name) as progress:
         finished = ckc_pin.simulate(scene, progress=progress, profile=profile)
+    if profile:
+        errors.print(profile_table(finished))
+    if not as_json:
+        _print_table(run_table(finished))
     if out is not None:
         _write(finished, out)
-    if profile:
-        _print_profile(finished)
     if as_json:
         _print_json(finished.summary())
-    else:
-        Console(highlight=False).print(run_table(finished))
-        if out is not None:
-            print(f"written to {out}")
-    if finished.status == "stopped":
-        errors.print(finished.message, markup=False)
-        raise typer.Exit(STOPPED)
-    if finished.status == "interrupted":
-        errors.print(finished.message, markup=False)
-        raise typer.Exit(TERMINATED if "SIGTERM" in finished.message else INTERRUPTED)
+    elif out is not None:
+        print(f"written to {out}")
+    if finished.status != "done":
+        errors.print(finished.message)
+        raise typer.Exit(STOPPED if finished.status == "stopped" else _interrupted(finished.message))
 
 
-@app.command()
+@app.command(epilog=_examples("ckc plot runs/reduced runs/spf --out figures"))
 def plot(runs: Runs, out: Annotated[Path, typer.Option("--out", help="Folder for the figures.")] = Path()) -> None:
-    """Figures of one or several runs.
-
-    Example: ckc plot runs/reduced runs/spf --out figures
-    """
+    """Figures of one or several runs."""
     from ckc_pin.view.figures import plot as plot_runs
 
     for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out):
         print(path)
 
 
-@app.command()
+@app.command(epilog=_examples("ckc play runs/spf"))
 def play(
     runs: Runs,
     speed: Annotated[float, typer.Option(help="Playback speed, 1 is real time.", min=1e-6)] = 1.0,
     port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0: any free one.", min=0, max=65535)] = 0,
 ) -> None:
-    """Play runs back in the browser through meshcat, on this machine only.
-
-    Example: ckc play runs/tracking
-    """
+    """Play runs back in the browser through meshcat, on this machine only."""
     ckc_pin.play(*[ckc_pin.Run.load(path) for path in runs], speed=speed, port=port)
 
 
-@app.command("import")
+@app.command("import", epilog=_examples("ckc import cassie.xml --out mechanisms/cassie"))
 def import_(
     file: Annotated[Path, typer.Argument(help="MuJoCo's MJCF, a URDF, or a robot.yaml beside its URDF.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write to; absent: one named after it.")] = None,
@@ -188,36 +209,60 @@ def import_(
     for verb, items in (("written", written), ("guessed", draft.guessed), ("left out", draft.left_out)):
         for item in items:
             print(f"{verb}: {item}")
-    Console(highlight=False).print(check_table(found) if found else f"check: {problem}", markup=False)
+    _print_table(check_table(found) if found else f"check: {problem}")
 
 
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
     as_json = "--json" in sys.argv
+    signal.signal(signal.SIGTERM, _terminate)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no error
     code = DONE
     try:
-        code = app(standalone_mode=False) or DONE  # the code of a typer.Exit, None without one
-    except (InputError, MechanismError) as error:
-        _fail(str(error), WRONG_INPUT, as_json)
+        command = typer.main.get_command(app)
+        with command.make_context("ckc", sys.argv[1:]) as context:
+            command.invoke(context)
+        sys.stdout.flush()
+    except typer.Exit as exit_:
+        code = exit_.exit_code
     except NumericalError as error:
         _fail(str(error), STOPPED, as_json, status="stopped")
     except CkcError as error:
         _fail(str(error), WRONG_INPUT, as_json)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader went away; nothing is wrong
-        sys.exit(DONE)
+    except KeyboardInterrupt as stop:
+        _fail(f"interrupted{_by(stop)}", _interrupted(str(stop)), as_json, status="interrupted")
+    except BrokenPipeError:  # the reader went away; nothing is wrong
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT, as_json)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        _fail(f"{error.name} is not installed: {VIEW}", WRONG_INPUT, as_json)
     except Exception as error:
-        usage = getattr(error, "format_message", None)  # click's own errors about the command line
+        usage = _usage(error)
         if usage is None:
             raise
-        _fail(usage(), WRONG_INPUT, as_json)
+        _fail(usage, WRONG_INPUT, as_json)
     sys.exit(code)
 
 
+def _usage(error: Exception) -> str | None:
+    """What was wrong with the command line; None when that is not the error."""
+    says = getattr(error, "format_message", None)
+    if says is None:
+        return None
+    context = getattr(error, "ctx", None)
+    path = "ckc" if context is None else context.command_path
+    commands = getattr(getattr(context, "command", None), "commands", None)
+    choices = f"Commands: {', '.join(commands)}" if commands else f"See {path} --help"
+    what = says()
+    return f"{path}: {what if what.endswith(('.', '?')) else f'{what}.'} {choices}"
+
+
 def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoReturn:
-    errors.print(f"{status}: {message}", markup=False)
+    errors.print(f"{status}: {message}")
     if as_json:
         _print_json({"status": status, "message": message})
     sys.exit(code)
@@ -227,63 +272,40 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt("SIGTERM")
 
 
+def _interrupted(message: str) -> int:
+    return TERMINATED if "SIGTERM" in message else INTERRUPTED
+
+
+def _by(stop: KeyboardInterrupt) -> str:
+    return f" by {stop}" if str(stop) else ""
+
+
 def _print_json(data: dict[str, Any]) -> None:
-    print(json.dumps(_finite(data), ensure_ascii=False))
+    print(to_json(data))
 
 
-def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null."""
-    if isinstance(value, dict):
-        return {key: _finite(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(x) for x in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _print_table(table: RenderableType) -> None:
+    Console(highlight=False, markup=False, emoji=False).print(table)
 
 
-def _table(text: str, option: str) -> dict[str, float]:
+def _make_folder(out: Path) -> None:
+    """Find out before a run, not after it, whether it can be saved."""
     try:
-        table = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{option}: not JSON: {error}") from None
-    if not isinstance(table, dict):
-        raise InputError(f'{option}: a table by coordinate is needed, e.g. {{"theta_1": 0.4}}')
-    for name, value in table.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{option}: {name} = {value!r} is not a number")
-    return table
-
-
-def _changes(settings: list[str]) -> dict[str, Any]:
-    """Read KEY=VALUE; the value is TOML where it can be, else a plain string."""
-    changes: dict[str, Any] = {}
-    for setting in settings:
-        key, equals, text = setting.partition("=")
-        if not equals or not key.strip():
-            raise InputError(f"--set {setting}: write KEY=VALUE, e.g. solver.rtol=1e-10")
-        try:
-            value = tomllib.loads(f"x = {text}")["x"]
-        except tomllib.TOMLDecodeError:
-            value = text
-        changes[key.strip()] = value
-    return changes
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise InputError(f"--out {out}: no folder that can be written to: {error.strerror}") from None
 
 
 def _write(finished: ckc_pin.Run, out: Path) -> None:
+    finished.save(out / "run.npz")
+    (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        finished.save(out / "run.npz")
-        (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from None
-    from ckc_pin.view.figures import plot as plot_runs
-
-    plot_runs([finished], out)
-
-
-def _print_profile(finished: ckc_pin.Run) -> None:
-    errors.print(f"{'term':<20}{'evaluated':>12}{'ms':>10}")
-    for name, cost in finished.profile.items():
-        errors.print(f"{name:<20}{cost['calls']:>12}{1e3 * cost['seconds']:>10.2f}")
+        from ckc_pin.view.figures import plot as plot_runs
+    except ModuleNotFoundError as error:
+        errors.print(f"no figures: {error.name} is not installed: {VIEW}")
+    else:
+        plot_runs([finished], out)
 
 
 class _progress_bar:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -15,9 +17,22 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import Check
 from ckc_pin.simulation.run import Run
 
-__all__ = ["check_plain", "check_table", "run_table", "terms_plain", "terms_table"]
+__all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_plain", "terms_table", "to_json"]
 
 TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
+
+
+def to_json(data: dict[str, Any]) -> str:
+    """Return plain data as one line of JSON, which knows no NaN and no infinity: null."""
+    return json.dumps(_finite(data), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def check_plain(found: Check) -> dict[str, Any]:
@@ -100,6 +115,16 @@ def run_table(run: Run) -> Table:
     table.add_row("method", f"{stats['method']}, {stats['steps']} steps, {stats['rejected']} rejected")
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
     table.add_row("work", f"{work}, {stats['factorizations']} factorizations, {stats['wall_s']:.2f} s")
+    return table
+
+
+def profile_table(run: Run) -> Table:
+    """Return which terms were evaluated, how often, and what that cost."""
+    table = Table("term", box=None, pad_edge=False)
+    for title in ("evaluated", "ms"):
+        table.add_column(title, justify="right")
+    for name, cost in run.profile.items():
+        table.add_row(name, str(cost["calls"]), f"{1e3 * cost['seconds']:.2f}")
     return table
 
 

@@ -1,0 +1,56 @@
+"""What a person types on a command line: KEY=VALUE for a scene, a table of numbers by coordinate."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from collections.abc import Iterable
+from typing import Any
+
+from ckc_pin.errors import InputError
+
+__all__ = ["read_changes", "read_table"]
+
+
+def read_changes(option: str, settings: Iterable[str]) -> dict[str, Any]:
+    """Read KEY=VALUE settings; a value is TOML where it can be, else a plain string.
+
+    Raises
+    ------
+    InputError
+        No `=`, or an empty part in the key.
+    """
+    changes: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not all(part.strip() for part in key.split(".")):
+            raise InputError(f"{option} {setting}: write KEY=VALUE, e.g. solver.rtol=1e-10")
+        try:
+            value = tomllib.loads(f"x = {text}")["x"]
+        except (ValueError, RecursionError):
+            value = text
+        changes[key.strip()] = value
+    return changes
+
+
+def read_table(option: str, text: str) -> dict[str, float]:
+    """Read a JSON table of numbers by coordinate.
+
+    Raises
+    ------
+    InputError
+        Not JSON, not a table, not a number.
+    """
+    example = f"write a table by coordinate, e.g. {option} '{{\"theta_1\": 0.4}}'"
+    try:
+        table = json.loads(text)
+    except (ValueError, RecursionError):
+        raise InputError(f"{option} {text[:80]}: not JSON; {example}") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{option} {text[:80]}: not a table; {example}")
+    for name, value in table.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not abs(value) <= sys.float_info.max:
+            raise InputError(f"{option}: {name} = {json.dumps(value)[:80]}: a finite number is needed")
+    return table
