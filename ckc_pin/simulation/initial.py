@@ -45,8 +45,8 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
             raise InputError(f"initial.w: {len(initial.w)} numbers, the closure has {rows} rows: {names}")
         w = np.array(initial.w, dtype=float)
     q_dot = mechanism.vector(initial.q_dot, mechanism.independent, "initial.q_dot", fill=0.0)
-    if initial.at == "equilibrium":
-        at = stable_equilibrium(mechanism)
+    if initial.at is not None:
+        at = mechanism.assembled if initial.at == "assembled" else stable_equilibrium(mechanism)
         return Start(_close(mechanism, mechanism.independent_part(at.q_tree), at, w), q_dot, w)
     q = mechanism.vector(
         {k: x for k, x in initial.q.items() if k not in mechanism.dependent},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,6 +24,7 @@ DEFAULT = "default"
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers replace anything finer
 
 Method = Literal["auto", "RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"]
 
@@ -32,9 +34,9 @@ class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class InitialSpec(_Spec, frozen=True):
-    """Where a run starts."""
+    """Where a run starts: at q, at the stable equilibrium reached from q_guess, or as assembled from q_guess."""
 
-    at: Literal["equilibrium"] | None = None
+    at: Literal["equilibrium", "assembled"] | None = None
     q: dict[str, float] = {}
     q_dot: dict[str, float] = {}
     w: list[float] | None = None
@@ -49,7 +51,7 @@ class SolverSpec(_Spec, frozen=True):
 
     method: Method = "auto"
     spf_equation: Literal[8, 17] | None = None
-    rtol: Positive = 1e-8
+    rtol: Tolerance = 1e-8
     atol: Positive | None = None
     max_step: Positive | None = None
     min_step: NonNegative = 0.0
@@ -122,8 +124,10 @@ def scene_file(name: str | Path) -> Path:
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
         if path.is_dir() or path.name == MECHANISM_FILE:
-            path = (path if path.is_dir() else path.parent) / f"{DEFAULT}{SUFFIX}"
+            path = _default(path if path.is_dir() else path.parent)
         return path
+    if Path(f"{name}{SUFFIX}").is_file():
+        raise InputError(f"no scene {name!r}; there is {name}{SUFFIX}, a path ends in .toml")
     mechanism, _, scene = name.partition("/")
     if mechanism not in shipped():
         raise InputError(
@@ -132,6 +136,14 @@ def scene_file(name: str | Path) -> Path:
     if (scene or DEFAULT) not in scene_names(mechanism):
         raise InputError(f"{mechanism} has no scene {scene!r}; it has {', '.join(scene_names(mechanism))}")
     return library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
+
+
+def _default(folder: Path) -> Path:
+    path = folder / f"{DEFAULT}{SUFFIX}"
+    others = sorted(p.name for p in folder.glob(f"*{SUFFIX}"))
+    if others and not path.is_file():
+        raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
+    return path
 
 
 def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scene:
@@ -150,8 +162,9 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
         A missing file, malformed TOML, an unknown key, a wrong type or value.
     """
     path = scene_file(name)
-    data = read_toml(read_text(path, "scene"), str(path))
-    return make_scene(with_changes(data, changes or {}), str(name), Sources(str(path), path.parent))
+    called = str(path) if isinstance(name, Path) or is_path(name) else name
+    data = read_toml(read_text(path, "scene"), called)
+    return make_scene(with_changes(data, changes or {}), str(name), Sources(called, path.parent))
 
 
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
@@ -162,27 +175,32 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     if spec.initial.at is not None and spec.initial.q:
         raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
     if spec.initial.at is None and not spec.initial.q:
-        raise InputError(f'{sources.name}: initial: give q (a table by coordinate) or at = "equilibrium"')
+        raise InputError(
+            f'{sources.name}: initial: give q (a table by coordinate), at = "equilibrium" or at = "assembled"'
+        )
     if spec.initial.w is not None and spec.formulation != "spf":
         raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
+    shortest, longest = spec.solver.min_step, spec.solver.max_step
+    if longest is not None and shortest > longest:
+        raise InputError(f"{sources.name}: solver: min_step = {shortest:g} is above max_step = {longest:g}")
     return Scene(spec, name, sources)
 
 
 def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scene's data with values replaced by dotted key; None removes a key."""
-    changed = msgspec.json.decode(msgspec.json.encode(data))
+    changed = deepcopy(data)
     for key, value in changes.items():
         *tables, last = key.split(".")
         at = changed
-        for table in tables:
+        for k, table in enumerate(tables):
             at = at.setdefault(table, {})
             if not isinstance(at, dict):
-                raise InputError(f"--set {key}: {table!r} is a value, not a table")
+                raise InputError(f"{key}: {'.'.join(tables[: k + 1])} is a value, not a table")
         if value is None:
             at.pop(last, None)
         else:
             at[last] = value
-    return dict(changed)
+    return changed
 
 
 def _present(value: Any) -> Any:
