@@ -30,11 +30,22 @@ class BudgetError(Exception):
 
 @dataclass(frozen=True)
 class Step:
-    """One accepted step and y in between."""
+    """One accepted step and y in between.
+
+    Attributes
+    ----------
+    nodes : (k,) array or None
+        Where in the step, from 0 to 1, the right-hand side was evaluated; None for multistep methods.
+    defect : float
+        Largest difference of y's change and the trapezoidal rule's, relative to |y|: small where the
+        motion is smooth at the scale of the step.
+    """
 
     t_old: float
     t: float
     interpolant: Callable[[float], Array]
+    nodes: Array | None
+    defect: float
 
 
 class Stepper:
@@ -109,7 +120,7 @@ class Stepper:
         if solver.t - t_old < self.spec.min_step and solver.status == "running":
             raise self._explain(f"the step fell below min_step = {self.spec.min_step:g} s")
         self.failure = None
-        return Step(t_old, self.t, self._interpolant(t_old, y_old, f_old))
+        return Step(t_old, self.t, self._interpolant(t_old, y_old, f_old), self._nodes(), self._defect(y_old, f_old))
 
     def settle(self) -> None:
         """Let the system take note of the step, project its state, or change its coordinates.
@@ -127,12 +138,12 @@ class Stepper:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
 
-    def take_back(self) -> None:
-        """Undo the last step; the next one starts at a quarter of its length."""
+    def take_back(self, length: float) -> None:
+        """Undo the last step; the next one tries another length."""
         t_old, y_old = self._before
         self.steps -= 1
         self.rejected += 1
-        self._restart(t_old, y_old, (self.t - t_old) / 4)
+        self._restart(t_old, y_old, length)
 
     def _restart(self, t: float, y: Array, first_step: float) -> None:
         """Go on with a new solver that remembers nothing."""
@@ -203,6 +214,21 @@ class Stepper:
         stages = 3 if self.method == "Radau" else 1
         distinct = len(self._times - {self.solver.t_old})
         return max(1, -(-distinct // stages))
+
+    def _nodes(self) -> Array | None:
+        """Stages of the method, with those that DOP853's interpolant adds."""
+        if self.method == "Radau":
+            return np.array([0.0, 0.4 - 0.1 * 6**0.5, 0.4 + 0.1 * 6**0.5, 1.0])
+        if self.method not in ONE_STEP:
+            return None
+        return np.concatenate([self.solver.C, getattr(self.solver, "C_EXTRA", []), [1.0]])
+
+    def _defect(self, y_old: Array, f_old: Array | None) -> float:
+        if f_old is None or self.solver.step_size is None:
+            return 0.0
+        solver = self.solver
+        gap = solver.y - y_old - 0.5 * (solver.t - solver.t_old) * (f_old + solver.f)
+        return float(np.abs(gap).max() / max(float(np.abs(solver.y).max()), 1e-300))
 
     def _interpolant(self, t_old: float, y_old: Array, f_old: Array | None) -> Callable[[float], Array]:
         """Radau's own interpolant is of order 3 only, so its end derivatives are used; else the solver's."""

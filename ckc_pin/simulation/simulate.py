@@ -251,8 +251,9 @@ def _steps(
     try:
         while stepper.solver.status == "running":
             step = stepper.step()
-            if not guard.resolves(step):
-                stepper.take_back()
+            retry = guard.accept(step)
+            if retry is not None:
+                stepper.take_back(retry)
                 continue
             halt = events.check(step, recorder.system)
             until = step.t if halt is None else halt

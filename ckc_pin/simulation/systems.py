@@ -42,6 +42,7 @@ __all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System", "nearly
 Gradient = Callable[[float, Terms], Array | None]  # d u / d q_dot at (t, terms); None where it is not known
 Rhs = Callable[[float, Array], Array]
 
+WEAK = 1e-3  # of the largest singular value of J: below that a direction is not trusted to close along
 DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
 SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
 CHART_MARGIN = 1e-5  # of |J|: phi_z's least singular value at which q has stopped to be a chart
@@ -67,6 +68,8 @@ class System(Protocol):
         How many leading entries of y are positions whose rates are the next as many; 0 when they are not.
     projects : bool
         Whether `accept` edits the state.
+    passes_rank_loss : bool
+        Whether the motion can be followed where J loses rank.
     """
 
     mechanism: Mechanism
@@ -77,6 +80,9 @@ class System(Protocol):
 
     @property
     def projects(self) -> bool: ...
+
+    @property
+    def passes_rank_loss(self) -> bool: ...
 
     def start(self) -> Array:
         """Initial y."""
@@ -125,6 +131,7 @@ class LevelSet:
     u_rate_gradient: Gradient | None = None
     may_switch: bool = False
     counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = False
     projects: bool = False
 
     def __post_init__(self) -> None:
@@ -249,6 +256,7 @@ class PrintedSpf:
     epsilon: float
     convention: CoriolisVelocity = "rho"
     counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = False
     projects: bool = False
 
     def __post_init__(self) -> None:
@@ -307,6 +315,7 @@ class Dae:
     force: Force
     projects: bool = True
     counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = True
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.n if self.mechanism.tree.flat else 0
@@ -366,7 +375,7 @@ class Dae:
         for _ in range(10):
             if np.abs(at.phi).max(initial=0.0) <= self.mechanism.tolerance:
                 break
-            step = closing_step(Terms(self.mechanism, at, v_tree), at.phi)
+            step = self._closing(Terms(self.mechanism, at, v_tree), at.phi)
             self.counts.newton += 1
             self.counts.factorizations += 2
             closed = float(np.abs(at.J @ step).max()) <= self.mechanism.tolerance  # what else remains, rows contradict
@@ -375,8 +384,15 @@ class Dae:
                 break
         else:
             raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
-        correction = closing_step(Terms(self.mechanism, at, v_tree), at.J @ v_tree)
+        correction = self._closing(Terms(self.mechanism, at, v_tree), at.J @ v_tree)
         return Terms(self.mechanism, at, v_tree + correction)
+
+    def _closing(self, terms: Terms, residual: Array) -> Array:
+        """Close in the metric of the inertia; near a rank loss only along the directions that J determines."""
+        values = np.linalg.svd(terms.at.J, compute_uv=False)
+        if self.mechanism.rank and values[self.mechanism.rank - 1] < WEAK * values[0]:
+            return -np.asarray(np.linalg.lstsq(terms.at.J, residual, rcond=WEAK)[0], dtype=float)
+        return closing_step(terms, residual)
 
 
 def nearly_singular(at: Kinematics, margin: float) -> str | None:
