@@ -31,8 +31,10 @@ def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = F
     """Largest difference of two arrays within a tolerance; `relative` to the largest entry of the second."""
     ours, theirs = np.broadcast_arrays(np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float))
     limit = tolerance * np.abs(theirs).max(initial=0.0) if relative else tolerance
-    worst = np.abs(ours - theirs).max(initial=0.0)
-    assert worst <= limit, f"off by {worst:.3g}, allowed {limit:.3g}\nours:\n{ours}\ntheirs:\n{theirs}"
+    gap = np.abs(ours - theirs)
+    if not gap.max(initial=0.0) <= limit:
+        at = tuple(map(int, np.unravel_index(np.argmax(gap), gap.shape)))
+        raise AssertionError(f"off by {gap[at]:.3g}, allowed {limit:.3g}: {ours[at]} for {theirs[at]} at {at}")
 
 
 @pytest.fixture(scope="session", params=REFERENCES)

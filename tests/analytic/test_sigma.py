@@ -84,7 +84,7 @@ def test_out_of_reach_is_said_with_the_miss(pair: Pair) -> None:
     """Beyond l2 + l4 the nearest miss of the tips is what the distal links are too short by."""
     mechanism, reference = pair
     reach, seen = reference.l[1] + reference.l[3], 0
-    for q in random_q(5, 200):
+    for q in random_q(5, 60):
         gap = elbow_distance(reference, q) - reach
         if gap > 1e-3:
             found = mechanism.sigma(q)
@@ -95,7 +95,7 @@ def test_out_of_reach_is_said_with_the_miss(pair: Pair) -> None:
             assert gap / np.sqrt(2) * (1 - 1e-6) <= found.miss <= gap * (1 + 1e-6)
             with pytest.raises(ValueError, match="out of reach"):
                 reference.sigma(q)
-    assert seen > 20
+    assert seen > 10
 
 
 @pytest.mark.parametrize("inside", [1e-2, 1e-4, 1e-6, 1e-8])

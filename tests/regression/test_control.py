@@ -1,0 +1,128 @@
+"""Both control cases of the paper against the independent integration, the controller's model right and wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin import Run, check
+from ckc_pin.mechanism.library import library
+from tests.analytic.five_bar import Q, desired
+from tests.conftest import REFERENCES, assert_close
+from tests.regression.reference import FORMULATIONS, Trajectory, trajectory
+
+formulations = pytest.mark.parametrize("formulation", FORMULATIONS)
+
+
+def assert_follows(ours: Run, reference: Trajectory) -> None:
+    rows = reference.rows(ours)
+    assert_close(ours.q_tree[rows], reference.q_tree, 1e-9)
+    assert_close(ours.v_tree[rows], reference.v_tree, 1e-7)
+    assert_close(ours.u[rows], reference.u, 1e-7)
+    assert_close(ours.tau, ours.u, 0)
+    model = REFERENCES[reference.mechanism]
+    assert_close([model.phi(q) for q in ours.q_tree], 0, 1e-12)
+    assert ours.max_phi <= 1e-12
+
+
+@formulations
+def test_tracking(run: Callable[..., Run], formulation: str) -> None:
+    assert_follows(run("five_bar/tracking", formulation=formulation), trajectory("tracking"))
+
+
+@formulations
+def test_tracking_error_at_the_end(run: Callable[..., Run], formulation: str) -> None:
+    """The notes' figure; e^-t times the initial one."""
+    ours = run("five_bar/tracking", formulation=formulation)
+    assert ours.t[-1] == 9.5
+    assert_close(ours.q_tree[-1, Q] - desired(9.5)[0], [-1.0775e-4, -1.281e-4], 6e-9)
+
+
+def test_tracking_with_another_epsilon(run: Callable[..., Run]) -> None:
+    """From a consistent start the SPF is the reduced model whatever epsilon is."""
+    assert_follows(run("five_bar/tracking", formulation="spf", epsilon=1e-3), trajectory("tracking"))
+
+
+@formulations
+def test_torque_maxima(run: Callable[..., Run], formulation: str) -> None:
+    """24.84 N m at the start (the paper's 30), 1.35 N m after 4 s (the paper's 5)."""
+    ours = run("five_bar/tracking", formulation=formulation)
+    largest = np.abs(ours.u).max(axis=1)
+    assert np.argmax(largest) == 0
+    assert_close(largest[0], 24.84, 5e-3)
+    assert_close(largest[ours.t >= 4].max(), 1.35, 5e-3)
+
+
+@pytest.mark.parametrize("file", ["set_point", "set_point_as_printed"])
+@formulations
+def test_set_point(run: Callable[..., Run], file: str, formulation: str) -> None:
+    reference = trajectory(file)
+    assert_follows(run(reference.name, formulation=formulation), reference)
+
+
+@pytest.mark.parametrize("scene", ["five_bar/set_point", "five_bar/tracking"])
+def test_lyapunov_functions_decrease(run: Callable[..., Run], scene: str) -> None:
+    """Eqs. 15 and 18: along the closed loop, to rounding."""
+    lyapunov = run(scene, formulation="reduced").lyapunov
+    assert lyapunov is not None
+    assert np.all(lyapunov > -1e-12)
+    assert np.diff(lyapunov).max() < 1e-10 * lyapunov[0]
+
+
+def heavy_model(folder: Path, attributes: str) -> str:
+    """The shipped mechanism with these attributes of every <inertial> 20 % too large."""
+    shipped = library() / "five_bar"
+
+    def heavier(match: re.Match[str]) -> str:
+        return f'{match[1]}="{1.2 * float(match[2])!r}"'
+
+    urdf, scaled = re.subn(rf'\b({attributes})="([^"]*)"', heavier, (shipped / "five_bar.urdf").read_text("utf-8"))
+    assert scaled == 4 * (7 if "|" in attributes else 1)
+    (folder / "five_bar.urdf").write_text(urdf, "utf-8")
+    (folder / "mechanism.toml").write_text((shipped / "mechanism.toml").read_text("utf-8"), "utf-8")
+    return str(folder / "mechanism.toml")
+
+
+@formulations
+def test_tracking_with_a_model_whose_links_are_too_heavy(
+    run: Callable[..., Run], tmp_path: Path, formulation: str
+) -> None:
+    model = heavy_model(tmp_path, "value|i[xyz][xyz]")
+    ours = run("five_bar/tracking", formulation=formulation, controller__model=model)
+    assert_follows(ours, trajectory("tracking_heavy_links"))
+
+
+def test_tracking_with_a_model_whose_masses_alone_are_too_large(run: Callable[..., Run], tmp_path: Path) -> None:
+    ours = run("five_bar/tracking", formulation="dae", controller__model=heavy_model(tmp_path, "value"))
+    assert_follows(ours, trajectory("tracking_heavy_masses"))
+
+
+def test_as_printed_says_when_the_desired_trajectory_leaves() -> None:
+    found = check("five_bar_as_printed/tracking")
+    assert found.desired is not None
+    assert_close(found.desired.leaves_at, 4.39313, 5.1e-6)
+    assert "leaves the workspace at t = 4.39313 s" in " ".join(found.warnings)
+
+
+def test_the_default_reading_stays_inside() -> None:
+    found = check("five_bar/tracking")
+    assert found.desired is not None
+    assert found.desired.leaves_at is None
+    assert not [warning for warning in found.warnings if "desired" in warning]
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae"])
+def test_as_printed_stalls_at_the_singular_configuration(run: Callable[..., Run], formulation: str) -> None:
+    """As a DAE too: eq. 16's D grows without bound there."""
+    ours = run("five_bar_as_printed/tracking", formulation=formulation, solver__rtol=1e-6)
+    assert ours.status == "stopped"
+    assert_close(ours.t[-1], 4.341, 1e-3)
+    assert "phi_z is singular" in ours.message
+    assert "t = 4.341" in ours.message
+    model = REFERENCES["five_bar_as_printed"]
+    assert abs(model.s(ours.q_tree[-1])) < 1e-3
+    assert_close([model.phi(q) for q in ours.q_tree], 0, 1e-12)
