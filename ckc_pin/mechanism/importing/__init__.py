@@ -43,5 +43,19 @@ def read(path: Path) -> Draft:
     if tag not in ("mujoco", "robot"):
         raise InputError(f"{path}: the root element is <{tag}>; read are <mujoco> (MJCF) and <robot> (URDF)")
     draft = read_mjcf(text, path) if tag == "mujoco" else read_urdf(text, path)
+    _drop_idle_loops(draft)
     settle_independent(draft)
     return draft
+
+
+def _drop_idle_loops(draft: Draft) -> None:
+    """Leave out loops within one rigid body: between two links on fixed joints, or with what moves in MuJoCo alone."""
+    _, frames, _ = draft.tree()
+    kept = []
+    for spec, comment in draft.loops:
+        ends = [frames.find(frame, f"loop {spec.name!r}").joint for frame in (spec.frame_a, spec.frame_b)]
+        if ends[0] == ends[1]:
+            draft.left_out.append(f"loop {spec.name}: both of its frames are on one rigid body here")
+        else:
+            kept.append((spec, comment))
+    draft.loops = kept

@@ -30,9 +30,12 @@ def take_closing_frames(draft: Draft, names: Names) -> None:
         spec = LoopSpec(name=_stem(one), type="hinge", frame_a=one, frame_b=two)
         draft.loops.append((spec, f"the frames {one}_z and {two}_z mark its axis"))
     points = [LoopSpec(name=_stem(one), type="point", frame_a=one, frame_b=two) for one, two in unknown]
+    proposals: dict[tuple[str, str], list[str]] = {}
     for spec, why in propose(draft, points):
         draft.loops.append((spec, f"guessed: {why}"))
-        draft.guessed.append(f"loop {spec.name} is a {spec.type}: {why}")
+        proposals.setdefault((spec.type, why), []).append(spec.name)
+    for (kind, why), loops in proposals.items():
+        draft.guessed.append(f"{kind} for loop {', '.join(loops)}: {why}")
 
 
 def _stem(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -12,13 +12,16 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.importing.orientation import to_rpy
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, Frame, FrameSpec, LoopSpec, MechanismSpec, SpringSpec, Vector3
+from ckc_pin.mechanism.tree import Tree
+from ckc_pin.mechanism.urdf import TreeText, UrdfTree, merge
 
-__all__ = ["Draft", "frame", "number", "safe_name", "unique", "vector"]
+__all__ = ["Draft", "checked_direction", "frame", "number", "safe_name", "some", "unique", "vector"]
 
 T = TypeVar("T")
 Noted = list[tuple[T, str]]  # with a comment for the file, or ""
@@ -89,6 +92,15 @@ class Draft:
             spring=[spec for spec, _ in self.springs],
         )
 
+    def tree(self) -> tuple[Tree, Frames, UrdfTree]:
+        """Build the tree alone, its frames, and what its checks found."""
+        text, urdf = merge([TreeText(self.urdf(), self.urdf_file)])
+        try:
+            tree = Tree(pin.buildModelFromXML(text))
+        except (ValueError, RuntimeError) as error:
+            raise MechanismError(f"{self.name}: Pinocchio cannot build this tree: {error}") from None
+        return tree, Frames(tree.model), urdf
+
     def mechanism(self) -> Mechanism:
         """Build the mechanism, as `ckc check` will.
 
@@ -124,6 +136,11 @@ def safe_name(path: Path, declared: str = "") -> str:
         if cleaned and cleaned.lower() not in WORDS_WITHOUT_MEANING:
             return cleaned
     return "imported"
+
+
+def some(names: Sequence[str]) -> str:
+    """Return a few of many names."""
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def unique(name: str, taken: Iterable[str]) -> str:

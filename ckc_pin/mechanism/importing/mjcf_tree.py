@@ -8,25 +8,22 @@ A joint's `ref`, its value in the reference pose, goes into the joint's origin: 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.importing.draft import checked_direction, number, unique, vector
+from ckc_pin.mechanism.importing.draft import number, some, unique, vector
 from ckc_pin.mechanism.importing.mjcf_document import MAIN, Attributes, Child, Document
 from ckc_pin.mechanism.importing.mjcf_inertia import Geom, bounded, declared, from_geoms
-from ckc_pin.mechanism.importing.orientation import from_axis_angle
-from ckc_pin.mechanism.importing.urdf_out import Body, JointLimits, add_joint, add_link
+from ckc_pin.mechanism.importing.mjcf_joints import MjcfJoint, is_free_root
+from ckc_pin.mechanism.importing.urdf_out import UNLIMITED, Body, JointLimits, add_joint, add_link
 from ckc_pin.mechanism.spec import SpringSpec
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["MjcfTree", "Placed"]
-
-JOINT_TYPES = ("hinge", "slide", "ball", "free")
-SCALAR = ("hinge", "slide")
 
 
 @dataclass(frozen=True)
@@ -40,24 +37,6 @@ class Placed:
     def at(self, pose: pin.SE3) -> Placed:
         """Return what stands at a pose in this."""
         return Placed(self.link, self.pose * pose, self.reference * pose)
-
-
-@dataclass(frozen=True)
-class _Joint:
-    """A joint of a body, in the body's frame."""
-
-    name: str
-    kind: str
-    at: Array
-    axis: Array
-    ref: float
-    attributes: Attributes
-
-    def turned(self, value: float) -> pin.SE3:
-        """Displacement that a value of the joint stands for."""
-        if self.kind == "slide":
-            return pin.SE3(np.eye(3), value * self.axis)
-        return pin.SE3(from_axis_angle(self.axis, value) if value else np.eye(3), np.zeros(3))
 
 
 @dataclass
@@ -101,21 +80,23 @@ class MjcfTree:
         self._seen: set[str] = set()
         self._armature: dict[str, float] = {}
         self._undrawn = 0
+        self._weightless: list[str] = []
+        self._unweighed: list[str] = []
         self._solids: dict[str, Body] = {}
         self._elements = {"world": add_link(self.robot, "world")}
         self.bodies["world"] = Placed("world", pin.SE3.Identity(), pin.SE3.Identity())
         for world in self.document.root.findall("worldbody"):
             self._content(world, self.bodies["world"], world.get("childclass", MAIN))
         self._weigh()
+        if self._unweighed:
+            self.left_out.append(f"masses of shapes unknown here; give the link an <inertial>: {some(self._unweighed)}")
+        if self._weightless:
+            self.left_out.append(f"gravity compensation of bodies: {some(self._weightless)}")
         if self._armature:
-            found = ", ".join(f"{name} {x:g}" for name, x in self._armature.items())
+            found = some([f"{name} {x:g}" for name, x in self._armature.items()])
             self.left_out.append(f"armature, the inertia of rotors behind gears (kg m^2 or kg): {found}")
         if self._undrawn:
             self.left_out.append(f"{self._undrawn} shapes that are no box, cylinder or sphere: not drawn")
-
-    def joint_names(self) -> Iterator[str]:
-        """Yield the joints of one freedom."""
-        yield from self.ref
 
     # --- bodies ----------------------------------------------------------------------------------
 
@@ -152,7 +133,7 @@ class MjcfTree:
         if a.get("mocap") == "true":
             self.left_out.append(f"body {name} is moved from outside (mocap): it stands still here")
         if a.number("gravcomp"):
-            self.left_out.append(f"gravity compensation of body {name}")
+            self._weightless.append(name)
         place = self._free if self._is_free(joints, name, parent) else self._chain
         pose = place(joints, name, start)
         placed = self.bodies[name] = Placed(name, pose, start.reference)
@@ -169,7 +150,7 @@ class MjcfTree:
         body, unknown = from_geoms(geoms, self.document) if rule != "false" else (None, [])
         for geom in unknown:
             of = geom.attributes.get("name") or geom.attributes.get("mesh") or "without a name"
-            self.left_out.append(f"the mass of {geom.kind} {of} of body {name}: give the link an <inertial>")
+            self._unweighed.append(f"{name} ({geom.kind} {of})")
         return bounded(body or Body(0.0, np.zeros(3), np.zeros((3, 3))), self.document)
 
     def _weigh(self) -> None:
@@ -193,44 +174,33 @@ class MjcfTree:
 
     # --- joints ----------------------------------------------------------------------------------
 
-    def _read_joints(self, children: Sequence[Child], body: str) -> Iterator[_Joint]:
+    def _read_joints(self, children: Sequence[Child], body: str) -> Iterator[MjcfJoint]:
         for child in children:
             if child.element.tag not in ("joint", "freejoint"):
                 continue
-            a = self.document.attributes(child.element, child.childclass, child.element.get("name", f"of {body}"))
-            kind = "free" if child.element.tag == "freejoint" else a.get("type", "hinge")
-            if kind not in JOINT_TYPES:
-                raise InputError(f"{a.where}: type={kind!r} is not one of {', '.join(JOINT_TYPES)}")
-            axis = checked_direction(a.numbers("axis", "0 0 1", 3)[:3], f"{a.where}: axis")
-            axis = child.frame.rotation @ axis / np.linalg.norm(axis)
-            ref = a.number("ref") * (self.document.radians if kind == "hinge" else 1.0)
-            name = child.element.get("name") or unique("root" if kind == "free" else f"{body}_{kind}", self._joints)
-            if name in self._seen:
-                raise InputError(f"{a.where}: two joints have this name")
-            self._seen.add(name)
-            self._joints.add(name)
-            at = np.zeros(3) if kind == "free" else child.frame.act(a.point("pos"))
-            yield _Joint(name, kind, at, axis, ref if kind in SCALAR else 0.0, a)
+            joint = MjcfJoint.read(child, body, self.document)
+            if not joint.name:
+                name = unique("root" if joint.kind == "free" else f"{body}_{joint.kind}", self._joints)
+                joint = replace(joint, name=name)
+            if joint.name in self._seen:
+                raise InputError(f"{joint.attributes.where}: two joints have this name")
+            self._seen.add(joint.name)
+            self._joints.add(joint.name)
+            yield joint
 
-    def _is_free(self, joints: Sequence[_Joint], body: str, parent: Placed) -> bool:
+    def _is_free(self, joints: Sequence[MjcfJoint], body: str, parent: Placed) -> bool:
         """Whether joints leave a body all six freedoms as a free joint does, with nothing acting on them."""
         kinds = [joint.kind for joint in joints]
         if "free" in kinds:
             if kinds != ["free"] or parent.link != "world":
                 raise InputError(f"{self.document.source}: body {body!r}: a free joint is the only one of a top body")
             return True
-        if kinds != ["slide", "slide", "slide", "ball"] or parent.link != "world" or joints[3].at.any():
-            return False
-        acting = ("stiffness", "damping", "armature", "frictionloss")
-        if any(j.name in self.used or any(j.attributes.number(key) for key in acting) for j in joints):
-            return False
-        axes = np.array([joint.axis for joint in joints[:3]])
-        if np.abs(axes @ axes.T - np.eye(3)).max() > 1e-12:
+        if parent.link != "world" or any(j.name in self.used for j in joints) or not is_free_root(joints):
             return False
         self.guessed.append(f"the three slides and the ball of body {body} are one free joint, 'root'")
         return True
 
-    def _free(self, joints: Sequence[_Joint], body: str, start: Placed) -> pin.SE3:
+    def _free(self, joints: Sequence[MjcfJoint], body: str, start: Placed) -> pin.SE3:
         """Add a floating joint; its coordinates are the body's pose in the world."""
         name = joints[0].name if joints[0].kind == "free" else unique("root", self._joints)
         self._joints.add(name)
@@ -241,7 +211,7 @@ class MjcfTree:
                 self.q_guess[f"{name}.{label}"] = number(value)
         return pin.SE3.Identity()
 
-    def _chain(self, joints: Sequence[_Joint], body: str, start: Placed) -> pin.SE3:
+    def _chain(self, joints: Sequence[MjcfJoint], body: str, start: Placed) -> pin.SE3:
         """Add a body's joints one after another, massless links between them; return its pose in its link."""
         link, pose = start.link, start.pose
         if not joints:
@@ -258,22 +228,16 @@ class MjcfTree:
             link, pose = child, pin.SE3(np.eye(3), -joint.at)
         return pose
 
-    def _scalar(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
+    def _scalar(self, joint: MjcfJoint, link: str, child: str, origin: pin.SE3) -> None:
         """Add a hinge or a slide, with its range, damping, friction and spring."""
         a, name = joint.attributes, joint.name
-        unit = self.document.radians if joint.kind == "hinge" else 1.0
-        autolimits = self.document.compiler.flag("autolimits", "true") == "true"
-        limited = a.flag("limited", "auto")
-        limits = JointLimits()
-        if limited == "true" or (limited == "auto" and autolimits and "range" in a):
-            lower, upper = (number(x * unit) for x in a.numbers("range", "0 0", 2)[:2])
-            limits = JointLimits(lower, upper, max(map(abs, a.numbers("actuatorfrcrange", "0 0"))))
+        limits = joint.limits(self.document)
         kind = "prismatic" if joint.kind == "slide" else ("continuous" if limits.lower is None else "revolute")
         damping, *more = a.numbers("damping", "0", 1)
         self._join(name, kind, link, child, origin, joint.axis, limits, damping, a.number("frictionloss"))
         stiffness, *more_ = a.numbers("stiffness", "0", 1)
         if stiffness:
-            rest = number(a.number("springref") * unit)
+            rest = number(a.number("springref") * joint.unit(self.document))
             self.springs.append((SpringSpec(joint=name, stiffness=stiffness, rest=rest), "the joint's stiffness"))
         if any((*more, *more_)):
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {name}")
@@ -285,7 +249,7 @@ class MjcfTree:
         if self.ref[name]:
             self.q_guess[name] = self.ref[name]
 
-    def _ball(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
+    def _ball(self, joint: MjcfJoint, link: str, child: str, origin: pin.SE3) -> None:
         """Add three hinges through massless links for a ball joint."""
         names = [unique(f"{joint.name}_{axis}", self._joints) for axis in "xyz"]
         for position, (name, axis) in enumerate(zip(names, np.eye(3), strict=True)):
@@ -311,7 +275,7 @@ class MjcfTree:
         child: str,
         origin: pin.SE3,
         axis: Sequence[float] | Array = (),
-        limits: JointLimits = JointLimits(),
+        limits: JointLimits = UNLIMITED,
         damping: float = 0.0,
         friction: float = 0.0,
     ) -> None:

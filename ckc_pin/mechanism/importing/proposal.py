@@ -10,16 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pinocchio as pin
 
 from ckc_pin.mechanism.assembly import assemble
 from ckc_pin.mechanism.closure import ClosureBuilder
-from ckc_pin.mechanism.frames import Frame, Frames
+from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.importing.draft import Draft, vector
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Array, Tree
-from ckc_pin.mechanism.urdf import TreeText, merge
 
 __all__ = ["propose"]
 
@@ -38,24 +36,24 @@ def propose(draft: Draft, pairs: Sequence[LoopSpec]) -> list[tuple[LoopSpec, str
     pairs : sequence of LoopSpec
         Of type point.
     """
-    text, urdf = merge([TreeText(draft.urdf(), draft.urdf_file)])
-    tree = Tree(pin.buildModelFromXML(text))
-    frames = Frames(tree.model)
+    tree, frames, urdf = draft.tree()
     known = draft.spec().loop
     found: dict[str, tuple[LoopSpec, str]] = {}
     for pair in pairs:
         a, b = (frames.find(f, f"loop {pair.name!r}") for f in (pair.frame_a, pair.frame_b))
-        normal = None if a.joint == b.joint else _normal(tree, a, b)
         if a.joint == b.joint:
-            found[pair.name] = pair, "both frames are on one body, so it closes nothing: correct the names"
-        elif normal is not None:
+            found[pair.name] = pair, "both frames are on one body"
+            continue
+        normal = _normal(tree, a, b)
+        if normal is not None:
             found[pair.name] = _planar(tree, pair, a, b, normal)
     spatial = [pair for pair in pairs if pair.name not in found]
     if spatial:
         couplings = [CouplingSpec(joint=j, other=o, ratio=r, offset=c) for j, o, r, c in urdf.mimic]
         builder = ClosureBuilder(tree, frames)
         for loop in [*known, *(spec for spec, _ in found.values()), *spatial]:
-            builder.add_loop(loop)
+            if frames.find(loop.frame_a, loop.name).joint != frames.find(loop.frame_b, loop.name).joint:
+                builder.add_loop(loop)
         for coupling in [*draft.spec().coupling, *couplings]:
             builder.add_coupling(coupling)
         closure = builder.build()

@@ -13,7 +13,7 @@ from ckc_pin.mechanism.importing.draft import number
 from ckc_pin.mechanism.importing.orientation import to_rpy
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Body", "JointLimits", "add_joint", "add_link", "add_shape"]
+__all__ = ["UNLIMITED", "Body", "JointLimits", "add_joint", "add_link", "add_shape"]
 
 
 @dataclass
@@ -51,6 +51,9 @@ class JointLimits:
     effort: float = 0.0
 
 
+UNLIMITED = JointLimits()
+
+
 def add_link(robot: Element, name: str, body: Body | None = None) -> Element:
     """Add a link; one without a body has no mass."""
     link = SubElement(robot, "link", name=name)
@@ -71,7 +74,7 @@ def add_joint(
     child: str,
     origin: pin.SE3,
     axis: Sequence[float] | Array = (),
-    limits: JointLimits = JointLimits(),
+    limits: JointLimits = UNLIMITED,
     damping: float = 0.0,
     friction: float = 0.0,
 ) -> None:

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.importing.closing_frames import take_closing_frames
-from ckc_pin.mechanism.importing.draft import Draft, safe_name
+from ckc_pin.mechanism.importing.draft import Draft, safe_name, some
 from ckc_pin.mechanism.importing.rbda_loops import take_loops
 from ckc_pin.mechanism.importing.robot_yaml import take_yaml
 from ckc_pin.mechanism.importing.urdf_in import Names
@@ -51,7 +51,7 @@ def read_urdf(text: str, path: Path) -> Draft:
             draft.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
     mimics = [name for name, joint in names.joints.items() if joint.find("mimic") is not None]
     if mimics:
-        draft.guessed.append(f"the URDF's mimic joints are couplings, they stay in the URDF: {_some(mimics)}")
+        draft.guessed.append(f"the URDF's mimic joints are couplings, they stay in the URDF: {some(mimics)}")
     if not any(joint.get("type") == "floating" for joint in names.joints.values()):
         base = next(name for name in names.links if name not in names.above)
         draft.guessed.append(f'{base} stands fixed in the world; for a free base write [[tree]] with root = "free"')
@@ -82,7 +82,3 @@ def _refuse_xacro(robot: Element, path: Path) -> None:
     for element in robot.iter():
         if "xacro" in element.tag or any("${" in value for value in element.attrib.values()):
             raise InputError(f"{path}: a xacro, from which a URDF is made: expand it first (xacro FILE > robot.urdf)")
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f", {len(names) - 5} more" if len(names) > 5 else "")
