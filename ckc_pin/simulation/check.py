@@ -12,8 +12,8 @@ from ckc_pin.mechanism.branches import assembly_branches
 from ckc_pin.mechanism.library import is_path, load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
-from ckc_pin.simulation.simulate import scene_controller, scene_mechanism
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
 __all__ = ["Check", "check"]

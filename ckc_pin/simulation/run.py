@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-import zipfile
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from ckc_pin.errors import InputError
@@ -19,14 +14,13 @@ from ckc_pin.mechanism.library import MECHANISM_FILE, build
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
 
 __all__ = ["Run", "Status"]
 
 Status = Literal["done", "stopped", "interrupted"]
 
-FORMAT = 1
-MAX_BYTES = 2**31  # of one array in a run file, before it is expanded
-ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
+META = tuple(name for name in RunMeta.__struct_fields__ if name not in ("format", "hashes"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +80,6 @@ class Run:
     scene: dict[str, Any]
     texts: dict[str, str]
     profile: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def hashes(self) -> dict[str, str]:
-        """SHA-256 of every text."""
-        return {name: sha256(text.encode()).hexdigest() for name, text in sorted(self.texts.items())}
 
     @cached_property
     def mechanism(self) -> Mechanism:
@@ -166,31 +155,13 @@ class Run:
     def save(self, path: str | Path) -> Path:
         """Write the run to a file: whole or not at all, also when the machine goes down meanwhile."""
         path = Path(path)
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
-        if self.lyapunov is not None:
-            arrays["lyapunov"] = self.lyapunov
-        arrays["coordinates"] = np.array(self.coordinates)
-        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays and f.name != "lyapunov"}
-        arrays["meta"] = np.frombuffer(
-            msgspec.json.encode({"format": FORMAT, "hashes": self.hashes, **rest}), dtype=np.uint8
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **arrays)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL) if getattr(self, name) is not None}
+        write_run(path, self.coordinates, arrays, self._meta())
         return path
 
     @classmethod
     def load(cls, path: str | Path) -> Run:
-        """Read a run file.
+        """Read a run file, or the run.npz of a folder.
 
         Raises
         ------
@@ -202,25 +173,11 @@ class Run:
             path = path / "run.npz"
         if not path.is_file():
             raise InputError(f"{path}: no such run file")
-        try:
-            with zipfile.ZipFile(path) as archive:
-                largest = max((entry.file_size for entry in archive.infolist()), default=0)
-            if largest > MAX_BYTES:
-                raise InputError(f"{path}: an array of {largest} bytes; a run has at most {MAX_BYTES}")
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
-            meta = msgspec.json.decode(arrays.pop("meta").tobytes())
-            version = meta.pop("format")
-            if version != FORMAT:
-                raise InputError(f"{path}: a run of format {version}; this program reads format {FORMAT}")
-            hashes = meta.pop("hashes")
-            arrays["coordinates"] = tuple(str(x) for x in arrays["coordinates"])
-            meta |= {key: tuple(meta[key]) for key in ("independent", "actuated")}
-            run = cls(**{"lyapunov": None, **arrays, **meta})
-            if run.hashes != hashes:
-                raise InputError(f"{path}: damaged: its texts do not match their hashes")
-            return run
-        except InputError:
-            raise
-        except Exception as error:  # whatever a damaged archive makes NumPy, zlib or msgspec raise
-            raise InputError(f"{path}: not a run file, or damaged ({type(error).__name__})") from None
+        coordinates, arrays, meta = read_run(path)
+        rest: dict[str, Any] = {"lyapunov": None, **arrays} | {name: getattr(meta, name) for name in META}
+        for name in ("max_phi", "max_phi_dot"):
+            rest[name] = np.nan if rest[name] is None else rest[name]
+        return cls(coordinates=coordinates, **rest)
+
+    def _meta(self) -> RunMeta:
+        return RunMeta(**{name: getattr(self, name) for name in META})

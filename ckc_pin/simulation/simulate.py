@@ -4,32 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.actuation import Actuation, Effort
-from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import Controller, SetPoint, Tracking
-from ckc_pin.dynamics.terms import Terms
+from ckc_pin.control.controllers import Controller
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.lazy import Tally
-from ckc_pin.mechanism.library import load, mechanism_file
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Events
-from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.integrate import BudgetError, Stepper
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.rank_guard import RankGuard
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
 
-__all__ = ["Progress", "scene_controller", "scene_mechanism", "simulate"]
+__all__ = ["Progress", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 
@@ -77,33 +70,22 @@ def simulate(
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
     started = perf_counter()
-    mechanism = scene_mechanism(scene)
     times = _output_instants(scene)
-    model_texts: dict[str, str] = {}
-    own = controller is not None
-    if controller is None:
-        controller = scene_controller(scene, mechanism, model_texts)
-    limit = scene.spec.controller.torque_limit if scene.spec.controller else None
-    actuation = Actuation(mechanism, limit)
-    _refuse_immobile(mechanism)
+    ready = prepare(scene, controller)
+    mechanism, plant = ready.mechanism, ready.plant
     events = Events(scene.spec.event, mechanism)
-    start = find_start(mechanism, scene)
-    if controller is not None:
-        actuation.require_transmission(start.at)
-    plant = _Plant(controller, actuation)
     tally = Tally() if profile else None
     mechanism.tree.tally = tally
     try:
-        system = _system(mechanism, scene, start, plant)
-        stepper = Stepper(system, _method(scene, system), scene.spec.solver, scene.spec.t_end)
-        recorder = Recorder(system, plant.effort, getattr(controller, "lyapunov", None))
+        stepper = Stepper(ready.system, ready.method, scene.spec.solver, scene.spec.t_end)
+        recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None))
         recorder.add(0.0, stepper.y)
         status, message = _steps(stepper, recorder, times, events, scene.spec.t_end, progress)
     finally:
         mechanism.tree.tally = None
     stats = {**stepper.stats(), "wall_s": perf_counter() - started,
              "method": stepper.method, "backend": "python"}  # fmt: skip
-    texts = {**mechanism.sources.texts, **scene.sources.texts, **model_texts}
+    texts = {**mechanism.sources.texts, **scene.sources.texts, **ready.texts}
     run = Run(
         status=status,
         message=message,
@@ -115,7 +97,7 @@ def simulate(
         events=events.met,
         stats=stats,
         scene_name=scene.name,
-        scene=_as_run(scene, own),
+        scene=_as_run(scene, controller is not None),
         texts=texts,
         profile=tally.plain() if tally else {},
         **{"lyapunov": None, **recorder.arrays()},  # type: ignore[arg-type]
@@ -130,99 +112,6 @@ def _as_run(scene: Scene, own_controller: bool) -> dict[str, Any]:
     if own_controller:
         plain.pop("controller", None)
     return plain
-
-
-def scene_mechanism(scene: Scene) -> Mechanism:
-    """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
-    mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism)
-
-
-def _beside(scene: Scene, name: str) -> str | Path:
-    folder = scene.sources.folder
-    if folder is not None and (name.endswith(".toml") or (folder / name).exists()):
-        return mechanism_file(folder / name)
-    return name
-
-
-def scene_controller(
-    scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
-) -> SetPoint | Tracking | None:
-    """Build a scene's controller; the texts of its own model are added to `texts`."""
-
-    def load_model(name: str) -> Mechanism:
-        model = load(_beside(scene, name))
-        if texts is not None:
-            texts.update({f"model/{file}": text for file, text in model.sources.texts.items()})
-        return model
-
-    spec = scene.spec
-    if spec.controller is None:
-        return None
-    return make_controller(spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model)
-
-
-def _refuse_immobile(mechanism: Mechanism) -> None:
-    if mechanism.d == 0:
-        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
-
-
-@dataclass(frozen=True)
-class _Plant:
-    """What acts on the mechanism: a controller through its actuators, or nothing."""
-
-    controller: Controller | None
-    actuation: Actuation
-
-    def effort(self, t: float, terms: Terms) -> Effort:
-        if self.controller is None:
-            return self.actuation.none
-        return self.actuation.apply(terms, self.controller.u(t, terms))
-
-    def force(self, t: float, terms: Terms) -> Array:
-        return self.effort(t, terms).u_tree
-
-    def u_rate_gradient(self, t: float, terms: Terms) -> Array | None:
-        """d u / d q_dot: nothing acts, or the controller knows its own; None for a controller that does not."""
-        if self.controller is None:
-            return np.zeros((len(terms.q), len(terms.q)))
-        gradient = getattr(self.controller, "u_rate_gradient", None)
-        if gradient is None or not self.actuation.direct:
-            return None
-        free = self.actuation.unlimited(self.effort(t, terms).tau)
-        return free[:, None] * gradient(t, terms)
-
-
-def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: _Plant) -> System:
-    spec, force = scene.spec, plant.force
-    free = plant.controller is None  # of a controller that lives in the mechanism's own q
-    if spec.formulation == "dae":
-        return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, spec.solver.projection)
-    if spec.formulation == "reduced":
-        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
-    equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
-    if equation == 8:
-        return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
-    return LevelSet(
-        mechanism,
-        start.at,
-        start.q_dot,
-        force,
-        spec.epsilon,
-        spec.coriolis_velocity,
-        start.w,
-        plant.u_rate_gradient,
-        free,
-    )
-
-
-def _method(scene: Scene, system: System) -> str:
-    """What "auto" means: closed loops are stiff through their gains, eq. 8 through epsilon."""
-    spec = scene.spec
-    if spec.solver.method != "auto":
-        return spec.solver.method
-    stiff = spec.controller is not None or isinstance(system, PrintedSpf)
-    return "Radau" if stiff else "DOP853"
 
 
 def _output_instants(scene: Scene) -> Array:

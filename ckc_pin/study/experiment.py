@@ -22,8 +22,8 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.integrate import ONE_STEP, BudgetError, Step, Stepper
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene, SolverSpec
-from ckc_pin.simulation.simulate import scene_controller, scene_mechanism
 from ckc_pin.simulation.systems import Dae, Force, LevelSet, PrintedSpf, System
 
 __all__ = [

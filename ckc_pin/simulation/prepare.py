@@ -1,0 +1,167 @@
+"""From a scene to a system that can be stepped: mechanism, controller, start, formulation, solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ckc_pin.control.actuation import Actuation, Effort
+from ckc_pin.control.build import make_controller
+from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.library import load, mechanism_file
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import Start, find_start
+from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
+
+__all__ = ["Plant", "Prepared", "prepare", "scene_controller", "scene_mechanism"]
+
+
+def scene_mechanism(scene: Scene) -> Mechanism:
+    """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
+    mechanism = scene.spec.mechanism
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism)
+
+
+def _beside(scene: Scene, name: str) -> str | Path:
+    folder = scene.sources.folder
+    if folder is not None and (name.endswith(".toml") or (folder / name).exists()):
+        return mechanism_file(folder / name)
+    return name
+
+
+def scene_controller(
+    scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
+) -> SetPoint | Tracking | None:
+    """Build a scene's controller; the texts of its own model are added to `texts`."""
+
+    def load_model(name: str) -> Mechanism:
+        model = load(_beside(scene, name))
+        if texts is not None:
+            texts.update({f"model/{file}": text for file, text in model.sources.texts.items()})
+        return model
+
+    spec = scene.spec
+    if spec.controller is None:
+        return None
+    return make_controller(spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """What acts on the mechanism: a controller through its actuators, or nothing."""
+
+    controller: Controller | None
+    actuation: Actuation
+
+    def effort(self, t: float, terms: Terms) -> Effort:
+        """What the actuators do at (t, terms)."""
+        if self.controller is None:
+            return self.actuation.none
+        return self.actuation.apply(terms, self.controller.u(t, terms))
+
+    def force(self, t: float, terms: Terms) -> Array:
+        """u' on the tree, shape (n,)."""
+        return self.effort(t, terms).u_tree
+
+    def u_rate_gradient(self, t: float, terms: Terms) -> Array | None:
+        """d u / d q_dot: nothing acts, or the controller knows its own; None for a controller that does not."""
+        if self.controller is None:
+            return np.zeros((len(terms.q), len(terms.q)))
+        gradient = getattr(self.controller, "u_rate_gradient", None)
+        if gradient is None or not self.actuation.direct:
+            return None
+        free = self.actuation.unlimited(self.effort(t, terms).tau)
+        return free[:, None] * gradient(t, terms)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scene ready to be stepped.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    plant : Plant
+        What acts on it.
+    system : System
+        The formulation as a first-order system, at its start.
+    method : str
+        The solver that "auto" stands for here, or the one named.
+    texts : dict of str to str
+        Files that the scene's controller brought along.
+    """
+
+    mechanism: Mechanism
+    plant: Plant
+    system: System
+    method: str
+    texts: dict[str, str]
+
+
+def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
+    """Build everything that a scene needs before its first step.
+
+    Parameters
+    ----------
+    controller : Controller, optional
+        Takes the place of the scene's.
+
+    Raises
+    ------
+    InputError, MechanismError
+        The scene cannot be run as written.
+    NumericalError
+        Its start is singular.
+    """
+    mechanism = scene_mechanism(scene)
+    texts: dict[str, str] = {}
+    if controller is None:
+        controller = scene_controller(scene, mechanism, texts)
+    limit = scene.spec.controller.torque_limit if scene.spec.controller else None
+    actuation = Actuation(mechanism, limit)
+    if mechanism.d == 0:
+        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
+    start = find_start(mechanism, scene)
+    if controller is not None:
+        actuation.require_transmission(start.at)
+    plant = Plant(controller, actuation)
+    system = _system(mechanism, scene, start, plant)
+    return Prepared(mechanism, plant, system, _method(scene, system), texts)
+
+
+def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> System:
+    spec, force = scene.spec, plant.force
+    free = plant.controller is None  # of a controller that lives in the mechanism's own q
+    if spec.formulation == "dae":
+        return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, spec.solver.projection)
+    if spec.formulation == "reduced":
+        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
+    equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
+    if equation == 8:
+        return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
+    return LevelSet(
+        mechanism,
+        start.at,
+        start.q_dot,
+        force,
+        spec.epsilon,
+        spec.coriolis_velocity,
+        start.w,
+        plant.u_rate_gradient,
+        free,
+    )
+
+
+def _method(scene: Scene, system: System) -> str:
+    """What "auto" means: closed loops are stiff through their gains, eq. 8 through epsilon."""
+    spec = scene.spec
+    if spec.solver.method != "auto":
+        return spec.solver.method
+    stiff = spec.controller is not None or isinstance(system, PrintedSpf)
+    return "Radau" if stiff else "DOP853"

@@ -1,0 +1,110 @@
+"""Eq. 1 as a DAE: its closure differentiated twice, position and velocity projected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.dynamics.formulations import closing_step, dae_acceleration
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.systems.base import Counts, Force, Rhs
+
+__all__ = ["Dae"]
+
+WEAK = 1e-3  # of the largest singular value of J: below that a direction is not trusted to close along
+
+
+@dataclass
+class Dae:
+    """Eq. 1: y = (q', v'), position and velocity put back on the closure after each step if `projects`."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    v_tree: Array
+    force: Force
+    projects: bool = True
+    counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = True
+
+    def __post_init__(self) -> None:
+        self.positions = self.mechanism.n if self.mechanism.tree.flat else 0
+
+    def start(self) -> Array:
+        return np.concatenate([self.initial.q_tree, self.v_tree])
+
+    def w(self, t: float) -> Array:
+        return np.zeros(self.mechanism.closure.rows)
+
+    def w_dot(self, t: float) -> Array:
+        return np.zeros(self.mechanism.closure.rows)
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        return terms.v_tree
+
+    def _split(self, y: Array) -> tuple[Array, Array]:
+        tree = self.mechanism.tree
+        return (y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])), y[tree.nq :]
+
+    def terms(self, t: float, y: Array) -> Terms:
+        q_tree, v_tree = self._split(y)
+        at = self.mechanism.kinematics(q_tree)
+        return self._projected(at, v_tree) if self.projects else Terms(self.mechanism, at, v_tree)
+
+    def configuration(self, t: float, y: Array) -> Array:
+        return self._split(y)[0]
+
+    def rhs(self, t: float, y: Array) -> Array:
+        q_tree, v_tree = self._split(y)
+        terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
+        self.counts.factorizations += 2
+        rate = self.mechanism.tree.configuration_rate(q_tree, v_tree)
+        return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms))])
+
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        return None
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        if not self.projects:
+            return None
+        q_tree, v_tree = self._split(y)
+        at = self.mechanism.kinematics(q_tree)
+        drift = np.abs(at.phi).max(initial=0.0)
+        drift_rate = np.abs(at.J @ v_tree).max(initial=0.0) / (1.0 + np.abs(v_tree).max(initial=0.0))
+        if max(drift, drift_rate) <= self.mechanism.tolerance:
+            return None
+        terms = self._projected(at, v_tree)
+        return np.concatenate([terms.q_tree, terms.v_tree])
+
+    def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
+        """Put a state on the closure by the shortest steps in the metric of the inertia.
+
+        That is the correction with the least work on the motion: its velocity part does not change the
+        momentum along the allowed directions, so the energy drifts less than with steps in coordinates.
+        """
+        for _ in range(10):
+            if np.abs(at.phi).max(initial=0.0) <= self.mechanism.tolerance:
+                break
+            step = self._closing(Terms(self.mechanism, at, v_tree), at.phi)
+            self.counts.newton += 1
+            self.counts.factorizations += 2
+            closed = float(np.abs(at.J @ step).max()) <= self.mechanism.tolerance  # what else remains, rows contradict
+            at = at.moved(step)
+            if closed:
+                break
+        else:
+            raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
+        correction = self._closing(Terms(self.mechanism, at, v_tree), at.J @ v_tree)
+        return Terms(self.mechanism, at, v_tree + correction)
+
+    def _closing(self, terms: Terms, residual: Array) -> Array:
+        """Close in the metric of the inertia; near a rank loss only along the directions that J determines."""
+        values = np.linalg.svd(terms.at.J, compute_uv=False)
+        if self.mechanism.rank and values[self.mechanism.rank - 1] < WEAK * values[0]:
+            return -np.asarray(np.linalg.lstsq(terms.at.J, residual, rcond=WEAK)[0], dtype=float)
+        return closing_step(terms, residual)

@@ -1,0 +1,156 @@
+"""The reduced model, eq. 6, on a level set of phi: with w(t) of eq. 17 that is the SPF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ckc_pin.dynamics.formulations import CoriolisVelocity, reduced_acceleration, spf_terms
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.chart import Chart
+from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rank import choose_dependent, scaled
+from ckc_pin.mechanism.sigma import newton, predict, sigma
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.systems.base import Counts, Force, Gradient, Rhs, require_chart, spf_velocity
+
+__all__ = ["LevelSet"]
+
+SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
+DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
+
+
+@dataclass
+class LevelSet:
+    """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
+
+    z is found on the level set by Newton from where the last evaluated state, moved along rho, leads.
+    With `may_switch` the split into q and z is changed where phi_z comes near to singular; a controller,
+    which lives in the mechanism's own q, forbids that.
+    """
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    epsilon: float = 1.0
+    convention: CoriolisVelocity = "rho"
+    w0: Array | None = None
+    u_rate_gradient: Gradient | None = None
+    may_switch: bool = False
+    counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = False
+    projects: bool = False
+
+    def __post_init__(self) -> None:
+        tree = self.mechanism.tree
+        self._last = self.initial
+        self._d = self.mechanism.d
+        self._on_manifold = self.w0 is None or not np.any(self.w0)
+        self._zero = np.zeros(self.mechanism.closure.rows)
+        self._chart = Chart(tree, self.mechanism.partition.q, self.initial.q_tree)
+        # a free root among q is charted by rotation vectors, and the chart moves along between steps
+        self.projects = not self._chart.plain
+        self.positions = self._d if self._chart.plain else 0
+
+    def start(self) -> Array:
+        return np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
+
+    def w(self, t: float) -> Array:
+        """Eq. 17's second line, exact."""
+        if self._on_manifold or self.w0 is None:
+            return self._zero
+        return self.w0 * np.exp(-t / self.epsilon)
+
+    def w_dot(self, t: float) -> Array:
+        return -self.w(t) / self.epsilon
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        if self._on_manifold:
+            return terms.v_tree
+        return spf_velocity(terms, self.epsilon, self.w(t))
+
+    def terms(self, t: float, y: Array) -> Terms:
+        q_dot, w = y[self._d :], self.w(t)
+        dq = self._chart.step(self._last.q_tree, y[: self._d])
+        guess = predict(self._last, dq)
+        outcome = newton(guess, w, self.mechanism.tolerance)
+        self.counts.newton += outcome.iterations
+        self.counts.factorizations += outcome.iterations
+        if not outcome.converged:
+            found = sigma(self._last, dq, w, self.mechanism.tolerance, anywhere=False)
+            self.counts.newton += found.iterations
+            self.counts.factorizations += found.iterations
+            if found.verdict != "converged":
+                raise NumericalError(
+                    f"sigma(q) is {found.verdict}: {found.reason}",
+                    t=t,
+                    q_tree=self.mechanism.tree.named(self.mechanism.tree.to_coordinates(found.at.q_tree)),
+                )
+            outcome = type(outcome)(found.at, found.iterations, True)
+        self._last = outcome.at
+        if self._on_manifold:
+            return Terms(self.mechanism, outcome.at, outcome.at.rho @ q_dot)
+        return spf_terms(self.mechanism, outcome.at, q_dot, self.epsilon, w, self.convention)
+
+    def configuration(self, t: float, y: Array) -> Array:
+        return self.terms(t, y).q_tree
+
+    def rhs(self, t: float, y: Array) -> Array:
+        terms = self.terms(t, y)
+        self.counts.factorizations += 2  # phi_z and D
+        q_dot = y[self._d :]
+        with_actual = self.convention == "actual" and not self._on_manifold
+        q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if with_actual else None)
+        return np.concatenate([self._chart.rate(terms.q_tree, q_dot), q_ddot])
+
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        """Exact along q_dot, where a closed loop is stiff; forward differences along q."""
+        terms = self.terms(t, y)
+        gradient = self.u_rate_gradient(t, terms) if self.u_rate_gradient else None
+        if gradient is None or not self._chart.plain:
+            return None
+        d, f = self._d, rhs(t, y)
+        # C(x) y = C(y) x, so that d(C q_dot)/d q_dot = 2 C
+        gradient = gradient - 2 * terms.C
+        if self.mechanism.springs.any_damping:
+            gradient -= terms.rho.T @ self.mechanism.springs.damping_matrix(terms.q_tree) @ terms.rho
+        jacobian = np.zeros((2 * d, 2 * d))
+        jacobian[:d, d:] = np.eye(d)
+        jacobian[d:, d:] = terms.D_factor.solve(gradient)
+        for k in range(d):
+            moved = y.copy()
+            moved[k] += DIFFERENCE
+            jacobian[d:, k] = (rhs(t, moved)[d:] - f[d:]) / (moved[k] - y[k])
+        return jacobian
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        margin = self._last.sigma_min() / max(float(np.linalg.norm(self._last.J)), 1e-300)
+        if margin < SWITCH_MARGIN and self.may_switch:
+            better = self._better_partition(margin)
+            if better is not None:
+                terms = self.terms(t, y)
+                self._last = Kinematics(terms.at.tree, terms.at.closure, better, terms.q_tree)
+                self._chart = Chart(terms.at.tree, better.q, terms.q_tree)
+                self.counts.switches += 1
+                return np.concatenate([self._chart.numbers(terms.q_tree), terms.v_tree[better.q]])
+        require_chart(self._last)
+        if self._chart.plain:
+            return None
+        q_tree = self.terms(t, y).q_tree
+        self._chart = Chart(self.mechanism.tree, self._last.partition.q, q_tree)
+        return np.concatenate([self._chart.numbers(q_tree), y[self._d :]])
+
+    def _better_partition(self, margin: float) -> Partition | None:
+        """Return a split whose phi_z is clearly further from singular here, if there is one."""
+        tree, closure, at = self.mechanism.tree, self.mechanism.closure, self._last
+        jacobian = scaled(at.J, tree, closure, self.mechanism.size)
+        z = choose_dependent(jacobian, self.mechanism.rank, [np.arange(v, v + 6) for _, v in tree.free])
+        if z is None:
+            return None
+        split = Partition(np.setdiff1d(np.arange(tree.n), z), z)
+        gained = Kinematics(tree, closure, split, at.q_tree).sigma_min() / float(np.linalg.norm(at.J))
+        return split if gained > 2 * margin else None

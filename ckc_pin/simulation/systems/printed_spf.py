@@ -1,0 +1,76 @@
+"""Eq. 8 as printed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ckc_pin.dynamics.formulations import CoriolisVelocity, reduced_acceleration, spf_terms, spf_z_dot
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.systems.base import Counts, Force, Rhs, require_chart, spf_velocity
+
+__all__ = ["PrintedSpf"]
+
+
+@dataclass
+class PrintedSpf:
+    """Eq. 8 as printed: y = (q, q_dot, z)."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    epsilon: float
+    convention: CoriolisVelocity = "rho"
+    counts: Counts = field(default_factory=Counts)
+    passes_rank_loss: bool = False
+    projects: bool = False
+
+    def __post_init__(self) -> None:
+        self.positions = self.mechanism.d
+        tree, partition = self.mechanism.tree, self.mechanism.partition
+        self._d = self.mechanism.d
+        self._q, self._z = tree.place[partition.q], tree.place[partition.z]
+        self._w0 = self.initial.phi
+
+    def start(self) -> Array:
+        q_tree = self.initial.q_tree
+        return np.concatenate([q_tree[self._q], self.q_dot, q_tree[self._z]])
+
+    def w(self, t: float) -> Array:
+        return self._w0 * np.exp(-t / self.epsilon)
+
+    def w_dot(self, t: float) -> Array:
+        return -self.w(t) / self.epsilon
+
+    def velocity(self, t: float, terms: Terms) -> Array:
+        return spf_velocity(terms, self.epsilon, terms.phi)
+
+    def terms(self, t: float, y: Array) -> Terms:
+        d = self._d
+        q_tree = np.empty(self.mechanism.tree.nq)
+        q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
+        at = self.mechanism.kinematics(q_tree)
+        return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
+
+    def configuration(self, t: float, y: Array) -> Array:
+        return self.terms(t, y).q_tree
+
+    def rhs(self, t: float, y: Array) -> Array:
+        d = self._d
+        terms = self.terms(t, y)
+        self.counts.factorizations += 2
+        q_dot = y[d : 2 * d]
+        q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if self.convention == "actual" else None)
+        return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
+
+    def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
+        return None
+
+    def accept(self, t: float, y: Array) -> Array | None:
+        require_chart(self.terms(t, y).at)
+        return None
