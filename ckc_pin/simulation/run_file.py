@@ -106,9 +106,9 @@ def _arrays(path: Path) -> dict[str, Any]:
 def _check_size(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
     """Bound what NumPy will allocate, which it takes from the array's header alone."""
     with archive.open(entry) as file:
-        major, _ = np.lib.format.read_magic(file)  # type: ignore[arg-type]
+        major, _ = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)  # type: ignore[arg-type]
+        shape, _, dtype = read(file)
     size = dtype.itemsize
     for length in shape:
         size *= length
