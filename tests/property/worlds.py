@@ -71,11 +71,11 @@ class World:
 
     def configuration(self) -> Numbers:
         """A random configuration; angles of the root well below half a turn."""
-        return dict(zip(self.coordinates, self.random.uniform(-1, 1, len(self.coordinates)), strict=True))
+        return dict(zip(self.coordinates, self.random.uniform(-1, 1, len(self.coordinates)).tolist(), strict=True))
 
     def velocity(self) -> Numbers:
         """A random velocity; a free root's is its twist in its own axes."""
-        return dict(zip(self.coordinates, self.random.uniform(-2, 2, len(self.coordinates)), strict=True))
+        return dict(zip(self.coordinates, self.random.uniform(-2, 2, len(self.coordinates)).tolist(), strict=True))
 
     def moved(self, q: Numbers, v: Numbers, time: float) -> Numbers:
         """A path through q whose velocity there is v."""
