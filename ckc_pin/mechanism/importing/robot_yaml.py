@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 import msgspec
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.importing.draft import Draft, unique
+from ckc_pin.mechanism.importing.draft import Draft, some, unique
 from ckc_pin.mechanism.importing.urdf_in import Names
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.toml import convert
@@ -53,6 +53,14 @@ def take_yaml(draft: Draft, names: Names, text: str, source: str) -> None:
         raise InputError(f"{source}: joint_name has {counts}")
     for joint, kind in zip(content.joint_name, content.joint_type, strict=True):
         _substitute(draft, names, joint, kind, source)
+    hinges = [
+        n for n, j in names.joints.items() if "spherical" in n and j.get("type") != "fixed" and n not in names.made
+    ]
+    if hinges:
+        remedy = "if they stand for balls, give them joint_name and joint_type SPHERICAL and import again"
+        draft.guessed.append(
+            f"joints called spherical stay hinges, {source} says nothing else: {some(hinges)}; {remedy}"
+        )
     for position, (one, two) in enumerate(content.closed_loop):
         kind = content.type[position].lower() if position < len(content.type) else ""
         if kind and kind not in TYPES:
@@ -86,8 +94,9 @@ def _parse(text: str, source: str) -> tuple[RobotYaml, list[str]]:
 def _substitute(draft: Draft, names: Names, name: str, kind: str, source: str) -> None:
     """Turn a hinge into a ball or universal joint of several hinges, or fix it."""
     joint = names.joints.get(name)
-    if joint is None:
-        raise MechanismError(f"{source}: joint_name: no joint {name!r}; there are {', '.join(names.joints)}")
+    if joint is None:  # as in the format's own loader, which passes over it
+        draft.left_out.append(f"{source}: joint_name {name}: no joint has this name{names.near(name)}")
+        return
     universal = re.fullmatch(r"UJOINT_([XYZ])([XYZ])", kind)
     if kind == "FIXED":
         _reduce(joint, "fixed")

@@ -47,6 +47,11 @@ class Names:
         self._collect(robot)
         self.split[joint] = [name for name in self.joints if name not in before]
 
+    @property
+    def made(self) -> set[str]:
+        """Joints that came out of a split."""
+        return {name for names in self.split.values() for name in names}
+
     def near(self, name: str) -> str:
         """Return a hint at names like one that does not exist."""
         close = difflib.get_close_matches(name, [*self.links, *self.joints], 3)

@@ -49,9 +49,7 @@ def read_urdf(text: str, path: Path) -> Draft:
         take_closing_frames(draft, names)
         if draft.loops:
             draft.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
-    mimics = [name for name, joint in names.joints.items() if joint.find("mimic") is not None]
-    if mimics:
-        draft.guessed.append(f"the URDF's mimic joints are couplings, they stay in the URDF: {some(mimics)}")
+    _check_mimics(draft, names)
     if not any(joint.get("type") == "floating" for joint in names.joints.values()):
         base = next(name for name in names.links if name not in names.above)
         draft.guessed.append(f'{base} stands fixed in the world; for a free base write [[tree]] with root = "free"')
@@ -60,6 +58,23 @@ def read_urdf(text: str, path: Path) -> Draft:
     if meshes:
         draft.left_out.append(f"{len(meshes)} mesh files, such as {meshes[0]}: not copied to where the URDF is now")
     return draft
+
+
+def _check_mimics(draft: Draft, names: Names) -> None:
+    """Mimic joints are couplings already; one that follows no joint there is would make the URDF useless."""
+    kept = []
+    for name, joint in names.joints.items():
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        other = names.joints.get(mimic.get("joint", ""))
+        if other is None or other.get("type") not in ("revolute", "continuous", "prismatic") or other is joint:
+            joint.remove(mimic)
+            draft.left_out.append(f"joint {name} follows {mimic.get('joint')!r}, which is no joint that moves")
+        else:
+            kept.append(name)
+    if kept:
+        draft.guessed.append(f"the URDF's mimic joints are couplings, they stay in the URDF: {some(kept)}")
 
 
 def urdf_beside(path: Path) -> Path:
