@@ -201,7 +201,7 @@ def import_(
     except ckc_pin.MechanismError as error:  # a finding: what was written is there to be corrected
         problem = str(error)
     if as_json:
-        result = {"closed": True, **check_plain(found)} if found else {"closed": False, "message": problem}
+        result = {"status": "done", **check_plain(found)} if found else {"status": "error", "message": problem}
         paths = [str(path) for path in written]
         said = {"left_out": draft.left_out, "guessed": draft.guessed}
         _print_json({"status": "done", "written": paths, **said, "check": result})
