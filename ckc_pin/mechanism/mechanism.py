@@ -13,6 +13,7 @@ from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.freedoms import count_freedoms, idle_coordinates
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import rank_of
 from ckc_pin.mechanism.sigma import Sigma, sigma
@@ -84,7 +85,8 @@ class Mechanism:
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
         self.warnings += self.tree.unmodelled()
-        self._assemble()
+        with one_blas_thread():
+            self._assemble()
 
     def __repr__(self) -> str:
         return f"Mechanism({self.name!r}, n={self.n}, d={self.d}, independent={list(self.independent)})"

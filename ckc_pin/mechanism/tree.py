@@ -66,10 +66,10 @@ class Tree:
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
-        for joint in range(1, model.njoints):
-            for ancestor in list(model.supports[joint])[1:]:
-                j = model.joints[ancestor]
-                self.support[joint, 0, j.idx_v : j.idx_v + j.nv] = 1.0
+        parents = list(model.parents)
+        for k, joint in list(enumerate(model.joints))[1:]:
+            self.support[k] = self.support[parents[k]]
+            self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
         self._placement = _strided_placements(self.data)
         # a matrix of one column would come as a vector
         self._jacobian, self._jacobian_dot = self.data.J.reshape(6, self.n), self.data.dJ.reshape(6, self.n)

@@ -13,6 +13,7 @@ import numpy as np
 from ckc_pin.control.controllers import Controller
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.lazy import Tally
+from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Events
 from ckc_pin.simulation.integrate import BudgetError, Stepper
@@ -77,10 +78,11 @@ def simulate(
     tally = Tally() if profile else None
     mechanism.tree.tally = tally
     try:
-        stepper = Stepper(ready.system, ready.method, scene.spec.solver, scene.spec.t_end)
-        recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None))
-        recorder.add(0.0, stepper.y)
-        status, message = _steps(stepper, recorder, times, events, scene.spec.t_end, progress)
+        with one_blas_thread():
+            stepper = Stepper(ready.system, ready.method, scene.spec.solver, scene.spec.t_end)
+            recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None))
+            recorder.add(0.0, stepper.y)
+            status, message = _steps(stepper, recorder, times, events, scene.spec.t_end, progress)
     finally:
         mechanism.tree.tally = None
     stats = {**stepper.stats(), "wall_s": perf_counter() - started,
