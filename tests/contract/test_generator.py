@@ -1,0 +1,100 @@
+"""Mechanisms made by rule: the scene key `mechanism = {generator, N}`, its bounds, and runs that carry it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin import MechanismError, Run, check, load, load_scene, simulate
+from ckc_pin.mechanism.generators import MAX_N, GeneratorSpec, generate
+from ckc_pin.mechanism.tree import MOST
+from tests.contract.helpers.bad import Bad, expect
+from tests.contract.helpers.command import ckc
+
+TOO_MANY = f"an integer of at most {MAX_N} is needed"
+RUN = ("run", "n_four_bar", "--set")
+SCENE = (
+    'mechanism = {generator = "n_four_bar", N = 3}\nformulation = "reduced"\nt_end = 0.1\n[initial.q]\ntheta_0 = 1.0\n'
+)
+
+CASES = [
+    Bad("none", [*RUN, "mechanism.N=0"], ["mechanism.N = 0: an integer of at least 1 is needed"]),
+    Bad("a thousand million", [*RUN, "mechanism.N=1000000000"], ["mechanism.N = ", TOO_MANY]),
+    Bad("one too many", [*RUN, f"mechanism.N={MAX_N + 1}"], ["mechanism.N = ", TOO_MANY]),
+    Bad("half a square", [*RUN, "mechanism.N=2.5"], ["mechanism.N", "integer"]),
+    Bad("a word", [*RUN, "mechanism.N=many"], ["mechanism.N", "integer"]),
+    Bad("another parameter", [*RUN, "mechanism.M=3"], ["mechanism: unknown key 'M'", "valid: generator, N"]),
+    Bad("another generator", [*RUN, "mechanism.generator=n_bar"], ["mechanism.generator", "'n_bar'", "n_four_bar"]),
+    Bad("N of a file", ["run", "bar", "--set", "mechanism.N=3"], ["mechanism", "is a value, not a table"]),
+    Bad("check too", ["check", "x.scene.toml"], ["x.scene.toml: mechanism.N = ", TOO_MANY],
+        files={"x.scene.toml": SCENE.replace("N = 3", "N = 1000000000")}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
+def test_wrong_number(case: Bad, bar: Path) -> None:
+    expect(case, bar)
+
+
+def test_by_name_it_has_its_usual_size() -> None:
+    found = ckc("check", "n_four_bar", "--json").json
+    assert (found["n"], found["d"], found["rows"]) == (9, 1, 8)
+    assert found["independent"] == ["theta_0"]
+    assert ckc("check", "n_four_bar/default", "--json").json["n"] == 9
+    terms = ckc("terms", "n_four_bar", "--q", '{"theta_0": 1.0}', "--json").json
+    assert terms["D"] == [[pytest.approx((5 + 4 * 3) / 3)]]  # N + 1 rods turn about an end, N bars do not turn
+
+
+@pytest.mark.parametrize("N", [1, 2, 13])
+def test_any_number(N: int) -> None:
+    found = check(load_scene("n_four_bar", {"mechanism.N": N}))
+    assert (found.n, found.d, found.rows, found.rank) == (2 * N + 1, 1, 2 * N, 2 * N)
+    assert found.warnings == ()
+
+
+def test_scene_of_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "own.scene.toml"
+    path.write_text(SCENE)
+    run = simulate(path)
+    assert run.status == "done"
+    assert run.scene["mechanism"] == {"generator": "n_four_bar", "N": 3}
+    assert len(run.coordinates) == 7
+
+
+def test_listed_like_the_others() -> None:
+    entry = next(m for m in ckc("list", "--json").json["mechanisms"] if m["name"] == "n_four_bar")
+    assert "any number N" in entry["about"]
+    assert "default" in entry["scenes"]
+
+
+def test_a_saved_run_carries_what_was_made(tmp_path: Path) -> None:
+    run = simulate("n_four_bar", {"mechanism.N": 3, "t_end": 0.1})
+    again = Run.load(run.save(tmp_path / "run.npz"))
+    assert again.mechanism.coordinates == run.coordinates
+    assert again.scene == run.scene
+    np.testing.assert_array_equal(again.points["B0"], run.points["B0"])
+    text, sources = generate(GeneratorSpec(generator="n_four_bar", N=3))
+    assert again.texts["mechanism.toml"] == text
+    assert again.texts["n_four_bar.urdf"] == sources.texts["n_four_bar.urdf"]
+
+
+def test_what_is_made_can_be_written_down_and_loaded(tmp_path: Path) -> None:
+    text, sources = generate(GeneratorSpec(generator="n_four_bar", N=2))
+    (tmp_path / "mechanism.toml").write_text(text)
+    (tmp_path / "n_four_bar.urdf").write_text(sources.texts["n_four_bar.urdf"])
+    assert load(tmp_path).coordinates == load(GeneratorSpec(generator="n_four_bar", N=2)).coordinates
+
+
+def test_a_tree_too_large_for_a_workspace_is_refused(tmp_path: Path) -> None:
+    """Pinocchio's workspace grows with the cube of the coordinates: a small file could ask for all memory."""
+    links = "".join(f'<link name="l{k}"/>' for k in range(MOST + 2))
+    joints = "".join(
+        f'<joint name="j{k}" type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'
+        for k in range(MOST + 1)
+    )
+    (tmp_path / "m.urdf").write_text(f'<robot name="chain">{links}{joints}</robot>')
+    (tmp_path / "mechanism.toml").write_text('name = "chain"\nurdf = "m.urdf"\n')
+    with pytest.raises(MechanismError, match=f"{MOST + 1} coordinates.*at most {MOST}"):
+        load(tmp_path)

@@ -1,0 +1,208 @@
+"""Every shipped mechanism: its known freedoms, every scene of it starts, and what moves freely keeps its energy."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from ckc_pin import Mechanism, Run, check, load, simulate
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.library import library, shipped
+from ckc_pin.simulation.scene import catalogue, scene_names
+
+# coordinates, freedoms, closure rows, rank: what the literature, or counting, says
+MOBILITY = {
+    "andrews": (7, 1, 6, 6),
+    "bricard": (5, 1, 5, 4),  # overconstrained: counting rows would leave none
+    "delta": (21, 3, 18, 18),
+    "five_bar": (4, 2, 2, 2),
+    "five_bar_as_printed": (4, 2, 2, 2),
+    "four_bar": (3, 1, 2, 2),
+    "n_four_bar": (9, 1, 8, 8),  # N = 4
+    "slider_crank": (3, 1, 2, 2),
+    "slider_crank_spatial": (4, 1, 3, 3),
+    "stewart": (24, 6, 18, 18),
+    "talos": (38, 26, 12, 12),
+    "three_rrr": (7, 3, 4, 4),
+    "two_ur5": (18, 6, 12, 12),
+}
+# mechanisms that nothing damps or drives, and how long a run of the test is (s)
+FREE = {
+    "andrews": 0.03,
+    "bricard": 5.0,
+    "delta": 1.5,
+    "four_bar": 5.0,
+    "n_four_bar": 0.6,
+    "slider_crank": 2.0,
+    "slider_crank_spatial": 2.0,
+    "stewart": 1.0,
+    "three_rrr": 5.0,
+    "two_ur5": 0.6,
+}
+SLIDER_CRANK = library() / "slider_crank"
+OF_OTHERS = ("talos", "two_ur5")  # links drawn by the robots' own meshes
+SCENES = [f"{name}/{scene}" for name in shipped() for scene in scene_names(name)]
+
+
+@cache
+def mechanism(name: str) -> Mechanism:
+    return load(name)
+
+
+def test_each_is_known_here() -> None:
+    assert shipped() == sorted(MOBILITY)
+
+
+@pytest.mark.parametrize("name", MOBILITY)
+def test_freedoms(name: str) -> None:
+    found = check(mechanism(name))
+    assert (found.n, found.d, found.rows, found.rank) == MOBILITY[name]
+    assert len(found.redundant) == found.rows - found.rank
+    assert found.cond_phi_z < 100
+    assert not mechanism(name).freedoms.singular
+    assert mechanism(name).residual <= 1e-10
+
+
+@pytest.mark.parametrize("name", sorted(set(MOBILITY) - set(OF_OTHERS)))
+def test_nothing_to_warn_about(name: str) -> None:
+    assert check(mechanism(name)).warnings == ()
+
+
+def test_each_says_what_it_is() -> None:
+    for name, about, scenes in catalogue():
+        assert len(about.split()) > 5, name
+        assert "default" in scenes, name
+        assert all(scenes.values()), name
+
+
+@pytest.mark.parametrize("name", sorted(set(shipped()) - {"n_four_bar"}))
+def test_each_moving_link_can_be_seen(name: str) -> None:
+    for file in (library() / name).glob("*.urdf"):
+        for link in ElementTree.parse(file).getroot().findall("link"):
+            if link.find("inertial") is not None:
+                assert link.find("visual/geometry") is not None, f"{file}: {link.get('name')}"
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_each_scene_runs(scene: str) -> None:
+    run = simulate(scene, {"t_end": 0.01, "solver.output_dt": None})
+    assert run.status == "done", run.message
+    assert run.max_phi <= 1e-10
+
+
+# --- energy --------------------------------------------------------------------------------------
+
+
+def drift(run: Run) -> float:
+    """Largest change of the energy, over the largest kinetic energy and the range of the potential one."""
+    model = run.mechanism
+    potential = np.array(
+        [
+            Terms(model, model.kinematics(model.tree.from_coordinates(q)), v).potential_energy
+            for q, v in zip(run.q_tree, run.v_tree, strict=True)
+        ]
+    )
+    scale = (run.energy - potential).max() + np.ptp(potential)
+    return float(np.abs(run.energy - run.energy[0]).max() / scale)
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+@pytest.mark.parametrize("name", FREE)
+def test_energy_is_kept(name: str, formulation: str) -> None:
+    t_end = FREE[name]
+    changes = {"formulation": formulation, "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": t_end / 100}
+    run = simulate(name, changes)
+    assert run.status == "done", run.message
+    assert drift(run) <= 3e-8  # asked for: 1e-7
+    assert run.max_phi <= 1e-10
+    assert np.ptp(run.q_tree, axis=0).max() > 0.01  # it did move
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+def test_energy_of_talos_goes_into_its_dampers(formulation: str) -> None:
+    run = simulate("talos", {"formulation": formulation, "t_end": 0.1, "solver.output_dt": 1e-4})
+    power = np.sum(run.mechanism.springs.joint_damping * run.v_tree**2, axis=1)
+    assert len(power) % 2 == 1
+    dissipated = 1e-4 / 3 * (power[0] + 4 * power[1::2].sum() + 2 * power[2:-1:2].sum() + power[-1])
+    lost = run.energy[0] - run.energy[-1]
+    assert lost > 0.01
+    assert lost == pytest.approx(dissipated, rel=1e-6)
+
+
+# --- the same mechanism, cut open elsewhere ------------------------------------------------------
+
+RAIL = """
+name = "slider_crank"
+urdf = "slider_crank.urdf"
+gravity = [0.0, -9.81, 0.0]
+independent = ["crank"]
+[q_guess]
+crank = 1.5707963267948966
+rod = -1.9
+pin = 0.33
+[[loop]]
+name = "rail"
+type = "{type}"
+frame_a = "{a}"
+frame_b = "{b}"
+axis_a = [1.0, 0.0, 0.0]
+axis_b = [1.0, 0.0, 0.0]
+"""
+
+
+@cache
+def crank_angle(scene: str | Path, formulation: str) -> float:
+    """Crank after most of a turn."""
+    run = simulate(scene, {"formulation": formulation, "t_end": 0.5, "solver.rtol": 1e-11, "solver.output_dt": 0.5})
+    angle = float(run.q_tree[-1, run.column("crank")])
+    assert angle > 3.0
+    return angle
+
+
+def assert_same_motion(folder: Path) -> None:
+    """The crank of a slider-crank in a folder turns as the shipped one's does."""
+    scene = folder / "default.scene.toml"
+    scene.write_text((SLIDER_CRANK / scene.name).read_text())
+    for formulation in ("dae", "reduced"):
+        assert crank_angle(scene, formulation) == pytest.approx(crank_angle("slider_crank", formulation), abs=1e-9)
+
+
+@pytest.mark.parametrize("ends", [("world", "slider_link"), ("slider_link", "world")], ids=" to ".join)
+@pytest.mark.parametrize(("kind", "rows"), [("prismatic", 5), ("cylindrical", 4)])
+def test_cut_at_the_rail(tmp_path: Path, kind: str, rows: int, ends: tuple[str, str]) -> None:
+    """The slider pinned to the rod in the tree, its rail a loop: redundant rows, the same motion."""
+    tree = ElementTree.parse(SLIDER_CRANK / "slider_crank.urdf")
+    joint = next(j for j in tree.getroot().findall("joint") if j.get("name") == "slider")
+    joint.set("name", "pin")
+    joint.set("type", "continuous")
+    for tag, key, value in (("parent", "link", "rod_link"), ("origin", "xyz", "0.3 0 0"), ("axis", "xyz", "0 0 1")):
+        element = joint.find(tag)
+        assert element is not None
+        element.set(key, value)
+    tree.write(tmp_path / "slider_crank.urdf")
+    (tmp_path / "mechanism.toml").write_text(RAIL.format(type=kind, a=ends[0], b=ends[1]))
+    found = check(tmp_path / "mechanism.toml")
+    assert (found.n, found.d, found.rows, found.rank) == (3, 1, rows, 2)
+    assert_same_motion(tmp_path)
+
+
+OTHER_PINS = {
+    "point": ('type = "point"', 3),
+    "hinge": ('type = "hinge"', 5),
+    "universal": ('type = "universal"\naxis_b = [0.0, 1.0, 0.0]', 4),
+}
+
+
+@pytest.mark.parametrize(("loop", "rows"), OTHER_PINS.values(), ids=OTHER_PINS)
+def test_closed_with_more_rows_than_it_takes(tmp_path: Path, loop: str, rows: int) -> None:
+    """What a planar pin is in space, told by a ball, a hinge, a universal joint."""
+    (tmp_path / "slider_crank.urdf").write_text((SLIDER_CRANK / "slider_crank.urdf").read_text())
+    text = (SLIDER_CRANK / "mechanism.toml").read_text()
+    (tmp_path / "mechanism.toml").write_text(text.replace('type = "point_2d"', loop))
+    found = check(tmp_path / "mechanism.toml")
+    assert (found.n, found.d, found.rows, found.rank) == (3, 1, rows, 2)
+    assert_same_motion(tmp_path)
