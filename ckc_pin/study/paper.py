@@ -24,6 +24,7 @@ __all__ = ["SECTIONS", "STUDIES", "collect", "main", "page"]
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKERS = 2
+LONG = 20  # rows of a table that are shown at once
 
 # Which module of this room answers what; those that take longest come first.
 STUDIES: dict[str, tuple[str, ...]] = {
@@ -127,7 +128,7 @@ def page(claims: Sequence[Claim], figures: str = "paper") -> str:
     ]
     ordered = [by_key[key] for _, keys in SECTIONS for key in keys]
     for claim in ordered:
-        cells = (escaped(text, table=True) for text in (claim.says, claim.where))
+        cells = (escaped(text, table=True) for text in (_capital(claim.says), claim.where))
         lines.append(f"| {' | '.join(cells)} | [{claim.verdict}](#{claim.key}) |")
     for title, keys in SECTIONS:
         lines += ["", f"## {title}"]
@@ -145,20 +146,31 @@ def _counts(claims: Sequence[Claim]) -> str:
 
 
 def _entry(claim: Claim, figures: str) -> list[str]:
-    where = claim.where[0].upper() + claim.where[1:]
     lines = [
         f"### {claim.key}",
         "",
-        f"> {escaped(claim.says)} ({escaped(where)})",
+        f"> {escaped(_capital(claim.says))} ({escaped(_capital(claim.where))})",
         "",
         f"**The statement {claim.verdict}.** {escaped(claim.found)}",
     ]
     if claim.table is not None:
-        lines += ["", *table(*claim.table)]
+        lines += ["", *_folded(table(*claim.table))]
     lines += ["", "```sh", *claim.command.split("; "), "```"]
     for name in claim.figures:
         lines += ["", f"![{claim.key}: {name}]({figures}/{name})"]
     return lines
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _folded(lines: list[str]) -> list[str]:
+    """Fold a long table, which a reader opens when the sentence above is not enough."""
+    rows = len(lines) - 2
+    if rows <= LONG:
+        return lines
+    return ["<details>", f"<summary>Table of {rows} rows</summary>", "", *lines, "", "</details>"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
