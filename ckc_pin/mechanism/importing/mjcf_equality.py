@@ -14,7 +14,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.importing.draft import frame, number, unique, vector
 from ckc_pin.mechanism.importing.mjcf_document import Attributes, Document
 from ckc_pin.mechanism.importing.mjcf_tree import MjcfTree, Placed
-from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
+from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec
 
 __all__ = ["Equalities"]
 
@@ -150,20 +150,21 @@ class Equalities:
                 spec = LoopSpec(
                     name=unique(first.name, taken),
                     type="hinge",
-                    frame_a=frame(first.a.link, pin.SE3(np.eye(3), first.a.pose.translation)),
-                    frame_b=frame(first.b.link, pin.SE3(np.eye(3), first.b.pose.translation)),
+                    frame_a=_point(first.a),
+                    frame_b=_point(first.b),
                     axis_a=vector(along_a / apart),
                     axis_b=vector(along_b / np.linalg.norm(along_b)),
                 )
                 self.loops.append((spec, f"two connects {1e3 * apart:g} mm apart: {first.comment}; {second.comment}"))
                 return
         for closure in pair:
-            spec = LoopSpec(
-                name=unique(closure.name, [spec.name for spec, _ in self.loops]),
-                type="weld" if closure.kind == "weld" else "point",
-                frame_a=frame(closure.a.link, closure.a.pose),
-                frame_b=frame(closure.b.link, closure.b.pose),
-            )
+            name = unique(closure.name, [spec.name for spec, _ in self.loops])
+            if closure.kind == "weld":
+                ends = [frame(end.link, end.pose) for end in (closure.a, closure.b)]
+                spec = LoopSpec(name=name, type="weld", frame_a=ends[0], frame_b=ends[1])
+            else:
+                ends = [_point(end) for end in (closure.a, closure.b)]
+                spec = LoopSpec(name=name, type="point", frame_a=ends[0], frame_b=ends[1])
             self.loops.append((spec, closure.comment))
 
     def _find(self, known: dict[str, Placed], a: Attributes, key: str, what: str) -> Placed:
@@ -176,3 +177,8 @@ class Equalities:
             known = ", ".join(self.tree.ref) or "none"
             raise InputError(f"{a.where}: {key}: no hinge or slide {a.get(key)!r}; there are {known}")
         return a.get(key)
+
+
+def _point(placed: Placed) -> Frame:
+    """Return a frame at a point, along the link's axes."""
+    return frame(placed.link, pin.SE3(np.eye(3), placed.pose.translation))
