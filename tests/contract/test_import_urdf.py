@@ -1,0 +1,346 @@
+"""`ckc import` of URDFs: loops inside the file, in a robot.yaml, as pairs of frames; mimic joints."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ckc_pin.mechanism.importing import Draft, read
+from ckc_pin.mechanism.importing.orientation import euler, from_rpy, from_x_and_y, from_z, to_rpy
+from tests.conftest import assert_close
+
+BODY = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def link(name: str, body: str = BODY) -> str:
+    return f'<link name="{name}">{body}</link>'
+
+
+def joint(name: str, parent: str, child: str, xyz: str = "0 0 0", axis: str = "0 0 1", **more: str) -> str:
+    kind, rpy, inner = more.get("type", "revolute"), more.get("rpy", "0 0 0"), more.get("inner", "")
+    return (
+        f'<joint name="{name}" type="{kind}" {more.get("attributes", "")}><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>{inner}</joint>'
+    )
+
+
+def frame(name: str, parent: str, xyz: str = "0 0 0", rpy: str = "0 0 0") -> str:
+    """A frame as onshape-to-robot writes it: a link on a fixed joint."""
+    light = '<inertial><mass value="1e-9"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'
+    return link(name, light) + joint(f"{name}_frame", parent, name, xyz, rpy=rpy, type="fixed")
+
+
+def imported(tmp_path: Path, content: str, yaml: str | None = None) -> Draft:
+    path = tmp_path / "thing.urdf"
+    path.write_text(f'<robot name="thing">{content}</robot>', encoding="utf-8")
+    if yaml is not None:
+        (tmp_path / "robot.yaml").write_text(yaml, encoding="utf-8")
+    return read(path)
+
+
+def said(notes: list[str], *fragments: str) -> bool:
+    return any(all(fragment in note for fragment in fragments) for note in notes)
+
+
+FOUR_BAR = (
+    link("base")
+    + link("crank")
+    + link("coupler")
+    + link("rocker")
+    + joint("a", "base", "crank", attributes='independent="True"')
+    + joint("b", "crank", "coupler", "1 0 0", attributes='independent="FALSE"')
+    + joint("c", "base", "rocker", "2 0 0", rpy="0 0 1.5707963267948966", attributes='independent="false"')
+)
+PIN = """<loop name="pin" type="{type}"><predecessor link="coupler"><origin xyz="1 1 0"/></predecessor>
+<successor link="rocker"><origin xyz="1 0 0"/></successor>{axis}</loop>"""
+
+
+# --- generalized_rbda ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "ours", "rows", "rank"),
+    [
+        ("revolute", "hinge", 5, 2),
+        ("continuous", "hinge", 5, 2),
+        ("spherical", "point", 3, 2),
+        ("fixed", "weld", 6, 3),
+    ],
+)
+def test_loops_of_generalized_rbda(tmp_path: Path, kind: str, ours: str, rows: int, rank: int) -> None:
+    pin = PIN.format(type=kind, axis='<axis xyz="0 0 2"/>')
+    draft = imported(tmp_path, FOUR_BAR + pin)
+    ((loop, _),) = draft.loops
+    assert (loop.name, loop.type) == ("pin", ours)
+    if ours == "hinge":
+        assert loop.axis_a == loop.axis_b == (0.0, 0.0, 1.0)
+    mechanism = draft.mechanism()
+    assert (mechanism.n, mechanism.closure.rows, mechanism.rank, mechanism.d) == (3, rows, rank, 3 - rank)
+    assert "loop" not in draft.urdf()
+    assert "independent" not in draft.urdf()
+
+
+def test_independent_in_any_capitals_and_by_default(tmp_path: Path) -> None:
+    draft = imported(tmp_path, FOUR_BAR + PIN.format(type="revolute", axis='<axis xyz="0 0 1"/>'))
+    assert draft.independent == ["a"]
+    assert draft.mechanism().independent == ("a",)
+    chain = link("base") + link("x") + link("y") + joint("p", "base", "x", attributes='independent="true"')
+    assert imported(tmp_path, chain + joint("q", "x", "y")).independent == ["p", "q"]
+
+
+def test_independent_that_cannot_serve_is_replaced_and_said(tmp_path: Path) -> None:
+    wrong = FOUR_BAR.replace('independent="FALSE"', 'independent="true"')
+    draft = imported(tmp_path, wrong + PIN.format(type="revolute", axis='<axis xyz="0 0 1"/>'))
+    assert draft.independent is None
+    assert said(draft.guessed, "independent is chosen by the program", "2 coordinates (a, b)", "d = 1")
+
+
+@pytest.mark.parametrize(("axis", "along"), [('<axis xyz="0 3 0"/>', (0.0, 1.0, 0.0)), ("", (1.0, 0.0, 0.0))])
+def test_a_loop_that_slides(tmp_path: Path, axis: str, along: tuple[float, ...]) -> None:
+    draft = imported(tmp_path, FOUR_BAR + PIN.format(type="prismatic", axis=axis))
+    ((loop, _),) = draft.loops
+    assert (loop.type, loop.axis_a) == ("prismatic", along)
+
+
+def test_couplings_of_generalized_rbda(tmp_path: Path) -> None:
+    content = "".join(link(name) for name in ("base", "thigh", "rotor", "shank", "motor"))
+    content += joint("hip", "base", "thigh") + joint("spin", "base", "rotor")
+    content += joint("knee", "thigh", "shank") + joint("drive", "base", "motor")
+    content += '<coupling name="gear"><predecessor link="thigh"/><successor link="rotor"/><ratio value="6"/></coupling>'
+    content += '<coupling name="belt"><predecessor link="shank"/><successor link="motor"/><ratio value="2"/></coupling>'
+    draft = imported(tmp_path, content)
+    ((coupling, _),) = draft.couplings
+    assert (coupling.joint, coupling.other, coupling.ratio, coupling.offset) == ("spin", "hip", 6.0, 0.0)
+    assert said(draft.left_out, "coupling belt of more than two joints", "drive = 2 (knee + hip)")
+    assert draft.mechanism().d == 3
+
+
+# --- pairs of frames -------------------------------------------------------------------------------------------------
+
+TILT = "0.3 -0.5 0.8"
+
+
+def two_legs(
+    offset: float = 0.0, second_axis: str = "0 0 1", names: tuple[str, str] = ("closing_tip_1", "closing_tip_2")
+) -> str:
+    """Two legs of two hinges each in a tilted plane, meeting at frames that stand 90 degrees apart."""
+    content = link("base") + link("plane") + joint("tilt", "base", "plane", rpy=TILT, type="fixed")
+    for side, x in (("left", -0.5), ("right", 0.5)):
+        axis = second_axis if side == "right" else "0 0 1"
+        content += link(f"{side}_upper") + joint(f"{side}_hip", "plane", f"{side}_upper", f"{x} 0 0")
+        content += link(f"{side}_lower") + joint(f"{side}_knee", f"{side}_upper", f"{side}_lower", f"{x} 1 0", axis)
+    content += frame(names[0], "left_lower", "1 1 0", "1.5707963267948966 0 0")
+    return content + frame(names[1], "right_lower", f"-1 1 {offset}", "0 0 0.7")
+
+
+def test_a_loop_in_a_plane_is_two_rows(tmp_path: Path) -> None:
+    draft = imported(tmp_path, two_legs())
+    ((loop, comment),) = draft.loops
+    assert (loop.name, loop.type) == ("tip", "point_2d")
+    assert_close(loop.axis_a, [0.0, 1.0, 0.0], 1e-12)  # the plane's normal, in the tilted frame's own axes
+    assert comment.startswith("guessed: its joints move in one plane")
+    assert said(draft.guessed, "point_2d for loop tip")
+    mechanism = draft.mechanism()
+    assert (mechanism.closure.rows, mechanism.rank, mechanism.d) == (2, 2, 2)
+
+
+def test_an_offset_across_the_plane_is_said(tmp_path: Path) -> None:
+    draft = imported(tmp_path, two_legs(offset=0.03))
+    assert said(draft.guessed, "point_2d for loop tip", "stay 30 mm apart")
+    assert draft.mechanism().rank == 2
+
+
+def test_names_without_the_prefix_count_when_both_are_mere_frames(tmp_path: Path) -> None:
+    pair = ("tip_1", "tip_2")
+    assert [loop.name for loop, _ in imported(tmp_path, two_legs(names=pair)).loops] == ["tip"]
+    third = two_legs(names=pair) + frame("tip_3", "base")
+    assert not imported(tmp_path, third).loops
+    heavy = two_legs(names=pair).replace('<mass value="1e-9"/>', '<mass value="0.2"/>')
+    assert not imported(tmp_path, heavy).loops
+
+
+def spatial(rpy: str) -> str:
+    """An RSSR-like loop that is no plane's; the frames meet at neutral, their z axes turned by rpy."""
+    content = link("base") + link("in") + link("rod") + link("out")
+    content += joint("drive", "base", "in") + joint("swing", "in", "rod", "0.4 0 0", axis="0 1 0")
+    content += (
+        joint("twist", "rod", "out", "0 0 1", axis="1 0 0") + link("far") + joint("lean", "base", "far", axis="1 1 0")
+    )
+    return content + frame("closing_x_1", "out", "0.1 0.2 0.3") + frame("closing_x_2", "far", "0.5 0.2 1.3", rpy)
+
+
+@pytest.mark.parametrize(("rpy", "axis_b"), [("0 0 0.4", (0.0, 0.0, 1.0)), (f"{math.pi} 0 0", (0.0, 0.0, -1.0))])
+def test_aligned_frames_are_a_pin(tmp_path: Path, rpy: str, axis_b: tuple[float, ...]) -> None:
+    draft = imported(tmp_path, spatial(rpy))
+    ((loop, _),) = draft.loops
+    assert (loop.type, loop.axis_b) == ("hinge", axis_b)
+    assert said(draft.guessed, "hinge for loop x", "aligned")
+
+
+def test_frames_that_are_not_aligned_are_a_ball(tmp_path: Path) -> None:
+    draft = imported(tmp_path, spatial("0.5 0 0"))
+    ((loop, _),) = draft.loops
+    assert loop.type == "point"
+    assert said(draft.guessed, "point for loop x", "28.6 degrees apart")
+
+
+def test_frames_that_mark_the_axis_are_a_hinge(tmp_path: Path) -> None:
+    marks = frame("closing_x_1_z", "out", "0.1 0.2 0.4") + frame("closing_x_2_z", "far", "0.5 0.2 1.4")
+    draft = imported(tmp_path, spatial("0 0 0") + marks)
+    ((loop, comment),) = draft.loops
+    assert (loop.name, loop.type) == ("x", "hinge")
+    assert "mark its axis" in comment
+    assert not said(draft.guessed, "loop x")
+
+
+def test_a_pair_on_one_body_closes_nothing(tmp_path: Path) -> None:
+    content = (
+        link("base")
+        + link("arm")
+        + joint("j", "base", "arm")
+        + frame("closing_x_1", "arm")
+        + frame("closing_x_2", "arm")
+    )
+    draft = imported(tmp_path, content)
+    assert not draft.loops
+    assert said(draft.left_out, "loop x", "one rigid body")
+
+
+# --- example-parallel-robots -------------------------------------------------------------------------------------------
+
+YAML = "closed_loop: [['end_A', 'end_B'], ['b_knee', 'end_B']]\ntype: ['3d', '6D']\nname_mot: ['a_hip']\n"
+
+
+def legs() -> str:
+    content = link("base")
+    for side, x in (("a", -0.5), ("b", 0.5)):
+        content += link(f"{side}_upper") + joint(f"{side}_hip", "base", f"{side}_upper", f"{x} 0 0")
+        content += link(f"{side}_lower") + joint(f"{side}_knee", f"{side}_upper", f"{side}_lower", f"{x} 1 0")
+    return content + frame("end_A", "a_lower", "1 1 0") + frame("end_B", "b_lower", "-1 1 0")
+
+
+def test_robot_yaml(tmp_path: Path) -> None:
+    draft = imported(tmp_path, legs(), YAML)
+    ((loop, _),) = draft.loops
+    assert (loop.name, loop.type, loop.frame_a, loop.frame_b) == ("end", "point", "end_A", "end_B")
+    assert said(draft.left_out, "both of its frames are on one rigid body")  # b_knee moves with what carries end_B
+    assert draft.actuated == ["a_hip"]
+    assert draft.independent is not None
+    assert draft.independent[0] == "a_hip"
+    assert draft.mechanism().d == 2
+
+
+def test_robot_yaml_names_a_joint(tmp_path: Path) -> None:
+    draft = imported(tmp_path, legs(), "closed_loop: [[a_knee, b_knee]]\ntype: [3d]")
+    ((loop, _),) = draft.loops
+    assert (loop.frame_a, loop.frame_b) == ("joint:a_knee", "joint:b_knee")
+
+
+def test_robot_yaml_without_a_type_is_a_weld_and_says_so(tmp_path: Path) -> None:
+    draft = imported(tmp_path, legs(), "closed_loop: [[end_A, end_B]]")
+    assert draft.loops[0][0].type == "weld"
+    assert said(draft.guessed, "loop end is a weld", "has no type")
+
+
+def test_robot_yaml_by_its_own_name(tmp_path: Path) -> None:
+    imported(tmp_path, legs(), YAML)
+    assert read(tmp_path / "robot.yaml").loops[0][0].frame_a == "end_A"
+
+
+def test_joints_that_stand_for_others(tmp_path: Path) -> None:
+    """A hinge becomes a ball or a universal joint at the same place: the body is where the turns put it."""
+    yaml = "joint_name: [a_knee, b_knee, b_hip, gone]\njoint_type: [SPHERICAL, UJOINT_ZX, FIXED, SPHERICAL]"
+    draft = imported(tmp_path, legs(), yaml)
+    mechanism = draft.mechanism()
+    assert mechanism.coordinates == ("a_hip", "a_knee_X", "a_knee_Y", "a_knee_Z", "b_knee_Z", "b_knee_X")
+    values = {"a_knee_X": 0.3, "a_knee_Y": -0.4, "a_knee_Z": 0.5, "b_knee_Z": 0.7, "b_knee_X": -0.2}
+    q = np.array([values.get(name, 0.0) for name in mechanism.coordinates])
+    placement, _ = mechanism.tree.kinematics(q)
+    expected = {
+        "a_lower": (Rotation.from_euler("XYZ", [0.3, -0.4, 0.5]).as_matrix(), [-1.0, 1.0, 0.0]),
+        "b_lower": (Rotation.from_euler("ZX", [0.7, -0.2]).as_matrix(), [1.0, 1.0, 0.0]),
+    }
+    for name, (rotation, place) in expected.items():
+        at = mechanism.frames.find(name, name)
+        assert_close(placement[at.joint, :9].reshape(3, 3).T @ at.rotation, rotation, 1e-15)
+        assert_close(placement[at.joint, 9:], place, 1e-15)
+    assert said(draft.guessed, "ball joint a_knee is three hinges", "a_knee_Y is +-90 degrees")
+    assert said(draft.left_out, "joint_name gone")
+
+
+def test_hinges_called_spherical_are_pointed_out(tmp_path: Path) -> None:
+    draft = imported(tmp_path, legs().replace("a_knee", "a_spherical_knee"), YAML)
+    assert said(draft.guessed, "a_spherical_knee", "joint_type SPHERICAL")
+
+
+# --- plain URDFs -------------------------------------------------------------------------------------------------------
+
+
+def test_mimic_joints_stay_couplings(tmp_path: Path) -> None:
+    content = link("base") + link("one") + link("two") + joint("p", "base", "one")
+    follow = joint("q", "base", "two", inner='<mimic joint="p" multiplier="-2" offset="0.1"/>')
+    draft = imported(tmp_path, content + follow)
+    assert not draft.loops
+    assert not draft.couplings
+    mechanism = draft.mechanism()
+    assert (mechanism.n, mechanism.closure.rows, mechanism.d) == (2, 1, 1)
+    assert_close(mechanism.q_tree[1], -2 * mechanism.q_tree[0] + 0.1, 1e-12)
+    broken = imported(tmp_path, content + follow.replace('joint="p"', 'joint="nobody"'))
+    assert broken.mechanism().d == 2
+    assert said(broken.left_out, "joint q follows 'nobody'")
+
+
+def test_what_a_urdf_cannot_say_is_said(tmp_path: Path) -> None:
+    mesh = '<visual><geometry><mesh filename="package://x/a.stl"/></geometry></visual>'
+    draft = imported(tmp_path, link("base") + link("arm", BODY + mesh) + joint("j", "base", "arm"))
+    assert said(draft.guessed, "base stands fixed", 'root = "free"')
+    assert said(draft.guessed, "gravity is along -z")
+    assert said(draft.left_out, "1 mesh files", "package://x/a.stl")
+
+
+# --- rotations -----------------------------------------------------------------------------------------------------------
+
+angle = st.floats(-math.pi, math.pi)
+near_the_pole = st.sampled_from([math.pi / 2, -math.pi / 2, math.pi / 2 - 1e-9, 1e-4 - math.pi / 2, math.pi / 2 - 5e-4])
+direction = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
+
+
+@given(angle, angle | near_the_pole, angle)
+def test_roll_pitch_yaw_are_exact_at_the_poles_too(roll: float, pitch: float, yaw: float) -> None:
+    rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
+    assert_close(from_rpy([roll, pitch, yaw]), rotation, 1e-14)
+    assert_close(from_rpy(to_rpy(rotation)), rotation, 1e-14)
+
+
+@given(st.tuples(angle, angle, angle), st.permutations("xyz"), st.booleans())
+def test_euler_sequences(angles: tuple[float, ...], letters: list[str], fixed: bool) -> None:
+    sequence = "".join(letters)
+    scipys = sequence if fixed else sequence.upper()  # scipy has the capitals the other way round
+    rotation = Rotation.from_euler(scipys, angles).as_matrix()
+    assert_close(euler(angles, sequence.upper() if fixed else sequence), rotation, 1e-14)
+
+
+@given(direction)
+def test_the_smallest_rotation_to_a_direction(z: tuple[float, ...]) -> None:
+    rotation = from_z(np.array(z))
+    along = np.array(z) / np.linalg.norm(z)
+    assert_close(rotation[:, 2], along, 1e-9)
+    assert_close(rotation.T @ rotation, np.eye(3), 1e-14)
+    assert_close(np.trace(rotation), 1 + 2 * along[2], 1e-9)  # the angle is that between z and the direction
+
+
+@given(direction, direction)
+def test_a_frame_from_two_axes(x: tuple[float, ...], y: tuple[float, ...]) -> None:
+    normal = np.cross(x, y)
+    if np.linalg.norm(normal) < 1e-2:
+        return
+    rotation = from_x_and_y(np.array(x), np.array(y))
+    assert_close(rotation.T @ rotation, np.eye(3), 1e-12)
+    assert_close(rotation[:, 0], np.array(x) / np.linalg.norm(x), 1e-14)
+    assert_close(rotation[:, 2], normal / np.linalg.norm(normal), 1e-9)
