@@ -33,7 +33,7 @@ def said(notes: list[str], *fragments: str) -> bool:
     return any(all(fragment in note for fragment in fragments) for note in notes)
 
 
-# --- the same machine in MuJoCo and here --------------------------------------------------------------------------
+# --- the same machine in MuJoCo and here ----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_what_else_the_machine_says(machine: Draft) -> None:
     assert said(machine.guessed, "ball joint ball is three hinges, ball_x, ball_y, ball_z", "90 degrees")
 
 
-# --- loops -------------------------------------------------------------------------------------------------------
+# --- loops ----------------------------------------------------------------------------------------------------------
 
 TWO_ARMS = """
 <body name="left"><joint name="a" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
@@ -188,7 +188,7 @@ def test_a_loop_within_one_rigid_body_is_left_out(tmp_path: Path) -> None:
     assert said(draft.left_out, "loop glue", "one rigid body")
 
 
-# --- roots -------------------------------------------------------------------------------------------------------
+# --- roots ----------------------------------------------------------------------------------------------------------
 
 
 def root(extra: str = "", ball: str = "") -> str:
@@ -218,7 +218,7 @@ def test_slides_that_are_used_stay(tmp_path: Path) -> None:
     assert draft.actuated == ["z"]
 
 
-# --- masses, springs, names ----------------------------------------------------------------------------------------
+# --- masses, springs, names -----------------------------------------------------------------------------------------
 
 
 def test_masses_that_only_a_mesh_knows_are_said(tmp_path: Path) -> None:
