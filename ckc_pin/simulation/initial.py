@@ -81,6 +81,7 @@ def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinem
         _refuse_singular(mechanism, found.at)
         return found.at
     if found.verdict == "converged":
+        _refuse_contradiction(mechanism, found.at, w)
         return found.at
     where = ", ".join(f"{name} = {x:.6g}" for name, x in zip(mechanism.independent, q, strict=True))
     level = f" on phi = w = {w.tolist()}" if np.any(w) else ""
@@ -92,6 +93,16 @@ def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinem
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(found.at.q_tree)),
         )
     raise InputError(f"initial: the start {where}{level} is out of reach: {found.reason}")
+
+
+def _refuse_contradiction(mechanism: Mechanism, at: Kinematics, w: Array) -> None:
+    """Redundant rows cannot be off by anything: where some are w, the others follow."""
+    miss = float(np.abs(at.phi - w).max(initial=0.0))
+    if mechanism.redundant and miss > max(10 * mechanism.tolerance, 1e-6 * float(np.abs(w).max())):
+        raise InputError(
+            f"initial.w: no configuration has phi = w = {w.tolist()} (nearest miss {miss:.3g}): rows of the closure "
+            f"follow from others ({', '.join(mechanism.redundant)}), and w contradicts them"
+        )
 
 
 def _refuse_singular(mechanism: Mechanism, at: Kinematics) -> None:

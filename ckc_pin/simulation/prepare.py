@@ -144,6 +144,11 @@ def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> S
         return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
     equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
     if equation == 8:
+        if mechanism.tree.free:
+            raise InputError(
+                "solver: eq. 8 as printed integrates q and z as numbers, and the rotation of a free root is none; "
+                'give spf_equation = 17, or method = "auto"'
+            )
         return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
     return LevelSet(
         mechanism,

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from ckc_pin import Mechanism, Run, check, load, simulate
+from ckc_pin import InputError, Mechanism, Run, check, load, simulate
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.library import library, shipped
 from ckc_pin.simulation.scene import catalogue, scene_names
@@ -206,3 +206,26 @@ def test_closed_with_more_rows_than_it_takes(tmp_path: Path, loop: str, rows: in
     found = check(tmp_path / "mechanism.toml")
     assert (found.n, found.d, found.rows, found.rank) == (3, 1, rows, 2)
     assert_same_motion(tmp_path)
+
+
+# --- what a formulation cannot do is refused, not computed ----------------------------------------
+
+
+@pytest.mark.parametrize("name", ["delta", "stewart", "talos", "two_ur5"])
+def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
+    with pytest.raises(InputError, match=r"rotation of a free root is none; give spf_equation = 17"):
+        simulate(name, {"formulation": "spf", "solver.spf_equation": 8, "t_end": 0.01})
+    assert simulate(name, {"formulation": "spf", "t_end": 0.01}).status == "done"
+
+
+def test_redundant_rows_are_off_together_or_not_at_all() -> None:
+    """w of Bricard's hinge has four freedoms for five rows."""
+    changes = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
+    with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):
+        simulate("bricard", {**changes, "initial.w": [1e-3] * 5})
+    off = mechanism("bricard").assembled.moved(np.array([1e-3, 0.0, 2e-3, 0.0, 0.0]))
+    assert np.abs(off.phi).max() > 1e-4
+    run = simulate("bricard", {**changes, "initial.w": off.phi.tolist()})
+    assert run.status == "done"
+    assert np.abs(run.phi[0] - off.phi).max() <= 1e-12
+    assert np.abs(run.phi[-1]).max() < 0.7 * np.abs(off.phi).max()
