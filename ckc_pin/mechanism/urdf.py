@@ -11,30 +11,18 @@ common root, stripped to what dynamics need, before Pinocchio sees them.
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
-from xml.parsers import expat
-
-import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.strict_xml import strict_xml
+from ckc_pin.mechanism.urdf_checks import Mimic, by_name, check_connected, check_inertial, check_joint
 
-__all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse", "strict_xml"]
+__all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse"]
 
 WORLD = "ckc_pin_world"  # the common root of several trees
-
-MAX_DEPTH = 300  # of nested elements; ElementTree writes by recursion
-
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # what both Python and C read alike
-INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
-SHORTEST = 1e-9  # an axis that is not zero by mistake
-ROUNDING = 1e-18  # kg m^2: what is left of a zero tensor that was turned about
-
-JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 
 
 @dataclass(frozen=True)
@@ -66,7 +54,7 @@ class UrdfTree:
 
     root: ElementTree.Element
     base: str
-    mimic: list[tuple[str, str, float, float]] = field(default_factory=list)
+    mimic: list[Mimic] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
@@ -85,14 +73,14 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
         raise InputError(f"{source}: the root element is <{root.tag}>, a URDF's is <robot>")
     if prefix:
         _add_prefix(root, prefix)
-    links = _by_name(root, "link", source)
-    joints = _by_name(root, "joint", source)
+    links = by_name(root, "link", source)
+    joints = by_name(root, "joint", source)
     tree = UrdfTree(root, "")
     for name, link in links.items():
-        _check_inertial(name, link, source, tree.warnings)
+        check_inertial(name, link, source, tree.warnings)
     children: dict[str, str] = {}
     for name, joint in joints.items():
-        child = _check_joint(name, joint, links, source, tree)
+        child = check_joint(name, joint, links, source, tree.mimic)
         if child in children:
             raise MechanismError(f"{source}: link {child!r} has two parents: joints {children[child]!r} and {name!r}")
         children[child] = name
@@ -100,7 +88,7 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     if len(roots) != 1:
         found = ", ".join(map(repr, roots)) or "none: the joints form a circle"
         raise MechanismError(f"{source}: a URDF is a tree with one root link; roots found: {found}")
-    _check_connected(roots[0], joints, links, source)
+    check_connected(roots[0], joints, links, source)
     tree.base = roots[0]
     return tree
 
@@ -170,40 +158,6 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(x)) for x in values)
 
 
-def strict_xml(text: str, source: str) -> ElementTree.Element:
-    """Parse XML from a stranger: no recovery, no document type, hence no entities, no abyss of nested elements.
-
-    Raises
-    ------
-    InputError
-        With the line, where expat has one.
-    """
-    depth = 0
-
-    def refuse(name: str, *_: object) -> None:
-        raise InputError(f"{source}: a document type declaration ({name}) is not accepted")
-
-    def enter(*_: object) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > MAX_DEPTH:
-            raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
-
-    def leave(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    # The text is UTF-8, or it would not have been read, whatever its first line says.
-    checker = expat.ParserCreate("utf-8")
-    checker.StartDoctypeDeclHandler = refuse
-    checker.StartElementHandler, checker.EndElementHandler = enter, leave
-    try:
-        checker.Parse(text.encode(), True)
-        return ElementTree.fromstring(text.encode(), ElementTree.XMLParser(encoding="utf-8"))
-    except (expat.ExpatError, ElementTree.ParseError) as error:
-        raise InputError(f"{source}: malformed XML: {error}") from None
-
-
 def _add_prefix(root: ElementTree.Element, prefix: str) -> None:
     for element in [*root.findall("link"), *root.findall("joint")]:
         if element.get("name"):
@@ -213,160 +167,3 @@ def _add_prefix(root: ElementTree.Element, prefix: str) -> None:
             reference = joint.find(tag)
             if reference is not None and reference.get(attribute):
                 reference.set(attribute, prefix + reference.attrib[attribute])
-
-
-def _by_name(root: ElementTree.Element, tag: str, source: str) -> dict[str, ElementTree.Element]:
-    found: dict[str, ElementTree.Element] = {}
-    for element in root.findall(tag):
-        name = element.get("name")
-        if not name:
-            raise MechanismError(f"{source}: a <{tag}> has no name")
-        if name in found:
-            raise MechanismError(f"{source}: two <{tag}> elements are called {name!r}")
-        found[name] = element
-    if tag == "link" and not found:
-        raise MechanismError(f"{source}: no <link>")
-    return found
-
-
-def _floats(
-    element: ElementTree.Element | None, attribute: str, count: int, default: str | None, where: str
-) -> list[float]:
-    """Read an attribute's numbers; without a default it must be there."""
-    text = default if element is None else element.get(attribute, default)
-    if text is None:
-        raise InputError(f"{where} has no {attribute}")
-    words = text.split()
-    values = [float(word) for word in words if NUMBER.fullmatch(word)]
-    if len(values) != count or len(words) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: {attribute}={text!r} is not {_finite_numbers(count)}")
-    return values
-
-
-def _finite_numbers(count: int) -> str:
-    return "a finite number" if count == 1 else f"{count} finite numbers"
-
-
-def _origin(element: ElementTree.Element, where: str) -> None:
-    origin = element.find("origin")
-    _floats(origin, "xyz", 3, "0 0 0", f"{where}, <origin>")
-    _floats(origin, "rpy", 3, "0 0 0", f"{where}, <origin>")
-
-
-def _needed(element: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
-    found = element.find(tag)
-    if found is None:
-        raise InputError(f"{where} has no <{tag}>")
-    return found
-
-
-def _check_inertial(name: str, link: ElementTree.Element, source: str, warnings: list[str]) -> None:
-    inertial = link.find("inertial")
-    if inertial is None:
-        return
-    where = f"{source}: link {name!r}"
-    _origin(inertial, where)
-    (mass,) = _floats(_needed(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
-    if mass < 0:
-        raise MechanismError(f"{where}: negative mass {mass:g} kg")
-    tensor = _needed(inertial, "inertia", f"{where}, <inertial>")
-    xx, yy, zz, xy, xz, yz = (_floats(tensor, key, 1, None, f"{where}, <inertia>")[0] for key in INERTIA)
-    principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    size = float(np.abs(principal).max())
-    if principal[0] < -(1e-9 * size + ROUNDING):
-        raise MechanismError(f"{where}: its inertia has a negative principal moment, {principal[0]:g} kg m^2")
-    if principal[2] > (principal[0] + principal[1]) * (1 + 1e-6) + 1e-12 * size:
-        warnings.append(
-            f"link {name!r}: principal moments {', '.join(f'{x:.3g}' for x in principal)} kg m^2 violate the "
-            "triangle inequality; no body has them, a planar model may"
-        )
-
-
-def _check_joint(
-    name: str, joint: ElementTree.Element, links: dict[str, ElementTree.Element], source: str, tree: UrdfTree
-) -> str:
-    where = f"{source}: joint {name!r}"
-    kind = joint.get("type")
-    if kind not in JOINT_TYPES:
-        found = f"type {kind!r} is not supported" if kind else "it has no type"
-        raise MechanismError(f"{where}: {found}; valid: {', '.join(JOINT_TYPES)}")
-    for tag in ("parent", "child"):
-        link = _needed(joint, tag, where).get("link")
-        if link not in links:
-            found = f"its {tag} link {link!r} does not exist" if link else f"its <{tag}> names no link"
-            raise MechanismError(f"{where}: {found}; there are {', '.join(links)}")
-    _origin(joint, where)
-    if kind in ("revolute", "continuous", "prismatic"):
-        element = joint.find("axis")
-        axis = _floats(element, "xyz", 3, "1 0 0" if element is None else None, f"{where}, <axis>")
-        if math.hypot(*axis) < SHORTEST:
-            raise MechanismError(f"{where}: its axis is zero")
-        _limits(joint, kind, where)
-        _damping(joint, where)
-        _mimic(name, joint, where, tree)
-    return joint.find("child").attrib["link"]  # type: ignore[union-attr]
-
-
-def _mimic(name: str, joint: ElementTree.Element, where: str, tree: UrdfTree) -> None:
-    """Take note of a coupling, which is a closure to us."""
-    mimic = joint.find("mimic")
-    if mimic is None:
-        return
-    other = mimic.get("joint")
-    if not other:
-        raise MechanismError(f"{where}: its <mimic> names no joint")
-    (ratio,) = _floats(mimic, "multiplier", 1, "1", f"{where}, <mimic>")
-    (offset,) = _floats(mimic, "offset", 1, "0", f"{where}, <mimic>")
-    tree.mimic.append((name, other, ratio, offset))
-
-
-def _damping(joint: ElementTree.Element, where: str) -> None:
-    """Damping and friction take energy away, they never give any; both absent is an error to urdfdom."""
-    dynamics = joint.find("dynamics")
-    if dynamics is None:
-        return
-    for key in ("damping", "friction"):
-        (value,) = _floats(dynamics, key, 1, "0", f"{where}, <dynamics>")
-        if value < 0:
-            raise MechanismError(f"{where}: negative {key} {value:g}")
-        dynamics.set(key, dynamics.get(key, "0"))
-
-
-def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
-    """Leave Pinocchio a joint it cannot misread: an absent range is no range, not [0, 0]."""
-    limit = joint.find("limit")
-    unbounded = kind == "continuous" or limit is None or ("lower" not in limit.attrib and "upper" not in limit.attrib)
-    if kind == "continuous":
-        joint.set("type", "revolute")
-    if limit is None:
-        limit = ElementTree.SubElement(joint, "limit")
-    for key, default in (("effort", "0"), ("velocity", "0")):
-        _floats(limit, key, 1, default, f"{where}, <limit>")
-        limit.set(key, limit.get(key, default))
-    if unbounded:
-        limit.set("lower", "-1e308")
-        limit.set("upper", "1e308")
-    else:
-        (lower,) = _floats(limit, "lower", 1, "0", f"{where}, <limit>")
-        (upper,) = _floats(limit, "upper", 1, "0", f"{where}, <limit>")
-        if lower > upper:
-            raise MechanismError(f"{where}: its lower limit {lower:g} is above the upper one {upper:g}")
-
-
-def _check_connected(
-    base: str, joints: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element], source: str
-) -> None:
-    below: dict[str, list[str]] = {}
-    for joint in joints.values():
-        below.setdefault(joint.find("parent").attrib["link"], []).append(joint.find("child").attrib["link"])  # type: ignore[union-attr]
-
-    def walk(start: str) -> Iterator[str]:
-        stack = [start]
-        while stack:
-            link = stack.pop()
-            yield link
-            stack += below.get(link, [])
-
-    lost = set(links) - set(walk(base))
-    if lost:
-        raise MechanismError(f"{source}: links in a circle, not below {base!r}: {', '.join(sorted(lost))}")

@@ -14,8 +14,8 @@ from ckc_pin.mechanism.importing.mjcf import read_mjcf
 from ckc_pin.mechanism.importing.partition import settle_independent
 from ckc_pin.mechanism.importing.urdf_reader import read_urdf, urdf_beside
 from ckc_pin.mechanism.importing.write import mechanism_text, write
+from ckc_pin.mechanism.strict_xml import strict_xml
 from ckc_pin.mechanism.toml import read_text
-from ckc_pin.mechanism.urdf import strict_xml
 
 __all__ = ["Draft", "mechanism_text", "read", "write"]
 

@@ -14,9 +14,9 @@ import pinocchio as pin
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.importing import orientation
 from ckc_pin.mechanism.importing.draft import checked_direction
+from ckc_pin.mechanism.strict_xml import MAX_DEPTH, strict_xml
 from ckc_pin.mechanism.toml import read_text
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.mechanism.urdf import MAX_DEPTH, strict_xml
 
 __all__ = ["Attributes", "Child", "Document"]
 

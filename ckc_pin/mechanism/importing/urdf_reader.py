@@ -11,8 +11,9 @@ from ckc_pin.mechanism.importing.draft import Draft, safe_name, some
 from ckc_pin.mechanism.importing.rbda_loops import take_loops
 from ckc_pin.mechanism.importing.robot_yaml import take_yaml
 from ckc_pin.mechanism.importing.urdf_in import Names
+from ckc_pin.mechanism.strict_xml import strict_xml
 from ckc_pin.mechanism.toml import read_text
-from ckc_pin.mechanism.urdf import parse, strict_xml
+from ckc_pin.mechanism.urdf import parse
 
 __all__ = ["read_urdf", "urdf_beside"]
 
