@@ -1,0 +1,138 @@
+"""Bad gains, targets, trajectories and models: exit 2 and one message, before anything moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.contract.helpers.bad import Bad, expect
+
+NAMED = "bar/tracking.scene.toml: "
+DESIRED = f"{NAMED}controller.desired"
+FINITE = "a finite number is needed"
+JOINTS = "theta_1, theta_3"
+PENDULUM = """<robot name="p"><link name="a"/><link name="b"><inertial><mass value="1"/><origin xyz="1 0 0"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="swing" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
+
+
+def _tracking(*changes: str) -> tuple[str, ...]:
+    return ("run", "bar/tracking.scene.toml", *(w for c in changes for w in ("--set", f"controller.{c}")))
+
+
+def _value(change: str, *says: str) -> Bad:
+    return Bad(change[:60], _tracking(change), says)
+
+
+def _target(change: str, *says: str) -> Bad:
+    return Bad(change[:60], ("run", "bar/set_point.scene.toml", "--set", f"controller.{change}"), says)
+
+
+def _csv(what: str, content: str | bytes, *says: str) -> Bad:
+    return Bad(f"csv: {what}", _tracking('desired={file="way.csv"}'), says, files={"bar/way.csv": content})
+
+
+def _rows(*cells: str) -> str:
+    return "\n".join(["t,theta_1,theta_3", *cells, ""])
+
+
+def _way(first: int = 0, last: int = 10) -> list[str]:
+    return [f"{k},0.1,0.2" for k in range(first, last + 1)]
+
+
+GAINS = [
+    _value("K_D=high", f"{NAMED}controller.K_D = 'high': a number, a table or a list is needed, not a string"),
+    _value("K_D=nan", f"{NAMED}controller.K_D = nan: {FINITE}"),
+    _value("K_D=-1", "K_D is not positive definite: its least eigenvalue is -1"),
+    _value("K_D=0", "K_D is not positive definite: its least eigenvalue is 0"),
+    _value("K_D=[1.0, 2.0]", "controller.K_D[0] = 1.0: a list is needed, not a number"),
+    _value("K_D=[]", "controller.K_D: a matrix must be 2 x 2", f"in the order {JOINTS}"),
+    _value("K_D=[[1.0]]", "controller.K_D: a matrix must be 2 x 2"),
+    _value("K_D=[[1.0, 0.0], [1.0]]", "controller.K_D: a matrix must be 2 x 2"),
+    _value('K_D=[[1.0, "a"], [0.0, 1.0]]', "controller.K_D[0][1] = 'a': a number is needed"),
+    _value("K_D=[[nan, 0.0], [0.0, 1.0]]", f"controller.K_D[0][0] = nan: {FINITE}"),
+    _value("K_D=[[1.0, 0.5], [0.0, 1.0]]", "K_D is not symmetric: its entries [0][1] = 0.5 and [1][0] = 0 differ"),
+    _value("K_D=[[1.0, 2.0], [2.0, 1.0]]", "K_D is not positive definite: its least eigenvalue is -1"),
+    _value("K_D=[[1.0, 1.0], [1.0, 1.0]]", "K_D is not positive definite"),
+    _value("K_D={theta_1=1.0}", f"controller.K_D: a table needs the joints {JOINTS}; 'theta_3' is missing"),
+    _value("K_D={theta_1=1.0, theta_2=1.0}", f"a table needs the joints {JOINTS}; 'theta_2' is none of them"),
+    _value('K_D={theta_1=1.0, theta_3="x"}', "controller.K_D.theta_3 = 'x': a number is needed"),
+    _value("Lambda=0", "Lambda^T K_D is not positive definite", "eq. 18"),
+    _value("Lambda=-1", "Lambda^T K_D is not positive definite: its least eigenvalue is -10"),
+    Bad(
+        "Lambda and K_D that do not commute",
+        _tracking("Lambda={theta_1=1.0, theta_3=2.0}", "K_D=[[2.0, 1.0], [1.0, 2.0]]"),
+        ["Lambda^T K_D is not symmetric: its entries [0][1] = 1 and [1][0] = 2 differ"],
+    ),
+    _target("K_P=0", "K_P is not positive definite"),
+    _target("K_V=-0.1", "K_V is not positive semi-definite: its least eigenvalue is -0.1"),
+]
+
+CONTROLLER = [
+    _value("type=pid", f"{NAMED}controller.type = 'pid'; valid: 'set_point', 'tracking'"),
+    _value("K_P=3", "controller: unknown key 'K_P'; valid: type, Lambda, K_D, desired"),
+    Bad("no controller but a number", ("run", "bar", "--set", "controller=3"), ["controller = 3: a table is needed"]),
+    Bad(
+        "no type",
+        _tracking(),
+        [f"{NAMED}controller: the key 'type' is missing; valid: 'set_point', 'tracking'"],
+        {"tracking.scene.toml": ('type = "tracking"', "")},
+    ),
+    Bad("no K_D", _tracking(), ["the key 'K_D' is missing"], {"tracking.scene.toml": ("K_D = 10.0", "")}),
+    _value("torque_limit=0", "controller.torque_limit = 0: a number greater than 0 is needed"),
+    _value("torque_limit={theta_2=3.0}", f"controller.torque_limit: 'theta_2' is no actuator; there are {JOINTS}"),
+    _value("torque_limit={theta_1=-3.0}", "controller.torque_limit.theta_1 = -3.0: a number greater than 0"),
+    _value("torque_limit=strong", "controller.torque_limit = 'strong': a number or a table is needed"),
+    _target("q_d=1", "controller.q_d = 1: a table is needed"),
+    _target("q_d.theta_7=1", f"controller.q_d: no coordinate 'theta_7' here; there are {JOINTS}"),
+    _target("q_d={theta_1=1.0}", f"controller.q_d: theta_3 missing; needed are {JOINTS}"),
+    _target("q_d.theta_1=nan", f"controller.q_d.theta_1 = nan: {FINITE}"),
+    _target("q_d={theta_1=3.1, theta_3=0.0}", "controller.q_d: the target theta_1 = 3.1, theta_3 = 0 is out of reach"),
+    Bad(
+        "too few actuators",
+        _tracking(),
+        ["actuated: theta_1 cannot hold every freedom", "theta_3 is held by none"],
+        {"mechanism.toml": ('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]')},
+    ),
+    _value("model=other.toml", "bar/other.toml: no such mechanism file"),
+    Bad(
+        "a model with other coordinates",
+        _tracking("model=pendulum.toml"),
+        ["controller.model: its coordinates are swing, the plant's theta_1, theta_2, theta_3, theta_4"],
+        files={"bar/pendulum.toml": 'name = "p"\nurdf = "p.urdf"\n', "bar/p.urdf": PENDULUM},
+    ),
+]
+
+TRAJECTORY = [
+    _value("desired=3", f"{DESIRED} = 3: a table is needed"),
+    _value("desired.theta_1=3", f"{DESIRED}.theta_1 = 3: a table is needed, not an integer"),
+    _value("desired.theta_2.offset=1.0", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_2' is none"),
+    _value("desired={theta_1={offset=0.1}}", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_3' is missing"),
+    _value("desired.theta_1.harmnics=[]", f"{DESIRED}.theta_1: unknown key 'harmnics'; valid: offset, harmonics"),
+    _value("desired.theta_1.offset=a", f"{DESIRED}.theta_1.offset = 'a': a number is needed"),
+    _value("desired.theta_1.offset=nan", f"{DESIRED}.theta_1.offset = nan: {FINITE}"),
+    _value("desired.theta_1.harmonics=[1.0, 2.0, 3.0]", f"{DESIRED}.theta_1.harmonics[0] = 1.0: a list is needed"),
+    _value("desired.theta_1.harmonics=[[1.0, 2.0]]", ".harmonics[0] = [1.0, 2.0]: a list of 3 is needed, not of 2"),
+    _value("desired.file=way.csv", f"{DESIRED}: either file", f"or a table for each of {JOINTS}"),
+    _value("desired={file=3}", f'{DESIRED}: either file = "NAME.csv" alone'),
+    _value('desired={file="way.csv"}', "bar/way.csv: no such"),
+    _csv("empty", "", "way.csv: it is empty", "columns t, theta_1, theta_3"),
+    _csv("other columns", "time,theta_1,theta_3\n", "its header is 'time,theta_1,theta_3'", "t, theta_1, theta_3"),
+    _csv("a column twice", "t,theta_1,theta_1\n", "its header is 't,theta_1,theta_1'"),
+    _csv("too short", _rows(*_way(last=4)), "way.csv: 5 rows; a smooth trajectory needs at least 6"),
+    _csv("a word", _rows(*_way(), "11,b,3"), "way.csv, line 13: '11,b,3' is not 3 finite numbers"),
+    _csv("a missing cell", _rows(*_way(last=5), "", "6,1"), "way.csv, line 9: '6,1' is not 3 finite numbers"),
+    _csv("one number", _rows(*_way(last=5), "6"), "way.csv, line 8: '6' is not 3 finite numbers"),
+    _csv("nan", _rows(*_way(last=5), "6,nan,0"), "way.csv, line 8: '6,nan,0' is not 3 finite numbers"),
+    _csv("time that steps back", _rows(*_way(), *_way(5, 9)), "line 13: t = 5 after t = 10; t must increase"),
+    _csv("a late start", _rows(*_way(1)), "way.csv: starts at t = 1 s; a run starts at 0"),
+    _csv("an early end", _rows(*_way(last=8)), "ends at t = 8 s, the scene at t_end = 9.5 s", "shorten the run"),
+    _csv("a picture", b"\x89PNG\r\n\x1a\n", "bar/way.csv: not a", "not UTF-8 text"),
+    _csv("an endless cell", _rows("x" * 200_000), "way.csv"),
+]
+
+
+@pytest.mark.parametrize("case", [*GAINS, *CONTROLLER, *TRAJECTORY], ids=lambda case: case.what)
+def test_bad_controller(case: Bad, bar: Path) -> None:
+    expect(case, bar)

@@ -1,0 +1,116 @@
+"""Scenes with something wrong in them: exit 2 and one message with the place, the value and what is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.contract.helpers.bad import Bad, expect
+
+RUN = ("run", "bar/swing.scene.toml")
+NAMED = "bar/swing.scene.toml: "
+GREATER = "a number greater than 0 is needed"
+FINITE = "a finite number is needed"
+
+
+def _set(*changes: str) -> tuple[str, ...]:
+    return (*RUN, *(word for change in changes for word in ("--set", change)))
+
+
+def _value(change: str, *says: str) -> Bad:
+    return Bad(change[:60], _set(change), says)
+
+
+def _file(what: str, old: str, new: str, *says: str) -> Bad:
+    return Bad(what, RUN, [NAMED, *says], {"swing.scene.toml": (old, new)})
+
+
+SCENE = [
+    _value("t_end=0", f"{NAMED}t_end = 0: {GREATER}"),
+    _value("t_end=-1", f"{NAMED}t_end = -1: {GREATER}"),
+    _value("t_end=nan", "t_end = nan", GREATER),
+    _value("t_end=inf", f"t_end = inf: {FINITE}"),
+    _value("t_end=soon", "t_end = 'soon': a number is needed, not a string"),
+    _value("t_end=true", "t_end = true: a number is needed"),
+    _value("t_end=2020-01-01", "t_end: a number is needed, not a date"),
+    _value("formulation=ode", "formulation = 'ode'; valid: 'dae', 'reduced', 'spf'"),
+    _value("formulation=3", "formulation = 3: a string is needed, not an integer"),
+    _value("epsilon=0", f"epsilon = 0: {GREATER}"),
+    _value("epsilon=-1e-3", f"epsilon = -0.001: {GREATER}"),
+    _value("coriolis_velocity=rhoo", "coriolis_velocity = 'rhoo'; valid: 'actual', 'rho'"),
+    _value("mechanism=nothing", "no mechanism 'nothing'", "five_bar"),
+    _value("mechanism=nothing.toml", "bar/nothing.toml: no such mechanism file"),
+    _value("mechanism=3", "mechanism = 3: a string or a table is needed"),
+    _value('mechanism={generator="x"}', "mechanism.generator = 'x'; valid: 'n_four_bar'"),
+    _value('mechanism={generator="n_four_bar", N=1000000000}', "mechanism.N = 1000000000: an integer of at most"),
+    _file("no mechanism", 'mechanism = "mechanism.toml"', "", "the key 'mechanism' is missing"),
+    _file("no formulation", 'formulation = "dae"', "", "'formulation' is missing; valid: 'dae', 'reduced', 'spf'"),
+    _file("malformed", "t_end = 2.0", "t_end = ", "malformed TOML", "line "),
+    _file("nested without end", "t_end = 2.0", f"t_end = {'[' * 10000}", "malformed TOML: nested too deeply"),
+    _file("nan in the file", "rtol = 1e-8", "max_step = nan", f"solver.max_step = nan: {GREATER}"),
+    _file("a number of 400 digits", "t_end = 2.0", f"t_end = 1{'0' * 400}", "t_end", "out of range"),
+]
+
+SOLVER = [
+    _value("solver.rtol=0", f"{NAMED}solver.rtol = 0: a number of at least 2.3e-14 is needed"),
+    _value("solver.rtol=-1e-8", "solver.rtol = -1e-08: a number of at least"),
+    _value("solver.rtol=nan", "solver.rtol = nan"),
+    _value("solver.rtol=inf", "solver.rtol = inf: a number less than 1 is needed"),
+    _value("solver.rtol=1e-300", "solver.rtol = 1e-300: a number of at least 2.3e-14"),
+    _value("solver.rtol=high", "solver.rtol = 'high': a number is needed, not a string"),
+    _value("solver.atol=0", f"solver.atol = 0: {GREATER}"),
+    _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'BDF', 'DOP853', 'LSODA', 'RK23', 'RK45', 'Radau'"),
+    _value("solver.backend=cuda", "solver.backend = 'cuda'; valid: 'auto', "),
+    _value("solver.projection=yes", "solver.projection = 'yes': true or false is needed, not a string"),
+    _value("solver.spf_equation=9", "solver.spf_equation = 9; valid: 8, 17"),
+    _value("solver.max_rhs=0", "solver.max_rhs = 0: an integer of at least 1 is needed"),
+    _value("solver.max_rhs=1.5", "solver.max_rhs = 1.5: an integer is needed, not a number"),
+    _value("solver.max_wall_s=0", f"solver.max_wall_s = 0: {GREATER}"),
+    _value("solver.max_step=0", f"solver.max_step = 0: {GREATER}"),
+    _value("solver.min_step=-1", "solver.min_step = -1: a number of at least 0 is needed"),
+    _value("solver={min_step=1.0, max_step=0.1}", "solver: min_step = 1 is above max_step = 0.1"),
+    _value("solver.output_dt=0", f"solver.output_dt = 0: {GREATER}"),
+    _value("solver.output_dt=1e-300", "solver.output_dt = 1e-300 gives more than 1000000 output instants in 2 s"),
+    _value("solver.method=BDF", "BDF is a multistep method", "RK23, RK45, DOP853, Radau, or projection = false"),
+    _value("solver.method=LSODA", "LSODA is a multistep method", "projection = false"),
+]
+
+START = [
+    _value("initial.at=rest", "initial.at = 'rest'; valid: 'assembled', 'equilibrium'"),
+    _value("initial.at=equilibrium", "initial: give either at", "or q, not both"),
+    _value("initial.q={}", "initial: give q (a table by coordinate)", 'at = "equilibrium"'),
+    _value("initial.q=[1.0, 2.0]", "initial.q = [1.0, 2.0]: a table is needed, not a list"),
+    _value("initial.q.theta_9=1", "initial.q: no coordinate 'theta_9'", "theta_1, theta_3"),
+    _value("initial.q.theta_1=abc", f"{NAMED}initial.q.theta_1 = 'abc': a number is needed, not a string"),
+    _value("initial.q.theta_1=nan", f"initial.q.theta_1 = nan: {FINITE}"),
+    _value("initial.q={theta_1=1.0}", "initial.q: theta_3 missing; needed are theta_1, theta_3"),
+    _value("initial.q={theta_1=3.1, theta_3=0.0}", "the start theta_1 = 3.1, theta_3 = 0 is out of reach"),
+    _value("initial.q.theta_2=40.0", "initial.q: the loops do not close near the given theta_2", "leave them out"),
+    _value("initial.q_dot.theta_9=1", "initial.q_dot: ", "'theta_9'", "theta_1, theta_3"),
+    _value("initial.q_dot.theta_2=1", "initial.q_dot: ", "'theta_2'", "theta_1, theta_3"),
+    _value("initial.q_dot.theta_1=inf", f"initial.q_dot.theta_1 = inf: {FINITE}"),
+    _value("initial.w=[0.1, 0.1]", "initial.w: only the SPF can start off phi = 0, not 'dae'"),
+    Bad("w of the reduced", _set("initial.w=[0.1, 0.1]", "formulation=reduced"), ["initial.w", "not 'reduced'"]),
+    Bad(
+        "w too short", _set("initial.w=[0.1]", "formulation=spf"), ["initial.w: 1 numbers", "2 rows: elbow.x, elbow.y"]
+    ),
+    Bad("w that is a number", _set("initial.w=0.1", "formulation=spf"), ["initial.w = 0.1: a list is needed"]),
+    Bad("w with nan", _set("initial.w=[nan, 0.1]", "formulation=spf"), [f"initial.w[0] = nan: {FINITE}"]),
+    Bad("w out of reach", _set("initial.w=[9.0, 0.1]", "formulation=spf"), ["phi = w = [9.0, 0.1] is out of reach"]),
+]
+
+EVENTS = [
+    _value('event={coordinate="theta_1"}', "event: a list is needed, not a table"),
+    _value("event=[{value=1.0}]", f"{NAMED}event[0]: the key 'coordinate' is missing"),
+    _value('event=[{coordinate="x"}]', "event", "no coordinate 'x'; there are theta_1, theta_2, theta_3, theta_4"),
+    _value('event=[{coordinate="x", val=1.0}]', "event[0]: unknown key 'val'; valid: coordinate, of, value"),
+    _value('event=[{coordinate="x", of="v"}]', "event[0].of = 'v'; valid: 'q', 'q_dot'"),
+    _value('event=[{coordinate="x", direction=2}]', "event[0].direction = 2; valid: -1, 0, 1"),
+    _value('event=[{coordinate="x"}, {coordinate="x", stop=1}]', "event[1].stop = 1: true or false is needed"),
+]
+
+
+@pytest.mark.parametrize("case", [*SCENE, *SOLVER, *START, *EVENTS], ids=lambda case: case.what)
+def test_bad_scene(case: Bad, bar: Path) -> None:
+    expect(case, bar)

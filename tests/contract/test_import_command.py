@@ -1,0 +1,269 @@
+"""The command `ckc import`: what it writes and says, what it refuses, and published robots where they are at hand."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.contract.helpers.bad import Bad, expect
+from tests.contract.helpers.command import ckc
+
+ROBOTS = Path(__file__).resolve().parents[2].parent / "shared" / "robots"
+
+FOUR_BAR = """<mujoco model="linkage"><compiler angle="radian"/><worldbody>
+<body name="crank"><joint name="a" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
+  <body name="rod" pos="1 0 .5"><joint name="b" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/></body></body>
+<body name="rocker" pos="2 0 -1"><joint name="c" axis="0 1 0" armature="0.1"/><geom type="box" size=".1 .1 .1"/></body>
+</worldbody><equality><connect name="elbow" body1="rod" body2="rocker" anchor="1 0 -.5"/></equality></mujoco>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "linkage.xml").write_text(FOUR_BAR, encoding="utf-8")
+    return tmp_path
+
+
+# --- what it writes -----------------------------------------------------------------------------------------------
+
+
+def test_import_then_check(folder: Path) -> None:
+    done = ckc("import", "linkage.xml")
+    assert (done.code, done.err) == (0, "")
+    for line in ("written: linkage/mechanism.toml", "written: linkage/linkage.urdf", "left out: armature"):
+        assert line in done.out
+    text = (folder / "linkage" / "mechanism.toml").read_text(encoding="utf-8")
+    assert text.startswith("# Imported from linkage.xml, a MuJoCo model.")
+    assert "#   - armature, the inertia of rotors behind gears (kg m^2 or kg): c 0.1" in text
+    found = ckc("check", "linkage", "--json").json
+    assert (found["n"], found["rows"], found["rank"], found["d"]) == (3, 3, 2, 1)
+
+
+def test_the_json_of_an_import(folder: Path) -> None:
+    found = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
+    assert set(found) == {"status", "written", "left_out", "guessed", "check"}
+    assert found["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
+    assert [note.split(",")[0] for note in found["left_out"]] == ["armature"]
+    check = ckc("check", "there/deep", "--json").json
+    assert found["check"] == {"status": "done", **check}
+
+
+def test_a_robot_that_does_not_close_is_written_all_the_same(folder: Path) -> None:
+    far = FOUR_BAR.replace("<connect", "<weld").replace('anchor="1 0 -.5"', 'relpose="9 0 0 1 0 0 0"')
+    (folder / "far.xml").write_text(far, encoding="utf-8")
+    found = ckc("import", "far.xml", "--json")
+    assert found.code == 0
+    assert found.json["check"]["status"] == "error"
+    assert "not closed: nearest miss" in found.json["check"]["message"]
+    assert "not closed" in ckc("import", "far.xml", "--out", "again").out
+    assert (folder / "far" / "mechanism.toml").is_file()
+
+
+def test_files_that_are_there_are_kept_unless_told(folder: Path) -> None:
+    ckc("import", "linkage.xml")
+    file = folder / "linkage" / "mechanism.toml"
+    file.write_text("mine", encoding="utf-8")
+    refused = ckc("import", "linkage.xml")
+    assert refused.code == 2
+    assert "linkage/mechanism.toml and linkage/linkage.urdf: there already" in refused.err
+    assert "--overwrite" in refused.err
+    assert file.read_text(encoding="utf-8") == "mine"
+    assert ckc("import", "linkage.xml", "--overwrite").code == 0
+    assert file.read_text(encoding="utf-8").startswith("# Imported")
+
+
+NAMES = [
+    'a "quoted" name',
+    "back\\slash",
+    "with.dot",
+    "名前",
+    "new&#10;line",
+    "tab&#9;bed",
+    "x = 1 # no comment",
+    "del\x7f",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_survives(folder: Path, name: str) -> None:
+    """Names come from strangers: what is written is the TOML and the URDF that was meant, whatever they hold."""
+    quoted = name.replace('"', "&quot;")
+    text = FOUR_BAR.replace('name="a"', f'name="{quoted}" ref="0.2"').replace('name="elbow"', f'name="{quoted}"')
+    text = text.replace("</mujoco>", f'<actuator><motor joint="{quoted}"/></actuator></mujoco>')
+    text = text.replace('model="linkage"', f'model="{quoted}"')
+    (folder / "odd.xml").write_text(text, encoding="utf-8")
+    assert ckc("import", "odd.xml", "--out", "odd").code == 0
+    meant = name.replace("&#10;", "\n").replace("&#9;", "\t")
+    content: dict[str, Any] = tomllib.loads((folder / "odd" / "mechanism.toml").read_text(encoding="utf-8"))
+    assert content["actuated"] == [meant]
+    assert content["q_guess"] == {meant: 0.2}
+    assert [loop["name"] for loop in content["loop"]] == [meant]
+    assert meant in ckc("check", "odd", "--json").json["coordinates"]
+
+
+def test_a_file_named_after_nothing_takes_the_name_of_its_folder(folder: Path) -> None:
+    (folder / "my robot").mkdir()
+    (folder / "my robot" / "robot.xml").write_text(FOUR_BAR, encoding="utf-8")
+    assert ckc("import", "my robot/robot.xml", "--json").json["written"][0] == "my_robot/mechanism.toml"
+
+
+# --- what it refuses ----------------------------------------------------------------------------------------------
+
+
+def mjcf(body: str = "", rest: str = "", file: str = "m.xml") -> dict[str, str]:
+    return {file: f"<mujoco><worldbody>{body}</worldbody>{rest}</mujoco>"}
+
+
+def urdf(content: str, **others: str) -> dict[str, str]:
+    links = '<link name="base"/><link name="arm"/><joint name="j" type="revolute"><parent link="base"/>'
+    return {
+        "r.urdf": f'<robot name="r">{links}<child link="arm"/><axis xyz="0 0 1"/></joint>{content}</robot>',
+        **{name.replace("_", "."): text for name, text in others.items()},
+    }
+
+
+BODY = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><mujoco>&b;</mujoco>'
+X, R = ["import", "m.xml"], ["import", "r.urdf"]
+LOOP = '<loop name="l" type="{}"><predecessor link="{}"/><successor link="base"/>{}</loop>'
+GEAR = '<coupling name="g"><predecessor link="{}"/><successor link="base"/>{}</coupling>'
+
+CASES = [
+    Bad("no file", ["import", "nowhere.xml"], ["nowhere.xml: no such robot file"]),
+    Bad("a folder", ["import", "d"], ["d: a folder"], files={"d/x": ""}),
+    Bad("not XML", X, ["m.xml: malformed XML"], files={"m.xml": "solid"}),
+    Bad("not text", X, ["m.xml", "not UTF-8"], files={"m.xml": b"\xff\xfe\x00"}),
+    Bad("an entity bomb", X, ["document type declaration (x) is not accepted"], files={"m.xml": BOMB}),
+    Bad("an abyss", X, ["nested more than 300 deep"], files={"m.xml": "<body>" * 1000 + "</body>" * 1000}),
+    Bad("another XML", X, ["root element is <sdf>", "<mujoco> (MJCF) and <robot> (URDF)"], files={"m.xml": "<sdf/>"}),
+    Bad("another YAML", ["import", "x.yaml"], ["only a robot.yaml beside its URDF"], files={"x.yaml": ""}),
+    Bad(
+        "a yaml alone", ["import", "robot.yaml"], ["one URDF beside it is needed; found none"], files={"robot.yaml": ""}
+    ),
+    Bad("a folder that cannot be made", [*X, "--out", "m.xml/x"], ["m.xml/x: cannot be written"], files=mjcf(BODY)),
+    # MJCF
+    Bad("global coordinates", X, ["coordinate='global'"], files=mjcf("", "<compiler coordinate='global'/>")),
+    Bad("unknown unit", X, ["angle='gon' is not degree or radian"], files=mjcf("", "<compiler angle='gon'/>")),
+    Bad("bad sequence", X, ["eulerseq='xyq'"], files=mjcf("", "<compiler eulerseq='xyq'/>")),
+    Bad(
+        "unknown class",
+        X,
+        ["<joint> 'j'", "no default class 'k'"],
+        files=mjcf("<body><joint name='j' class='k'/></body>"),
+    ),
+    Bad("class without name", X, ["nested <default> has no class"], files=mjcf("", "<default><default/></default>")),
+    Bad("unknown joint type", X, ["type='screw' is not one of"], files=mjcf("<body><joint type='screw'/></body>")),
+    Bad(
+        "two of one name",
+        X,
+        ["two joints have this name"],
+        files=mjcf("<body><joint name='j'/><joint name='j'/></body>"),
+    ),
+    Bad("two bodies of one name", X, ["two bodies are called 'b'"], files=mjcf(BODY + "<body name='b'/>")),
+    Bad("a word for a number", X, ["pos='0 0 up'", "not a list of numbers"], files=mjcf("<body pos='0 0 up'/>")),
+    Bad("not a number", X, ["pos='0 0 nan'", "3 finite numbers"], files=mjcf("<body pos='0 0 nan'/>")),
+    Bad("too few numbers", X, ["quat='1 0'", "4 finite numbers"], files=mjcf("<body quat='1 0'/>")),
+    Bad("no rotation", X, ["quat is zero"], files=mjcf("<body quat='0 0 0 0'/>")),
+    Bad("no axis", X, ["axis", "all three are zero"], files=mjcf("<body><joint axis='0 0 0'/></body>")),
+    Bad("no size", X, ["<geom> 'g'", "size=''"], files=mjcf("<body><geom name='g' type='box'/></body>")),
+    Bad("negative size", X, ["size='-1'", "positive"], files=mjcf("<body><geom size='-1'/></body>")),
+    Bad(
+        "a free joint below", X, ["a free joint is the only one"], files=mjcf("<body><body><freejoint/></body></body>")
+    ),
+    Bad("replicas", X, ["<replicate> is not read", "mj_saveLastXML"], files=mjcf("<replicate count='9'/>")),
+    Bad("an include from outside", X, ["include file='../x'"], files=mjcf("<include file='../x'/>")),
+    Bad("an include of itself", X, ["'m.xml' is included twice"], files=mjcf("<include file='m.xml'/>")),
+    Bad("an include of nothing", X, ["n.xml: no such MuJoCo model"], files=mjcf("<include file='n.xml'/>")),
+    Bad("no such body", X, ["body1: no body 'q'"], files=mjcf(BODY, "<equality><weld body1='q'/></equality>")),
+    Bad("no such site", X, ["no site 'q'"], files=mjcf(BODY, "<equality><weld site1='q' site2='q'/></equality>")),
+    Bad("nothing to connect", X, ["needs body1"], files=mjcf(BODY, "<equality><connect/></equality>")),
+    Bad("no anchor", X, ["anchor=''"], files=mjcf(BODY, "<equality><connect body1='b'/></equality>")),
+    Bad(
+        "no such joint",
+        X,
+        ["no hinge or slide 'q'; there are j"],
+        files=mjcf(BODY, "<equality><joint joint1='q'/></equality>"),
+    ),
+    Bad("a motor on nothing", X, ["no joint 'q'"], files=mjcf(BODY, "<actuator><motor joint='q'/></actuator>")),
+    Bad("neither true nor false", X, ["active='yes'"], files=mjcf(BODY, "<equality><weld active='yes'/></equality>")),
+    # URDF
+    Bad("a xacro", R, ["a xacro", "expand it first"], files=urdf('<link name="${x}"/>')),
+    Bad("two roots", R, ["roots found: 'base', 'lost'"], files=urdf('<link name="lost"/>')),
+    Bad(
+        "unknown loop", R, ["loop 'l': type 'screw'", "known are revolute"], files=urdf(LOOP.format("screw", "arm", ""))
+    ),
+    Bad("loop from nothing", R, ["its predecessor 'x' is no link"], files=urdf(LOOP.format("revolute", "x", ""))),
+    Bad(
+        "loop about nothing", R, ["is no direction"], files=urdf(LOOP.format("revolute", "arm", '<axis xyz="0 0 0"/>'))
+    ),
+    Bad("loop about a word", R, ["xyz='up'"], files=urdf(LOOP.format("revolute", "arm", '<axis xyz="up"/>'))),
+    Bad("coupling from nothing", R, ["coupling 'g': its predecessor 'x'"], files=urdf(GEAR.format("x", ""))),
+    Bad("coupling by nothing", R, ["coupling 'g': its <ratio> has no number"], files=urdf(GEAR.format("arm", ""))),
+    Bad(
+        "neither independent nor not",
+        R,
+        ["independent='maybe'"],
+        files=urdf(
+            '<link name="i"/><joint name="k" '
+            'type="revolute" independent="maybe"><parent link="arm"/><child link="i"/></joint>'
+        ),
+    ),
+    # robot.yaml
+    Bad("broken YAML", R, ["robot.yaml: malformed YAML"], files=urdf("", robot_yaml="a: [b")),
+    Bad("YAML of nothing", R, ["robot.yaml: not a table"], files=urdf("", robot_yaml="- a")),
+    Bad("YAML aliases", R, ["anchors and aliases"], files=urdf("", robot_yaml="type: &a [3d]\nname_mot: *a")),
+    Bad(
+        "YAML objects",
+        R,
+        ["robot.yaml: malformed YAML"],
+        files=urdf("", robot_yaml="type: !!python/object:os.system x"),
+    ),
+    Bad("much YAML", R, ["more than 65536"], files=urdf("", robot_yaml="#" * 70000)),
+    Bad("deep YAML", R, ["nested more than 20 deep"], files=urdf("", robot_yaml="[" * 60000)),
+    Bad("deep YAML on a line", R, ["nested more than 20 deep"], files=urdf("", robot_yaml="- " * 30000)),
+    Bad("half a loop", R, ["robot.yaml", "closed_loop"], files=urdf("", robot_yaml="closed_loop: [[base]]")),
+    Bad(
+        "loop to nothing",
+        R,
+        ["no link or joint 'arn'; close to it: arm"],
+        files=urdf("", robot_yaml="closed_loop: [[base, arn]]"),
+    ),
+    Bad("unknown loop type", R, ["type '5d'"], files=urdf("", robot_yaml="closed_loop: [[base, arm]]\ntype: [5d]")),
+    Bad("a type too many", R, ["joint_name has 1 entries, joint_type 0"], files=urdf("", robot_yaml="joint_name: [j]")),
+    Bad(
+        "unknown joint to stand for",
+        R,
+        ["joint_type 'BALL' of j"],
+        files=urdf("", robot_yaml="joint_name: [j]\njoint_type: [BALL]"),
+    ),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
+def test_bad_robot(case: Bad, bar: Path) -> None:
+    expect(case, bar)
+
+
+# --- published robots ---------------------------------------------------------------------------------------------
+
+# rows, rank and freedoms; the freedoms are the robots' motors and the rods that spin about themselves
+PUBLISHED = {
+    "example-parallel-robots/5bar_linkage_iso3d/robot.yaml": (5, 3, 3, 2),
+    "example-parallel-robots/cassie_like/robot.urdf": (19, 12, 12, 5 + 2),
+    "example-parallel-robots/robot_delta/robot.yaml": (14, 18, 9, 2 + 3),
+    "example-parallel-robots/talos_like/robot.yaml": (13, 6, 6, 6 + 1),
+    "generalized_rbda/four_bar.urdf": (3, 5, 2, 1),
+    "generalized_rbda/six_bar.urdf": (5, 5, 2, 3),
+}
+
+
+@pytest.mark.skipif(not ROBOTS.is_dir(), reason="the folder of published robots is not beside the project")
+@pytest.mark.parametrize("file", PUBLISHED)
+def test_published_robots_close(file: str, folder: Path) -> None:
+    found = ckc("import", str(ROBOTS / file), "--out", "robot", "--json").json["check"]
+    assert found["status"] == "done", found
+    assert (found["n"], found["rows"], found["rank"], found["d"]) == PUBLISHED[file]
