@@ -1,13 +1,14 @@
 """The robot.yaml of example-parallel-robots: pairs of frames, motors, and joints that stand for others.
 
-PyYAML reads it through msgspec, by its safe loader; anchors and aliases are refused, so what comes out is
-no larger than what went in.
+PyYAML reads it through msgspec, by its safe loader. Its C parser overflows the stack on values nested without
+end, and aliases multiply what comes out, so both are refused beforehand.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import accumulate
 from xml.etree.ElementTree import Element, SubElement
 
 import msgspec
@@ -23,6 +24,8 @@ __all__ = ["take_yaml"]
 MAX_CHARACTERS = 2**16  # the largest published one has 2500
 TYPES = ("3d", "6d")
 AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
+MAX_DEPTH = 20
+STACKED = re.compile(r"([-?:][ \t]+){20}")  # "- - - ..." nests on one line
 ALIAS = re.compile(r"(^|[\s\[{,:-])[&*]\w", re.MULTILINE)
 
 
@@ -77,6 +80,8 @@ def take_yaml(draft: Draft, names: Names, text: str, source: str) -> None:
 def _parse(text: str, source: str) -> tuple[RobotYaml, list[str]]:
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"{source}: more than {MAX_CHARACTERS} characters, too large for a robot.yaml")
+    if STACKED.search(text) or max(accumulate((c in "[{") - (c in "]}") for c in text), default=0) > MAX_DEPTH:
+        raise InputError(f"{source}: values nested more than {MAX_DEPTH} deep are not accepted")
     if ALIAS.search(text):
         raise InputError(f"{source}: YAML anchors and aliases (&name, *name) are not accepted")
     try:
