@@ -47,16 +47,23 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
     at = mechanism.assembled
     terms = Terms(mechanism, at, np.zeros(mechanism.n))
     scale = 1e-13 * (1.0 + _weight(mechanism))
+    if mechanism.d == 0:
+        return at
     for _ in range(300):
-        if np.abs(terms.h).max(initial=0.0) <= scale:
-            return at
         values, vectors = np.linalg.eigh((hessian := h_gradient(mechanism, at)) / 2 + hessian.T / 2)
-        floor = 1e-3 * np.abs(values).max()
-        step = -vectors @ ((vectors.T @ terms.h) / np.maximum(np.abs(values), floor))
-        step *= min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
+        steepest = np.abs(values).max()
+        falls_away = values[0] < -1e-9 * steepest
+        calm = np.abs(terms.h).max() <= scale
+        if calm and not falls_away:
+            return at
+        if calm:  # balanced on a top or a saddle, as an upright start is: off it, either way leads down
+            step = 0.1 * vectors[:, 0]
+        else:
+            step = -vectors @ ((vectors.T @ terms.h) / np.maximum(np.abs(values), 1e-3 * steepest))
+            step *= min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
         moved = _downhill(mechanism, terms, step)
         if moved is None:
-            if np.abs(terms.h).max() <= 1e3 * scale:  # energy differences are rounding here
+            if np.abs(terms.h).max() <= 1e3 * scale and not falls_away:  # energy differences are rounding here
                 return at
             raise NumericalError(
                 f"no stable equilibrium of {mechanism.name!r} was reached from q_guess: the descent ends at a "

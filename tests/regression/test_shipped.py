@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, Mechanism, Run, check, load, simulate
-from ckc_pin.dynamics.terms import Terms
+from ckc_pin.dynamics import Terms, h_gradient, stable_equilibrium
 from ckc_pin.mechanism.library import library, shipped
 from ckc_pin.simulation.scene import catalogue, scene_names
 
@@ -131,6 +131,30 @@ def test_energy_of_talos_goes_into_its_dampers(formulation: str) -> None:
     lost = run.energy[0] - run.energy[-1]
     assert lost > 0.01
     assert lost == pytest.approx(dissipated, rel=1e-6)
+
+
+# --- equilibria ----------------------------------------------------------------------------------
+
+# where gravity and springs leave a mechanism, by symmetry; q_guess of both slider-cranks is balanced upright
+RESTS = {
+    "bricard": {"hinge_1": np.pi / 2},
+    "slider_crank": {"crank": 3 * np.pi / 2},
+    "slider_crank_spatial": {"crank": np.pi},
+    "stewart": {"plate_place.x": 0.0, "plate_place.y": 0.0, "plate_place.rz": 0.0},
+    "delta": {"plate_place.x": 0.0, "plate_place.y": 0.0, "plate_place.rz": 0.0},
+    "four_bar": {},
+    "andrews": {},
+}
+
+
+@pytest.mark.parametrize("name", RESTS)
+def test_equilibrium_is_stable(name: str) -> None:
+    model = mechanism(name)
+    at = stable_equilibrium(model)
+    q = model.tree.named(model.tree.to_coordinates(at.q_tree))
+    assert {key: q[key] for key in RESTS[name]} == pytest.approx(RESTS[name], abs=1e-7)
+    assert np.abs(Terms(model, at, np.zeros(model.n)).h).max() <= 1e-9
+    assert np.linalg.eigvalsh(h_gradient(model, at))[0] > 0
 
 
 # --- the same mechanism, cut open elsewhere ------------------------------------------------------
