@@ -1,0 +1,147 @@
+"""Mechanism files and URDFs with something wrong in them: exit 2, one message, nothing from urdfdom beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.contract.helpers.bad import Bad, expect
+
+CHECK = ("check", "bar")
+NAMED = "bar/mechanism.toml: "
+LINKS = "there are base, link_1, link_2, link_3, link_4, tip_left, tip_right"
+COORDINATES = "there are theta_1, theta_2, theta_3, theta_4"
+INDEPENDENT = '["theta_1", "theta_3"]'
+FINITE = "a finite number is needed"
+
+
+def _edit(what: str, old: str, new: str, *says: str) -> Bad:
+    return Bad(what, CHECK, says, {"mechanism.toml": (old, new)})
+
+
+def _add(what: str, entry: str, *says: str) -> Bad:
+    return _edit(what, "[[point]]", f"{entry}\n[[point]]", *says)
+
+
+def _file(what: str, content: str | bytes, *says: str) -> Bad:
+    return Bad(what, CHECK, says, files={"bar/mechanism.toml": content})
+
+
+def _named(what: str, content: str, *says: str) -> Bad:
+    return _file(what, f'name = "o"\n{content}\n', *says)
+
+
+FILES = [
+    _file("malformed", "name = \n", f"{NAMED}malformed TOML", "line 1"),
+    _file("empty", "", f"{NAMED}the key 'name' is missing"),
+    _file("binary", b"\x00\xff\xfe", f"{NAMED}not a mechanism file, not UTF-8 text (byte 1)"),
+    _file("nested without end", f"x = {'[' * 100_000}", "malformed TOML: nested too deeply"),
+    _file("a number of 5000 digits", f"name = 1{'0' * 5000}", "malformed TOML"),
+    _file("17 MiB", b"#" * (17 * 2**20), f"{NAMED}more than 16 MiB"),
+    _file("a URDF", "<robot/>", "malformed TOML", "this is XML: a URDF is named in a mechanism.toml"),
+    _file("a name that is empty", 'name = ""', "name = '': a string that is not empty is needed"),
+    _file("a name that is a number", "name = 3", "name = 3: a string is needed, not an integer"),
+    _edit("an unknown key", "gravity", "gravty", f"{NAMED}unknown key 'gravty'; valid: name, urdf, tree, gravity"),
+    _named("no urdf", "", f'{NAMED}give either urdf = "FILE" or [[tree]] entries'),
+    _named("urdf and tree", 'urdf = "a"\n[[tree]]\nfile = "b"', "give either urdf"),
+    _named("a missing urdf", 'urdf = "nope.urdf"', "bar/nope.urdf: no such"),
+    _named("a folder for a urdf", 'urdf = "."', "bar: a folder or a device, not a"),
+    _named("a device for a urdf", 'urdf = "/dev/zero"', "/dev/zero: a folder or a device, not a"),
+    _named("a urdf of no possible name", 'urdf = "a\\u0000b"', "no name of a file"),
+    _named("an unknown package", 'urdf = "package://nope/x.urdf"', "no package 'nope' is installed"),
+    _named("gravity of two numbers", "gravity = [0.0, 1.0]", "gravity = [0.0, 1.0]: a list of 3 is needed, not of 2"),
+    _named("gravity of one number", "gravity = 9.81", "gravity = 9.81: a list is needed, not a number"),
+    _named("gravity with nan", 'urdf = "five_bar.urdf"\ngravity = [0.0, nan, 0.0]', f"gravity[1] = nan: {FINITE}"),
+    _named("tree root", '[[tree]]\nfile = "five_bar.urdf"\nroot = "loose"', "tree[0].root = 'loose'; valid: 'fixed'"),
+    _named("tree parent", '[[tree]]\nfile = "five_bar.urdf"\nparent = "floor"', "five_bar.urdf: its parent 'floor' is"),
+    _named(
+        "two trees of the same names",
+        '[[tree]]\nfile = "five_bar.urdf"\n[[tree]]\nfile = "five_bar.urdf"',
+        "five_bar.urdf: link 'base' is already in an earlier tree; give this [[tree]] a prefix",
+    ),
+]
+
+LOOPS = [
+    _edit("loop key", "rows_in", "row_in", "loop[0]: unknown key 'row_in'; valid: name, type, frame_a", "rows_in"),
+    _edit("loop type", "point_2d", "point2d", "loop[0].type = 'point2d'; valid: 'cylindrical', 'distance', 'hinge'"),
+    _edit("no loop type", 'type = "point_2d"', "", "loop[0]: the key 'type' is missing; valid: 'cylindrical'"),
+    _edit("rows_in", 'in = "world"', 'in = "b"', "loop[0].rows_in = 'b'; valid: 'a', 'world'"),
+    _edit("loop frame", '"tip_left"', '"tip"', "loop 'elbow', frame_a: no link 'tip'", LINKS),
+    _edit("loop joint frame", '"tip_left"', '"joint:tip"', "loop 'elbow', frame_a: no joint 'tip'", "theta_1"),
+    _edit("loop frame table", '"tip_left"', '{link = "tip"}', "loop 'elbow', frame_a: no link 'tip'", LINKS),
+    _edit("loop frame key", '"tip_left"', '{lnk = "tip"}', "loop[0].frame_a: unknown key 'lnk'; valid: link, xyz, rpy"),
+    _edit("loop frame number", '"tip_left"', "3", "loop[0].frame_a = 3: a string or a table is needed"),
+    _edit("loop frame at nan", '"tip_left"', '{link = "base", xyz = [0.0, nan, 0.0]}', f"xyz[1] = nan: {FINITE}"),
+    _edit("loop on one body", '"tip_left"', '"link_4"', "loop 'elbow': frames A and B move together"),
+    _add(
+        "two loops of one name",
+        '[[loop]]\nname = "elbow"\ntype = "point"\nframe_a = "base"\nframe_b = "link_2"',
+        "loop 'elbow': two loops have this name",
+    ),
+    _edit("zero loop axis", "rows_in", "axis_a = [0.0, 0.0, 0.0]\nrows_in", "loop 'elbow', axis_a", "not all zero"),
+    _edit("length of a point", "rows_in", "length = 1.0\nrows_in", "'point_2d' has no key length"),
+    _edit("distance without length", '"point_2d"', '"distance"', "loop 'elbow': type 'distance' needs the key length"),
+    _edit("length zero", "rows_in", "length = 0.0\nrows_in", "loop[0].length = 0.0: a number greater than 0"),
+    _edit(
+        "a loop that cannot close",
+        '"tip_right"',
+        '{link = "tip_right", xyz = [5.0, 0.0, 0.0]}',
+        f"{NAMED}not closed: nearest miss 3.02 m at loop elbow",
+        "[q_guess]",
+    ),
+    _add("coupling of nothing", '[[coupling]]\njoint = "theta_1"\nother = "x"\nratio = 1.0', "'x'", COORDINATES),
+    _add("coupling to itself", '[[coupling]]\njoint = "theta_1"\nother = "theta_1"\nratio = 1.0', "to itself"),
+    _add("coupling without ratio", '[[coupling]]\njoint = "theta_1"\nother = "theta_3"', "'ratio' is missing"),
+    _add("spring on nothing", "[[spring]]\nstiffness = 1.0", "spring 1: give either joint, or frame_a and frame_b"),
+    _add("spring on an unknown joint", '[[spring]]\njoint = "x"\nstiffness = 1.0', "'x'", COORDINATES),
+    _add("negative spring", '[[spring]]\njoint = "theta_1"\nstiffness = -1.0', "stiffness = -1.0: a number of at"),
+    _add("force on nothing", '[[force]]\njoint = "x"\nvalue = 1.0', "'x'", COORDINATES),
+    _edit("point frame", 'frame = "tip_left"\n', 'frame = "x"\n', "point 'tip': no link 'x'", LINKS),
+]
+
+COORDINATE_CHOICES = [
+    _edit("unknown independent", INDEPENDENT, '["theta_1", "x"]', "independent: no coordinate 'x'", COORDINATES),
+    _edit("too few independent", INDEPENDENT, '["theta_1"]', "independent: 1 coordinates (theta_1)", "d = 2"),
+    _edit("too many independent", INDEPENDENT, '["theta_1", "theta_2", "theta_3"]', "3 coordinates", "d = 2", "do"),
+    _edit("none independent", INDEPENDENT, "[]", "independent: 0 coordinates (none)", "d = 2"),
+    _edit("independent twice", INDEPENDENT, '["theta_1", "theta_1"]', "independent: a coordinate is named twice"),
+    _edit("independent as a string", INDEPENDENT, '"theta_1"', "independent = 'theta_1': a list is needed"),
+    _edit("unknown actuated", f"actuated = {INDEPENDENT}", 'actuated = ["x"]', "actuated: no coordinate 'x'"),
+    _edit("actuated twice", f"actuated = {INDEPENDENT}", 'actuated = ["theta_1", "theta_1"]', "actuated: a joint is"),
+    _edit("unknown guess", "theta_4 = -0.248", "theta_5 = 1.0", "q_guess: no coordinate 'theta_5'", COORDINATES),
+    _edit("guess of nan", "theta_4 = -0.248", "theta_4 = nan", f"{NAMED}q_guess.theta_4 = nan: {FINITE}"),
+    _edit("guess in words", "theta_4 = -0.248", 'theta_4 = "a"', f"{NAMED}q_guess.theta_4 = 'a': a number is needed"),
+    Bad(
+        "independent that cannot parametrise",
+        CHECK,
+        ["independent: geared cannot parametrise the mechanism", "(phi_z is singular there); loose would do"],
+        files={
+            # One joint is welded to the world, the second is geared to the first, only the third can turn.
+            "bar/mechanism.toml": """
+name = "held"
+urdf = "p.urdf"
+independent = ["geared"]
+[[coupling]]
+joint = "geared"
+other = "welded"
+ratio = 1.0
+[[loop]]
+name = "hold"
+type = "weld"
+frame_a = "b"
+frame_b = "world"
+""",
+            "bar/p.urdf": """<robot name="p"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
+<joint name="welded" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint>
+<joint name="geared" type="continuous"><parent link="a"/><child link="c"/><axis xyz="0 0 1"/></joint>
+<joint name="loose" type="continuous"><parent link="a"/><child link="d"/><axis xyz="0 0 1"/></joint></robot>""",
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize("case", [*FILES, *LOOPS, *COORDINATE_CHOICES], ids=lambda case: case.what)
+def test_bad_mechanism(case: Bad, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    expect(case, bar)
+    assert capfd.readouterr() == ("", "")
