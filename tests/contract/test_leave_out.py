@@ -1,0 +1,63 @@
+"""What is not needed is not loaded, read from sys.modules in a fresh interpreter."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import ckc_pin
+
+VIEW = {"meshcat", "matplotlib", "yourdfpy"}
+
+LIST = "import sys, json; print(json.dumps(sorted(sys.modules)), file=sys.stderr)"
+RUN = f"""
+import sys
+from ckc_pin.cli import main
+sys.argv = ["ckc", *sys.argv[1:]]
+try:
+    main()
+finally:
+    {LIST}
+"""
+
+
+def _modules(code: str, *words: str) -> tuple[set[str], str]:
+    """Return the names of the modules that code leaves loaded, and what it printed."""
+    here = str(Path(ckc_pin.__file__).parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": here},
+    )
+    return set(json.loads(done.stderr.splitlines()[-1])), done.stdout
+
+
+def test_importing_loads_no_solver_no_command_line_and_no_pictures() -> None:
+    modules, _ = _modules(f"import ckc_pin; {LIST}")
+    assert "pinocchio" in modules
+    assert not modules & (VIEW | {"typer", "scipy.integrate"})
+
+
+def test_terms_need_no_solver() -> None:
+    modules, _ = _modules(
+        'import ckc_pin; ckc_pin.terms(ckc_pin.load("five_bar"), {"theta_1": -1.2, "theta_3": -1.9}).C; ' + LIST
+    )
+    assert not modules & (VIEW | {"typer", "scipy.integrate"})
+
+
+def test_a_run_in_json_loads_no_pictures() -> None:
+    modules, out = _modules(RUN, "run", "five_bar/swing", "--set", "t_end=0.01", "--json")
+    assert json.loads(out)["status"] == "done"
+    assert "scipy.integrate" in modules
+    assert not modules & (VIEW | {"PIL", "tornado", "zmq"})
+
+
+def test_checking_loads_no_pictures() -> None:
+    modules, out = _modules(RUN, "check", "five_bar", "--json")
+    assert json.loads(out)["d"] == 2
+    assert not modules & (VIEW | {"scipy.integrate"})
