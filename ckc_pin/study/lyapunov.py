@@ -1,0 +1,82 @@
+"""A Lyapunov function recorded along a run, differentiated and compared with what the paper says its rate is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.run import Run
+
+__all__ = ["Record", "derivative", "record"]
+
+DEGREE = 7  # of the spline through the recorded values
+ROUNDING = 8  # spacings of floating-point numbers at the energies that the function is a difference of
+
+
+@dataclass(frozen=True)
+class Record:
+    """A Lyapunov function along a run.
+
+    Attributes
+    ----------
+    t, value : (m,) arrays
+        s, J.
+    rate : (m,) array
+        Derivative of the recorded values, by a spline of degree DEGREE: knows nothing of the equations. W.
+    predicted : (m,) array
+        The paper's right-hand side at the recorded states, W.
+    largest_increase : float
+        Of the value from one output instant to the next, J; negative when it always falls.
+    round_off : float
+        What rounding does to the value, J.
+    """
+
+    t: Array
+    value: Array
+    rate: Array
+    predicted: Array
+    largest_increase: float
+    round_off: float
+
+    @property
+    def mismatch(self) -> float:
+        """Largest difference of rate and prediction, relative to the largest prediction."""
+        return float(np.abs(self.rate - self.predicted).max() / np.abs(self.predicted).max())
+
+    @property
+    def monotone(self) -> bool:
+        """Whether no increase is larger than rounding."""
+        return self.largest_increase <= self.round_off
+
+
+def record(run: Run, predicted: Callable[[int], float]) -> Record:
+    """Compare a run's Lyapunov function with its predicted rate.
+
+    Parameters
+    ----------
+    run : Run
+        Of a controller with a Lyapunov function, recorded densely.
+    predicted : callable
+        From a row of the run to the rate, W.
+    """
+    if run.lyapunov is None:
+        raise ValueError("the run's controller has no Lyapunov function")
+    largest = max(float(np.abs(run.energy).max()), float(np.abs(run.lyapunov).max()))
+    return Record(
+        t=run.t,
+        value=run.lyapunov,
+        rate=derivative(run.t, run.lyapunov),
+        predicted=np.array([predicted(k) for k in range(len(run.t))]),
+        largest_increase=float(np.diff(run.lyapunov).max()),
+        round_off=ROUNDING * float(np.spacing(largest)),
+    )
+
+
+def derivative(t: Array, value: Array) -> Array:
+    """Differentiate samples by an interpolating spline, shape (m,)."""
+    from scipy.interpolate import make_interp_spline
+
+    return np.asarray(make_interp_spline(t, value, k=DEGREE).derivative()(t))
