@@ -92,7 +92,9 @@ NAMES = [
 def test_any_name_survives(folder: Path, name: str) -> None:
     """Names come from strangers: what is written is the TOML and the URDF that was meant, whatever they hold."""
     quoted = name.replace('"', "&quot;")
-    text = FOUR_BAR.replace('name="a"', f'name="{quoted}" ref="0.2"').replace('name="elbow"', f'name="{quoted}"')
+    text = FOUR_BAR.replace('name="a"', f'name="{quoted}" ref="0.2" armature="0.1"').replace(
+        'name="elbow"', f'name="{quoted}"'
+    )
     text = text.replace("</mujoco>", f'<actuator><motor joint="{quoted}"/></actuator></mujoco>')
     text = text.replace('model="linkage"', f'model="{quoted}"')
     (folder / "odd.xml").write_text(text, encoding="utf-8")

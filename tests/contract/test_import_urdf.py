@@ -124,9 +124,11 @@ def test_couplings_of_generalized_rbda(tmp_path: Path) -> None:
 TILT = "0.3 -0.5 0.8"
 
 
-def two_legs(offset: float = 0.0, names: tuple[str, str] = ("closing_tip_1", "closing_tip_2")) -> str:
+def two_legs(
+    offset: float = 0.0, base: str = "fixed", names: tuple[str, str] = ("closing_tip_1", "closing_tip_2")
+) -> str:
     """Two legs of two hinges each in a tilted plane, meeting at frames that stand 90 degrees apart."""
-    content = link("base") + link("plane") + joint("tilt", "base", "plane", rpy=TILT, type="fixed")
+    content = link("base") + link("plane") + joint("tilt", "base", "plane", "0 0.1 0.2", "1 0 0", rpy=TILT, type=base)
     for side, x in (("left", -0.5), ("right", 0.5)):
         content += link(f"{side}_upper") + joint(f"{side}_hip", "plane", f"{side}_upper", f"{x} 0 0")
         content += link(f"{side}_lower") + joint(f"{side}_knee", f"{side}_upper", f"{side}_lower", f"{x} 1 0")
@@ -143,6 +145,14 @@ def test_a_loop_in_a_plane_is_two_rows(tmp_path: Path) -> None:
     assert said(draft.guessed, "point_2d for loop tip")
     mechanism = draft.mechanism()
     assert (mechanism.closure.rows, mechanism.rank, mechanism.d) == (2, 2, 2)
+
+
+def test_a_plane_that_turns_as_a_whole_is_still_one(tmp_path: Path) -> None:
+    draft = imported(tmp_path, two_legs(base="revolute"))
+    ((loop, _),) = draft.loops
+    assert loop.type == "point_2d"
+    assert_close(loop.axis_a, [0.0, 1.0, 0.0], 1e-12)
+    assert draft.mechanism().d == 3
 
 
 def test_an_offset_across_the_plane_is_said(tmp_path: Path) -> None:

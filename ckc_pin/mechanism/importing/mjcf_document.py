@@ -21,6 +21,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Attributes", "Child", "Document"]
 
 MAIN = "main"
+LARGEST = 1e100  # squares of what is larger overflow
 IN_BODIES = ("joint", "freejoint", "inertial", "geom", "site", "body", "frame", "camera", "light", "plugin")
 
 
@@ -46,7 +47,7 @@ class Attributes:
             found = [float(word) for word in text.split()]
         except ValueError:
             raise InputError(f"{self.where}: {key}={text!r} is not a list of numbers") from None
-        if len(found) < least or not all(map(math.isfinite, found)):
+        if len(found) < least or not all(abs(x) < LARGEST for x in found):
             raise InputError(f"{self.where}: {key}={text!r}: {least} finite numbers are needed")
         return found
 
