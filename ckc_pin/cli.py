@@ -36,9 +36,6 @@ __all__ = ["main"]
 
 DONE, WRONG_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143
 
-EXTRAS = ("matplotlib", "meshcat", "yourdfpy")
-VIEW = "pip install 'ckc_pin[view]'"
-
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
@@ -236,10 +233,6 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT, as_json)
-    except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
-            raise
-        _fail(f"{error.name} is not installed: {VIEW}", WRONG_INPUT, as_json)
     except Exception as error:
         usage = _usage(error)
         if usage is None:
@@ -300,12 +293,12 @@ def _make_folder(out: Path) -> None:
 def _write(finished: ckc_pin.Run, out: Path) -> None:
     finished.save(out / "run.npz")
     (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
+    from ckc_pin.view.figures import plot as plot_runs
+
     try:
-        from ckc_pin.view.figures import plot as plot_runs
-    except ModuleNotFoundError as error:
-        errors.print(f"no figures: {error.name} is not installed: {VIEW}")
-    else:
         plot_runs([finished], out)
+    except InputError as error:  # matplotlib is an extra; the run itself is saved
+        errors.print(f"no figures: {error}")
 
 
 class _progress_bar:
