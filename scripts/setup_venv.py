@@ -126,9 +126,7 @@ def run_with_progress(lock: int, what: str, command: list[str]) -> None:
     run_quietly(lock, what, command, progress)
 
 
-def run_quietly(
-    lock: int, what: str, command: list[str], on_line: Callable[[str], None] = lambda line: None
-) -> None:
+def run_quietly(lock: int, what: str, command: list[str], on_line: Callable[[str], None] = lambda line: None) -> None:
     """Run a command that is heard only when it fails.
 
     It holds the lock as well: should we be killed, nobody touches .venv while it still writes there.
