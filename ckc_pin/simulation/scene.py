@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
 from ckc_pin.control.spec import ControllerSpec
 from ckc_pin.errors import InputError
@@ -199,8 +200,17 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
         if value is None:
             at.pop(last, None)
         else:
-            at[last] = value
+            at[last] = _plain(value)
     return changed
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that a Python program gave as TOML would: NumPy's numbers and arrays as Python's."""
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _present(value: Any) -> Any:
