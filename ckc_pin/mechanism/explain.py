@@ -102,7 +102,7 @@ def _needed(text: str) -> str:
         needed += " that is not empty" if length[1] else f" of {length[2]}"
     if got is None or got == "bool":
         return f"{needed} is needed"
-    return f"{needed} is needed, not {PLAIN.get(got, f'of {got}')}"
+    return f"{needed} is needed, not {f'of {got}' if got.isdigit() else PLAIN.get(got, got)}"
 
 
 # --- places ----------------------------------------------------------------------------------------
