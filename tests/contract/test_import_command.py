@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -248,6 +249,15 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
 def test_bad_robot(case: Bad, bar: Path) -> None:
     expect(case, bar)
+
+
+def test_a_robot_yaml_without_its_library(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, text in urdf("", robot_yaml="name_mot: [j]").items():
+        (folder / name).write_text(text, encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    refused = ckc("import", "r.urdf")
+    assert refused.code == 2
+    assert "robot.yaml: reading it needs PyYAML" in refused.err
 
 
 # --- published robots ---------------------------------------------------------------------------------------------
