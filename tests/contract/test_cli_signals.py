@@ -60,7 +60,7 @@ def test_an_interrupted_run_is_printed_and_saved(number: signal.Signals, code: i
     assert found["status"] == "interrupted"
     assert says in found["message"]
     assert err == f"{found['message']}\n"
-    assert found["t"] > 0.5
+    assert found["t"] >= 0.5, "the output instants before the step that was told"
     run = ckc_pin.Run.load(tmp_path)
     assert run.status == "interrupted"
     assert run.t[-1] == found["t"]
