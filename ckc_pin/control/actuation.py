@@ -81,7 +81,16 @@ class Actuation:
         return np.ones(len(tau)) if self.limit is None else (np.abs(tau) < self.limit).astype(float)
 
     def apply(self, terms: Terms, u: Array) -> Effort:
-        """Map u to tau (minimum norm when there are more actuators than freedoms) and limit it."""
+        """Map u to tau (minimum norm when there are more actuators than freedoms) and limit it.
+
+        Raises
+        ------
+        InputError
+            A controller's u of the wrong shape.
+        """
+        if np.shape(u) != (self.mechanism.d,):
+            names = ", ".join(self.mechanism.independent)
+            raise InputError(f"the controller's u has shape {np.shape(u)}; ({self.mechanism.d},) is needed: {names}")
         transmission = terms.rho[self.at].T  # u = transmission tau
         tau = u if self.direct else np.asarray(np.linalg.lstsq(transmission, u, rcond=1e-9)[0], dtype=float)
         if self.limit is not None:

@@ -99,9 +99,9 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, actuated: IntArr
     tangent : (n, d) array
         Basis of the velocities that the loops allow.
     """
-    if tangent.shape[1] == 0:
-        return []
     moves = np.vstack([tree.centre_jacobians(q_tree), np.eye(tree.n)[actuated]]) @ tangent
+    if 0 in moves.shape:
+        return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)
     still = directions[int(np.sum(values > 1e-8 * max(values[0], 1e-300))) :]
     names: list[str] = []

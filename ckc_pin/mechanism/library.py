@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 
 from ckc_pin.errors import InputError
@@ -76,8 +78,12 @@ def about(name: str) -> str:
 
 
 def first_comment(text: str) -> str:
-    """Return the first line of a TOML text that is a comment, without its mark."""
-    return next((line.lstrip("# ").strip() for line in text.splitlines() if line.startswith("#")), "")
+    """Return the first sentence of the first comment of a TOML text, without its marks."""
+    lines = text.splitlines()
+    start = next((k for k, line in enumerate(lines) if line.startswith("#")), len(lines))
+    comment = itertools.takewhile(lambda line: line.startswith("#"), lines[start:])
+    whole = " ".join(line.lstrip("# ").strip() for line in comment)
+    return re.split(r"(?<=\.) (?=[A-Z])", whole, maxsplit=1)[0]
 
 
 def _text(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:

@@ -81,6 +81,8 @@ class Mechanism:
         self.closure: Closure = builder.build()
         self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
+        if len(self.points) < len(spec.point):
+            raise MechanismError("point: two points have the same name")
         self.size = _size(self.tree, self.closure)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n

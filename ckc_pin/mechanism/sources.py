@@ -43,7 +43,7 @@ class Sources:
         if file not in self.texts:
             if self.folder is None:
                 raise InputError(f"{self.name}: the text of {file!r} is not part of it")
-            self.texts[file] = read_text(resolve(file, self.folder, self.name), "URDF")
+            self.texts[file] = read_text(resolve(file, self.folder, self.name), "file")
         return self.texts[file]
 
 
@@ -52,6 +52,8 @@ def resolve(file: str, folder: Path, where: str) -> Path:
     if not file.startswith(PACKAGE):
         return folder / file
     package, _, rest = file.removeprefix(PACKAGE).partition("/")
+    if package in ("", ".", ".."):
+        raise InputError(f"{where}: {file!r} names no package; write package://PACKAGE/PATH")
     for share in _shares():
         base = (share / package).resolve()
         if base.is_dir():

@@ -77,9 +77,9 @@ class Stepper:
         self.method = method
         self.spec = spec
         self.rhs_count = self.steps = self.rejected = 0
-        self.t_failed: float | None = None
         self.failure: NumericalError | None = None
         self._deadline = perf_counter() + spec.max_wall_s if spec.max_wall_s else np.inf
+        self._budgeted = False  # from the first step on: what a solver evaluates to be made is let pass
         self._times: set[float] = set()
         atol = spec.atol if spec.atol is not None else spec.rtol / 100
         options: dict[str, Any] = {"max_step": spec.max_step} if spec.max_step else {}
@@ -89,7 +89,9 @@ class Stepper:
             options["jac"] = self._jacobian
         self._options = {"rtol": spec.rtol, "atol": atol, **options}
         self._class = getattr(scipy.integrate, method)
-        self.solver = self._class(self._rhs, 0.0, self.y, t_end, **self._options)
+        with np.errstate(all="ignore"):
+            self.solver = self._class(self._rhs, 0.0, self.y, t_end, **self._options)
+        self._budgeted = True
         self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
 
     @property
@@ -111,7 +113,11 @@ class Stepper:
         t_old, y_old, f_old = self.t, solver.y.copy(), getattr(solver, "f", None)
         before = self.rhs_count
         self._times.clear()
-        message = solver.step()
+        try:
+            with np.errstate(all="ignore"):
+                message = solver.step()
+        except (ValueError, np.linalg.LinAlgError) as error:  # an overflow in an implicit method's own algebra
+            raise self._explain(f"the solver met a number that is not finite ({error})") from None
         if solver.status == "failed":
             raise self._explain(message)
         self._before = (t_old, y_old)
@@ -167,9 +173,9 @@ class Stepper:
     def _rhs(self, t: float, y: Array, at_start: bool = False) -> Array:
         self.rhs_count += 1
         self._times.add(t)
-        if self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
+        if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
             raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
-        if perf_counter() > self._deadline:
+        if self._budgeted and perf_counter() > self._deadline:
             raise BudgetError(f"the budget of max_wall_s = {self.spec.max_wall_s:g} s is used up")
         try:
             with np.errstate(all="ignore"):

@@ -44,6 +44,10 @@ class Recorder:
         """Record the state at an instant; instants not after the last one are passed over."""
         if self.rows["t"] and t <= self.rows["t"][-1]:
             return
+        with np.errstate(all="ignore"):
+            self._add(t, y)
+
+    def _add(self, t: float, y: Array) -> None:
         system = self.system
         terms = system.terms(t, y)
         velocity, w = system.velocity(t, terms), system.w(t)

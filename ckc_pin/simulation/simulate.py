@@ -146,6 +146,7 @@ def _steps(
             if retry is not None:
                 stepper.take_back(retry)
                 continue
+            end = (step.t, stepper.solver.y)
             halt = events.check(step, recorder.system)
             until = step.t if halt is None else halt
             while due < len(times) and (times[due] <= until or (until >= t_end and due == len(times) - 1)):
@@ -157,7 +158,6 @@ def _steps(
                 recorder.add(halt, step.interpolant(halt))
                 return "done", f"stopped by the event at t = {halt:.9g} s"
             if stepper.solver.status == "running":
-                end = (step.t, stepper.solver.y)
                 stepper.settle()
                 end = (step.t, stepper.solver.y)
     except NumericalError as error:
