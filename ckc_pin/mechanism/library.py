@@ -83,7 +83,7 @@ def first_comment(text: str) -> str:
     start = next((k for k, line in enumerate(lines) if line.startswith("#")), len(lines))
     comment = itertools.takewhile(lambda line: line.startswith("#"), lines[start:])
     whole = " ".join(line.lstrip("# ").strip() for line in comment)
-    return re.split(r"(?<=\.) (?=[A-Z])", whole, maxsplit=1)[0]
+    return re.split(r"(?<=\.) +(?=[A-Z])", whole, maxsplit=1)[0]
 
 
 def _text(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
