@@ -128,11 +128,31 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
     start = find_start(mechanism, scene)
+    _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     if controller is not None:
         actuation.require_transmission(start.at)
     plant = Plant(controller, actuation)
     system = _system(mechanism, scene, start, plant)
     return Prepared(mechanism, plant, system, _method(scene, system), texts)
+
+
+def _refuse_massless(terms: Terms) -> None:
+    """Massless links are fine as long as every motion that the loops allow moves some mass.
+
+    Judged on D with its diagonal scaled to one, so that neither units nor ratios of masses matter.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(terms.D), 0.0))
+    least = int(np.argmin(scale))
+    if scale[least] > 1e-12 * scale.max():
+        values, directions = np.linalg.eigh(terms.D / np.outer(scale, scale))
+        if values[0] > 1e-13:
+            return
+        least = int(np.argmax(np.abs(directions[:, 0])))
+    name = terms.mechanism.independent[least]
+    raise InputError(
+        f"{terms.mechanism.name}: the motion along {name} moves no mass, so no force can tell its acceleration; "
+        "give the links it moves a mass and an inertia, or make the joint fixed"
+    )
 
 
 def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> System:
