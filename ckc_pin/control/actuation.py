@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ckc_pin.control.spec import Limit
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Actuation", "Effort"]
+__all__ = ["Actuation", "Effort", "require_u"]
+
+
+def require_u(u: Any, mechanism: Mechanism, what: str = "the controller's u") -> Array:
+    """Return u as an array of the right shape, finite or not.
+
+    Raises
+    ------
+    InputError
+        Not numbers, or not one for each independent coordinate.
+    """
+    try:
+        vector = np.asarray(u, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is no vector of numbers: {u!r:.80}") from None
+    if vector.shape != (mechanism.d,):
+        names = ", ".join(mechanism.independent)
+        raise InputError(f"{what} has shape {vector.shape}; ({mechanism.d},) is needed: {names}")
+    return vector
 
 
 @dataclass(frozen=True)
@@ -87,10 +106,12 @@ class Actuation:
         ------
         InputError
             A controller's u of the wrong shape.
+        NumericalError
+            A controller's u that is not finite.
         """
-        if np.shape(u) != (self.mechanism.d,):
-            names = ", ".join(self.mechanism.independent)
-            raise InputError(f"the controller's u has shape {np.shape(u)}; ({self.mechanism.d},) is needed: {names}")
+        u = require_u(u, self.mechanism)
+        if not np.isfinite(u).all():
+            raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
         transmission = terms.rho[self.at].T  # u = transmission tau
         tau = u if self.direct else np.asarray(np.linalg.lstsq(transmission, u, rcond=1e-9)[0], dtype=float)
         if self.limit is not None:

@@ -15,6 +15,8 @@ Limit = Annotated[float, msgspec.Meta(gt=0)]
 class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="type"):
     torque_limit: Limit | dict[str, Limit] | None = None
     model: str | None = None
+    sample_time: Annotated[float, msgspec.Meta(gt=0)] | None = None  # s; absent: u is continuous
+    delay: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # s, from a sample to its action
 
 
 class SetPointSpec(_Spec, frozen=True, tag="set_point"):

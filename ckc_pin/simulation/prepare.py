@@ -10,6 +10,7 @@ import numpy as np
 from ckc_pin.control.actuation import Actuation, Effort
 from ckc_pin.control.build import make_controller
 from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+from ckc_pin.control.sampled import Held, Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load, mechanism_file
@@ -121,9 +122,12 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
     """
     mechanism = scene_mechanism(scene)
     texts: dict[str, str] = {}
+    spec = scene.spec.controller
     if controller is None:
         controller = scene_controller(scene, mechanism, texts)
-    limit = scene.spec.controller.torque_limit if scene.spec.controller else None
+        if controller is not None and spec is not None and spec.sample_time is not None:
+            controller = Sampled(controller, spec.sample_time, spec.delay)
+    limit = spec.torque_limit if spec else None
     actuation = Actuation(mechanism, limit)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
@@ -133,7 +137,7 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
         actuation.require_transmission(start.at)
     plant = Plant(controller, actuation)
     system = _system(mechanism, scene, start, plant)
-    return Prepared(mechanism, plant, system, _method(scene, system), texts)
+    return Prepared(mechanism, plant, system, _method(scene, system, plant), texts)
 
 
 def _refuse_massless(terms: Terms) -> None:
@@ -183,10 +187,11 @@ def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> S
     )
 
 
-def _method(scene: Scene, system: System) -> str:
-    """What "auto" means: closed loops are stiff through their gains, eq. 8 through epsilon."""
+def _method(scene: Scene, system: System, plant: Plant) -> str:
+    """What "auto" means: closed loops are stiff through their gains, unless u is held; eq. 8 is through epsilon."""
     spec = scene.spec
     if spec.solver.method != "auto":
         return spec.solver.method
-    stiff = spec.controller is not None or isinstance(system, PrintedSpf)
+    feedback = spec.controller is not None and not isinstance(plant.controller, Held)
+    stiff = feedback or isinstance(system, PrintedSpf)
     return "Radau" if stiff else "DOP853"

@@ -181,6 +181,8 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
         )
     if spec.initial.w is not None and spec.formulation != "spf":
         raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
+    if spec.controller is not None and spec.controller.delay and spec.controller.sample_time is None:
+        raise InputError(f"{sources.name}: controller.delay: give sample_time too; what is sampled is delayed")
     shortest, longest = spec.solver.min_step, spec.solver.max_step
     if longest is not None and shortest > longest:
         raise InputError(f"{sources.name}: solver: min_step = {shortest:g} is above max_step = {longest:g}")
