@@ -28,6 +28,7 @@ LONG = 20  # rows of a table that are shown at once
 
 # Which module of this room answers what; those that take longest come first.
 STUDIES: dict[str, tuple[str, ...]] = {
+    "tracking": ("tracking-lyapunov", "tracking-skew", "tracking-gains", "tracking-deviations"),
     "cost_claims": ("cost",),
     "set_point": (
         "set-point-lyapunov", "set-point-gradient-bound", "set-point-gain-condition", "set-point-unique",
@@ -54,10 +55,13 @@ SECTIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
         "II-B. Set-point control",
         ("set-point-gradient-bound", "set-point-gain-condition", "set-point-unique", "set-point-lyapunov"),
     ),
-    ("II-C. Tracking control", ("tikhonov-velocity",)),
+    ("II-C. Tracking control", ("tracking-lyapunov", "tracking-skew", "tracking-gains", "tikhonov-velocity")),
     ("III-A. Singular configurations", ("singular-type-1", "singular-type-2", "singular-freedoms")),
     ("III-B. Set-point control, results", ("initial-equilibrium", "figure-3", "cost")),
-    ("III-C. Tracking control, results", ("no-singularities", "figure-4", "torques", "tracking-error-law")),
+    (
+        "III-C. Tracking control, results",
+        ("no-singularities", "figure-4", "torques", "tracking-error-law", "tracking-deviations"),
+    ),
     ("Appendix", ("appendix",)),
 )
 
