@@ -162,7 +162,7 @@ def _gains_claim() -> Claim:
         gap, printed = (float(np.abs(form - f(Lambda, K_D)).max()) for f in (claimed_form, printed_form))
         (fits if symmetric else misfits).append(gap)
         lows = (f"{np.linalg.eigvalsh(x)[0]:.3g}" for x in ((A + A.T) / 2, form))
-        rows.append((name, _yes(symmetric), f"{gap:.1g}", f"{printed:.2g}", *lows, _yes(_accepted(Lambda, K_D))))
+        rows.append((name, _yes(symmetric), f"{gap:.2g}", f"{printed:.2g}", *lows, _yes(_accepted(Lambda, K_D))))
     return Claim(
         key="tracking-gains",
         where="section II-C, eqs. 18 and 19",
