@@ -9,11 +9,9 @@ from __future__ import annotations
 import io
 import json
 import os
-import signal
 import sys
 import tempfile
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -22,6 +20,7 @@ from rich.console import Console, RenderableType
 import ckc_pin
 from ckc_pin.errors import CkcError, InputError, NumericalError
 from ckc_pin.simulation.arguments import read_changes, read_table
+from ckc_pin.simulation.interrupts import Interrupts
 from ckc_pin.simulation.report import (
     check_plain,
     check_table,
@@ -43,6 +42,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+interrupts = Interrupts()
 errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 BEGIN = """Dynamics and control of closed kinematic chains.
@@ -146,19 +146,20 @@ def run(
         _make_folder(out)
     with _progress_bar(scene.name) as progress:
         finished = ckc_pin.simulate(scene, progress=progress, profile=profile)
+    stop = _write(finished, out) if out is not None else None
     if profile:
         errors.print(profile_table(finished))
-    if not as_json:
-        _print_table(run_table(finished))
-    if out is not None:
-        _write(finished, out)
     if as_json:
         _print_json(finished.summary())
-    elif out is not None:
-        print(f"written to {out}")
+    else:
+        _print_table(run_table(finished))
+        if out is not None:
+            print(f"written to {out}")
     if finished.status != "done":
         errors.print(finished.message)
         raise typer.Exit(STOPPED if finished.status == "stopped" else _interrupted(finished.message))
+    if stop is not None:
+        raise typer.Exit(_interrupted(str(stop)))
 
 
 @app.command(epilog=_examples("ckc plot runs/reduced runs/spf --out figures"))
@@ -212,7 +213,7 @@ def import_(
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
     as_json = "--json" in sys.argv
-    signal.signal(signal.SIGTERM, _terminate)
+    interrupts.install()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no error
     code = DONE
@@ -261,10 +262,6 @@ def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoRe
     sys.exit(code)
 
 
-def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise KeyboardInterrupt("SIGTERM")
-
-
 def _interrupted(message: str) -> int:
     return TERMINATED if "SIGTERM" in message else INTERRUPTED
 
@@ -290,15 +287,21 @@ def _make_folder(out: Path) -> None:
         raise InputError(f"--out {out}: no folder that can be written to: {error.strerror}") from None
 
 
-def _write(finished: ckc_pin.Run, out: Path) -> None:
-    finished.save(out / "run.npz")
-    (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
-    from ckc_pin.view.figures import plot as plot_runs
-
+def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
+    """Save a run, whatever signals come, then draw its figures; return what interrupted that."""
     try:
+        with interrupts.held():
+            finished.save(out / "run.npz")
+            (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
+        from ckc_pin.view.figures import plot as plot_runs
+
         plot_runs([finished], out)
     except InputError as error:  # matplotlib is an extra; the run itself is saved
         errors.print(f"no figures: {error}")
+    except KeyboardInterrupt as stop:
+        errors.print(f"no figures: interrupted{_by(stop)}; the run is saved")
+        return stop
+    return None
 
 
 class _progress_bar:

@@ -7,6 +7,7 @@ Before the first one acts, u = 0. What is held is eq. 6's force u.
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -68,8 +69,12 @@ class Sampled(Held):
     """
 
     def __init__(self, controller: Controller, sample_time: float, delay: float = 0.0) -> None:
-        for name, value, least in (("sample_time", sample_time, "greater than 0"), ("delay", delay, "of at least 0")):
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        given: list[tuple[str, Any, str]] = [
+            ("sample_time", sample_time, "greater than 0"),
+            ("delay", delay, "of at least 0"),
+        ]
+        for name, value, least in given:
+            number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
             if not number or not 0 <= value < np.inf or (name == "sample_time" and value == 0):
                 raise InputError(f"{name} = {value!r:.80}: a number {least} is needed, in seconds")
         self.controller = controller

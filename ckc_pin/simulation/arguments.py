@@ -6,6 +6,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 from ckc_pin.errors import InputError
@@ -26,12 +27,20 @@ def read_changes(option: str, settings: Iterable[str]) -> dict[str, Any]:
         key, equals, text = setting.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             raise InputError(f"{option} {setting}: write KEY=VALUE, e.g. solver.rtol=1e-10")
-        try:
-            value = tomllib.loads(f"x = {text}")["x"]
-        except (ValueError, RecursionError):
-            value = text
-        changes[key.strip()] = value
+        changes[key.strip()] = _value(text)
     return changes
+
+
+def _value(text: str) -> Any:
+    """Read TOML, or a number that TOML would write otherwise (.1, 5., 1.e-3), else take the text as it is."""
+    try:
+        return tomllib.loads(f"x = {text}")["x"]
+    except (ValueError, RecursionError):
+        pass
+    with suppress(ValueError):
+        if any(character.isdigit() for character in text):  # not Infinity, not NaN
+            return float(text)
+    return text
 
 
 def read_table(option: str, text: str) -> dict[str, float]:

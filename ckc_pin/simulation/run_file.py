@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import zipfile
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +21,9 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "read_run", "write_run"]
 
 FORMAT = 1
-MAX_BYTES = 2**31  # of one array, before it is expanded
+MAX_BYTES = 2**31  # of a run, expanded
+MAX_META = 2**27  # of what it holds beside its arrays: as Python's objects that takes many times as much
+MAX_HEADER = 10_000  # of an array's header; NumPy's own limit
 ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
 OPTIONAL = ("lyapunov",)
 OTHERS = ("coordinates", "meta")
@@ -61,9 +65,20 @@ def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array]
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+        _sync_folder(path.parent)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the new name last as well; some file systems have no such thing."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
@@ -81,7 +96,10 @@ def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
         if version != FORMAT:
             raise InputError(f"{path}: a run of format {version}; this program reads format {FORMAT}")
         meta = msgspec.json.decode(rest, type=RunMeta)
-        coordinates = tuple(str(name) for name in content.pop("coordinates"))
+        named = content.pop("coordinates")
+        if named.ndim != 1 or named.dtype.kind != "U":
+            raise InputError(f"{path}: damaged: coordinates is {named.shape} {named.dtype}, not names")
+        coordinates = tuple(str(name) for name in named)
     except InputError:
         raise
     except Exception as error:  # whatever a damaged archive makes NumPy, zlib or msgspec raise
@@ -93,27 +111,39 @@ def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
+    """Read the arrays, after everything that the file declares about them has been found harmless."""
+    if path.stat().st_size > MAX_BYTES:
+        raise InputError(f"{path}: a file of {path.stat().st_size} bytes; a run has at most {MAX_BYTES}")
     with zipfile.ZipFile(path) as archive:
-        names = {entry.filename.removesuffix(".npy") for entry in archive.infolist()}
-        if not {*ARRAYS, *OTHERS} <= names <= {*ARRAYS, *OPTIONAL, *OTHERS}:
-            raise InputError(f"{path}: not a run file: it holds {', '.join(sorted(names)) or 'nothing'}")
-        for entry in archive.infolist():
-            _check_size(path, archive, entry)
+        entries = archive.infolist()
+        names = sorted(entry.filename for entry in entries)
+        allowed = {f"{name}.npy" for name in (*ARRAYS, *OPTIONAL, *OTHERS)}
+        needed = {f"{name}.npy" for name in (*ARRAYS, *OTHERS)}
+        if len(set(names)) != len(names) or not needed <= set(names) <= allowed:
+            held = ", ".join(name.removesuffix(".npy") for name in names[:20])
+            raise InputError(f"{path}: not a run file: it holds {held or 'nothing'}")
+        total = 0
+        for entry in entries:
+            size = _declared(path, archive, entry)
+            total += size
+            most = MAX_META if entry.filename == "meta.npy" else MAX_BYTES
+            if size > most:
+                raise InputError(f"{path}: an array of {size} bytes; a run has at most {most}")
+        if total > MAX_BYTES:
+            raise InputError(f"{path}: {total} bytes when expanded; a run has at most {MAX_BYTES}")
     with np.load(path, allow_pickle=False) as data:
         return {name: data[name] for name in data.files}
 
 
-def _check_size(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Bound what NumPy will allocate, which it takes from the array's header alone."""
+def _declared(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """Bytes that an entry says it has, which is what would be allocated: by the archive and by the array's header."""
     with archive.open(entry) as file:
-        major, _ = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-    size = dtype.itemsize
-    for length in shape:
-        size *= length
-    if max(size, entry.file_size) > MAX_BYTES:
-        raise InputError(f"{path}: an array of {max(size, entry.file_size)} bytes; a run has at most {MAX_BYTES}")
+        if np.lib.format.read_magic(file) != (1, 0):  # a later version's header may itself be of 4 GiB
+            raise InputError(f"{path}: damaged: {entry.filename} has a header that a run does not need")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER)
+    if dtype.hasobject:
+        raise InputError(f"{path}: damaged: {entry.filename} holds Python objects")
+    return max(dtype.itemsize * math.prod(shape), entry.file_size)
 
 
 def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array], meta: RunMeta) -> None:
