@@ -30,22 +30,11 @@ class BudgetError(Exception):
 
 @dataclass(frozen=True)
 class Step:
-    """One accepted step and y in between.
-
-    Attributes
-    ----------
-    nodes : (k,) array or None
-        Where in the step, from 0 to 1, the right-hand side was evaluated; None for multistep methods.
-    defect : float
-        Largest difference of y's change and the trapezoidal rule's, relative to |y|: small where the
-        motion is smooth at the scale of the step.
-    """
+    """One accepted step and y in between."""
 
     t_old: float
     t: float
     interpolant: Callable[[float], Array]
-    nodes: Array | None
-    defect: float
 
 
 class Stepper:
@@ -99,6 +88,11 @@ class Stepper:
         """Time reached."""
         return float(self.solver.t)
 
+    @property
+    def before(self) -> tuple[float, Array]:
+        """Where the last step began: t and y."""
+        return self._before
+
     def step(self) -> Step:
         """Advance by one accepted step; to be followed by `settle` once the step has been looked at.
 
@@ -126,7 +120,7 @@ class Stepper:
         if solver.t - t_old < self.spec.min_step and solver.status == "running":
             raise self._explain(f"the step fell below min_step = {self.spec.min_step:g} s")
         self.failure = None
-        return Step(t_old, self.t, self._interpolant(t_old, y_old, f_old), self._nodes(), self._defect(y_old, f_old))
+        return Step(t_old, self.t, self._interpolant(t_old, y_old, f_old))
 
     def settle(self) -> None:
         """Let the system take note of the step, project its state, or change its coordinates.
@@ -143,6 +137,24 @@ class Stepper:
         elif projected is not None:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
+
+    def rate(self, t: float, y: Array) -> Array:
+        """Evaluate y' at (t, y), counted; NaN where it does not exist."""
+        return self._rhs(t, y)
+
+    def refine(self, rtol: float) -> bool:
+        """Take a finer tolerance from the next solver on; return whether it is finer than before."""
+        finer = rtol < self._options["rtol"]
+        if finer:
+            self._options.update(rtol=rtol, atol=min(self._options["atol"], rtol / 100))
+        return finer
+
+    def go_on(self, t: float, y: Array, length: float) -> None:
+        """Go on from (t, y), which something else integrated to; the next step tries a length."""
+        if t < self.solver.t_bound:
+            self._restart(t, y, length)
+        else:
+            self.solver.t, self.solver.y, self.solver.status = t, y, "finished"
 
     def take_back(self, length: float) -> None:
         """Undo the last step; the next one tries another length."""
@@ -220,21 +232,6 @@ class Stepper:
         stages = 3 if self.method == "Radau" else 1
         distinct = len(self._times - {self.solver.t_old})
         return max(1, -(-distinct // stages))
-
-    def _nodes(self) -> Array | None:
-        """Stages of the method, with those that DOP853's interpolant adds."""
-        if self.method == "Radau":
-            return np.array([0.0, 0.4 - 0.1 * 6**0.5, 0.4 + 0.1 * 6**0.5, 1.0])
-        if self.method not in ONE_STEP:
-            return None
-        return np.concatenate([self.solver.C, getattr(self.solver, "C_EXTRA", []), [1.0]])
-
-    def _defect(self, y_old: Array, f_old: Array | None) -> float:
-        if f_old is None or self.solver.step_size is None:
-            return 0.0
-        solver = self.solver
-        gap = solver.y - y_old - 0.5 * (solver.t - solver.t_old) * (f_old + solver.f)
-        return float(np.abs(gap).max() / max(float(np.abs(solver.y).max()), 1e-300))
 
     def _interpolant(self, t_old: float, y_old: Array, f_old: Array | None) -> Callable[[float], Array]:
         """Radau's own interpolant is of order 3 only, so its end derivatives are used; else the solver's."""

@@ -1,111 +1,220 @@
-"""Watches for J losing rank inside a step, where branches of the motion meet.
+"""Watches for J losing rank, where branches of the motion meet.
 
 At a change point (a flat four-bar) the loops stop to determine the motion: a step that passes over it can
 come out on the other branch, within tolerance and wrong. The smallest singular value s(t) of J shows it
 as a V that reaches zero: falling at the start of a step, rising at its end. In such a step the minimum is
-searched for.
+searched for. Where the motion itself is smooth there, it is crossed by a leap (`simulation.leap`).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.rank import scaled
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.integrate import Step
-from ckc_pin.simulation.systems import System
+from ckc_pin.simulation.integrate import Step, Stepper
+from ckc_pin.simulation.leap import Leap, leap
+from ckc_pin.simulation.systems import Dae
 
 __all__ = ["RankGuard"]
 
+FINE = 1e-7  # at least, in a run with crossings: with less they come out up to 1e-2 off after ten seconds
 LOST = 1e-5  # relative to the largest singular value: the rank is lost
 NECK = 0.2  # of the larger end value: a minimum below that has to be resolved by shorter steps
 SHORTEST = 1e-6  # s; a step below that resolves any neck that is wider than LOST
-NEAR = 0.25  # of a step: no step ends so short of a crossing
-GAP = 0.1  # of a step: how far stages stay away from the crossing
-ATTEMPTS = 20  # to place a step across a crossing
-SMOOTH = 0.1  # the largest defect of a step that kept its branch; off it the velocity jumps by its own size
+NEAR = 2.0  # steps: a crossing that is as near as that is leapt over
+AHEAD = 0.1  # of s: what is left of it at a crossing, the motion extrapolated
+ATTEMPTS = 6  # leaps, each from half as far away as the one before
+CENTRED = 0.04  # of half a leap: how well the crossing has to be in its middle
+CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a leap, or the branches do not meet
 
 
 class RankGuard:
-    """Follows the smallest singular value of J along a run.
+    """Steps a run, and takes it across positions where J loses rank, or stops it there.
 
     A crossing is passed when the formulation does not need the branch from J (the DAE: its solution is
-    smooth there), by a step none of whose stages comes near it, and whose velocity goes on smoothly.
+    smooth there). A run that meets none evaluates no right-hand side more.
 
     Parameters
     ----------
-    system : System
+    stepper : Stepper
+
+    Attributes
+    ----------
+    crossings : list of float
+        When J lost rank, s.
     """
 
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self.rank = system.mechanism.rank
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper = stepper
+        self.system = stepper.system
+        self.rank = self.system.mechanism.rank
+        self.dae = self.system if isinstance(self.system, Dae) and self.system.projects else None
         self.crossings: list[float] = []
         self._end: tuple[float, float] | None = None  # s and its rate at the end of the last step
+        self._length = 0.0  # of that step
+        self._inside: float | None = None  # when rank is lost within a step that was taken back
+        self._reach = np.inf  # s; from farther away no leap is expected to be accurate
         self._attempts = 0
+        self._first_leg = stepper.solver.t_bound
 
-    def accept(self, step: Step) -> float | None:
-        """Look at a step; return None if it stands, else the length to take it again with.
+    def step(self) -> Step:
+        """Advance by one accepted step, or a leap; to be followed by `Stepper.settle`.
 
         Raises
         ------
         NumericalError
-            J loses rank in the step, and it cannot be passed.
+            J loses rank and the system cannot pass it, or the solver cannot go on.
+        BudgetError
+            A budget is used up.
         """
-        if self.rank == 0:
-            return None
+        while True:
+            left = self._time_to_crossing()
+            across = None if left is None else self._across(left)
+            if across is not None:
+                return across
+            step = self.stepper.step()
+            if self.rank == 0 or self._stands(step):
+                return step
+
+    def _stands(self, step: Step) -> bool:
+        """Whether a step can be kept; if not it is taken back."""
         (old, falling), (new, rising) = self._end or self._rate(step, step.t_old), self._rate(step, step.t)
-        if falling < 0 < rising:
-            t, value = self._minimum(step)
-            h = step.t - step.t_old
+        h = step.t - step.t_old
+        if falling < 0 < rising and _lower_bound(h, old, falling, new, rising) < NECK * max(old, new):
+            t, value = self._minimum(step.interpolant, step.t_old, step.t)
             if value < LOST:
-                retry = self._pass(step, t, value)
-                if retry is not None:
-                    return retry
-                self.crossings.append(t)
-            elif value < NECK * max(old, new) and h > SHORTEST:
-                return h / 4
-        early = self._too_near(step, new, rising)
-        if early is not None:
-            return early
+                if not self._passes:
+                    raise self._lost(step, t, value)
+                self._inside = t
+                self.stepper.take_back((t - step.t_old) / 2)
+                return False
+            if value < NECK * max(old, new) and h > SHORTEST:
+                self.stepper.take_back(h / 4)
+                return False
         if new < LOST:
             raise self._lost(step, step.t, new)
+        if rising > 0:
+            self._attempts = 0
+        self._end, self._length = (new, rising), h
+        return True
+
+    # --- crossing --------------------------------------------------------------------------------
+
+    @property
+    def _passes(self) -> bool:
+        return self.dae is not None and self._attempts < ATTEMPTS
+
+    def _time_to_crossing(self) -> float | None:
+        """Time until J loses rank; None when that is not near. Costs no right-hand side."""
+        t, inside = self.stepper.t, self._inside
+        self._inside = None
+        if inside is not None:
+            return inside - t
+        s, falling = self._end or (0.0, 0.0)
+        if falling >= 0 or not self._passes or s > -NEAR * self._length * falling:
+            return None
+        y, rate, n = self.stepper.solver.y, self.stepper.solver.f, self.system.positions
+
+        def extrapolated(t_ahead: float) -> Array:
+            ahead = y + (t_ahead - t) * rate
+            ahead[:n] += 0.5 * (t_ahead - t) ** 2 * rate[n : 2 * n]
+            return ahead
+
+        left = -s / falling
+        crossing, least = self._minimum(extrapolated, t + 0.3 * left, t + 1.3 * left, accuracy=1e-2)
+        return crossing - t if least < AHEAD * s else None
+
+    def _across(self, left: float) -> Step | None:
+        """Leap over a crossing; None where it has to be approached first, or is none."""
+        stepper = self.stepper
+        t, y = stepper.t, stepper.solver.y.copy()
+        if left > self._reach:
+            stepper.go_on(t, y, left - 0.9 * self._reach)
+            return None
+        starts = [(t, y)]
+        if left < 0.5 * self._length:  # so near J is ill-conditioned: rather from where the last step began
+            starts.insert(0, stepper.before)
+        self._attempts += 1
+        for start in starts:
+            found, crossing = self._leap(*start, t + left)
+            if crossing is not None:
+                break
+        else:
+            stepper.go_on(t, y, max(left - 0.9 * self._reach, 0.1 * left))
+            return None
+        if stepper.refine(FINE) and stepper.solver.t_bound == self._first_leg:
+            self._end, self._length = self._again(t), t - stepper.before[0]
+            return None
+        self.crossings.append(crossing)
         self._attempts = 0
-        self._end = new, rising
-        return None
+        end = min(found.t, float(stepper.solver.t_bound))
+        step = Step(t, end, found)
+        stepper.go_on(end, found(end), self._length or left)
+        stepper.steps += 1
+        self._end = self._rate(step, end)
+        return step
 
-    def _too_near(self, step: Step, new: float, rate: float) -> float | None:
-        """A step that ends just before a crossing leaves no room to step across: end it earlier."""
-        h = step.t - step.t_old
-        if rate >= 0 or step.nodes is None or not self.system.passes_rank_loss or self._attempts >= ATTEMPTS:
-            return None
-        left = -new / rate  # time to the crossing, along the line
-        if left > NEAR * h:
-            return None
-        self._attempts += 1
-        return left + h * (1 - _widest_gap(step.nodes))
+    def _again(self, t: float) -> tuple[float, float]:
+        """Come to t once more from the start, with the finer tolerance; return s and its rate there."""
+        stepper = self.stepper
+        t_end = stepper.solver.t_bound
+        stepper.go_on(0.0, stepper.y, t / 10)
+        stepper.solver.t_bound = t
+        while stepper.solver.status == "running":
+            step = stepper.step()
+            stepper.settle()
+        stepper.solver.t_bound, stepper.solver.status = t_end, "running"
+        return self._rate(step, t)
 
-    def _pass(self, step: Step, t: float, value: float) -> float | None:
-        """Return None if the step passes the crossing well, else a length that may."""
-        self._attempts += 1
-        if not self.system.passes_rank_loss or step.nodes is None or self._attempts > ATTEMPTS:
-            raise self._lost(step, t, value)
-        h, place = step.t - step.t_old, (t - step.t_old) / (step.t - step.t_old)
-        if np.abs(step.nodes - place).min() >= GAP and step.defect < SMOOTH:
-            return None
-        middle = _widest_gap(step.nodes)
-        if step.defect >= SMOOTH:
-            h *= 0.7
-        # the crossing in the widest gap between stages: now, or after a shorter step up to there
-        return h * place / middle if place <= middle else h * (place - middle)
+    def _leap(self, t: float, y: Array, crossing: float) -> tuple[Leap, float | None]:
+        """Leap from (t, y) with a crossing in the middle; also when exactly it was met, None if it was not."""
+        for _ in range(2):
+            left = crossing - t
+            found = leap(self._rate_on_closure, t, y, 2 * left)
+            self._reach = left * float(np.clip(found.scale, 0.25, 2.0))
+            if not found.good:
+                break
+            met, value = self._minimum(found, t + 0.5 * left, t + 1.5 * left)
+            if value > LOST or not self._closed(found):
+                break
+            if abs(met - crossing) < CENTRED * left:
+                return found, met
+            crossing = met
+        return found, None
 
-    def _minimum(self, step: Step) -> tuple[float, float]:
+    def _rate_on_closure(self, t: float, y: Array) -> Array:
+        assert self.dae is not None
+        try:
+            return self.stepper.rate(t, self.dae.on_closure(y))
+        except NumericalError:
+            return np.full_like(y, np.nan)
+
+    def _closed(self, found: Leap) -> bool:
+        """Whether the branches meet: off the closure the leap would have jumped a narrow gap between them."""
+        mechanism = self.system.mechanism
+        for t in np.linspace(found.t_old, found.t, 9):
+            phi = mechanism.kinematics(self.system.configuration(t, found(t))).phi
+            if np.abs(phi).max() > max(CLOSED * mechanism.size, 10 * mechanism.tolerance):
+                return False
+        return True
+
+    # --- the least singular value ----------------------------------------------------------------
+
+    def _minimum(
+        self, motion: Callable[[float], Array], start: float, end: float, accuracy: float = 1e-7
+    ) -> tuple[float, float]:
+        """When s is least on a motion, relative to the interval as accurately as said, and that s."""
         from scipy.optimize import minimize_scalar
 
-        options = {"xatol": 1e-7 * (step.t - step.t_old)}
-        bounds = (step.t_old, step.t)
-        least = minimize_scalar(lambda t: self._value(step, t), bounds=bounds, method="bounded", options=options)
+        def value(t: float) -> float:
+            return self._value(self.system.configuration(t, motion(t)))
+
+        options = {"xatol": accuracy * (end - start)}
+        least = minimize_scalar(value, bounds=(start, end), method="bounded", options=options)
         return float(least.x), float(least.fun)
 
     def _lost(self, step: Step, t: float, value: float) -> NumericalError:
@@ -122,10 +231,9 @@ class RankGuard:
         mechanism = self.system.mechanism
         return scaled(jacobian, mechanism.tree, mechanism.closure, mechanism.size)
 
-    def _value(self, step: Step, t: float) -> float:
+    def _value(self, q_tree: Array) -> float:
         """The rank-th singular value of the scaled J, relative to the largest."""
-        at = self.system.mechanism.kinematics(self.system.configuration(t, step.interpolant(t)))
-        values = np.linalg.svd(self._scaled(at.J), compute_uv=False)
+        values = np.linalg.svd(self._scaled(self.system.mechanism.kinematics(q_tree).J), compute_uv=False)
         return float(values[self.rank - 1] / values[0])
 
     def _rate(self, step: Step, t: float) -> tuple[float, float]:
@@ -137,8 +245,7 @@ class RankGuard:
         return float(values[k] / values[0]), float(rate / values[0])
 
 
-def _widest_gap(nodes: Array) -> float:
-    """Middle of the widest interval without a stage."""
-    places = np.unique(nodes)
-    k = int(np.argmax(np.diff(places)))
-    return float(places[k] + places[k + 1]) / 2
+def _lower_bound(h: float, old: float, falling: float, new: float, rising: float) -> float:
+    """Where the tangents at both ends of a V meet; looking closer costs an interpolant's right-hand sides."""
+    place = (new - old - rising * h) / (falling - rising)
+    return old + falling * place

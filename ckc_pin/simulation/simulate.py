@@ -137,15 +137,11 @@ def _steps(
     progress: Progress | None,
 ) -> tuple[Status, str]:
     """Step to the end, recording on the way; say how it ended."""
-    due, guard = 1, RankGuard(stepper.system)
+    due, guard = 1, RankGuard(stepper)
     end = (0.0, stepper.y)  # the last state that is known to be good
     try:
         while stepper.solver.status == "running":
-            step = stepper.step()
-            retry = guard.accept(step)
-            if retry is not None:
-                stepper.take_back(retry)
-                continue
+            step = guard.step()
             end = (step.t, stepper.solver.y)
             halt = events.check(step, recorder.system)
             until = step.t if halt is None else halt

@@ -42,8 +42,6 @@ class System(Protocol):
         How many leading entries of y are positions whose rates are the next as many; 0 when they are not.
     projects : bool
         Whether `accept` edits the state.
-    passes_rank_loss : bool
-        Whether the motion can be followed where J loses rank.
     """
 
     mechanism: Mechanism
@@ -54,9 +52,6 @@ class System(Protocol):
 
     @property
     def projects(self) -> bool: ...
-
-    @property
-    def passes_rank_loss(self) -> bool: ...
 
     def start(self) -> Array:
         """Initial y."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.dynamics.formulations import closing_step, dae_acceleration
+from ckc_pin.dynamics.formulations import closing_step, dae_acceleration, tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
@@ -17,6 +17,7 @@ from ckc_pin.simulation.systems.base import Counts, Force, Rhs
 
 __all__ = ["Dae"]
 
+NEGLIGIBLE = 1e-9  # rad, m: Newton's last step onto the closure
 WEAK = 1e-3  # of the largest singular value of J: below that a direction is not trusted to close along
 
 
@@ -30,7 +31,6 @@ class Dae:
     force: Force
     projects: bool = True
     counts: Counts = field(default_factory=Counts)
-    passes_rank_loss: bool = True
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.n if self.mechanism.tree.flat else 0
@@ -80,6 +80,25 @@ class Dae:
             return None
         terms = self._projected(at, v_tree)
         return np.concatenate([terms.q_tree, terms.v_tree])
+
+    def on_closure(self, y: Array) -> Array:
+        """Return y put on the closure to rounding, along every direction, however weakly J determines it.
+
+        Within the tolerance of a projection an error off the closure would stay, and be divided by J's
+        least singular value in the acceleration.
+        """
+        q_tree, v_tree = self._split(y)
+        at = self.mechanism.kinematics(q_tree)
+        for _ in range(10):
+            step = self._shortest(at, at.phi)
+            at = at.moved(step)
+            if np.abs(step).max() <= NEGLIGIBLE:  # what is left is its square
+                return np.concatenate([at.q_tree, v_tree + self._shortest(at, at.J @ v_tree)])
+        raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
+
+    def _shortest(self, at: Kinematics, residual: Array) -> Array:
+        self.counts.factorizations += 1
+        return tangent_basis(Terms(self.mechanism, at, residual), residual)[1]
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
         """Put a state on the closure by the shortest steps in the metric of the inertia.

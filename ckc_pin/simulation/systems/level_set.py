@@ -42,7 +42,6 @@ class LevelSet:
     u_rate_gradient: Gradient | None = None
     may_switch: bool = False
     counts: Counts = field(default_factory=Counts)
-    passes_rank_loss: bool = False
     projects: bool = False
 
     def __post_init__(self) -> None:

@@ -27,7 +27,6 @@ class PrintedSpf:
     epsilon: float
     convention: CoriolisVelocity = "rho"
     counts: Counts = field(default_factory=Counts)
-    passes_rank_loss: bool = False
     projects: bool = False
 
     def __post_init__(self) -> None:
