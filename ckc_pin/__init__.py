@@ -11,20 +11,24 @@ Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and 
 
 from typing import Any
 
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.mechanism import Mechanism, load
-from ckc_pin.simulation import Check, Run, Scene, check, load_scene, simulate
+from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, check, load_scene, simulate
 
 __all__ = [
     "Check",
     "CkcError",
+    "Event",
     "InputError",
     "Mechanism",
     "MechanismError",
     "NumericalError",
     "Run",
+    "Sampled",
     "Scene",
+    "Simulator",
     "Terms",
     "check",
     "load",

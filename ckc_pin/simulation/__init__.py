@@ -1,8 +1,10 @@
-"""From a scene to a run: integrate, project, events, record."""
+"""From a scene to a run: integrate, project, events, record. Or step by step, the loop closed by the caller."""
 
 from ckc_pin.simulation.check import Check, check
+from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
+from ckc_pin.simulation.simulator import Simulator
 
-__all__ = ["Check", "Run", "Scene", "check", "load_scene", "simulate"]
+__all__ = ["Check", "Event", "Run", "Scene", "Simulator", "check", "load_scene", "simulate"]

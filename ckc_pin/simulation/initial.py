@@ -19,11 +19,15 @@ __all__ = ["Start", "find_start"]
 
 @dataclass(frozen=True)
 class Start:
-    """A state to start from: the closure's terms at q' (on phi = w), q_dot, and w."""
+    """A state to start from: the closure's terms at q' (on phi = w), q_dot, w, and the velocity on phi = w.
+
+    `v_tree` is rho q_dot where it is not known to the last digit.
+    """
 
     at: Kinematics
     q_dot: Array
     w: Array
+    v_tree: Array | None = None
 
 
 def find_start(mechanism: Mechanism, scene: Scene) -> Start:

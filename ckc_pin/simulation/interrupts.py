@@ -18,12 +18,16 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
         self._told = 0
         self._saving = False
         self._meanwhile: list[int] = []
 
     def install(self) -> None:
-        """Take over both signals, unless whoever started the process has them ignored."""
+        """Take over both signals from here on, unless whoever started the process has them ignored."""
+        self._forget()
         for number in (signal.SIGINT, signal.SIGTERM):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._handle)
@@ -37,7 +41,7 @@ class Interrupts:
         finally:
             self._saving = False
         if self._meanwhile:
-            raise _interrupt(self._meanwhile[0])
+            raise _interrupt(self._meanwhile.pop(0))
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._saving:

@@ -20,7 +20,7 @@ from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
 
-__all__ = ["Plant", "Prepared", "prepare", "scene_controller", "scene_mechanism"]
+__all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
@@ -94,6 +94,7 @@ class Prepared:
         The formulation as a first-order system, at its start.
     method : str
         The solver that "auto" stands for here, or the one named.
+    start : Start
     texts : dict of str to str
         Files that the scene's controller brought along.
     """
@@ -102,6 +103,7 @@ class Prepared:
     plant: Plant
     system: System
     method: str
+    start: Start
     texts: dict[str, str]
 
 
@@ -136,8 +138,8 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
     if controller is not None:
         actuation.require_transmission(start.at)
     plant = Plant(controller, actuation)
-    system = _system(mechanism, scene, start, plant)
-    return Prepared(mechanism, plant, system, _method(scene, system, plant), texts)
+    system = make_system(mechanism, scene, start, plant)
+    return Prepared(mechanism, plant, system, _method(scene, system, plant), start, texts)
 
 
 def _refuse_massless(terms: Terms) -> None:
@@ -159,11 +161,13 @@ def _refuse_massless(terms: Terms) -> None:
     )
 
 
-def _system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> System:
+def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> System:
+    """Make the first-order system of a scene's formulation, at a start."""
     spec, force = scene.spec, plant.force
     free = plant.controller is None  # of a controller that lives in the mechanism's own q
     if spec.formulation == "dae":
-        return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, spec.solver.projection)
+        v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+        return Dae(mechanism, start.at, v_tree, force, spec.solver.projection)
     if spec.formulation == "reduced":
         return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
     equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)

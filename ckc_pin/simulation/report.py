@@ -19,6 +19,7 @@ from ckc_pin.simulation.run import Run
 
 __all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_plain", "terms_table", "to_json"]
 
+MOST_EVENTS = 10  # in a table for people
 TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
 
 
@@ -111,6 +112,10 @@ def run_table(run: Run) -> Table:
         table.add_row("largest |u|, |tau|", f"{np.abs(run.u).max():.4g}, {np.abs(run.tau).max():.4g}")
     table.add_row("energy start, end", f"{run.energy[0]:.9g}, {run.energy[-1]:.9g} J")
     table.add_row("largest |phi - w|", f"{run.max_phi:.2g} (its rate {run.max_phi_dot:.2g})")
+    for event in run.events[:MOST_EVENTS]:
+        table.add_row("event", f"t = {event['t']:.9g} s: {event['name']}")
+    if len(run.events) > MOST_EVENTS:
+        table.add_row("", f"and {len(run.events) - MOST_EVENTS} more")
     stats = run.stats
     table.add_row("method", f"{stats['method']}, {stats['steps']} steps, {stats['rejected']} rejected")
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"

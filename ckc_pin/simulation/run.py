@@ -47,7 +47,8 @@ class Run:
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict
-        Events that were met: t, coordinate, of, value.
+        Events that were met, in order of time: t, name, of, coordinate, value, direction (1 rising, -1 falling; of
+        "limit" 1 is leaving, -1 coming back), stop.
     stats : dict
         rhs, steps, rejected, newton, factorizations, jacobians, switches, wall_s, method, backend.
     scene : dict

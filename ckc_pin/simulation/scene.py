@@ -64,11 +64,14 @@ class SolverSpec(_Spec, frozen=True):
 
 
 class EventSpec(_Spec, frozen=True):
-    """A coordinate or its rate crossing a value."""
+    """A coordinate or its rate crossing a value, a joint limit passed, or a singularity margin crossing a value.
 
-    coordinate: str
-    of: Literal["q", "q_dot"] = "q"
-    value: float = 0.0
+    `value`: 0 for "q" and "q_dot"; a limit's is the URDF's; a margin needs one, greater than 0.
+    """
+
+    coordinate: str | None = None
+    of: Literal["q", "q_dot", "limit", "sigma_min_phi_z", "sigma_min_J"] = "q"
+    value: float | None = None
     direction: Literal[-1, 0, 1] = 0
     stop: bool = False
 
@@ -183,10 +186,25 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
         raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
     if spec.controller is not None and spec.controller.delay and spec.controller.sample_time is None:
         raise InputError(f"{sources.name}: controller.delay: give sample_time too; what is sampled is delayed")
+    for k, event in enumerate(spec.event):
+        _check_event(event, f"{sources.name}: event[{k}]")
     shortest, longest = spec.solver.min_step, spec.solver.max_step
     if longest is not None and shortest > longest:
         raise InputError(f"{sources.name}: solver: min_step = {shortest:g} is above max_step = {longest:g}")
     return Scene(spec, name, sources)
+
+
+def _check_event(event: EventSpec, where: str) -> None:
+    """Refuse keys that do not go together."""
+    margin = event.of.startswith("sigma_min")
+    if event.coordinate is None and event.of in ("q", "q_dot"):
+        raise InputError(f"{where}: the key 'coordinate' is missing; of = {event.of!r} needs one")
+    if event.coordinate is not None and margin:
+        raise InputError(f"{where}: of = {event.of!r} has no key 'coordinate'; it is the whole mechanism's")
+    if event.value is not None and event.of == "limit":
+        raise InputError(f"{where}: of = 'limit' has no key 'value'; the limits are those of the URDF")
+    if margin and not (event.value or 0.0) > 0:
+        raise InputError(f"{where}: of = {event.of!r} needs a value greater than 0: no singular value is ever below 0")
 
 
 def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,13 +15,15 @@ from ckc_pin.control.controllers import Controller
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.lazy import Tally
 from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.events import Events
+from ckc_pin.simulation.clock import Clock, Legs
+from ckc_pin.simulation.events import Event, Events
 from ckc_pin.simulation.integrate import BudgetError, Stepper
 from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.rank_guard import RankGuard
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.run import Run, Status
+from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
 
 __all__ = ["Progress", "simulate"]
@@ -36,6 +39,7 @@ def simulate(
     changes: Mapping[str, Any] | None = None,
     *,
     controller: Controller | None = None,
+    events: Sequence[Event] = (),
     progress: Progress | None = None,
     profile: bool = False,
 ) -> Run:
@@ -48,7 +52,9 @@ def simulate(
     changes : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     controller : Controller, optional
-        Takes the place of the scene's.
+        Takes the place of the scene's, its sample time and delay included; `Sampled` gives it its own.
+    events : sequence of Event, optional
+        Functions of the state to watch, beside the scene's events.
     progress : callable, optional
         Called as progress(t, t_end) after each accepted step.
     profile : bool
@@ -74,15 +80,17 @@ def simulate(
     times = _output_instants(scene)
     ready = prepare(scene, controller)
     mechanism, plant = ready.mechanism, ready.plant
-    events = Events(scene.spec.event, mechanism)
+    _refuse_too_much(mechanism, len(times))
+    watched = Events(scene.spec.event, events, mechanism)
     tally = Tally() if profile else None
     mechanism.tree.tally = tally
     try:
         with one_blas_thread():
-            stepper = Stepper(ready.system, ready.method, scene.spec.solver, scene.spec.t_end)
+            clock = Clock(plant.controller, ready.system, scene.spec.t_end)
+            stepper = Stepper(ready.system, ready.method, scene.spec.solver, clock.ends[0])
             recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None))
             recorder.add(0.0, stepper.y)
-            status, message = _steps(stepper, recorder, times, events, scene.spec.t_end, progress)
+            status, message = _steps(stepper, recorder, times, watched, clock, progress)
     finally:
         mechanism.tree.tally = None
     stats = {**stepper.stats(), "wall_s": perf_counter() - started,
@@ -96,7 +104,7 @@ def simulate(
         actuated=mechanism.actuated,
         max_phi=recorder.max_phi,
         max_phi_dot=recorder.max_phi_dot,
-        events=events.met,
+        events=watched.met,
         stats=stats,
         scene_name=scene.name,
         scene=_as_run(scene, controller is not None),
@@ -125,7 +133,20 @@ def _output_instants(scene: Scene) -> Array:
             f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
         )
     times = np.array([k * output_dt for k in range(int(t_end / output_dt * (1 + 1e-12)) + 1)])
-    return times if t_end - times[-1] < 1e-9 * output_dt else np.append(times, t_end).astype(float)
+    if t_end - times[-1] > 1e-9 * output_dt:
+        return np.append(times, t_end).astype(float)
+    times[-1] = t_end
+    return times
+
+
+def _refuse_too_much(mechanism: Mechanism, rows: int) -> None:
+    """Refuse a run whose file nobody could read again."""
+    columns = 4 + 2 * mechanism.n + mechanism.d + len(mechanism.actuated) + 2 * mechanism.closure.rows
+    if 8 * rows * columns > MAX_BYTES:
+        raise InputError(
+            f"solver.output_dt: {rows} output instants of {columns} numbers each; a run has at most "
+            f"{MAX_BYTES // 2**20} MiB"
+        )
 
 
 def _steps(
@@ -133,41 +154,56 @@ def _steps(
     recorder: Recorder,
     times: Array,
     events: Events,
-    t_end: float,
+    clock: Clock,
     progress: Progress | None,
 ) -> tuple[Status, str]:
     """Step to the end, recording on the way; say how it ended."""
-    due, guard = 1, RankGuard(stepper)
-    end = (0.0, stepper.y)  # the last state that is known to be good
+    outputs, legs = _Outputs(recorder, times), Legs(stepper)
     try:
-        while stepper.solver.status == "running":
-            step = guard.step()
-            end = (step.t, stepper.solver.y)
-            halt = events.check(step, recorder.system)
-            until = step.t if halt is None else halt
-            while due < len(times) and (times[due] <= until or (until >= t_end and due == len(times) - 1)):
-                recorder.add(float(times[due]), step.interpolant(float(times[due])))
-                due += 1
-            if progress is not None:
-                progress(until, t_end)
-            if halt is not None:
-                recorder.add(halt, step.interpolant(halt))
-                return "done", f"stopped by the event at t = {halt:.9g} s"
-            if stepper.solver.status == "running":
-                stepper.settle()
-                end = (step.t, stepper.solver.y)
+        for end in clock:
+            legs.aim(end)
+            for step in legs.steps():
+                halt = events.check(step, recorder.system, last=step.t >= clock.t_end)
+                until = step.t if halt is None else halt
+                outputs.up_to(clock.within(until, end), step.interpolant)
+                if progress is not None:
+                    progress(until, clock.t_end)
+                if halt is not None:
+                    recorder.add(halt, step.interpolant(halt))
+                    return "done", f"stopped by the event at t = {halt:.9g} s: {events.stopped_by}"
+            clock.tick(end, stepper.solver.y)
+            outputs.up_to(clock.at(end), partial(_same, stepper.solver.y))
     except NumericalError as error:
         status: Status = "stopped"
-        message = _sentence(error, end[0])
+        message = _sentence(error, legs.good[0])
     except BudgetError as error:
-        status, message = "stopped", f"stopped at t = {end[0]:.6g} s: {error}"
+        status, message = "stopped", f"stopped at t = {legs.good[0]:.6g} s: {error}"
     except KeyboardInterrupt as signal:
-        status, message = "interrupted", f"interrupted at t = {end[0]:.6g} s{f' by {signal}' if str(signal) else ''}"
+        by = f" by {signal}" if str(signal) else ""
+        status, message = "interrupted", f"interrupted at t = {legs.good[0]:.6g} s{by}"
     else:
         return "done", "reached t_end"
     with suppress(NumericalError):  # where not even that state has terms, the last output instant is the end
-        recorder.add(*end)
+        recorder.add(*legs.good)
     return status, message
+
+
+class _Outputs:
+    """Records the output instants that have been reached."""
+
+    def __init__(self, recorder: Recorder, times: Array) -> None:
+        self.recorder, self.times, self.due = recorder, times, 1
+
+    def up_to(self, limit: float, state: Callable[[float], Array]) -> None:
+        """Record those up to a time, the state given as a function of it."""
+        while self.due < len(self.times) and self.times[self.due] <= limit:
+            t = float(self.times[self.due])
+            self.recorder.add(t, state(t))
+            self.due += 1
+
+
+def _same(y: Array, t: float) -> Array:
+    return y
 
 
 def _sentence(error: NumericalError, t: float) -> str:

@@ -105,7 +105,7 @@ EVENTS = [
     _value("event=[{value=1.0}]", f"{NAMED}event[0]: the key 'coordinate' is missing"),
     _value('event=[{coordinate="x"}]', "event", "no coordinate 'x'; there are theta_1, theta_2, theta_3, theta_4"),
     _value('event=[{coordinate="x", val=1.0}]', "event[0]: unknown key 'val'; valid: coordinate, of, value"),
-    _value('event=[{coordinate="x", of="v"}]', "event[0].of = 'v'; valid: 'q', 'q_dot'"),
+    _value('event=[{coordinate="x", of="v"}]', "event[0].of = 'v'; valid: 'limit', 'q', 'q_dot', 'sigma_min_J'"),
     _value('event=[{coordinate="x", direction=2}]', "event[0].direction = 2; valid: -1, 0, 1"),
     _value('event=[{coordinate="x"}, {coordinate="x", stop=1}]', "event[1].stop = 1: true or false is needed"),
 ]

@@ -37,7 +37,7 @@ class Outcome:
 def ckc(*words: str) -> Outcome:
     """Run `ckc WORDS...` in this process."""
     out, err = io.StringIO(), io.StringIO()
-    handler = signal.getsignal(signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     code: Any = None
     try:
         with (
@@ -49,6 +49,7 @@ def ckc(*words: str) -> Outcome:
     except SystemExit as stop:
         code = stop.code
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     assert isinstance(code, int)
     return Outcome(code, out.getvalue(), err.getvalue())

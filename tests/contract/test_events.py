@@ -1,0 +1,371 @@
+"""Events: found however they lie in a step, located on the motion that numpy and SciPy compute, refused when wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from ckc_pin import Event, InputError, Run, Terms, load, load_scene, simulate
+from ckc_pin.simulation.crossings import PLACES, walk
+from ckc_pin.simulation.events import Events
+from tests.analytic.five_bar import FIVE_BAR
+from tests.conftest import assert_close
+from tests.contract.helpers.bad import Bad, expect
+from tests.contract.helpers.command import ckc
+
+Array = NDArray[np.float64]
+FORMULATIONS = ["reduced", "spf", "dae"]
+TIGHT = {"solver.rtol": 1e-11}
+T_END = 0.6
+
+
+# --- within a step -------------------------------------------------------------------------------
+
+
+def _walk(function: Callable[[float], float], sign: int = 0, start: float = 0.0, end: float = 1.0) -> Any:
+    times = start + (end - start) * PLACES
+    return walk(function, times, np.array([function(t) for t in times.tolist()]), sign, 0.0)
+
+
+R = 1e-4  # half the distance of two roots
+
+
+@pytest.mark.parametrize(
+    ("function", "roots"),
+    [
+        (lambda t: t - 0.3, [(0.3, 1)]),
+        (lambda t: 0.3 - t, [(0.3, -1)]),
+        (lambda t: (t - 0.3) ** 2 - R**2, [(0.3 - R, -1), (0.3 + R, 1)]),
+        (lambda t: R**2 - (t - 0.7) ** 2, [(0.7 - R, 1), (0.7 + R, -1)]),
+        (lambda t: (t - 0.002) ** 2 - 1e-6, [(0.001, -1), (0.003, 1)]),
+        (lambda t: (t - 0.998) ** 2 - 1e-6, [(0.997, -1), (0.999, 1)]),
+        (lambda t: abs(t - 0.441) - R, [(0.441 - R, -1), (0.441 + R, 1)]),
+        (lambda t: max(R - abs(t - 0.62), -0.2), [(0.62 - R, 1), (0.62 + R, -1)]),
+        (lambda t: float(np.sin(9.4 * t + 0.3)), [((k * np.pi - 0.3) / 9.4, (-1) ** k) for k in (1, 2, 3)]),
+        (lambda t: 1e-9 * (t - 0.5) ** 3, [(0.5, 1)]),
+        (lambda t: 1.0 if t > 0.25 else -1.0, [(0.25, 1)]),
+        (lambda t: (t - 0.3) ** 2, []),
+        (lambda t: (t - 0.5) ** 2, []),
+        (lambda t: (t - 0.3) ** 2 + R**2, []),
+        (lambda t: 5.0, []),
+        (lambda t: 0.0, []),
+    ],
+    ids=["rising", "falling", "dip", "bump", "near the start", "near the end", "kink", "clipped tip", "three", "flat",
+         "jump", "touch", "touch at a node", "miss", "constant", "zero"],
+)  # fmt: skip
+def test_sign_changes_within_a_step(function: Callable[[float], float], roots: list[tuple[float, int]]) -> None:
+    found = _walk(function).found
+    assert [direction for _, direction in found] == [direction for _, direction in roots]
+    # near a double root its value's rounding moves it: 1e-16 over the slope
+    assert_close([t for t, _ in found], [t for t, _ in roots], 2e-12)
+
+
+@pytest.mark.parametrize("sign", [-1, 0, 1])
+def test_what_starts_on_zero_has_crossed_if_it_came_from_the_other_side(sign: int) -> None:
+    found = _walk(lambda t: t, sign)
+    assert found.found == ([(0.0, 1)] if sign == -1 else [])
+    assert found.sign == 1
+
+
+def test_what_ends_on_zero_waits_for_the_next_step() -> None:
+    found = _walk(lambda t: t - 1.0)
+    assert (found.found, found.sign, found.on_zero) == ([], -1, True)
+    assert _walk(lambda t: t - 1.0, -1, 1.0, 2.0).found == [(1.0, 1)]
+    assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0).found == []
+
+
+# --- against numpy and SciPy ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def motion() -> Callable[[float], Array]:
+    """(q', v') of `swing` at any time, to some 1e-13."""
+    start = load_scene("five_bar/swing").spec.initial.q
+
+    def rate(t: float, y: Array) -> Array:
+        return np.concatenate([y[2:], FIVE_BAR.acceleration(FIVE_BAR.sigma(y[:2]), y[2:], np.zeros(2))])
+
+    y = [start["theta_1"], start["theta_3"], 0.0, 0.0]
+    dense = solve_ivp(rate, (0, T_END), y, "DOP853", rtol=3e-14, atol=1e-15, max_step=0.01, dense_output=True).sol
+
+    def at(t: float) -> Array:
+        q_tree = FIVE_BAR.sigma(dense(t)[:2])
+        return np.concatenate([q_tree, FIVE_BAR.rho(q_tree) @ dense(t)[2:]])
+
+    return at
+
+
+def _roots(function: Callable[[float], float]) -> list[float]:
+    """Sign changes on a fine grid, each closed in by halving."""
+    grid = np.linspace(1e-4, T_END, 3001)
+    values = np.array([function(t) for t in grid])
+    roots = []
+    for k in np.flatnonzero(values[:-1] * values[1:] < 0):
+        low, high = grid[k], grid[k + 1]
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if values[k] * function(middle) > 0 else (low, middle)
+        roots.append(float(low))
+    return roots
+
+
+def _times(run: Run, **label: Any) -> list[float]:
+    return [event["t"] for event in run.events if all(event[key] == value for key, value in label.items())]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_two_crossings_in_one_step(formulation: str, motion: Callable[[float], Array]) -> None:
+    """theta_2 turns just beyond the value: loose steps pass over both crossings."""
+    turn = next(t for t in _roots(lambda t: float(motion(t)[5])) if t > 0.05)
+    value = float(motion(turn)[1]) - np.sign(motion(turn)[1] - motion(turn - 0.02)[1]) * 2e-4
+    wanted = [t for t in _roots(lambda t: float(motion(t)[1] - value)) if abs(t - turn) < 0.02]
+    assert len(wanted) == 2
+    changes = {"formulation": formulation, "t_end": T_END, "event": [{"coordinate": "theta_2", "value": value}]}
+    loose = simulate("five_bar/swing", {**changes, "solver.rtol": 1e-5, "solver.output_dt": T_END})
+    assert T_END / loose.stats["steps"] > 2 * (wanted[1] - wanted[0])
+    assert len([t for t in _times(loose) if abs(t - turn) < 0.02]) == 2
+    tight = simulate("five_bar/swing", {**changes, **TIGHT})
+    assert_close([t for t in _times(tight) if abs(t - turn) < 0.02], wanted, 1e-9)  # 0.01 of slope: 1e-11 rad
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_margins_and_functions_are_located(formulation: str, motion: Callable[[float], Array]) -> None:
+    def margin(t: float) -> float:
+        return float(np.linalg.svd(FIVE_BAR.phi_z(motion(t)[:4]), compute_uv=False)[-1])
+
+    def margin_of_j(t: float) -> float:
+        return float(np.linalg.svd(FIVE_BAR.J(motion(t)[:4]), compute_uv=False)[-1])
+
+    def energy(t: float) -> float:
+        y = motion(t)
+        return float(FIVE_BAR.potential_energy(y[:4]))
+
+    values = [float(np.median([f(t) for t in np.linspace(0, T_END, 50)])) for f in (margin, margin_of_j, energy)]
+    changes = {
+        **TIGHT,
+        "formulation": formulation,
+        "t_end": T_END,
+        "event": [{"of": "sigma_min_phi_z", "value": values[0]}, {"of": "sigma_min_J", "value": values[1]}],
+    }
+    offset = FIVE_BAR.potential_energy(motion(0.0)[:4])
+
+    def fallen(t: float, terms: Terms) -> float:
+        return terms.potential_energy - start - (values[2] - offset)
+
+    start = load("five_bar").kinematics(simulate("five_bar/swing", {"t_end": 1e-6}).q_tree[0])
+    start = Terms(load("five_bar"), start, np.zeros(4)).potential_energy
+    run = simulate("five_bar/swing", changes, events=[Event(fallen), Event(lambda t, terms: t - 0.25, name="clock")])
+    for of, function, value in zip(
+        ("sigma_min_phi_z", "sigma_min_J", "function"), (margin, margin_of_j, energy), values, strict=True
+    ):
+        wanted = _roots(lambda t, f=function, v=value: f(t) - v)
+        assert wanted, of
+        assert_close([t for t in _times(run, of=of) if t not in _times(run, name="clock")], wanted, 1e-10)
+    assert _times(run, name="clock") == [pytest.approx(0.25, abs=1e-12)]
+    assert {event["name"] for event in run.events} >= {"fallen", "clock", f"sigma_min_J = {values[1]:g}"}
+    assert [event["t"] for event in run.events] == sorted(event["t"] for event in run.events)
+
+
+def test_events_do_not_change_the_motion() -> None:
+    plain = simulate("five_bar/swing", {"t_end": 0.3})
+    watched = simulate("five_bar/swing", {"t_end": 0.3, "event": [{"coordinate": "theta_2", "value": 0.5}]})
+    assert watched.events
+    assert watched.stats["steps"] == plain.stats["steps"]
+    assert_close(watched.q_tree, plain.q_tree, 1e-12)
+
+
+def test_nothing_is_computed_without_events() -> None:
+    assert Events([], [], load("five_bar")).check(None, None) is None  # type: ignore[arg-type]
+
+
+# --- limits --------------------------------------------------------------------------------------
+
+
+def _limit(bar: Path, joint: str, lower: float, upper: float) -> None:
+    path = bar / "five_bar.urdf"
+    head, tail = path.read_text(encoding="utf-8").split(f'<joint name="{joint}" type="continuous">', 1)
+    limit = f'<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>'
+    path.write_text(f'{head}<joint name="{joint}" type="revolute">{limit}{tail}', encoding="utf-8")
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_limits_are_events_and_no_walls(formulation: str, bar: Path, motion: Callable[[float], Array]) -> None:
+    _limit(bar, "theta_2", -3.0, 0.5)
+    _limit(bar, "theta_3", -1.4, 3.0)
+    beyond = {"theta_2": lambda t: float(motion(t)[1] - 0.5), "theta_3": lambda t: float(-1.4 - motion(t)[2])}
+    scene = bar / "swing.scene.toml"
+    run = simulate(scene, {**TIGHT, "formulation": formulation, "t_end": T_END, "event": [{"of": "limit"}]})
+    assert run.status == "done"
+    for name, function in beyond.items():
+        wanted = _roots(function)
+        assert wanted, name
+        assert_close(_times(run, coordinate=name), wanted, 1e-10)
+        for event in run.events:
+            if event["coordinate"] == name:
+                assert event["of"] == "limit"
+                assert event["value"] == (0.5 if name == "theta_2" else -1.4)
+                assert event["direction"] == np.sign(function(event["t"] + 1e-3)), "1 is leaving"
+    leaving = [{"of": "limit", "coordinate": "theta_3", "direction": 1, "stop": True}]
+    first = next(t for t in _roots(beyond["theta_3"]) if beyond["theta_3"](t + 1e-3) > 0)
+    stopped = simulate(scene, {**TIGHT, "formulation": formulation, "t_end": T_END, "event": leaving})
+    assert stopped.t[-1] == pytest.approx(first, abs=1e-10)
+    assert stopped.message.endswith("s: theta_3 at its lower limit")
+
+
+def test_limits_that_are_not_there(bar: Path) -> None:
+    scene = bar / "swing.scene.toml"
+    with pytest.raises(InputError, match=r"event\[0\]: no joint of five_bar has limits in its URDF"):
+        simulate(scene, {"event": [{"of": "limit"}]})
+    _limit(bar, "theta_2", -3.0, 0.5)
+    with pytest.raises(InputError, match=r"event\[0\]: theta_1 has no limits in its URDF; theta_2 have"):
+        simulate(scene, {"event": [{"of": "limit", "coordinate": "theta_1"}]})
+
+
+# --- start, end, graze, order --------------------------------------------------------------------
+
+
+def test_a_run_that_starts_on_the_value_has_not_crossed_it() -> None:
+    """From rest: every rate starts at zero; theta_1 starts at the value, and comes back to it once a swing."""
+    start = load_scene("five_bar/swing").spec.initial.q
+    watched = [{"coordinate": c, "of": "q_dot"} for c in ("theta_1", "theta_2")]
+    run = simulate(
+        "five_bar/swing", {"t_end": 0.1, "event": [*watched, {"coordinate": "theta_1", "value": start["theta_1"]}]}
+    )
+    assert run.events == []
+
+
+def test_a_value_that_is_reached_at_the_end_is_an_event() -> None:
+    run = simulate("five_bar/swing", {"t_end": 0.25}, events=[Event(lambda t, terms: t - 0.25, stop=True, name="bell")])
+    assert [(event["t"], event["name"], event["direction"]) for event in run.events] == [(0.25, "bell", 1)]
+    assert run.t[-1] == 0.25
+    assert simulate("five_bar/swing", {"t_end": 0.25}, events=[Event(lambda t, terms: t - 0.26)]).events == []
+
+
+def test_a_graze_is_no_event() -> None:
+    run = simulate("five_bar/swing", {"t_end": 0.5}, events=[Event(lambda t, terms: (t - 0.2) ** 2)])
+    assert run.events == []
+
+
+def test_directions_and_order() -> None:
+    def wave(t: float, terms: Terms) -> float:
+        return float(np.sin(20 * t + 0.1))
+
+    both = [(k * np.pi - 0.1) / 20 for k in range(1, 4)]
+    for direction, wanted in ((0, both), (1, both[1::2]), (-1, both[::2])):
+        run = simulate("five_bar/swing", {"t_end": 0.5, "formulation": "reduced"}, events=[Event(wave, direction)])
+        assert_close(_times(run), wanted, 1e-11)
+    stopping = [Event(wave, name="a"), Event(wave, -1, True, "b"), Event(wave, name="c")]
+    run = simulate("five_bar/swing", {"t_end": 0.5, "formulation": "reduced"}, events=stopping)
+    assert [event["name"] for event in run.events] == ["a", "b", "c"], "all that happen at the instant of the stop"
+    assert run.t[-1] == run.events[0]["t"]
+    assert run.message.endswith("s: b")
+
+
+# --- in files and on the command line ------------------------------------------------------------
+
+
+def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
+    words = ("run", "five_bar/swing", "--set", "t_end=.3", "--set", 'event=[{coordinate="theta_2", value=.5}]')
+    bad = ckc(*words, "--json")
+    assert bad.code == 2, "a table's numbers are TOML"
+    answer = ckc(*words[:-1], 'event=[{coordinate="theta_2", value=0.5}]', "--json", "--out", str(tmp_path))
+    assert answer.code == 0
+    (event, *_) = answer.json["events"]
+    assert event == {
+        "t": pytest.approx(0.21412, abs=1e-4),
+        "name": "theta_2 = 0.5",
+        "of": "q",
+        "coordinate": "theta_2",
+        "value": 0.5,
+        "direction": event["direction"],
+        "stop": False,
+    }
+    assert event["direction"] in (-1, 1)
+    assert Run.load(tmp_path).events == answer.json["events"]
+
+
+# --- refused -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ((3,), "Event: 3 is no function"),
+        ((abs, 2), "direction = 2; valid: -1, 0, 1"),
+        ((abs, True), "direction = True"),
+        ((abs, 0, 1), "stop = 1: True or False is needed"),
+        ((abs, 0, True, 5), "name = 5: a string is needed"),
+    ],
+)
+def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Event(*arguments)
+
+
+@pytest.mark.parametrize("value", [None, "0.3", np.zeros(2), [0.1], 1j])
+def test_a_function_that_gives_no_number_is_refused(value: Any) -> None:
+    with pytest.raises(InputError, match=r"the event 'odd' gave .*; a number is needed"):
+        simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: value, name="odd")])
+
+
+def test_a_function_alone_is_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"events\[0\]: .* is no Event; write Event\(function, direction, stop, name\)"
+    ):
+        simulate("five_bar/swing", events=[lambda t, terms: t])  # type: ignore[list-item]
+
+
+def test_a_function_that_becomes_nan_stops_the_run() -> None:
+    def lost(t: float, terms: Terms) -> float:
+        return float("nan") if t > 0.2 else 1.0
+
+    run = simulate("five_bar/swing", {"t_end": 1.0}, events=[Event(lost)])
+    assert run.status == "stopped"
+    assert run.message.endswith("the event 'lost' is nan")
+    assert 0.05 < run.t[-1] <= 0.3
+
+
+SCENE = ("run", "bar/swing.scene.toml", "--set")
+BAD = [
+    ("{}", "event[0]: the key 'coordinate' is missing; of = 'q' needs one"),
+    ('{of="q_dot"}', "event[0]: the key 'coordinate' is missing; of = 'q_dot' needs one"),
+    ('{of="limit", value=1.0}', "event[0]: of = 'limit' has no key 'value'; the limits are those of the URDF"),
+    ('{of="limit"}', "event[0]: no joint of five_bar has limits in its URDF"),
+    ('{of="sigma_min_J", coordinate="theta_1", value=1.0}', "event[0]: of = 'sigma_min_J' has no key 'coordinate'"),
+    ('{of="sigma_min_phi_z"}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
+    ('{of="sigma_min_phi_z", value=-1.0}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
+    ('{coordinate="x", of="limit"}', "event[0].coordinate: no coordinate 'x'; there are theta_1, theta_2"),
+    ('{coordinate="theta_1", value=nan}', "event[0].value = nan: a finite number is needed"),
+]
+
+
+@pytest.mark.parametrize(("event", "says"), BAD, ids=[event for event, _ in BAD])
+def test_bad_events_in_a_scene(event: str, says: str, bar: Path) -> None:
+    expect(Bad(event, (*SCENE, f"event=[{event}]"), [says]), bar)
+
+
+def test_an_open_chain_has_no_margin(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has no closed loop, so there is no sigma_min_J"):
+        simulate(_pendulum(tmp_path), {"event": [{"of": "sigma_min_J", "value": 0.1}]})
+
+
+def _pendulum(folder: Path) -> Path:
+    (folder / "p.urdf").write_text(
+        '<robot name="p"><link name="a"/><link name="b"><inertial><mass value="1"/><origin xyz="1 0 0"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="swing" '
+        'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>',
+        encoding="utf-8",
+    )
+    (folder / "mechanism.toml").write_text('name = "pendulum"\nurdf = "p.urdf"\n', encoding="utf-8")
+    scene = folder / "s.scene.toml"
+    scene.write_text(
+        'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\n[initial.q]\nswing = 0.1\n',
+        encoding="utf-8",
+    )
+    return scene

@@ -1,0 +1,303 @@
+"""The simulator against whole runs: same accuracy, same verdicts; and what it promises about states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ckc_pin import Event, InputError, NumericalError, Simulator, Terms, load_scene, simulate
+from ckc_pin.simulation.simulator import State
+from tests.conftest import assert_close
+
+Array = NDArray[np.float64]
+FORMULATIONS = ["reduced", "spf", "dae"]
+TIGHT = {"solver.rtol": 1e-10}
+NO_FORCE = np.zeros(2)
+
+
+def assert_same(ours: State, theirs: State, tolerance: float = 0.0) -> None:
+    assert ours.t == pytest.approx(theirs.t, abs=1e-12)
+    assert_close(ours.q_tree, theirs.q_tree, tolerance)
+    assert_close(ours.v_tree, theirs.v_tree, tolerance)
+
+
+# --- against simulate ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_free_swing_is_the_whole_run(formulation: str) -> None:
+    changes = {**TIGHT, "formulation": formulation, "t_end": 0.5, "solver.output_dt": 0.01}
+    run, simulator = simulate("five_bar/swing", changes), Simulator("five_bar/swing", changes)
+    start = simulator.state.terms.energy
+    for k in range(1, len(run.t)):
+        state = simulator.step(None if k % 2 else NO_FORCE, 0.01)
+        assert state.t == pytest.approx(run.t[k], abs=1e-13)
+        assert_close(state.q_tree, run.q_tree[k], 1e-8)
+        assert_close(state.v_tree, run.v_tree[k], 1e-7)
+        assert_close(state.terms.phi, 0.0, 1e-12)
+    assert abs(simulator.state.terms.energy - start) < 1e-9
+
+
+def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
+    changes = {
+        **TIGHT,
+        "formulation": "spf",
+        "epsilon": 0.02,
+        "initial.w": [0.01, -0.02],
+        "t_end": 0.1,
+        "solver.output_dt": 0.01,
+    }
+    for equation in (17, 8):
+        given = {**changes, "solver.spf_equation": equation}
+        run, simulator = simulate("five_bar/swing", given), Simulator("five_bar/swing", given)
+        for k in range(1, 11):
+            state = simulator.step(None, 0.01)
+            assert_close(state.q_tree, run.q_tree[k], 1e-8)
+            assert_close(state.v_tree, run.v_tree[k], 1e-6)
+            assert_close(state.w, run.w[k], 1e-12)
+            if k == 5:  # and so it is from a state in the middle
+                simulator.reset(state)
+        assert simulator.state.t == pytest.approx(0.1, abs=1e-12)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_the_u_of_a_sampled_run_gives_that_run(formulation: str) -> None:
+    period = 0.001
+    changes = {**TIGHT, "formulation": formulation, "t_end": 0.05, "solver.output_dt": period}
+    run = simulate("five_bar/tracking", {**changes, "controller.sample_time": period})
+    simulator = Simulator("five_bar/tracking", changes)
+    assert simulator.controller is not None
+    for k in range(50):
+        u = simulator.controller.u(simulator.state.t, simulator.state.terms)
+        assert_close(u, run.u[k], 1e-8)
+        state = simulator.step(run.u[k], period)
+        assert_close(state.q_tree, run.q_tree[k + 1], 1e-8)
+        assert_close(state.q, run.q_tree[k + 1][[0, 2]], 1e-8)
+        assert_close(state.q_dot, run.v_tree[k + 1][[0, 2]], 1e-7)
+    assert np.abs(run.u).max() > 1.0
+
+
+def _push_on(simulator: Simulator, u: Array | None, steps: int) -> None:
+    for _ in range(steps):
+        simulator.step(u, 0.01)
+
+
+class Push:
+    """A constant u."""
+
+    def __init__(self, u: Array) -> None:
+        self.pushes = u
+
+    def u(self, t: float, terms: Terms) -> Array:
+        return self.pushes
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "spf"])
+def test_it_stops_where_simulate_stops(formulation: str) -> None:
+    u = np.array([1.0, -1.0])
+    changes = {"formulation": formulation, "t_end": 2.0, "solver.output_dt": 0.01}
+    run = simulate("five_bar/swing", changes, controller=Push(u))
+    assert run.status == "stopped"
+    assert "singular" in run.message
+    simulator = Simulator("five_bar/swing", changes)
+    with pytest.raises(NumericalError, match="singular") as error:
+        _push_on(simulator, u, 200)
+    assert error.value.t == simulator.state.t
+    assert error.value.t == pytest.approx(run.t[-1], abs=2e-3)
+    assert_close(simulator.state.terms.phi, 0.0, 1e-12)
+
+
+@pytest.mark.parametrize("u", [None, NO_FORCE], ids=["None", "zeros"])
+def test_what_moves_freely_passes_where_the_free_run_passes(u: Array | None) -> None:
+    changes = {
+        **TIGHT,
+        "formulation": "reduced",
+        "t_end": 0.5,
+        "initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0},
+        "solver.output_dt": 0.02,
+    }
+    run = simulate("five_bar/swing", changes)
+    assert run.status == "done"
+    assert run.stats["switches"] > 0
+    simulator = Simulator("five_bar/swing", changes)
+    for k in range(1, len(run.t)):
+        state = simulator.step(u, 0.02)
+        assert_close(state.q_tree, run.q_tree[k], 1e-6)
+        assert_close(state.q, run.q_tree[k][[0, 2]], 1e-6)
+    assert_close(state.terms.energy, run.energy[0], 1e-7)
+    assert_close(simulator.step(np.ones(2), 1e-3).q, state.q, 0.1)  # the user's own q again
+
+
+def test_a_budget_is_a_numerical_error() -> None:
+    simulator = Simulator("five_bar/swing", {"solver.max_rhs": 100, "solver.max_wall_s": 1e-9})
+    with pytest.raises(NumericalError, match="max_rhs = 100"):
+        _push_on(simulator, None, 20)
+    assert 0.02 < simulator.state.t < 0.2
+    simulator.reset()
+    assert simulator.step(None, 0.01).t == 0.01
+
+
+def test_a_step_is_cheap() -> None:
+    """One evaluation of a held u's motion more than the method's own: nothing is prepared again."""
+    scene = load_scene("five_bar/swing", {"formulation": "reduced"})
+    simulator = Simulator(scene)
+    calls: list[float] = []
+    rhs = type(simulator._system).rhs
+
+    def counted(system: Any, t: float, y: Array) -> Array:
+        calls.append(t)
+        return rhs(system, t, y)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(simulator._system), "rhs", counted)
+        simulator.step(None, 0.002)
+        calls.clear()
+        for _ in range(20):
+            simulator.step(None, 0.002)
+    assert len(calls) <= 20 * 13
+
+
+# --- states --------------------------------------------------------------------------------------
+
+
+def _play(simulator: Simulator, steps: int = 5) -> list[State]:
+    return [simulator.step([0.3 * k, -0.2], 0.004) for k in range(steps)]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_reset_restores_exactly(formulation: str) -> None:
+    simulator = Simulator("five_bar/swing", {"formulation": formulation})
+    start = simulator.state
+    first = _play(simulator)
+    assert_same(simulator.reset(), start)
+    again = _play(simulator)
+    for ours, theirs in zip(again, first, strict=True):
+        assert_same(ours, theirs)
+    middle = first[2]
+    assert_same(simulator.reset(middle), middle)
+    once = _play(simulator)
+    assert_same(simulator.reset(middle), middle)
+    for ours, theirs in zip(_play(simulator), once, strict=True):
+        assert_same(ours, theirs)
+    assert once[-1].t == pytest.approx(0.032, abs=1e-15)
+    simulator.reset(middle)
+    assert_same(simulator.step([0.9, -0.2], 0.004), first[3], 1e-8)
+
+
+def test_two_simulators_do_not_know_each_other() -> None:
+    alone = _play(Simulator("five_bar/swing"))
+    one, two = Simulator("five_bar/swing"), Simulator("five_bar/swing", {"formulation": "reduced"})
+    for k, expected in enumerate(alone):
+        ours = one.step([0.3 * k, -0.2], 0.004)
+        two.step([5.0, 5.0], 0.01)
+        assert_same(ours, expected)
+    before = two.state
+    one.reset(before)
+    assert_same(one.state, before)
+    assert_same(two.state, before)
+    assert_same(one.step(None, 0.01), two.step(None, 0.01), 1e-7)
+
+
+def test_a_state_stays_as_it_is() -> None:
+    simulator = Simulator("five_bar/swing")
+    state = simulator.step(None, 0.05)
+    q_tree, v_tree = state.q_tree, state.v_tree.copy()
+    simulator.step(np.ones(2), 0.2)
+    assert np.array_equal(state.q_tree, q_tree)
+    assert np.array_equal(state.v_tree, v_tree)
+    assert_close(state.terms.energy, Simulator("five_bar/swing").step(None, 0.05).terms.energy, 0.0)
+
+
+def test_reset_to_a_table() -> None:
+    simulator = Simulator("five_bar/swing")
+    table = {"q": {"theta_1": np.float64(-1.2), "theta_3": -1.5}, "q_dot": {"theta_3": 0.5}}
+    state = simulator.reset(table)
+    assert state.t == 0.0
+    assert_close(state.q, [-1.2, -1.5], 0.0)
+    assert_close(state.q_dot, [0.0, 0.5], 0.0)
+    assert_close(state.terms.phi, 0.0, 1e-12)
+    run = simulate("five_bar/swing", {"initial": table, "t_end": 0.1})
+    assert_close(simulator.step(None, 0.1).q_tree, run.q_tree[-1], 1e-7)
+    assert simulator.reset({"at": "equilibrium"}).terms.energy < state.terms.energy
+
+
+@pytest.mark.parametrize(
+    ("state", "says"),
+    [
+        ({}, "initial: give q"),
+        ({"q": {"theta_9": 1.0}}, "no coordinate 'theta_9'|theta_9"),
+        ({"q": {"theta_1": 3.1, "theta_3": 0.0}}, "out of reach"),
+        ({"w": [0.1, 0.1], "at": "assembled"}, "only the SPF can start off phi = 0"),
+        (3, "no State and no table"),
+    ],
+)
+def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> None:
+    simulator = Simulator("five_bar/swing")
+    before = simulator.step(None, 0.01)
+    with pytest.raises(InputError, match=says):
+        simulator.reset(state)
+    assert_same(simulator.state, before)
+    with pytest.raises(InputError, match="reset: a state of four_bar, this is five_bar"):
+        simulator.reset(Simulator("four_bar").state)
+
+
+@pytest.mark.parametrize(
+    ("u", "dt", "says"),
+    [
+        (np.zeros(3), 0.01, r"u has shape \(3,\); \(2,\) is needed: theta_1, theta_3"),
+        (1.0, 0.01, r"u has shape \(\)"),
+        ([np.nan, 0.0], 0.01, "u is not finite"),
+        ([np.inf, 0.0], 0.01, "u is not finite"),
+        (["a", "b"], 0.01, "u is no vector of numbers"),
+        (None, 0.0, "dt = 0.0: a number greater than 0"),
+        (None, -1, "dt = -1"),
+        (None, np.nan, "dt = nan"),
+        (None, np.inf, "dt = inf"),
+        (None, "1", "dt = '1'"),
+        (None, 1e-30, "dt = 1e-30"),
+    ],
+)
+def test_a_bad_step_is_refused_and_moves_nothing(u: Any, dt: Any, says: str) -> None:
+    simulator = Simulator("five_bar/swing")
+    before = simulator.step(None, 0.01)
+    with pytest.raises(InputError, match=says):
+        simulator.step(u, dt)
+    assert simulator.state is before
+
+
+def test_limits_of_torque_hold() -> None:
+    free = Simulator("five_bar/tracking", {"formulation": "reduced"})
+    held = Simulator("five_bar/tracking", {"formulation": "reduced", "controller.torque_limit": 2.0})
+    assert_same(held.step([9.0, -9.0], 0.01), free.step([2.0, -2.0], 0.01), 1e-13)
+
+
+# --- events --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_events_on_the_way(formulation: str) -> None:
+    """One that stops ends the step early, and does not happen again at once."""
+    changes = {**TIGHT, "formulation": formulation, "t_end": 0.5, "event": [{"coordinate": "theta_2", "value": 0.5}]}
+    bell = Event(lambda t, terms: t - 0.1, stop=True, name="bell")
+    wanted = simulate("five_bar/swing", changes, events=[Event(lambda t, terms: t - 0.1)]).events
+    simulator = Simulator("five_bar/swing", changes, events=[bell])
+    stops = []
+    while simulator.state.t < 0.5:
+        end = min(simulator.state.t + 0.03, 0.5)
+        if simulator.step(None, 0.03).t < end - 1e-9:
+            stops.append(simulator.state.t)
+    assert stops == [pytest.approx(0.1, abs=1e-11)]
+    assert_close([event["t"] for event in simulator.events][: len(wanted)], [event["t"] for event in wanted], 1e-8)
+    simulator.reset()
+    assert simulator.events == []
+    assert simulator.step(None, 0.2).t == pytest.approx(0.1, abs=1e-11)
+
+
+def test_a_scene_is_complete() -> None:
+    scene = load_scene("five_bar/swing")
+    assert Simulator(scene).step(None, 0.01).t == 0.01
+    with pytest.raises(InputError, match="changes go with the name of a scene"):
+        Simulator(scene, {"formulation": "dae"})
