@@ -181,6 +181,41 @@ def play(
     ckc_pin.play(*[ckc_pin.Run.load(path) for path in runs], speed=speed, port=port)
 
 
+@app.command(
+    "map",
+    epilog=_examples(
+        "ckc map five_bar --scene tracking --out figures",
+        "ckc map five_bar --space cartesian --out figures",
+        "ckc map delta --space cartesian --over x,z --out figures",
+    ),
+)
+def map_(
+    mechanism: Annotated[str, typer.Argument(help="A mechanism.", metavar="MECHANISM")],
+    scene: Annotated[str | None, typer.Option("--scene", help="Draw this scene's desired trajectory on top.")] = None,
+    over: Annotated[str | None, typer.Option("--over", metavar="A,B", help="The axes; all others are held.")] = None,
+    space: Annotated[str, typer.Option("--space", help="joint, or cartesian: where a point goes.")] = "joint",
+    point: Annotated[str | None, typer.Option("--point", help="A [[point]]; absent: the first one.")] = None,
+    cells: Annotated[int, typer.Option("--cells", help="Along each axis.")] = 200,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the figure.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Where a mechanism can go and where it is singular, branch by branch (the paper's Fig. 2)."""
+    from ckc_pin.study.map import map_plain, map_table, singularity_map
+    from ckc_pin.view.map_figure import require_figures, save_map
+
+    if out is not None:
+        _make_folder(out)
+        require_figures()
+    axes = None if over is None else [name.strip() for name in over.split(",")]
+    found = singularity_map(mechanism, scene=scene, space=space, over=axes, point=point, cells=cells)
+    if as_json:
+        _print_json(map_plain(found))
+    else:
+        _print_table(map_table(found))
+    for path in save_map(found, out) if out is not None else []:
+        (errors.print if as_json else print)(f"written: {path}")
+
+
 @app.command("import", epilog=_examples("ckc import cassie.xml --out mechanisms/cassie"))
 def import_(
     file: Annotated[Path, typer.Argument(help="MuJoCo's MJCF, a URDF, or a robot.yaml beside its URDF.")],
