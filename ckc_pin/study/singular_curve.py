@@ -17,10 +17,11 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.study.singularities import EXACT, SingularPoint, SingularSystem
 
-__all__ = ["SingularCurve", "trace_singular"]
+__all__ = ["SingularCurve", "trace", "trace_singular"]
 
 SHORTEST = 1e-6  # of the step wanted: where shorter ones would be needed the curve ends, or branches
 BEND = 0.95  # cosine of the angle that the tangent may turn in one step: a closed curve has twenty of them or more
+FLAT = 1e-9  # of the largest singular value: along such directions the equations stay solved
 FEWEST = 10  # points before the start can come back
 
 
@@ -84,9 +85,26 @@ def trace_singular(
         )
     if not 0 < step < np.inf:
         raise InputError(f"step = {step}: a positive number is needed")
-    system = SingularSystem(mechanism, point)
-    tangent = _tangent(system, start.at, start.null)
-    first = _Place(start.at, start.null, tangent, float(np.abs(system.residual(start.at, start.null)).max()))
+    return trace(SingularSystem(mechanism, point), start.at, start.null, step, max_points)
+
+
+def trace(
+    system: SingularSystem, at: Kinematics, null: Array, step: float = 0.05, max_points: int = 5000
+) -> SingularCurve:
+    """Follow the curve of solutions (q', v) of a system through one of them; what `trace_singular` does.
+
+    Parameters
+    ----------
+    system : SingularSystem
+        With curves of solutions.
+    at : Kinematics
+    null : (n,) array
+        The solution to start from.
+    step, max_points
+        As in `trace_singular`.
+    """
+    tangent = _tangent(system, at, null)
+    first = _Place(at, null, tangent, float(np.abs(system.residual(at, null)).max()))
     way, closed = _walk(system, first, step, max_points)
     if not closed:
         back, _ = _walk(system, _Place(first.at, first.null, -tangent, first.residual), step, max_points)
@@ -132,7 +150,11 @@ def _advance(system: SingularSystem, place: _Place, length: float) -> _Place | N
 
 
 def _tangent(system: SingularSystem, at: Kinematics, null: Array) -> Array:
-    return np.asarray(np.linalg.svd(system.jacobian(at, null))[2][-1])
+    """Return the direction of the curve; where v is not unique, the one that moves the mechanism most."""
+    _, sizes, directions = np.linalg.svd(system.jacobian(at, null))
+    along = directions[min(int(np.sum(sizes > FLAT * sizes[0])), len(directions) - 1) :]
+    mixed = np.linalg.svd(along[:, : system.mechanism.n], full_matrices=False)[0][:, 0]
+    return np.asarray(mixed @ along)
 
 
 def _lies_between(place: _Place, before: _Place, after: _Place) -> bool:
