@@ -1,0 +1,264 @@
+"""What ends a run early leaves a run: budgets, NaN from a controller, signals at every stage; and bombs."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, Run, Terms, load_scene, simulate
+from ckc_pin.simulation.interrupts import Interrupts
+from ckc_pin.simulation.run_file import MAX_BYTES, MAX_META
+from tests.conftest import assert_close
+from tests.contract.helpers.command import ckc
+
+# --- in this process -----------------------------------------------------------------------------
+
+
+class NanAfter:
+    """No force, and NaN after a time."""
+
+    def __init__(self, t: float) -> None:
+        self.t = t
+
+    def u(self, t: float, terms: Terms) -> Any:
+        return np.array([np.nan if t > self.t else 0.0, 0.0])
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae"])
+def test_nan_from_a_controller_is_named_and_everything_before_is_kept(formulation: str, tmp_path: Path) -> None:
+    changes = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 0.01}
+    run = simulate("five_bar/swing", changes, controller=NanAfter(0.203))
+    assert run.status == "stopped"
+    assert "not finite" in run.message
+    assert 0.2 <= run.t[-1] <= 0.203
+    assert len(run.t) > 20
+    assert_close(run.energy, run.energy[0], 1e-6)
+    assert Run.load(run.save(tmp_path / "run.npz")).message == run.message
+
+
+def test_min_step_ends_a_run_that_needs_shorter_ones() -> None:
+    """Where theta_1, theta_3 stop to determine the rest, steps become as short as you like."""
+
+    class Push:
+        def u(self, t: float, terms: Terms) -> Any:
+            return np.array([1.0, -1.0])
+
+    changes = {"formulation": "reduced", "solver.min_step": 1e-4}
+    run = simulate("five_bar/swing", changes, controller=Push())
+    assert run.status == "stopped"
+    assert "the step fell below min_step = 0.0001 s" in run.message
+    assert 0.2 < run.t[-1] < 0.25
+
+
+def test_numbers_as_people_write_them() -> None:
+    for text, value in ((".1", 0.1), ("1.", 1.0), ("+.5", 0.5), ("1.e-1", 0.1), ("1e-1", 0.1)):
+        answer = ckc("run", "five_bar/swing", "--json", "--set", f"t_end={text}", "--set", "formulation=reduced")
+        assert answer.code == 0
+        assert answer.json["t"] == value
+    for text in ("NaN", "Infinity", "1.5.2", "."):
+        assert ckc("run", "five_bar/swing", "--set", f"t_end={text}").code == 2
+
+
+def test_a_run_that_no_file_could_hold_is_refused() -> None:
+    names = {"solver.output_dt": 1e-6, "t_end": 1.0, "mechanism": {"generator": "n_four_bar", "N": 40}}
+    scene = load_scene("n_four_bar", names)
+    with pytest.raises(InputError, match=r"solver.output_dt: 1000001 output instants of \d+ numbers each"):
+        simulate(scene)
+
+
+# --- signals -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def interrupts() -> Iterator[Interrupts]:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started the tests may have it ignored
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    taken = Interrupts()
+    taken.install()
+    yield taken
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_the_second_interrupt_is_let_pass_and_the_third_is_not(interrupts: Interrupts) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_what_is_held_is_finished_first(interrupts: Interrupts) -> None:
+    done = []
+
+    def save() -> None:
+        with interrupts.held():
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+                signal.raise_signal(number)
+                done.append(number)
+
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        save()
+    assert len(done) == 3
+
+
+def test_what_was_ignored_stays_ignored(interrupts: Interrupts) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interrupts.install()
+    signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+# The command, in a process of its own, which says when it is under way, when it is saving, and waits there.
+CKC = """
+import os, signal, sys, time
+import ckc_pin, ckc_pin.cli
+signal.signal(signal.SIGINT, signal.default_int_handler)
+simulate, fsync, said = ckc_pin.simulate, os.fsync, []
+
+def say(what):
+    if what not in said:
+        said.append(what)
+        print(what, file=sys.stderr, flush=True)
+        return True
+
+def watched(scene, **options):
+    return simulate(scene, **{**options, "progress": lambda t, t_end: t > 0.2 and say("under way")})
+
+def slow(handle):
+    if say("saving"):
+        time.sleep(1.0)
+    fsync(handle)
+
+ckc_pin.simulate, os.fsync = watched, slow
+ckc_pin.cli.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("t_end", "first", "meanwhile", "code", "status"),
+    [
+        ("9000", [signal.SIGINT, signal.SIGINT], [signal.SIGTERM, signal.SIGINT], 130, "interrupted"),
+        ("0.3", [], [signal.SIGTERM, signal.SIGTERM], 143, "done"),
+    ],
+    ids=["interrupted before", "done before"],
+)
+def test_signals_while_saving(
+    t_end: str, first: list[signal.Signals], meanwhile: list[signal.Signals], code: int, status: str, tmp_path: Path
+) -> None:
+    """Ctrl-C twice at once, or not at all; then more of them while the run is written."""
+    words = ["run", "five_bar/swing", "--json", "--out", str(tmp_path), "--set", f"t_end={t_end}"]
+    with subprocess.Popen(
+        [sys.executable, "-c", CKC, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(ckc_pin.__file__).parent.parent)},
+    ) as process:
+        try:
+            assert process.stderr is not None
+            assert process.stderr.readline() == "under way\n"
+            for number in first:
+                process.send_signal(number)
+            assert process.stderr.readline() == "saving\n"
+            for number in meanwhile:
+                process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == code, err
+    assert json.loads(out)["status"] == status
+    assert "the run is saved" in err
+    run = Run.load(tmp_path)
+    assert run.status == status
+    assert run.t[-1] == json.loads(out)["t"] > 0.2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.npz", "scene.json"], "no figures, nothing half"
+
+
+# --- files of strangers --------------------------------------------------------------------------
+
+
+def _header(shape: tuple[int, ...], descr: str = "<f8", version: int = 1) -> bytes:
+    stream = io.BytesIO()
+    write = np.lib.format.write_array_header_1_0 if version == 1 else np.lib.format.write_array_header_2_0
+    write(stream, {"descr": descr, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+GIGABYTE = (2**27,)
+BOMBS: dict[str, tuple[dict[str, bytes], str]] = {
+    "one array": ({"energy": _header((2**60,))}, f"an array of {8 * 2**60} bytes; a run has at most {MAX_BYTES}"),
+    "a product that overflows": ({"u": _header((2**62, 2**62))}, f"an array of {8 * 2**124} bytes"),
+    "many arrays": (
+        {name: _header(GIGABYTE) for name in ("u", "tau", "w", "phi")},
+        "bytes when expanded; a run has at",
+    ),
+    "zeros that deflate well": ({"meta": bytes(MAX_META + 1)}, "damaged"),
+    "a long meta": ({"meta": _header((MAX_META + 1,), "|u1")}, f"a run has at most {MAX_META}"),
+    "long names": ({"coordinates": _header((10**6,), "<U10000")}, "bytes; a run has at most"),
+    "a later header": ({"t": _header((11,), version=2)}, "t.npy has a header that a run does not need"),
+    "Python objects": ({"t": _header((11,), "|O")}, "t.npy holds Python objects"),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The entries of a good run file."""
+    path = simulate("five_bar/swing", {"t_end": 0.01}).save(tmp_path_factory.mktemp("run") / "run.npz")
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _zip(path: Path, entries: list[tuple[str, bytes]]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in entries:
+            archive.writestr(name, data)
+    return path
+
+
+@pytest.mark.parametrize("what", BOMBS)
+def test_bombs_are_not_expanded(
+    what: str, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries, says = BOMBS[what]
+    path = _zip(tmp_path / "run.npz", list((whole | {f"{name}.npy": data for name, data in entries.items()}).items()))
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was expanded"))
+    with pytest.raises(InputError) as error:
+        Run.load(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert says in str(error.value)
+
+
+def test_an_entry_twice_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        path = _zip(tmp_path / "run.npz", [*whole.items(), ("t.npy", whole["t.npy"])])
+    with pytest.raises(InputError, match="not a run file: it holds"):
+        Run.load(path)
+
+
+def test_an_entry_that_is_no_array_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+    rename: Callable[[str], str] = lambda name: "t" if name == "t.npy" else name  # noqa: E731
+    path = _zip(tmp_path / "run.npz", [(rename(name), data) for name, data in whole.items()])
+    with pytest.raises(InputError, match="not a run file: it holds"):
+        Run.load(path)
+
+
+def test_names_that_are_numbers_are_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.zeros(4))
+    path = _zip(tmp_path / "run.npz", [*(whole | {"coordinates.npy": stream.getvalue()}).items()])
+    with pytest.raises(InputError, match=r"coordinates is \(4,\) float64, not names"):
+        Run.load(path)
