@@ -1,0 +1,280 @@
+"""The singularity map as a figure: a panel for each branch, det phi_z as colour, the unreachable gray."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mapped import LABELS, Axis, Kind, Locus, SingularityMap
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.view import style
+from ckc_pin.view.labels import symbol
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_map", "require_figures", "save_map"]
+
+UNREACHED = "#C9C9C9"
+COLOURS = "PuOr"  # its middle is singular, and its sides are told apart by every eye
+LOOKS: dict[Kind, dict[str, Any]] = {
+    "locked": {"color": style.COLOURS[1], "linewidth": 2.2},
+    "fold": {"color": "black", "linewidth": 2.2},
+    "rank loss": {"color": style.COLOURS[3], "linewidth": 2.2},
+    "serial": {"color": style.COLOURS[2], "linewidth": 1.7, "linestyle": (0, (4.0, 1.6))},
+}
+DESIRED: dict[str, Any] = {"color": style.COLOURS[0], "linewidth": 1.8}
+PALER = 1.5  # so that lines stand out
+POINT = 1e-9  # of the map's units: a locus no larger is drawn as a dot
+
+
+def save_map(found: SingularityMap, folder: Path, formats: Sequence[str] = ("png", "svg")) -> list[Path]:
+    """Draw a map and write it as map_joint or map_cartesian.
+
+    Raises
+    ------
+    InputError
+        A folder that cannot be written, matplotlib missing.
+    """
+    figure = draw_map(found)
+    paths = [folder / f"map_{found.space}.{suffix}" for suffix in formats]
+    for path in paths:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with _look():
+                figure.savefig(path, dpi=style.DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    return paths
+
+
+def draw_map(found: SingularityMap) -> Figure:
+    """Return the figure of a map.
+
+    Raises
+    ------
+    InputError
+        matplotlib missing.
+    """
+    with _look():
+        return _plane(found) if len(found.axes) == 2 else _line(found)
+
+
+def require_figures() -> None:
+    """Find out before a computation, not after it, whether it can be drawn (InputError)."""
+    _look()
+
+
+def _look() -> Any:
+    try:
+        from matplotlib import style as styles
+    except ModuleNotFoundError:
+        raise InputError("figures need matplotlib: pip install 'ckc_pin[view]'") from None
+    return styles.context(["default", style.RC])
+
+
+# --- over two coordinates ------------------------------------------------------------------------
+
+
+def _plane(found: SingularityMap) -> Figure:
+    from matplotlib.figure import Figure
+
+    columns = min(len(found.sheets), 2)
+    rows = -(-len(found.sheets) // columns)
+    figure = Figure(figsize=(4.7 * columns + 1.3, 4.2 * rows * _tall(found) + 1.4), layout="constrained")
+    figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    most = max(float(np.nanmax(np.abs(sheet.det_phi_z))) for sheet in found.sheets)
+    panels = []
+    for k, sheet in enumerate(found.sheets):
+        ax = figure.add_subplot(rows, columns, k + 1)
+        panels.append(ax)
+        ax.set_facecolor(UNREACHED)
+        ax.grid(False)
+        first, second = found.axes
+        edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in found.axes]
+        shown = ax.pcolormesh(
+            *edges,
+            sheet.det_phi_z.T,
+            cmap=COLOURS,
+            vmin=-PALER * most,
+            vmax=PALER * most,
+            shading="flat",
+            rasterized=True,
+        )
+        for locus in found.loci:
+            _locus(ax, found.axes, locus, k)
+        if found.path is not None:
+            _path(ax, found, k)
+        ax.set(
+            xlim=(first.low, first.high),
+            ylim=(second.low, second.high),
+            aspect="equal" if first.unit == second.unit else "auto",
+        )
+        ax.set(xlabel=_axis_label(found, first), ylabel=_axis_label(found, second))
+        for axis, ticks in ((first, ax.set_xticks), (second, ax.set_yticks)):
+            if axis.turns:
+                ticks(np.pi * np.arange(-1, 1.1, 0.5), ["$-π$", "$-π/2$", "0", "$π/2$", "$π$"])
+        ax.set_title(_panel_title(found, k))
+    unit = f", {found.measure_unit.replace('^', '$^{')}}}$" if "^" in found.measure_unit else (
+        f", {found.measure_unit}" if found.measure_unit else "")  # fmt: skip
+    label = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
+    figure.colorbar(shown, ax=panels, label=label + unit, shrink=0.85)
+    figure.legend(handles=_handles(found), loc="outside lower left", ncols=columns, handlelength=2.8)
+    return figure
+
+
+def _tall(found: SingularityMap) -> float:
+    """Height of the window over its width, within what fits a page."""
+    first, second = found.axes
+    if first.unit != second.unit:
+        return 1.0
+    return float(np.clip((second.high - second.low) / (first.high - first.low), 0.4, 1.5))
+
+
+def _locus(ax: Any, axes: Sequence[Axis], locus: Locus, sheet: int) -> None:
+    if np.ptp(locus.at, axis=0).max() < POINT:
+        if locus.on[sheet].any():
+            _curve(ax, axes, locus.at[:1], marker="o", markersize=7, markeredgecolor="white", zorder=4,
+                   color=LOOKS[locus.kind]["color"])  # fmt: skip
+        return
+    _curve(ax, axes, np.where(locus.on[sheet][:, None], locus.at, np.nan), zorder=3, **LOOKS[locus.kind])
+
+
+def _path(ax: Any, found: SingularityMap, sheet: int) -> None:
+    path = found.path
+    if path is None or not path.on[sheet].any():
+        return
+    at = np.where(path.on[sheet][:, None], path.at, np.nan)
+    _curve(ax, found.axes, at, zorder=5, **DESIRED)
+    if path.on[sheet][0]:
+        _curve(ax, found.axes, path.at[:1], zorder=6, marker="s", markersize=5.5, markeredgecolor="white",
+               color=DESIRED["color"])  # fmt: skip
+
+
+def _curve(ax: Any, axes: Sequence[Axis], at: Array, **look: Any) -> None:
+    """Draw a curve once for each turn by which it enters the window."""
+    from matplotlib.patheffects import Normal, Stroke
+
+    turns = []
+    for k, axis in enumerate(axes):
+        inside = at[:, k][np.isfinite(at[:, k])]
+        if not axis.turns or not len(inside):
+            turns.append([0.0])
+            continue
+        first = np.ceil((axis.low - inside.max()) / (2 * np.pi))
+        last = np.floor((axis.high - inside.min()) / (2 * np.pi))
+        turns.append([2 * np.pi * number for number in np.arange(first, last + 1)])
+    for x in turns[0]:
+        for y in turns[1]:
+            (line,) = ax.plot(at[:, 0] + x, at[:, 1] + y, **look)
+            line.set_path_effects([Stroke(linewidth=line.get_linewidth() + 1.6, foreground="white", alpha=0.75),
+                                   Normal()] if look.get("linestyle", "-") == "-" else [Normal()])  # fmt: skip
+
+
+# --- over one coordinate -------------------------------------------------------------------------
+
+
+def _line(found: SingularityMap) -> Figure:
+    from matplotlib.figure import Figure
+
+    axis = found.axes[0]
+    place = found.space == "cartesian"
+    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
+    figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    ax = figure.add_subplot()
+    if place:
+        _point_curves(ax, found)
+    else:
+        for k, sheet in enumerate(found.sheets):
+            ax.plot(axis.values, sheet.det_phi_z[:, 0], color=style.COLOURS[k], linewidth=1.8)
+        _gray(ax, axis, found.counts[:, 0] == 0)
+        for locus in found.loci:
+            if locus.on.any():
+                at = np.remainder(locus.at[0, 0] - axis.low, 2 * np.pi) + axis.low if axis.turns else locus.at[0, 0]
+                ax.axvline(at, zorder=3, **LOOKS[locus.kind])
+        ax.axhline(0.0, color=style.GREY, linewidth=0.8)
+        if found.path is not None:
+            level = np.full(len(found.path.at), 0.0)
+            _curve(ax, [axis, Axis("", "", 0, 0, False, level)], np.column_stack([found.path.at, level]), zorder=5,
+                   **DESIRED)  # fmt: skip
+        unit = f", {found.measure_unit}".replace("^2", "²") if found.measure_unit else ""
+        name = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
+        ax.set(xlabel=_axis_label(found, axis), ylabel=name + unit, xlim=(axis.low, axis.high))
+    figure.legend(handles=_handles(found), loc="outside lower left", ncols=2, handlelength=2.8)
+    return figure
+
+
+def _point_curves(ax: Any, found: SingularityMap) -> None:
+    """Where the point of a mechanism of one freedom goes, in the plane that holds most of it."""
+    every = np.concatenate([sheet.point[sheet.reached] for sheet in found.sheets if sheet.point is not None])
+    first, second = np.sort(np.argsort(-np.ptp(every, axis=0), kind="stable")[:2])
+    for k, sheet in enumerate(found.sheets):
+        if sheet.point is not None:
+            ax.plot(*sheet.point[:, 0, [first, second]].T, color=style.COLOURS[k], linewidth=1.8)
+    for locus in found.loci:
+        if locus.point is not None and locus.on.any():
+            ax.plot(*locus.point[0, [first, second]], "o", markersize=7, markeredgecolor="white", zorder=4,
+                    color=LOOKS[locus.kind]["color"])  # fmt: skip
+    ax.set(xlabel=f"${'xyz'[first]}$, m", ylabel=f"${'xyz'[second]}$, m", aspect="equal")
+    ax.margins(0.08)
+
+
+def _gray(ax: Any, axis: Axis, unreached: Array) -> None:
+    edges = np.linspace(axis.low, axis.high, len(unreached) + 1)
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], unreached.astype(int), [0]])))
+    for start, end in ends.reshape(-1, 2):
+        ax.axvspan(edges[start], edges[end], color=UNREACHED, linewidth=0)
+
+
+# --- words ---------------------------------------------------------------------------------------
+
+
+def _title(found: SingularityMap) -> str:
+    name = found.mechanism.replace("$", r"\$")
+    held = ", ".join(f"{symbol(k)} = {x:.4g}" for k, x in found.held.items())
+    where = f", workspace of {found.point}" if found.space == "cartesian" else ", singularity map"
+    return f"{name}{where}{f' at {held}' if held else ''}"
+
+
+def _panel_title(found: SingularityMap, k: int) -> str:
+    what = _what(found)
+    sheet = found.sheets[k]
+    which = f"{what} {k + 1}{' (as assembled)' if k == 0 else ''}"
+    return f"{which}: reaches {100 * float(np.mean(sheet.reached)):.1f} %"
+
+
+def _what(found: SingularityMap) -> str:
+    return "working mode" if found.space == "cartesian" and len(found.axes) == 2 else "branch"
+
+
+def _axis_label(found: SingularityMap, axis: Axis) -> str:
+    return f"${axis.name}$, m" if found.space == "cartesian" else f"{symbol(axis.name)}, {axis.unit}"
+
+
+def _handles(found: SingularityMap) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = []
+    for kind in LABELS:
+        some = [locus for locus in found.loci if locus.kind == kind and locus.on.any()]
+        if some:
+            dots = all(np.ptp(locus.at, axis=0).max() < POINT for locus in some) and len(found.axes) == 2
+            look = {"color": LOOKS[kind]["color"], "marker": "o", "linestyle": "none"} if dots else LOOKS[kind]
+            handles.append(Line2D([], [], label=LABELS[kind], **look))
+    if len(found.axes) == 1:
+        what = _what(found)
+        handles += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
+                    for k in range(len(found.sheets))]  # fmt: skip
+    if found.path is not None:
+        name = found.path.name.replace("$", r"\$")
+        handles.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
+    if len(found.axes) == 2 and not all(sheet.reached.all() for sheet in found.sheets):
+        handles.append(Patch(color=UNREACHED, label=f"not reached in this {_what(found)}"))
+    elif found.space == "joint" and not found.counts.all():
+        handles.append(Patch(color=UNREACHED, label="not reached on any branch shown"))
+    return handles
