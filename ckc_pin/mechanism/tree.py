@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.lazy import Tally
 
-__all__ = ["Array", "IntArray", "Tree"]
+__all__ = ["Array", "BoolArray", "IntArray", "Tree"]
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 MOST = 300  # coordinates; Pinocchio's workspace takes about 100 n^3 bytes whatever it is used for, 2.6 GB here
 
@@ -79,6 +80,14 @@ class Tree:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""
         pin.computeJointJacobians(self.model, self.data, q_tree)
         return self._placement.copy(), self._jacobian.copy()
+
+    def many_kinematics(self, q_tree: Array) -> tuple[Array, Array]:
+        """Return what `kinematics` does for each of (count, nq) configurations: (count, joints, 12), (count, 6, n)."""
+        placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
+        for k, q in enumerate(q_tree):
+            pin.computeJointJacobians(self.model, self.data, q)
+            placement[k], jacobian[k] = self._placement, self._jacobian
+        return placement, jacobian
 
     def jacobian_dot(self, q_tree: Array, v_tree: Array) -> Array:
         """Return d/dt of the world Jacobian (6, n) along v_tree."""

@@ -1,0 +1,194 @@
+"""A singularity map as a plain value: what a study computes and a figure draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
+
+__all__ = ["LABELS", "Approach", "Axis", "Kind", "Locus", "Path", "Sheet", "SingularityMap", "Space"]
+
+Space = Literal["joint", "cartesian"]
+Kind = Literal["locked", "fold", "rank loss", "serial"]
+
+# In the paper's terms and in those of parallel robots.
+LABELS: dict[Kind, str] = {
+    "locked": "type 1: parallel (second kind), q locked",
+    "fold": "type 2: parallel (second kind), two branches meet",
+    "rank loss": "J loses rank",
+    "serial": "serial (first kind): q moves, the point does not",
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of a map.
+
+    Attributes
+    ----------
+    name : str
+        A coordinate, or x, y, z of a point.
+    unit : "rad" or "m"
+    low, high : float
+    turns : bool
+        Whether both ends are the same, a full turn apart.
+    values : (count,) array
+        The middles of the cells.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    turns: bool
+    values: Array
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What one branch reaches without a singular configuration on the way.
+
+    In the joint space an assembly branch; in the Cartesian space a working mode.
+
+    Attributes
+    ----------
+    reached : (n_1, n_2) array of bool
+        n_2 = 1 in a map over one coordinate.
+    det_phi_z : (n_1, n_2) array
+        NaN where not reached. The smallest singular value where phi_z is not square.
+    q_tree : (n_1, n_2, nq) array
+        The configurations, NaN where not reached.
+    point : (n_1, n_2, 3) array or None
+        Where the mechanism's point is, metres.
+    """
+
+    reached: BoolArray
+    det_phi_z: Array
+    q_tree: Array
+    point: Array | None
+
+
+@dataclass(frozen=True)
+class Locus:
+    """A curve of singular configurations, a point of the map where q is locked or the map has one axis.
+
+    Attributes
+    ----------
+    kind : "locked" (type 1), "fold" (type 2), "rank loss" or "serial"
+    q_tree : (m, nq) array
+        Along the curve.
+    at : (m, axes) array
+        Its place in the map, angles not wrapped.
+    point : (m, 3) array or None
+    on : (sheets, m) array of bool
+        Which parts of it are seen from which sheet.
+    closed : bool
+    residual : float
+        Largest residual of the equations solved, m and rad.
+    """
+
+    kind: Kind
+    q_tree: Array
+    at: Array
+    point: Array | None
+    on: BoolArray
+    closed: bool
+    residual: float
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Where a trajectory comes closest to a locus, in the map's units.
+
+    Attributes
+    ----------
+    locus : int
+        Its number.
+    distance, t : float
+    at, to : (axes,) arrays
+        Places of the trajectory and of the locus.
+    """
+
+    locus: int
+    distance: float
+    t: float
+    at: Array
+    to: Array
+
+
+@dataclass(frozen=True)
+class Path:
+    """A scene's desired trajectory in the map.
+
+    Attributes
+    ----------
+    name : str
+    t : (m,) array
+        Seconds; in the Cartesian space as far as it can be followed.
+    at : (m, axes) array
+    on : (sheets, m) array of bool
+        Which parts of it are on which sheet.
+    leaves_at : float or None
+    closest_t, sigma_min : float
+        When it comes closest to a singular phi_z, and its smallest singular value then.
+    approaches : tuple of Approach
+        To each locus, the nearest first.
+    """
+
+    name: str
+    t: Array
+    at: Array
+    on: BoolArray
+    leaves_at: float | None
+    closest_t: float
+    sigma_min: float
+    approaches: tuple[Approach, ...]
+
+
+@dataclass(frozen=True)
+class SingularityMap:
+    """Fig. 2 of any mechanism.
+
+    Attributes
+    ----------
+    mechanism : str
+    space : "joint" or "cartesian"
+    point : str or None
+        Whose serial singularities and places these are.
+    axes : tuple of Axis
+        One or two.
+    held : dict of str to float
+        The other told values.
+    measure : "det phi_z" or "sigma_min(phi_z)"
+    measure_unit : str
+    sheets : tuple of Sheet
+        The assembled one first.
+    more_branches : bool
+        Whether there are branches beyond those shown.
+    loci : tuple of Locus
+    path : Path or None
+    seconds : float
+        What the sheets took to compute.
+    notes : tuple of str
+    """
+
+    mechanism: str
+    space: Space
+    point: str | None
+    axes: tuple[Axis, ...]
+    held: dict[str, float]
+    measure: str
+    measure_unit: str
+    sheets: tuple[Sheet, ...]
+    more_branches: bool
+    loci: tuple[Locus, ...]
+    path: Path | None
+    seconds: float
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def counts(self) -> IntArray:
+        """How many sheets reach each cell, shape (n_1, n_2)."""
+        total: IntArray = sum(sheet.reached.astype(int) for sheet in self.sheets)  # type: ignore[assignment]
+        return total
