@@ -21,7 +21,7 @@ Rate = Callable[[float, Array], Array]
 
 RUN_UP = 0.4  # of the leap: what is integrated first, to extrapolate the rest from
 STAGES = (10, 14)  # of the run-up and a first leap, and of the leap itself; even: none in the middle
-ACCURATE = 1e-10  # of |y|: how well the two leaps have to agree
+ACCURATE = 1e-9  # of |y|: how well the two leaps have to agree
 ORDER = 12  # in the length of a leap: how its error is observed to grow
 SWEEPS = 30  # of the fixed-point iteration on the stages
 PLACES = np.linspace(-1.0, 1.0, 41)  # where they are compared
@@ -95,7 +95,7 @@ def _collocated(rate: Rate, t: float, y: Array, span: float, stages: int, rates:
         new = np.array([rate(t + span * (1 + x) / 2, place) for x, place in zip(nodes, places, strict=True)])
         change = float(np.abs(new - rates).max()) * span
         rates = new
-        if change <= 0.01 * ACCURATE or not change < 0.5 * before:  # else at rounding, or diverging
+        if change <= 0.001 * ACCURATE or not change < 0.5 * before:  # else at rounding, or diverging
             break
         before = change
     return _series(rates, y, span)

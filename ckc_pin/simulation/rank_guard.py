@@ -23,9 +23,11 @@ __all__ = ["RankGuard"]
 
 FINE = 1e-7  # at least, in a run with crossings: with less they come out up to 1e-2 off after ten seconds
 LOST = 1e-5  # relative to the largest singular value: the rank is lost
+DEEP = 0.7  # of the larger end value: a V whose tangents meet below that is looked at through the interpolant
 NECK = 0.2  # of the larger end value: a minimum below that has to be resolved by shorter steps
 SHORTEST = 1e-6  # s; a step below that resolves any neck that is wider than LOST
-NEAR = 2.0  # steps: a crossing that is as near as that is leapt over
+JUMP = 0.7  # of the time to s = 0 along its tangent: the longest step that begins and ends with s falling
+NEAR = 4.0  # steps: a crossing that is as near as that is leapt over
 AHEAD = 0.1  # of s: what is left of it at a crossing, the motion extrapolated
 ATTEMPTS = 6  # leaps, each from half as far away as the one before
 CENTRED = 0.04  # of half a leap: how well the crossing has to be in its middle
@@ -84,7 +86,7 @@ class RankGuard:
         """Whether a step can be kept; if not it is taken back."""
         (old, falling), (new, rising) = self._end or self._rate(step, step.t_old), self._rate(step, step.t)
         h = step.t - step.t_old
-        if falling < 0 < rising and _lower_bound(h, old, falling, new, rising) < NECK * max(old, new):
+        if falling < 0 < rising and _tangents_meet(h, old, falling, new, rising) < DEEP * max(old, new):
             t, value = self._minimum(step.interpolant, step.t_old, step.t)
             if value < LOST:
                 if not self._passes:
@@ -95,6 +97,9 @@ class RankGuard:
             if value < NECK * max(old, new) and h > SHORTEST:
                 self.stepper.take_back(h / 4)
                 return False
+        if falling < 0 and rising <= 0 and h > JUMP * -old / falling and h > SHORTEST:
+            self.stepper.take_back(h / 2)  # it may have passed zero, a peak, and be falling again
+            return False
         if new < LOST:
             raise self._lost(step, step.t, new)
         if rising > 0:
@@ -133,7 +138,7 @@ class RankGuard:
         stepper = self.stepper
         t, y = stepper.t, stepper.solver.y.copy()
         if left > self._reach:
-            stepper.go_on(t, y, left - 0.9 * self._reach)
+            self._approach(left)
             return None
         starts = [(t, y)]
         if left < 0.5 * self._length:  # so near J is ill-conditioned: rather from where the last step began
@@ -144,9 +149,9 @@ class RankGuard:
             if crossing is not None:
                 break
         else:
-            stepper.go_on(t, y, max(left - 0.9 * self._reach, 0.1 * left))
+            self._approach(left)
             return None
-        if stepper.refine(FINE) and stepper.solver.t_bound == self._first_leg:
+        if stepper.refine(FINE) and t > 0 and stepper.solver.t_bound == self._first_leg:
             self._end, self._length = self._again(t), t - stepper.before[0]
             return None
         self.crossings.append(crossing)
@@ -157,6 +162,13 @@ class RankGuard:
         stepper.steps += 1
         self._end = self._rate(step, end)
         return step
+
+    def _approach(self, left: float) -> None:
+        """Let the next step end where a leap may succeed, unless it is to be shorter anyway."""
+        length = max(left - 0.9 * self._reach, 0.1 * left)
+        solver = self.stepper.solver
+        if solver.h_abs > length:
+            self.stepper.go_on(self.stepper.t, solver.y.copy(), length)
 
     def _again(self, t: float) -> tuple[float, float]:
         """Come to t once more from the start, with the finer tolerance; return s and its rate there."""
@@ -245,7 +257,7 @@ class RankGuard:
         return float(values[k] / values[0]), float(rate / values[0])
 
 
-def _lower_bound(h: float, old: float, falling: float, new: float, rising: float) -> float:
-    """Where the tangents at both ends of a V meet; looking closer costs an interpolant's right-hand sides."""
+def _tangents_meet(h: float, old: float, falling: float, new: float, rising: float) -> float:
+    """Height at which the tangents at both ends of a V meet: an estimate of its depth without right-hand sides."""
     place = (new - old - rising * h) / (falling - rising)
     return old + falling * place
