@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ckc_pin.control.controllers import Model, SetPoint, Tracking
-from ckc_pin.control.desired import Table, read_desired
 from ckc_pin.control.gains import gain_matrix
+from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec
 from ckc_pin.dynamics.formulations import CoriolisVelocity
-from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 
@@ -53,10 +52,5 @@ def make_controller(
             gain_matrix(spec.K_V, names, "K_V"),
             plant.vector(spec.q_d, names, "controller.q_d"),
         )
-    desired = read_desired(spec.desired, names, sources)
-    if isinstance(desired, Table) and desired.end < t_end:
-        raise InputError(
-            f"{spec.desired['file']}: ends at t = {desired.end:g} s, the scene at t_end = {t_end:g} s; "
-            "lengthen the trajectory or shorten the run"
-        )
+    desired = make_desired(spec.desired, plant, sources, t_end)
     return Tracking(gain_matrix(spec.Lambda, names, "Lambda"), gain_matrix(spec.K_D, names, "K_D"), desired, model)

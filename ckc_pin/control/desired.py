@@ -14,7 +14,7 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Desired", "Harmonics", "Table", "read_desired"]
+__all__ = ["Desired", "Harmonics", "Table", "read_desired", "read_table"]
 
 FEWEST = 6  # rows that a quintic spline needs
 
@@ -88,7 +88,7 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
     if "file" in desired:
         if len(desired) > 1 or not isinstance(desired["file"], str):
             raise InputError(f'{where}: either file = "NAME.csv" alone, or a table for each of {", ".join(names)}')
-        return _read_table(sources.text(desired["file"]), names, desired["file"])
+        return read_table(sources.text(desired["file"]), names, desired["file"])
     unknown = [name for name in desired if name not in names]
     missing = [name for name in names if name not in desired]
     if unknown or missing:
@@ -99,7 +99,7 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
     )
 
 
-def _read_table(text: str, names: Sequence[str], file: str) -> Table:
+def read_table(text: str, names: Sequence[str], file: str) -> Table:
     """Read `t` and a column for each name, in any order, empty lines passed over."""
     lines = [(number, line.split(",")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     wanted = ["t", *names]

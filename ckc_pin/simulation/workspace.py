@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.control.desired import Desired
+from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["DesiredCheck", "follow_desired"]
 
@@ -45,7 +45,7 @@ def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> Desi
     at, t_at = first.at, 0.0
     way = [(0.0, at.sigma_min(), at)]
     for t in times[1:]:
-        moved = _move(mechanism, at, desired(t)[0])
+        moved = _move(mechanism, at, desired, float(t))
         if moved is None:
             return _leaving(mechanism, desired, at, t_at, float(t))
         at, t_at = moved, float(t)
@@ -53,7 +53,11 @@ def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> Desi
     return _closest(mechanism, desired, way)
 
 
-def _move(mechanism: Mechanism, at: Kinematics, q: Array) -> Kinematics | None:
+def _move(mechanism: Mechanism, at: Kinematics, desired: Desired, t: float) -> Kinematics | None:
+    try:
+        q = desired(t)[0]
+    except NumericalError:  # a point's path has no q outside the workspace
+        return None
     outcome = mechanism.sigma(q, at)
     return outcome.at if outcome.verdict == "converged" else None
 
@@ -62,7 +66,7 @@ def _leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: flo
     """Bisect for the last instant that can be reached."""
     for _ in range(REFINEMENTS):
         middle = 0.5 * (inside + outside)
-        moved = _move(mechanism, at, desired(middle)[0])
+        moved = _move(mechanism, at, desired, middle)
         if moved is None:
             outside = middle
         else:
@@ -78,7 +82,7 @@ def _closest(mechanism: Mechanism, desired: Desired, way: list[tuple[float, floa
     low, high = way[max(k - 1, 0)][0], way[min(k + 1, len(way) - 1)][0]
 
     def margin_at(time: float) -> float:
-        moved = _move(mechanism, at, desired(time)[0])
+        moved = _move(mechanism, at, desired, time)
         return 0.0 if moved is None else moved.sigma_min()
 
     finer = minimize_scalar(margin_at, bounds=(low, high), method="bounded", options={"xatol": 1e-9})

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.control.desired import Desired, read_desired
+from ckc_pin.control.desired import Desired
+from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
@@ -46,6 +47,7 @@ def desired_along(run: Run) -> Wanted | None:
     if isinstance(spec, SetPointSpec):
         q_d = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
         return Wanted("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
-    desired: Desired = read_desired(spec.desired, run.independent, Sources(run.scene_name, None, run.texts))
+    sources = Sources(run.scene_name, None, run.texts)
+    desired: Desired = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
     sampled = np.array([desired(float(t))[:2] for t in run.t])
     return Wanted("tracking", sampled[:, 0], sampled[:, 1])

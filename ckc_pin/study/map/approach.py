@@ -8,6 +8,7 @@ import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
+from ckc_pin.control.point_path import PointPath
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.following import shapes
 from ckc_pin.mechanism.kinematics import Kinematics
@@ -45,7 +46,7 @@ def add_path(scene: Scene, mechanism: Mechanism, grids: Sequence[Grid], loci: Se
         raise InputError(f"--scene {scene.name}: it is of {own.name}, the map of {mechanism.name}")
     controller = scene_controller(scene, mechanism)
     if isinstance(controller, Tracking):
-        desired = controller.desired
+        desired: Desired = controller.desired
         check = follow_desired(mechanism, desired, scene.spec.t_end)
         t = np.linspace(0.0, scene.spec.t_end, SAMPLES + 1)
     elif isinstance(controller, SetPoint):
@@ -57,7 +58,7 @@ def add_path(scene: Scene, mechanism: Mechanism, grids: Sequence[Grid], loci: Se
             return target, np.zeros_like(target), np.zeros_like(target)
     else:
         raise InputError(f"--scene {scene.name}: it has no controller, so nothing is desired; give one that has")
-    if cartesian and check.leaves_at is not None:
+    if check.leaves_at is not None and (cartesian or isinstance(desired, PointPath)):
         t = t[t <= check.leaves_at]
     follower = _Follower(mechanism, grids[0].domain, cartesian)
     way, on = _way(follower, desired, t, grids)

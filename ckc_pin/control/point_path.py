@@ -1,0 +1,236 @@
+"""Desired trajectories that are told for a point of the mechanism, and followed by its independent coordinates.
+
+The inverse kinematics is exact at every instant: a table of configurations along the path, made once, says from where
+Newton's method starts, so that the answer at t does not depend on what was asked before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Protocol
+
+import msgspec
+import numpy as np
+
+from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.point import Point
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.spec import Vector3
+from ckc_pin.mechanism.toml import convert
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Circle", "Line", "Place", "PointPath", "make_desired"]
+
+KNOTS = 400  # of a path
+BISECTIONS = 50
+
+
+class Place(Protocol):
+    """A place over time."""
+
+    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,), metres and seconds."""
+
+
+class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class CircleSpec(_Spec, frozen=True):
+    """Round a centre, `frequency` in rad/s, against the clock when seen against the normal."""
+
+    centre: Vector3
+    radius: Annotated[float, msgspec.Meta(gt=0)]
+    frequency: float
+    phase: float = 0.0
+    normal: Vector3 = (0.0, 0.0, 1.0)
+
+
+class LineSpec(_Spec, frozen=True):
+    """From one place to another and back, as a cosine, `frequency` in rad/s."""
+
+    start: Vector3
+    end: Vector3
+    frequency: float
+
+
+class PointPathSpec(_Spec, frozen=True):
+    """`[controller.desired]` with `point` in it: one of file, circle and line."""
+
+    point: str
+    file: str | None = None
+    circle: CircleSpec | None = None
+    line: LineSpec | None = None
+
+
+class Circle:
+    """centre + radius (a cos(frequency t + phase) + b sin(frequency t + phase)), a, b and the normal right-handed."""
+
+    def __init__(self, spec: CircleSpec) -> None:
+        from ckc_pin.mechanism.closure import perpendicular
+
+        normal = np.array(spec.normal)
+        if not np.linalg.norm(normal) > 0:
+            raise InputError("controller.desired.circle: normal is no direction; give three numbers, not all zero")
+        self.spec = spec
+        self.centre = np.array(spec.centre)
+        self.a, self.b = perpendicular(normal / np.linalg.norm(normal))
+
+    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,)."""
+        rate, angle = self.spec.frequency, self.spec.frequency * t + self.spec.phase
+        out = self.spec.radius * (np.cos(angle) * self.a + np.sin(angle) * self.b)
+        along = self.spec.radius * (np.cos(angle) * self.b - np.sin(angle) * self.a)
+        return self.centre + out, rate * along, -(rate**2) * out
+
+
+class Line:
+    """The middle of start and end, minus half the way times cos(frequency t): at rest at both ends."""
+
+    def __init__(self, spec: LineSpec) -> None:
+        self.spec = spec
+        self.middle = (np.array(spec.start) + np.array(spec.end)) / 2
+        self.half = (np.array(spec.end) - np.array(spec.start)) / 2
+
+    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,)."""
+        rate, angle = self.spec.frequency, self.spec.frequency * t
+        cosine, sine = np.cos(angle) * self.half, np.sin(angle) * self.half
+        return self.middle - cosine, rate * sine, rate**2 * cosine
+
+
+class PointPath:
+    """q_d(t) that takes a point along a path, with exact rates and accelerations.
+
+    Parameters
+    ----------
+    point : Point
+    place : Place
+        The path.
+    t_end : float
+        How long it must last, s.
+
+    Attributes
+    ----------
+    leaves_at : float or None
+        When the path leaves the workspace of its working mode or of its assembly branch, s.
+
+    Raises
+    ------
+    InputError
+        Its start cannot be reached.
+    """
+
+    def __init__(self, point: Point, place: Place, t_end: float) -> None:
+        self.point = point
+        self.place = place
+        self.leaves_at: float | None = None
+        with one_blas_thread():
+            try:
+                first = point.inverse(place(0.0)[0])
+            except InputError as error:
+                raise InputError(f"controller.desired: the path cannot be started: {error}") from None
+            self.times, self.knots = [0.0], [point.kinematics(first.at.q_tree)]
+            for t in np.linspace(0.0, t_end, KNOTS + 1)[1:]:
+                at = self._follow(self.knots[-1], float(t))
+                if at is None:
+                    self._end(self.times[-1], float(t))
+                    break
+                self.times.append(float(t))
+                self.knots.append(at)
+
+    def _end(self, inside: float, outside: float) -> None:
+        """Bisect for the last instant that can be reached; it becomes the last knot."""
+        at = self.knots[-1]
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (inside + outside)
+            there = self._follow(at, middle)
+            if there is None:
+                outside = middle
+            else:
+                inside, at = middle, there
+        self.times.append(inside)
+        self.knots.append(at)
+        self.leaves_at = inside
+
+    def _follow(self, at: Kinematics, t: float) -> Kinematics | None:
+        """Go on to the place at t, unless the inverse kinematics or the independent coordinates fail on the way."""
+        there = self.point.follow(at, self.place(t)[0])
+        return there if there is not None and self._side(at) * self._side(there) > 0 else None
+
+    def _side(self, at: Kinematics) -> float:
+        """The sign of det phi_z, which changes where the assembly branch does: q cannot lead across."""
+        own = self.point.mechanism.kinematics(at.q_tree)
+        square = own.phi_z.shape[0] == own.phi_z.shape[1]
+        return float(np.sign(own.phi_z_factor.determinant())) if square else 1.0
+
+    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q_d, its rate and its acceleration at time t (s), each of shape (d,).
+
+        Raises
+        ------
+        NumericalError
+            The path has left the workspace, or passes a serial singularity.
+        """
+        if self.leaves_at is not None and t > self.leaves_at:
+            raise NumericalError(
+                f"the desired path of the point {self.point.name!r} leaves the workspace of its branch at "
+                f"t = {self.leaves_at:.5f} s",
+                t=t,
+            )
+        x, x_dot, x_ddot = self.place(t)
+        psi = self.point.follow(self._near(t), x)
+        if psi is None:
+            raise NumericalError(f"the desired path of the point {self.point.name!r} cannot be followed here", t=t)
+        v, v_dot = self.point.rates(psi, x_dot, x_ddot)
+        mechanism = self.point.mechanism
+        q = mechanism.partition.q
+        return mechanism.independent_part(psi.q_tree), v[q], v_dot[q]
+
+    def _near(self, t: float) -> Kinematics:
+        after = int(np.clip(np.searchsorted(self.times, t), 0, len(self.times) - 1))
+        before = max(after - 1, 0)
+        return self.knots[after if abs(self.times[after] - t) < abs(t - self.times[before]) else before]
+
+
+def make_desired(
+    desired: Mapping[str, Any], mechanism: Mechanism, sources: Sources, t_end: float
+) -> Harmonics | Table | PointPath:
+    """Build what the `[controller.desired]` table says: of the independent coordinates, or of a point.
+
+    Raises
+    ------
+    InputError
+        Not a trajectory, one that ends too soon, or one of a point whose start cannot be reached.
+    """
+    if "point" not in desired or "point" in mechanism.independent:
+        found = read_desired(desired, mechanism.independent, sources)
+        if isinstance(found, Table):
+            _require_length(found, str(desired["file"]), t_end)
+        return found
+    where = "controller.desired"
+    spec = convert(dict(desired), PointPathSpec, sources.name, where)
+    given = [name for name in ("file", "circle", "line") if getattr(spec, name) is not None]
+    if len(given) != 1:
+        raise InputError(f"{sources.name}: {where}: beside point give one of file, circle and line, not {given}")
+    place: Place
+    if spec.circle is not None:
+        place = Circle(spec.circle)
+    elif spec.line is not None:
+        place = Line(spec.line)
+    else:
+        place = table = read_table(sources.text(str(spec.file)), ("x", "y", "z"), str(spec.file))
+        _require_length(table, str(spec.file), t_end)
+    return PointPath(Point(mechanism, spec.point), place, t_end)
+
+
+def _require_length(table: Table, file: str, t_end: float) -> None:
+    if table.end < t_end:
+        raise InputError(
+            f"{file}: ends at t = {table.end:g} s, the scene at t_end = {t_end:g} s; "
+            "lengthen the trajectory or shorten the run"
+        )
