@@ -1,0 +1,190 @@
+"""Positions where J loses rank: crossed on their branch or stopped at, never left on another branch unnoticed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ckc_pin import Run, simulate
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.simulation.integrate import Stepper
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
+from tests.regression import one_freedom
+from tests.regression.test_reference_cases import first_top_pin
+
+# --- flat every half turn ------------------------------------------------------------------------
+
+
+def n_four_bar(N: int, rtol: float, **changes: Any) -> Run:
+    scene = {"mechanism.N": N, "solver.rtol": rtol, "solver.output_dt": 10.0, "t_end": 10.0}
+    return simulate("n_four_bar", {**scene, **{key.replace("__", "."): value for key, value in changes.items()}})
+
+
+@pytest.mark.parametrize(("N", "rtol"), [(1, 1e-5), (2, 1e-11), (7, 1e-8)])
+def test_a_dozen_crossings(N: int, rtol: float) -> None:
+    run = n_four_bar(N, rtol)
+    assert run.status == "done", run.message
+    assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(N, 10.0), abs=min(1e4 * rtol, 1e-4))
+
+
+@pytest.mark.parametrize("t_end", [0.7, 0.7084500152, 0.75])
+def test_a_run_may_end_before_at_or_behind_a_crossing(t_end: float) -> None:
+    run = n_four_bar(1, 1e-10, t_end=t_end)
+    assert run.status == "done", run.message
+    assert run.t[-1] == t_end
+    assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(1, t_end), abs=1e-9)
+
+
+def test_what_is_recorded_across_a_crossing_is_as_good_as_elsewhere() -> None:
+    run = n_four_bar(2, 1e-10, t_end=0.8, solver__output_dt=0.01)
+    exact = [first_top_pin(2, float(t)) for t in run.t[1:]]
+    np.testing.assert_allclose(run.points["B0"][1:, :2], exact, rtol=0, atol=1e-8)
+    assert run.max_phi <= 1e-12
+    assert np.ptp(run.energy) <= 1e-8
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])
+@pytest.mark.parametrize("formulation", ["reduced", "spf"])
+@pytest.mark.parametrize("N", [1, 2, 7])
+def test_models_that_need_the_branch_from_J_stop(N: int, formulation: str, rtol: float) -> None:
+    run = n_four_bar(N, rtol, formulation=formulation)
+    assert run.status == "stopped"
+    assert "J loses rank" in run.message or "phi_z becomes singular" in run.message
+    assert run.t[-1] < 0.72  # where the row is flat first
+    end = first_top_pin(N, float(run.t[-1])) if run.t[-1] else (0.0, 1.0)
+    assert run.points["B0"][-1][:2] == pytest.approx(end, abs=min(1e4 * rtol, 1e-4))
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_a_start_at_a_singular_position(formulation: str) -> None:
+    with pytest.raises(NumericalError, match=r"the start theta_0 = 0 is singular.*start elsewhere"):
+        simulate("n_four_bar", {"formulation": formulation, "initial.q": {"theta_0": 0.0}})
+
+
+# --- a change-point four-bar: ground + crank = coupler + rocker ------------------------------------
+
+GROUND, CRANK, COUPLER, ROCKER = 2.0, 1.0, 1.7, 1.3  # m; rods are thin, 1 kg/m
+SPEED = 9.0  # rad/s, enough to keep turning
+
+ROD = """<link name="{name}"><inertial><origin xyz="{half} 0 0"/><mass value="{length}"/>
+    <inertia ixx="1e-3" iyy="{izz}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+PIN = """<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>
+    <origin xyz="{x} 0 0"/><axis xyz="0 0 1"/></joint>"""
+
+
+def four_bar(theta: float, rocker: float = ROCKER) -> one_freedom.State:
+    """Of the crank's angle; the pin of coupler and rocker is beside the line from the crank's pin to the rocker's.
+
+    16 times the squared area of its triangle is ((b + c)^2 - r^2)(r^2 - (b - c)^2); with a change point the first
+    factor is 4 g a cos^2(theta / 2), so that its signed root passes through zero where the rods are in line.
+    """
+    g, a, b, c = GROUND, CRANK, COUPLER, rocker
+
+    def place(th: complex) -> NDArray[np.complex128]:
+        pin = a * np.array([np.cos(th), np.sin(th)])
+        to_rocker = np.array([g, 0.0]) - pin
+        r = np.sqrt(to_rocker @ to_rocker)
+        in_line = b + c == g + a
+        root = 2 * np.sqrt(g * a) * np.cos(th / 2) if in_line else np.sqrt((b + c) ** 2 - r**2)
+        height = root * np.sqrt(r**2 - (b - c) ** 2) / (2 * r)
+        along = (b**2 - c**2 + r**2) / (2 * r)
+        u = to_rocker / r
+        top = pin + along * u + height * np.array([-u[1], u[0]])
+        ends = [(np.zeros(2), pin), (pin, top), (np.array([g, 0.0]), top)]
+        return np.array([[*(p + q) / 2, *(q - p)] for p, q in ends])
+
+    values, rates = one_freedom._with_rate(place, theta)
+    masses = np.array([a, b, c])
+    M = masses @ (np.sum(rates[:, :2] ** 2, axis=1) + np.sum(rates[:, 2:] ** 2, axis=1) / 12)
+    return one_freedom.State(float(M), float(one_freedom.G * masses @ values[:, 1]), 0.0)
+
+
+def write_four_bar(folder: Path, rocker: float, formulation: str, rtol: float) -> Path:
+    lengths = {"crank_rod": CRANK, "coupler_rod": COUPLER, "rocker_rod": rocker}
+    rods = [ROD.format(name=name, half=x / 2, length=x, izz=x**3 / 12) for name, x in lengths.items()]
+    pins = [
+        PIN.format(name="crank", parent="ground", child="crank_rod", x=0),
+        PIN.format(name="coupler", parent="crank_rod", child="coupler_rod", x=CRANK),
+        PIN.format(name="rocker", parent="ground", child="rocker_rod", x=GROUND),
+    ]
+    (folder / "m.urdf").write_text(f'<robot name="m"><link name="ground"/>{"".join(rods + pins)}</robot>')
+    (folder / "mechanism.toml").write_text(
+        f"""name = "m"
+urdf = "m.urdf"
+gravity = [0.0, -9.81, 0.0]
+independent = ["crank"]
+[q_guess]
+crank = 0.5
+coupler = 0.6
+rocker = 1.8
+[[loop]]
+name = "top"
+type = "point_2d"
+frame_a = {{link = "coupler_rod", xyz = [{COUPLER}, 0.0, 0.0]}}
+frame_b = {{link = "rocker_rod", xyz = [{rocker}, 0.0, 0.0]}}
+"""
+    )
+    scene = folder / "default.scene.toml"
+    scene.write_text(
+        f"""mechanism = "mechanism.toml"
+formulation = "{formulation}"
+t_end = 2.0
+[initial]
+q = {{crank = 0.5}}
+q_dot = {{crank = {SPEED}}}
+[solver]
+rtol = {rtol}
+output_dt = 0.1
+"""
+    )
+    return scene
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-11])
+def test_a_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float) -> None:
+    run = simulate(write_four_bar(tmp_path, ROCKER, "dae", rtol))
+    theta, theta_dot = one_freedom.turning(four_bar, 0.5, SPEED, run.t)
+    assert theta[-1] > 3 * np.pi  # in line at pi and at 3 pi
+    assert run.status == "done", run.message
+    assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
+    assert np.abs(run.v_tree[:, run.column("crank")] - theta_dot).max() <= min(1e5 * rtol, 1e-3)
+
+
+@pytest.mark.parametrize("excess", [1e-2, 1e-4])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-10])
+def test_branches_that_only_come_near_are_not_mistaken_for_crossing(tmp_path: Path, excess: float, rtol: float) -> None:
+    """With a longer rocker the rods are never in line, and its pin stays on the side where it was."""
+
+    def near_miss(theta: float) -> one_freedom.State:
+        return four_bar(theta, ROCKER + excess)
+
+    run = simulate(write_four_bar(tmp_path, ROCKER + excess, "dae", rtol))
+    theta, _ = one_freedom.turning(near_miss, 0.5, SPEED, run.t)
+    assert run.status == "done", run.message
+    assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
+
+
+# --- what the watch costs -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", ["four_bar/turning", "five_bar/swing", "slider_crank"])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_a_run_without_a_crossing_evaluates_nothing_more(scene: str, rtol: float) -> None:
+    changes = {"formulation": "dae", "solver.rtol": rtol, "t_end": 1.0, "solver.output_dt": 1.0}
+    watched = simulate(scene, changes)
+    described = load_scene(scene, changes)
+    ready = prepare(described)
+    with one_blas_thread():
+        stepper = Stepper(ready.system, ready.method, described.spec.solver, 1.0)
+        while stepper.solver.status == "running":
+            stepper.step()
+            if stepper.solver.status == "running":
+                stepper.settle()
+    assert watched.status == "done"
+    assert watched.stats["rhs"] == stepper.rhs_count
