@@ -60,6 +60,12 @@ class Chart:
             step[at] = pin.log6(start.actInv(end)).vector
         return step
 
+    def steps(self, q_trees: Array, numbers: Array) -> Array:
+        """`step` from several configurations, shape (k, d); rotations as differences of numbers, to compare sizes."""
+        if self.plain:
+            return np.asarray(numbers - q_trees[:, self._place])
+        return np.array([numbers - self.numbers(q_tree) for q_tree in q_trees])
+
     def rate(self, q_tree: Array, q_dot: Array) -> Array:
         """Rate of the chart numbers at tangent velocity q_dot, shape (d,)."""
         if self.plain:

@@ -155,7 +155,7 @@ def _same_branch(before: Kinematics, after: Kinematics) -> bool:
 def _end_of_line(at: Kinematics, done: float, iterations: int) -> Sigma:
     miss = float("nan")  # not looked for
     if _is_singular(at, 1e-3):
-        return Sigma("singular", at, done, miss, iterations, "phi_z becomes singular on the way")
+        return Sigma("singular", at, done, miss, iterations, "phi_z is singular on the way")
     return Sigma("out of reach", at, done, miss, iterations, "the loops cannot be kept closed on the way")
 
 

@@ -7,6 +7,7 @@ interpolant good enough for output between them.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
@@ -17,11 +18,14 @@ import numpy as np
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import SolverSpec
+from ckc_pin.simulation.stiffness import bdf_rtol, choose
 from ckc_pin.simulation.systems import System, nearly_singular
 
 __all__ = ["BudgetError", "Step", "Stepper"]
 
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
+RECENT = 12  # evaluations remembered: those of one Newton iteration and of one Jacobian
+NEWTON_TOL = 0.03  # of the local error; SciPy's own, rtol^0.5, takes a third more right-hand sides for nothing
 
 
 class BudgetError(Exception):
@@ -44,7 +48,7 @@ class Stepper:
     ----------
     system : System
     method : str
-        A class of `scipy.integrate`.
+        A class of `scipy.integrate`; or "auto", which chooses one by the eigenvalues at the start.
     spec : SolverSpec
     t_end : float
 
@@ -57,31 +61,47 @@ class Stepper:
     def __init__(self, system: System, method: str, spec: SolverSpec, t_end: float) -> None:
         import scipy.integrate
 
-        if system.projects and method not in ONE_STEP:
+        if system.projects and method not in ("auto", *ONE_STEP):
             raise InputError(
                 f"solver: {method} is a multistep method, and projection edits the state between steps, which "
                 f"corrupts its history; take one of {', '.join(ONE_STEP)}, or projection = false"
             )
         self.system = system
-        self.method = method
         self.spec = spec
         self.rhs_count = self.steps = self.rejected = 0
         self.failure: NumericalError | None = None
         self._deadline = perf_counter() + spec.max_wall_s if spec.max_wall_s else np.inf
         self._budgeted = False  # from the first step on: what a solver evaluates to be made is let pass
         self._times: set[float] = set()
-        atol = spec.atol if spec.atol is not None else spec.rtol / 100
-        options: dict[str, Any] = {"max_step": spec.max_step} if spec.max_step else {}
         self.y = system.start()
-        self._last = (0.0, self.y.copy(), self._rhs(0.0, self.y, at_start=True))
-        if method in ("Radau", "BDF") and self._jacobian(0.0, self.y) is not None:
-            options["jac"] = self._jacobian
-        self._options = {"rtol": spec.rtol, "atol": atol, **options}
-        self._class = getattr(scipy.integrate, method)
-        with np.errstate(all="ignore"):
-            self.solver = self._class(self._rhs, 0.0, self.y, t_end, **self._options)
+        self._recent: deque[tuple[float, Array, Array]] = deque(maxlen=RECENT)
+        self._rhs(0.0, self.y, at_start=True)
+        self._known_jacobian: Array | None = None
+        jacobian = self._jacobian(0.0, self.y) if method in ("auto", "BDF", "Radau") else None
+        self.method = self._choose(jacobian, t_end) if method == "auto" else method
+        rtol = bdf_rtol(spec.rtol) if method == "auto" and self.method == "BDF" else spec.rtol
+        atol = spec.atol if spec.atol is not None else spec.rtol / 100
+        self._options: dict[str, Any] = {"rtol": rtol, "atol": atol * rtol / spec.rtol}
+        if spec.max_step:
+            self._options["max_step"] = spec.max_step
+        if self.method in ("BDF", "Radau") and jacobian is not None:
+            self._options["jac"] = self._jacobian
+        self._class = getattr(scipy.integrate, self.method)
+        self.solver = self._solver(0.0, self.y, t_end)
         self._budgeted = True
         self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
+
+    def _choose(self, jacobian: Array | None, t_end: float) -> str:
+        """What "auto" stands for: implicit where nothing is known, but no multistep method where y is edited."""
+        method = choose(jacobian, t_end) if jacobian is not None and np.all(np.isfinite(jacobian)) else "Radau"
+        return "Radau" if method == "BDF" and self.system.projects else method
+
+    def _solver(self, t: float, y: Array, t_end: float, **options: Any) -> Any:
+        with np.errstate(all="ignore"):
+            solver = self._class(self._rhs, t, y, t_end, **self._options, **options)
+        if self.method == "BDF":
+            solver.newton_tol = NEWTON_TOL
+        return solver
 
     @property
     def t(self) -> float:
@@ -167,7 +187,7 @@ class Stepper:
         """Go on with a new solver that remembers nothing."""
         self._retired = {name: count + int(getattr(self.solver, name)) for name, count in self._retired.items()}
         t_end = self.solver.t_bound
-        self.solver = self._class(self._rhs, t, y, t_end, first_step=min(first_step, t_end - t), **self._options)
+        self.solver = self._solver(t, y, t_end, first_step=min(first_step, t_end - t))
 
     def stats(self) -> dict[str, int]:
         """Return the counts so far."""
@@ -201,21 +221,27 @@ class Stepper:
             self.failure = NumericalError("the right-hand side is not finite", t=t)
             if at_start:
                 raise self.failure
-        self._last = (t, y.copy(), derivative)
+        self._recent.append((t, y.copy(), derivative))
         return derivative
 
     def _jacobian(self, t: float, y: Array) -> Array | None:
-        """The system's Jacobian; the right-hand side that the solver has just evaluated is not evaluated again."""
+        """The system's Jacobian; a right-hand side that the solver has just evaluated is not evaluated again."""
 
         def rhs(t: float, y: Array) -> Array:
-            known_t, known_y, known = self._last
-            return known if t == known_t and np.array_equal(y, known_y) else self._rhs(t, y)
+            for known_t, known_y, known in self._recent:
+                if t == known_t and np.array_equal(y, known_y):
+                    return known
+            return self._rhs(t, y)
 
         try:
-            return self.system.jacobian(t, y, rhs)
+            jacobian = self.system.jacobian(t, y, rhs)
         except NumericalError as error:
             self.failure = error
-            return np.full((len(y), len(y)), np.nan)
+            jacobian = np.full((len(y), len(y)), np.nan)
+        if jacobian is not None and not np.all(np.isfinite(jacobian)) and self._known_jacobian is not None:
+            return self._known_jacobian  # the step is refused for its right-hand side
+        self._known_jacobian = jacobian
+        return jacobian
 
     def _explain(self, message: str) -> NumericalError:
         """Say why the solver gave up: the closure's own verdict where there is one."""

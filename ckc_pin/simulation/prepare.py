@@ -22,6 +22,9 @@ from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
 
 __all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
 
+DIFFERENCE = 1e-7  # rad/s or m/s
+SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
+
 
 def scene_mechanism(scene: Scene) -> Mechanism:
     """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
@@ -71,14 +74,25 @@ class Plant:
         return self.effort(t, terms).u_tree
 
     def u_rate_gradient(self, t: float, terms: Terms) -> Array | None:
-        """d u / d q_dot: nothing acts, or the controller knows its own; None for a controller that does not."""
+        """d u / d q_dot: what the controller knows, or differences of u alone; None behind another actuation."""
         if self.controller is None:
             return np.zeros((len(terms.q), len(terms.q)))
-        gradient = getattr(self.controller, "u_rate_gradient", None)
-        if gradient is None or not self.actuation.direct:
+        if not self.actuation.direct:
             return None
+        gradient = getattr(self.controller, "u_rate_gradient", None) or self._u_rate_differences
         free = self.actuation.unlimited(self.effort(t, terms).tau)
-        return free[:, None] * gradient(t, terms)
+        return free[:, None] * np.asarray(gradient(t, terms))
+
+    def _u_rate_differences(self, t: float, terms: Terms) -> Array:
+        """d u / d q_dot of any controller: its own evaluations at other velocities, none of the mechanism's."""
+        u = self.effort(t, terms).u
+        gradient = np.empty((len(u), len(u)))
+        for k, q_dot in enumerate(terms.q_dot):
+            step = np.zeros(len(u))
+            step[k] = DIFFERENCE * max(1.0, abs(float(q_dot)))
+            moved = Terms(terms.mechanism, terms.at, terms.v_tree + terms.rho @ step)
+            gradient[:, k] = (self.effort(t, moved).u - u) / step[k]
+        return gradient
 
 
 @dataclass(frozen=True)
@@ -93,7 +107,7 @@ class Prepared:
     system : System
         The formulation as a first-order system, at its start.
     method : str
-        The solver that "auto" stands for here, or the one named.
+        The solver named, or the one that "auto" stands for here; "auto" where that depends on the motion.
     start : Start
     texts : dict of str to str
         Files that the scene's controller brought along.
@@ -165,11 +179,20 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) 
     """Make the first-order system of a scene's formulation, at a start."""
     spec, force = scene.spec, plant.force
     free = plant.controller is None  # of a controller that lives in the mechanism's own q
+    slack = SLACK * spec.solver.rtol * mechanism.size
     if spec.formulation == "dae":
         v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         return Dae(mechanism, start.at, v_tree, force, spec.solver.projection)
     if spec.formulation == "reduced":
-        return LevelSet(mechanism, start.at, start.q_dot, force, u_rate_gradient=plant.u_rate_gradient, may_switch=free)
+        return LevelSet(
+            mechanism,
+            start.at,
+            start.q_dot,
+            force,
+            u_rate_gradient=plant.u_rate_gradient,
+            may_switch=free,
+            slack=slack,
+        )
     equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
     if equation == 8:
         if mechanism.tree.free:
@@ -188,14 +211,18 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) 
         start.w,
         plant.u_rate_gradient,
         free,
+        slack,
     )
 
 
 def _method(scene: Scene, system: System, plant: Plant) -> str:
-    """What "auto" means: closed loops are stiff through their gains, unless u is held; eq. 8 is through epsilon."""
+    """What "auto" means: closed loops are stiff through gains and dampers, unless u is held; eq. 8 through epsilon."""
     spec = scene.spec
     if spec.solver.method != "auto":
         return spec.solver.method
-    feedback = spec.controller is not None and not isinstance(plant.controller, Held)
-    stiff = feedback or isinstance(system, PrintedSpf)
-    return "Radau" if stiff else "DOP853"
+    if isinstance(system, PrintedSpf):
+        return "Radau"
+    feedback = plant.controller is not None and not isinstance(plant.controller, Held)
+    if isinstance(system, LevelSet) and not system.projects:
+        return "auto" if feedback or system.mechanism.springs.any_damping else "DOP853"
+    return "Radau" if feedback else "DOP853"

@@ -10,13 +10,13 @@ from ckc_pin import Run, simulate
 
 # right-hand sides, Newton corrections per right-hand side
 LIMITS = {
-    ("five_bar/swing", "reduced"): (1_500, 2.5),
-    ("five_bar/swing", "spf"): (1_500, 2.5),
+    ("five_bar/swing", "reduced"): (1_450, 1.3),
+    ("five_bar/swing", "spf"): (1_450, 1.3),
     ("five_bar/swing", "dae"): (1_750, 0.3),
-    ("five_bar/set_point", "reduced"): (4_700, 1.5),
+    ("five_bar/set_point", "reduced"): (2_050, 1.0),
     ("five_bar/set_point", "dae"): (5_200, 0.3),
-    ("five_bar/tracking", "reduced"): (6_800, 2.0),
-    ("five_bar/tracking", "spf"): (6_800, 2.0),
+    ("five_bar/tracking", "reduced"): (1_700, 1.0),
+    ("five_bar/tracking", "spf"): (1_700, 1.0),
     ("five_bar/tracking", "dae"): (10_300, 0.3),
 }
 
@@ -36,10 +36,22 @@ def test_epsilon_costs_nothing_in_eq_17s_coordinates(run: Callable[..., Run]) ->
     assert len(counts) == 1
 
 
-def test_epsilon_costs_little_off_the_manifold(run: Callable[..., Run]) -> None:
-    off = {"formulation": "spf", "initial__w": [0.01, -0.006]}
-    counts = [run("five_bar/swing", epsilon=epsilon, **off).stats["rhs"] for epsilon in (1e-1, 1e-3, 1e-6, 1e-12)]
-    assert max(counts) <= 1.3 * min(counts)
+@pytest.mark.parametrize("scene", ["five_bar/swing", "five_bar/tracking"])
+def test_epsilon_costs_little_off_the_manifold(run: Callable[..., Run], scene: str) -> None:
+    """Against the reduced model at equal tolerance: a quarter more right-hand sides for any epsilon."""
+    reduced = run(scene, formulation="reduced").stats["rhs"]
+    for epsilon in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
+        off = run(scene, formulation="spf", epsilon=epsilon, initial__w=[0.01, -0.006])
+        assert off.status == "done"
+        assert off.stats["rhs"] <= 1.25 * reduced
+        assert off.stats["newton"] <= 1.5 * off.stats["rhs"]
+
+
+# right-hand sides hardly depend on it, so that these are Newton corrections for what z is predicted from
+@pytest.mark.parametrize("scene", ["andrews", "delta", "stewart", "talos"])
+def test_newton_corrections_of_other_mechanisms(run: Callable[..., Run], scene: str) -> None:
+    ours = run(scene, formulation="reduced", t_end=0.05, solver__output_dt=0.005)
+    assert ours.stats["newton"] <= 1.6 * ours.stats["rhs"]
 
 
 def test_an_uncontrolled_run_evaluates_no_matrix_C() -> None:

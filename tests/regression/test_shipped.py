@@ -117,7 +117,7 @@ def test_energy_is_kept(name: str, formulation: str) -> None:
     changes = {"formulation": formulation, "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": t_end / 100}
     run = simulate(name, changes)
     assert run.status == "done", run.message
-    assert drift(run) <= 3e-8  # asked for: 1e-7
+    assert drift(run) <= (1e-7 if name == "bricard" else 3e-8)  # Bricard's phi_z comes nearest to singular
     assert run.max_phi <= 1e-10
     assert np.ptp(run.q_tree, axis=0).max() > 0.01  # it did move
 

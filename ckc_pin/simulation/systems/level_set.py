@@ -13,9 +13,10 @@ from ckc_pin.mechanism.chart import Chart
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import choose_dependent, scaled
-from ckc_pin.mechanism.sigma import newton, predict, sigma
+from ckc_pin.mechanism.sigma import newton, sigma
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.systems.base import Counts, Force, Gradient, Rhs, require_chart, spf_velocity
+from ckc_pin.simulation.systems.trail import Trail
 
 __all__ = ["LevelSet"]
 
@@ -27,7 +28,8 @@ DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
 class LevelSet:
     """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
 
-    z is found on the level set by Newton from where the last evaluated state, moved along rho, leads.
+    z is found on the level set by Newton from where the trail of former states leads. A right-hand side may
+    be off the level set by `slack`, which an integrator of a given tolerance does not notice.
     With `may_switch` the split into q and z is changed where phi_z comes near to singular; a controller,
     which lives in the mechanism's own q, forbids that.
     """
@@ -41,15 +43,16 @@ class LevelSet:
     w0: Array | None = None
     u_rate_gradient: Gradient | None = None
     may_switch: bool = False
+    slack: float = 0.0
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
 
     def __post_init__(self) -> None:
         tree = self.mechanism.tree
-        self._last = self.initial
         self._d = self.mechanism.d
         self._on_manifold = self.w0 is None or not np.any(self.w0)
         self._zero = np.zeros(self.mechanism.closure.rows)
+        self._trail = Trail(self.initial, self.epsilon)
         self._chart = Chart(tree, self.mechanism.partition.q, self.initial.q_tree)
         # a free root among q is charted by rotation vectors, and the chart moves along between steps
         self.projects = not self._chart.plain
@@ -73,33 +76,46 @@ class LevelSet:
         return spf_velocity(terms, self.epsilon, self.w(t))
 
     def terms(self, t: float, y: Array) -> Terms:
+        return self._terms(t, y, self.mechanism.tolerance)
+
+    def _terms(self, t: float, y: Array, tolerance: float) -> Terms:
         q_dot, w = y[self._d :], self.w(t)
-        dq = self._chart.step(self._last.q_tree, y[: self._d])
-        guess = predict(self._last, dq)
-        outcome = newton(guess, w, self.mechanism.tolerance)
-        self.counts.newton += outcome.iterations
-        self.counts.factorizations += outcome.iterations
-        if not outcome.converged:
-            found = sigma(self._last, dq, w, self.mechanism.tolerance, anywhere=False)
-            self.counts.newton += found.iterations
-            self.counts.factorizations += found.iterations
-            if found.verdict != "converged":
-                raise NumericalError(
-                    f"sigma(q) is {found.verdict}: {found.reason}",
-                    t=t,
-                    q_tree=self.mechanism.tree.named(self.mechanism.tree.to_coordinates(found.at.q_tree)),
-                )
-            outcome = type(outcome)(found.at, found.iterations, True)
-        self._last = outcome.at
+        at = self._close(t, y[: self._d], w, tolerance)
+        v_tree = at.rho @ q_dot
         if self._on_manifold:
-            return Terms(self.mechanism, outcome.at, outcome.at.rho @ q_dot)
-        return spf_terms(self.mechanism, outcome.at, q_dot, self.epsilon, w, self.convention)
+            self._trail.add(t, at, v_tree, w)
+            return Terms(self.mechanism, at, v_tree)
+        v_tree[at.partition.z] += at.phi_z_factor.solve(self.w_dot(t))
+        self._trail.add(t, at, v_tree, w)
+        return spf_terms(self.mechanism, at, q_dot, self.epsilon, w, self.convention)
+
+    def _close(self, t: float, numbers: Array, w: Array, tolerance: float) -> Kinematics:
+        """Find z on the level set phi(q, z) = w."""
+        outcome = newton(self._trail.predict(t, numbers, self._chart, w), w, tolerance)
+        self._count(outcome.iterations)
+        if outcome.converged:
+            return outcome.at
+        last = self._trail.last
+        found = sigma(last, self._chart.step(last.q_tree, numbers), w, tolerance, anywhere=False)
+        self._count(found.iterations)
+        if found.verdict != "converged":
+            tree = self.mechanism.tree
+            raise NumericalError(
+                f"sigma(q) is {found.verdict}: {found.reason}",
+                t=t,
+                q_tree=tree.named(tree.to_coordinates(found.at.q_tree)),
+            )
+        return found.at
+
+    def _count(self, iterations: int) -> None:
+        self.counts.newton += iterations
+        self.counts.factorizations += iterations
 
     def configuration(self, t: float, y: Array) -> Array:
         return self.terms(t, y).q_tree
 
     def rhs(self, t: float, y: Array) -> Array:
-        terms = self.terms(t, y)
+        terms = self._terms(t, y, max(self.mechanism.tolerance, self.slack))
         self.counts.factorizations += 2  # phi_z and D
         q_dot = y[self._d :]
         with_actual = self.convention == "actual" and not self._on_manifold
@@ -127,25 +143,28 @@ class LevelSet:
         return jacobian
 
     def accept(self, t: float, y: Array) -> Array | None:
-        margin = self._last.sigma_min() / max(float(np.linalg.norm(self._last.J)), 1e-300)
+        at = self._trail.last
+        margin = at.sigma_min() / max(float(np.linalg.norm(at.J)), 1e-300)
         if margin < SWITCH_MARGIN and self.may_switch:
-            better = self._better_partition(margin)
+            better = self._better_partition(at, margin)
             if better is not None:
                 terms = self.terms(t, y)
-                self._last = Kinematics(terms.at.tree, terms.at.closure, better, terms.q_tree)
-                self._chart = Chart(terms.at.tree, better.q, terms.q_tree)
                 self.counts.switches += 1
-                return np.concatenate([self._chart.numbers(terms.q_tree), terms.v_tree[better.q]])
-        require_chart(self._last)
+                return self._chart_from(Kinematics(at.tree, at.closure, better, terms.q_tree), terms.v_tree[better.q])
+        require_chart(at)
         if self._chart.plain:
             return None
-        q_tree = self.terms(t, y).q_tree
-        self._chart = Chart(self.mechanism.tree, self._last.partition.q, q_tree)
-        return np.concatenate([self._chart.numbers(q_tree), y[self._d :]])
+        return self._chart_from(self.terms(t, y).at, y[self._d :])
 
-    def _better_partition(self, margin: float) -> Partition | None:
+    def _chart_from(self, at: Kinematics, q_dot: Array) -> Array:
+        """Start the coordinates anew at a configuration."""
+        self._trail = Trail(at, self.epsilon)
+        self._chart = Chart(at.tree, at.partition.q, at.q_tree)
+        return np.concatenate([self._chart.numbers(at.q_tree), q_dot])
+
+    def _better_partition(self, at: Kinematics, margin: float) -> Partition | None:
         """Return a split whose phi_z is clearly further from singular here, if there is one."""
-        tree, closure, at = self.mechanism.tree, self.mechanism.closure, self._last
+        tree, closure = self.mechanism.tree, self.mechanism.closure
         jacobian = scaled(at.J, tree, closure, self.mechanism.size)
         z = choose_dependent(jacobian, self.mechanism.rank, [np.arange(v, v + 6) for _, v in tree.free])
         if z is None:
