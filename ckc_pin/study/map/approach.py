@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from ckc_pin.study.map.domain import Domain
 from ckc_pin.study.map.loci import seen
 from ckc_pin.study.map.sheet import Grid
 
-__all__ = ["add_path"]
+__all__ = ["Wanted", "add_path", "read_wanted"]
 
 SAMPLES = 2000
 BATCH = 200  # samples compared with a locus at a time
@@ -33,8 +34,18 @@ SIDE = 6  # points of a locus on each side of the closest one
 Place = Callable[[float], Array]
 
 
-def add_path(scene: Scene, mechanism: Mechanism, grids: Sequence[Grid], loci: Sequence[Locus], cartesian: bool) -> Path:
-    """Follow a scene's desired trajectory and measure its closest approaches.
+@dataclass(frozen=True)
+class Wanted:
+    """A scene's desired trajectory: q_d at instants t (s), and whether it stays where the mechanism can follow."""
+
+    name: str
+    desired: Desired
+    t: Array
+    check: DesiredCheck
+
+
+def read_wanted(scene: Scene, mechanism: Mechanism) -> Wanted:
+    """Return what a scene's controller wants; a set point is a trajectory of one instant.
 
     Raises
     ------
@@ -45,29 +56,34 @@ def add_path(scene: Scene, mechanism: Mechanism, grids: Sequence[Grid], loci: Se
     if own.coordinates != mechanism.coordinates or own.independent != mechanism.independent:
         raise InputError(f"--scene {scene.name}: it is of {own.name}, the map of {mechanism.name}")
     controller = scene_controller(scene, mechanism)
-    if isinstance(controller, Tracking):
-        desired: Desired = controller.desired
-        check = follow_desired(mechanism, desired, scene.spec.t_end)
-        t = np.linspace(0.0, scene.spec.t_end, SAMPLES + 1)
-    elif isinstance(controller, SetPoint):
-        target = controller.target.q
+    if isinstance(controller, SetPoint):
+        target, still = controller.target.q, np.zeros(mechanism.d)
         check = DesiredCheck(None, 0.0, controller.target.at.sigma_min())
-        t = np.zeros(1)
-
-        def desired(t: float) -> tuple[Array, Array, Array]:
-            return target, np.zeros_like(target), np.zeros_like(target)
-    else:
+        return Wanted(scene.name, lambda t: (target, still, still), np.zeros(1), check)
+    if not isinstance(controller, Tracking):
         raise InputError(f"--scene {scene.name}: it has no controller, so nothing is desired; give one that has")
-    if check.leaves_at is not None and (cartesian or isinstance(desired, PointPath)):
+    check = follow_desired(mechanism, controller.desired, scene.spec.t_end)
+    t = np.linspace(0.0, scene.spec.t_end, SAMPLES + 1)
+    if check.leaves_at is not None and isinstance(controller.desired, PointPath):
+        t = t[t <= check.leaves_at]  # beyond there is no q_d
+    return Wanted(scene.name, controller.desired, t, check)
+
+
+def add_path(
+    wanted: Wanted, mechanism: Mechanism, grids: Sequence[Grid], loci: Sequence[Locus], cartesian: bool
+) -> Path:
+    """Draw a desired trajectory into a map and measure its closest approaches."""
+    desired, t, check = wanted.desired, wanted.t, wanted.check
+    if check.leaves_at is not None and cartesian:
         t = t[t <= check.leaves_at]
     follower = _Follower(mechanism, grids[0].domain, cartesian)
     way, on = _way(follower, desired, t, grids)
     found = [
-        _closest(grids[0].domain, k, locus, _shown(locus), t, way, on, lambda x: follower(desired(x)[0]))
+        _closest(grids[0].domain, k, locus, _shown(locus, cartesian), t, way, on, lambda x: follower(desired(x)[0]))
         for k, locus in enumerate(loci)
     ]
     return Path(
-        name=scene.name,
+        name=wanted.name,
         t=t,
         at=way,
         on=on,
@@ -78,9 +94,14 @@ def add_path(scene: Scene, mechanism: Mechanism, grids: Sequence[Grid], loci: Se
     )
 
 
-def _shown(locus: Locus) -> BoolArray:
-    """Which points of a locus are compared: of one that the map shows as a point any configuration stands for all."""
-    if np.ptp(locus.at, axis=0).max() < POINT:
+def _shown(locus: Locus, cartesian: bool) -> BoolArray:
+    """Which points of a locus are compared, shape (sheets, m).
+
+    All of one where a sheet ends, as far as it is seen at all, and of one that the map shows as a point: there any
+    of its configurations stands for all.
+    """
+    ends = (locus.kind == "serial") == cartesian
+    if ends or np.ptp(locus.at, axis=0).max() < POINT:
         return np.repeat(np.any(locus.on, axis=1, keepdims=True), locus.on.shape[1], axis=1)
     return locus.on
 

@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mapped import Axis, Locus, Sheet, SingularityMap
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.study.map.approach import add_path
+from ckc_pin.study.map.approach import add_path, read_wanted
 from ckc_pin.study.map.domain import Domain, joint_axis, middles, reach
 from ckc_pin.study.map.loci import find_loci
 from ckc_pin.study.map.sheet import HURRIED, Grid, fill
@@ -77,6 +77,7 @@ def singularity_map(
     if space not in ("joint", "cartesian"):
         raise InputError(f"space {space!r}: joint or cartesian")
     loaded = None if scene is None else scene if isinstance(scene, Scene) else _scene(named, scene)
+    wanted = None if loaded is None else read_wanted(loaded, mechanism)
     cells = -(-cells // MULTIPLE) * MULTIPLE
     cartesian = space == "cartesian"
     with one_blas_thread():
@@ -93,7 +94,7 @@ def singularity_map(
             raise InputError(f"{mechanism.name}: no cell of the map is reached from where it is assembled")
         seconds = perf_counter() - began
         loci = [_located(extended, locus) for locus in find_loci(extended, domain, grids, planar)]
-        path = None if loaded is None else add_path(loaded, mechanism, grids, loci, planar)
+        path = None if wanted is None else add_path(wanted, mechanism, grids, loci, planar)
         square = mechanism.assembled.phi_z.shape[0] == mechanism.assembled.phi_z.shape[1]
         start = grids[0].told[np.flatnonzero(grids[0].reached)[0]]
         return SingularityMap(

@@ -1,0 +1,244 @@
+"""The singularity map of the five-bar against closed forms of its geometry."""
+
+import numpy as np
+import pytest
+
+from ckc_pin import InputError, load
+from ckc_pin.mechanism.extended import extend
+from ckc_pin.study.map import map_plain, singularity_map
+from ckc_pin.study.map.loci import LocusSystem
+from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR
+from tests.conftest import assert_close
+
+MODELS = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
+CELLS = 64
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def joint(request):
+    return singularity_map(request.param, cells=CELLS, scene="tracking"), MODELS[request.param]
+
+
+@pytest.fixture(scope="module")
+def cartesian():
+    return singularity_map("five_bar", cells=CELLS, space="cartesian"), FIVE_BAR
+
+
+def elbows(model, theta_1, theta_3):
+    """World positions of both elbows, as complex numbers."""
+    return model.l[0] * np.exp(1j * theta_1), model.base + model.l[2] * np.exp(1j * theta_3)
+
+
+def wrapped(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def of_kind(found, kind):
+    return [locus for locus in found.loci if locus.kind == kind]
+
+
+def test_reached_is_where_two_circles_meet(joint):
+    found, model = joint
+    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in found.axes), indexing="ij"))
+    distance, (_, l2, _, l4) = abs(left - right), model.l
+    inside = (distance <= l2 + l4) & (distance >= abs(l2 - l4))
+    sure = np.minimum(abs(distance - l2 - l4), abs(distance - abs(l2 - l4))) > 1e-3
+    assert len(found.sheets) == 2
+    for sheet in found.sheets:
+        assert np.array_equal(sheet.reached[sure], inside[sure])
+        assert np.mean(sheet.reached != inside) < 2e-3
+
+
+def test_det_phi_z_is_twice_the_triangle_of_the_distal_links(joint):
+    found, model = joint
+    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in found.axes), indexing="ij"))
+    a, b, c = abs(left - right), model.l[1], model.l[3]
+    heron = np.maximum((a + b + c) * (b + c - a) * (a + c - b) * (a + b - c), 0.0) ** 0.5 / 2
+    signs = []
+    for sheet in found.sheets:
+        there = sheet.reached
+        assert_close(abs(sheet.det_phi_z[there]), heron[there], 1e-8)
+        signs += set(np.sign(sheet.det_phi_z[there]))
+    assert sorted(signs) == [-1.0, 1.0]  # one on each branch
+
+
+def test_type_1_points_exist_on_one_reading_only(joint):
+    found, model = joint
+    points = of_kind(found, "locked")
+    if model is AS_PRINTED:
+        assert points == []
+        return
+    at = sorted(wrapped(locus.at[0]).tolist() for locus in points)
+    assert_close(at, [[-0.993865, -2.147728], [0.993865, 2.147728]], 5e-7)  # as printed with six digits
+    # elbows at one place, halfway between the bases
+    x = np.arccos(model.base / 2 / model.l[0])
+    assert_close(at, [[-x, x - np.pi], [x, np.pi - x]], 1e-8)
+    for locus in points:
+        assert locus.closed
+        assert_close(locus.at, np.tile(locus.at[0], (len(locus.at), 1)), 1e-8)
+
+
+def test_type_2_curves_are_where_the_distal_links_are_in_line(joint):
+    found, model = joint
+    stretched = [
+        locus
+        for locus in of_kind(found, "fold")
+        if abs(np.subtract(*elbows(model, *locus.at[0]))) > max(model.l[1], model.l[3])
+    ]
+    folded = [locus for locus in of_kind(found, "fold") if not any(locus is other for other in stretched)]
+    assert len(stretched) == 1
+    assert len(folded) == (2 if model is AS_PRINTED else 0)  # the type 1 points of links that differ, opened
+    for loci, wanted in ((stretched, model.l[1] + model.l[3]), (folded, abs(model.l[1] - model.l[3]))):
+        for locus in loci:
+            assert locus.closed
+            assert_close(abs(np.subtract(*elbows(model, *locus.at.T))), wanted, 1e-8)
+    # the whole of it: the stretched curve goes once round in theta_1 - theta_3
+    angle = np.unwrap(np.angle(stretched[0].at @ [1, 1j] - stretched[0].at.mean(axis=0) @ [1, 1j]))
+    assert_close(abs(angle[-1] - angle[0]), 2 * np.pi, 1e-6)
+
+
+def test_serial_loci_are_chains_stretched_or_folded(joint):
+    found, model = joint
+    loci = of_kind(found, "serial")
+    seen = set()
+    for locus in loci:
+        assert locus.closed
+        bent = abs(np.sin(locus.q_tree[:, [1, 3]])).max(axis=0)
+        chain = int(np.argmin(bent))
+        assert bent[chain] < 1e-8
+        seen.add((chain, bool(np.cos(locus.q_tree[0, [1, 3][chain]]) > 0)))
+        reach = abs(locus.point[:, 0] + 1j * locus.point[:, 1] - chain * model.base)
+        l, m = model.l[2 * chain], model.l[2 * chain + 1]
+        assert min(abs(reach - l - m).max(), abs(reach - abs(l - m)).max()) < 1e-8
+    assert seen == {(0, False), (0, True), (1, False), (1, True)}
+
+
+def test_the_trajectory_of_eq_21(joint):
+    found, model = joint
+    t = np.linspace(0.0, 9.5, 200001)
+    q = np.array([np.pi / 3 * np.sin(t), np.pi / 4 * (1 - np.cos(t))])
+    distance = abs(np.subtract(*elbows(model, *q)))
+    if model is AS_PRINTED:
+        first = t[np.argmax(distance > model.l[1] + model.l[3])]
+        assert found.path.leaves_at == pytest.approx(first, abs=1e-4)
+        assert found.path.leaves_at == pytest.approx(4.39313, abs=1e-5)
+        return
+    assert found.path.leaves_at is None
+    # to type 2: the least distance to the curve, drawn densely from its own closed form
+    curve = of_kind(found, "fold")[0]
+    number = next(k for k, locus in enumerate(found.loci) if locus is curve)
+    approach = next(a for a in found.path.approaches if a.locus == number)
+    theta_1 = np.linspace(-1.5, -1.0, 200001)
+    theta_3 = crossing(model, theta_1)
+    near = np.nanmin([np.nanmin(np.hypot(x - theta_1, y - theta_3)) for x, y in q[:, 90000:110000:40].T])
+    assert approach.distance == pytest.approx(near, abs=2e-6)
+    # to type 1: a point
+    for number, locus in enumerate(found.loci[:2]):
+        approach = next(a for a in found.path.approaches if a.locus == number)
+        x = wrapped(q.T - locus.at[0])
+        assert approach.distance == pytest.approx(np.hypot(*x.T).min(), abs=1e-8)
+
+
+def crossing(model, theta_1):
+    """The upper theta_3 with elbows l2 + l4 apart, NaN where there is none."""
+    way = model.l[0] * np.exp(1j * theta_1) - model.base
+    cosine = (abs(way) ** 2 + model.l[2] ** 2 - (model.l[1] + model.l[3]) ** 2) / (2 * abs(way) * model.l[2])
+    with np.errstate(invalid="ignore"):
+        both = [wrapped(np.angle(way) + sign * np.arccos(cosine)) for sign in (1, -1)]
+    near = [np.where(abs(angle - 0.8) < 0.7, angle, np.nan) for angle in both]
+    return np.where(np.isnan(near[0]), near[1], near[0])
+
+
+def test_cartesian_workspace_is_two_rings_met(cartesian):
+    found, model = cartesian
+    x, y = np.meshgrid(*(axis.values for axis in found.axes), indexing="ij")
+    inside, sure = np.ones(x.shape, bool), np.ones(x.shape, bool)
+    for base, (l, m) in ((0.0, model.l[:2]), (model.base, model.l[2:])):
+        reach = abs(x - base + 1j * y)
+        inside &= (reach <= l + m) & (reach >= abs(l - m))
+        sure &= (abs(reach - l - m) > 1e-4) & (abs(reach - abs(l - m)) > 1e-4)
+    assert len(found.sheets) == 4
+    modes = set()
+    for sheet in found.sheets:
+        assert np.array_equal(sheet.reached[sure], inside[sure])
+        elbow = np.sign(np.sin(sheet.q_tree[sheet.reached][:, [1, 3]]))
+        assert_close(elbow, np.tile(elbow[0], (len(elbow), 1)), 0.0)  # one working mode throughout
+        modes.add(tuple(elbow[0]))
+        place = sheet.point[sheet.reached]
+        assert_close(place, np.column_stack([x[sheet.reached], y[sheet.reached], 0 * x[sheet.reached]]), 1e-8)
+    assert len(modes) == 4
+
+
+def test_cartesian_type_1_is_a_circle_round_the_elbows(cartesian):
+    found, model = cartesian
+    circles = of_kind(found, "locked")
+    assert len(circles) == 2
+    height = np.sqrt(model.l[0] ** 2 - model.base**2 / 4)
+    for locus in circles:
+        centre = model.base / 2 + 1j * height * np.sign(locus.point[:, 1].mean())
+        assert_close(abs(locus.point[:, 0] + 1j * locus.point[:, 1] - centre), model.l[1], 1e-8)
+
+
+@pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "stewart"])
+def test_second_derivatives_in_either_order(name):
+    """The Jacobian of the equations against finite differences, also where a free root turns."""
+    mechanism = load(name)
+    extended = extend(mechanism, next(iter(mechanism.points)))
+    random = np.random.default_rng(5)
+    held = extended.joints[2:]
+    for serial in (False, True):
+        system = LocusSystem(extended, serial, held, np.zeros(len(held)))
+        step = random.uniform(-0.3, 0.3, mechanism.n)
+        at = extended.kinematics(mechanism.tree.integrate(mechanism.q_tree, step))
+        v, e = random.normal(size=(2, mechanism.n))
+        h = 1e-6
+        there = [system.residual(at.moved(s * h * e), v) for s in (1, -1)]
+        numeric = (there[0] - there[1]) / (2 * h)
+        assert_close(system.jacobian(at, v)[:, : mechanism.n] @ e, numeric, 1e-7 * max(1.0, abs(numeric).max()))
+
+
+def test_one_freedom_and_held_ones():
+    crank = singularity_map("slider_crank", cells=96)
+    assert crank.sheets[0].reached.all()
+    assert sorted(round(abs(wrapped(locus.at[0, 0] + 1e-9)), 6) for locus in crank.loci) == [0, 0, 3.141593, 3.141593]
+    held = singularity_map("three_rrr", over=["a_3", "a_1"], cells=32)
+    assert [axis.name for axis in held.axes] == ["a_3", "a_1"]
+    assert held.held == {"a_2": pytest.approx(1.419)}
+    mechanism = load("three_rrr")
+    for locus in held.loci:
+        assert_close(locus.q_tree[:, mechanism.coordinates.index("a_2")], 1.419, 1e-9)
+        for q_tree in locus.q_tree[:: max(1, len(locus.q_tree) // 20)]:
+            at = mechanism.kinematics(q_tree)
+            assert abs(at.phi).max() < 1e-10
+            if locus.kind == "fold":
+                assert at.sigma_min() < 1e-9
+    assert {locus.kind for locus in held.loci} == {"fold", "serial"}
+
+
+def test_numbers_of_a_map_are_plain(joint):
+    found, _ = joint
+    plain = map_plain(found)
+    assert plain["axes"][0] == {"name": "theta_1", "unit": "rad", "low": -np.pi, "high": np.pi, "cells": CELLS}
+    assert plain["desired"]["leaves_at"] == found.path.leaves_at
+    assert [locus["kind"] for locus in plain["loci"]] == [locus.kind for locus in found.loci]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "says"),
+    [
+        ("five_bar", {"over": ["theta_2"]}, "no coordinate 'theta_2' to map over; there are theta_1, theta_3"),
+        ("five_bar", {"over": ["theta_1", "theta_1"]}, "one or two different names"),
+        ("five_bar", {"space": "polar"}, "joint or cartesian"),
+        ("five_bar", {"point": "elbow"}, "no point 'elbow' in five_bar; there are tip"),
+        ("five_bar", {"cells": 5}, "from 16 to 2000"),
+        ("five_bar", {"scene": "swing"}, "it has no controller"),
+        ("five_bar", {"scene": "three_rrr/circle"}, "it is of three_rrr, the map of five_bar"),
+        ("andrews", {"space": "cartesian", "point": "nowhere"}, "no point 'nowhere' in andrews"),
+        ("three_rrr", {"space": "cartesian", "over": ["x", "rz"]}, "there are x, y"),
+        ("delta", {"cells": 2000}, "takes at most"),
+    ],
+)
+def test_what_cannot_be_mapped_is_said_in_one_sentence(name, options, says):
+    with pytest.raises(InputError, match=says) as error:
+        singularity_map(name, **options)
+    assert "\n" not in str(error.value)
