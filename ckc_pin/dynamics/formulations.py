@@ -126,18 +126,19 @@ def closing_step(terms: Terms, residual: Array) -> Array:
     return particular - tangent @ Factorization(inertia).solve(tangent.T @ (terms.D_tree @ particular))
 
 
-def dae_acceleration(terms: Terms, u_tree: Array) -> Array:
-    """Solve eq. 1 with its closure differentiated twice, J a + J_dot v' = 0, for a = dv'/dt, shape (n,).
+def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
+    """Solve eq. 1 with its closure differentiated twice, J a + J_dot v' + correction = 0, for a = dv'/dt, shape (n,).
 
     The motion is projected on the tangent space of the closure, so no choice of q is involved,
     redundant rows do no harm, and massless links do none as long as D' is regular on that space.
+    `correction`, shape (rows,), is what Baumgarte's stabilisation adds.
 
     Raises
     ------
     NumericalError
         J has lost rank.
     """
-    tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree)
+    tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree + correction)
     force = u_tree - terms.bias_tree - terms.D_tree @ particular
     if terms.mechanism.springs.any_damping:
         force += terms.damping_force

@@ -19,7 +19,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import SolverSpec
 from ckc_pin.simulation.stiffness import bdf_rtol, choose
-from ckc_pin.simulation.systems import System, nearly_singular
+from ckc_pin.simulation.systems import Dae, System, nearly_singular
 
 __all__ = ["BudgetError", "Step", "Stepper"]
 
@@ -48,7 +48,8 @@ class Stepper:
     ----------
     system : System
     method : str
-        A class of `scipy.integrate`; or "auto", which chooses one by the eigenvalues at the start.
+        A class of `scipy.integrate`; "IDA", for a DAE that is not projected; or "auto", which chooses one by the
+        eigenvalues at the start.
     spec : SolverSpec
     t_end : float
 
@@ -86,7 +87,7 @@ class Stepper:
             self._options["max_step"] = spec.max_step
         if self.method in ("BDF", "Radau") and jacobian is not None:
             self._options["jac"] = self._jacobian
-        self._class = getattr(scipy.integrate, self.method)
+        self._class: Any = self._ida if self.method == "IDA" else getattr(scipy.integrate, self.method)
         self.solver = self._solver(0.0, self.y, t_end)
         self._budgeted = True
         self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
@@ -162,6 +163,12 @@ class Stepper:
         """Evaluate y' at (t, y), counted; NaN where it does not exist."""
         return self._rhs(t, y)
 
+    def _ida(self, *start: Any, **options: Any) -> Any:
+        from ckc_pin.simulation.ida import Ida
+
+        assert isinstance(self.system, Dae)
+        return Ida(*start, system=self.system, count=self._count, **options)
+
     def refine(self, rtol: float) -> bool:
         """Take a finer tolerance from the next solver on; return whether it is finer than before."""
         finer = rtol < self._options["rtol"]
@@ -203,12 +210,7 @@ class Stepper:
         }
 
     def _rhs(self, t: float, y: Array, at_start: bool = False) -> Array:
-        self.rhs_count += 1
-        self._times.add(t)
-        if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
-            raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
-        if self._budgeted and perf_counter() > self._deadline:
-            raise BudgetError(f"the budget of max_wall_s = {self.spec.max_wall_s:g} s is used up")
+        self._count(t)
         try:
             with np.errstate(all="ignore"):
                 derivative = self.system.rhs(t, y) if np.all(np.isfinite(y)) else np.full_like(y, np.nan)
@@ -223,6 +225,15 @@ class Stepper:
                 raise self.failure
         self._recent.append((t, y.copy(), derivative))
         return derivative
+
+    def _count(self, t: float) -> None:
+        """Take note of an evaluation, as long as there is a budget for it."""
+        self.rhs_count += 1
+        self._times.add(t)
+        if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
+            raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
+        if self._budgeted and perf_counter() > self._deadline:
+            raise BudgetError(f"the budget of max_wall_s = {self.spec.max_wall_s:g} s is used up")
 
     def _jacobian(self, t: float, y: Array) -> Array | None:
         """The system's Jacobian; a right-hand side that the solver has just evaluated is not evaluated again."""
@@ -260,9 +271,9 @@ class Stepper:
         return max(1, -(-distinct // stages))
 
     def _interpolant(self, t_old: float, y_old: Array, f_old: Array | None) -> Callable[[float], Array]:
-        """Radau's own interpolant is of order 3 only, so its end derivatives are used; else the solver's."""
+        """Radau's own interpolant is of order 3 only and IDA has none: end derivatives are used; else the solver's."""
         solver = self.solver
-        if self.method != "Radau" or f_old is None:
+        if self.method not in ("Radau", "IDA") or f_old is None:
             dense: list[Callable[[float], Array]] = []
             t_new, y_new = float(solver.t), solver.y.copy()
 

@@ -17,7 +17,7 @@ from ckc_pin.mechanism.library import load, mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene import Scene, SolverSpec
 from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
 
 __all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
@@ -182,7 +182,7 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) 
     slack = SLACK * spec.solver.rtol * mechanism.size
     if spec.formulation == "dae":
         v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
-        return Dae(mechanism, start.at, v_tree, force, spec.solver.projection)
+        return Dae(mechanism, start.at, v_tree, force, *_closing(spec.solver))
     if spec.formulation == "reduced":
         return LevelSet(
             mechanism,
@@ -213,6 +213,11 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) 
         free,
         slack,
     )
+
+
+def _closing(solver: SolverSpec) -> tuple[bool, tuple[float, float] | None]:
+    """What keeps a DAE on its closure: projection, Baumgarte's terms, or the method itself."""
+    return solver.projection and solver.method != "IDA", solver.baumgarte
 
 
 def _method(scene: Scene, system: System, plant: Plant) -> str:

@@ -23,13 +23,17 @@ WEAK = 1e-3  # of the largest singular value of J: below that a direction is not
 
 @dataclass
 class Dae:
-    """Eq. 1: y = (q', v'), position and velocity put back on the closure after each step if `projects`."""
+    """Eq. 1: y = (q', v'), position and velocity put back on the closure after each step if `projects`.
+
+    `baumgarte` = (alpha, beta) lets what is off the closure decay instead: phi_ddot + 2 alpha phi_dot + beta^2 phi = 0.
+    """
 
     mechanism: Mechanism
     initial: Kinematics
     v_tree: Array
     force: Force
     projects: bool = True
+    baumgarte: tuple[float, float] | None = None
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
@@ -64,7 +68,13 @@ class Dae:
         terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
         self.counts.factorizations += 2
         rate = self.mechanism.tree.configuration_rate(q_tree, v_tree)
-        return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms))])
+        return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms), self._correction(terms))])
+
+    def _correction(self, terms: Terms) -> Array | float:
+        if self.baumgarte is None:
+            return 0.0
+        alpha, beta = self.baumgarte
+        return 2 * alpha * (terms.at.J @ terms.v_tree) + beta**2 * terms.phi
 
     def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
         return None
