@@ -60,7 +60,7 @@ SOLVER = [
     _value("solver.rtol=1e-300", "solver.rtol = 1e-300: a number of at least 2.3e-14"),
     _value("solver.rtol=high", "solver.rtol = 'high': a number is needed, not a string"),
     _value("solver.atol=0", f"solver.atol = 0: {GREATER}"),
-    _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'BDF', 'DOP853', 'LSODA', 'RK23', 'RK45', 'Radau'"),
+    _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'BDF', 'DOP853', 'IDA', 'LSODA', 'RK23', 'RK45', 'Radau'"),
     _value("solver.backend=cuda", "solver.backend = 'cuda'; valid: 'auto', "),
     _value("solver.projection=yes", "solver.projection = 'yes': true or false is needed, not a string"),
     _value("solver.spf_equation=9", "solver.spf_equation = 9; valid: 8, 17"),
