@@ -11,7 +11,7 @@ from ckc_pin.mechanism.sources import Sources
 __all__ = ["GENERATORS", "MAX_N", "GeneratorSpec", "generate"]
 
 GENERATORS = ("n_four_bar",)
-MAX_N = 100  # n = 2 N + 1 coordinates, and memory grows with n^3
+MAX_N = 160  # n = 2 N + 1 coordinates, and memory grows with n^3: 2.2 GB
 
 
 class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,14 +39,14 @@ def generate(spec: GeneratorSpec) -> tuple[str, Sources]:
     urdf = _URDF.format(length=N + 0.2, middle=N / 2, parts="\n".join(rods + bars + feet + tops))
     guess = [f"theta_{k} = {_UP}" for k in range(N + 1)] + [f"psi_{k} = -{_UP}" for k in range(1, N + 1)]
     loops = [_LOOP.format(k=k) for k in range(1, N + 1)]
-    text = _MECHANISM.format(N=N, guess="\n".join(guess), loops="\n".join(loops))
+    text = _MECHANISM.format(N=N, most=MAX_N, guess="\n".join(guess), loops="\n".join(loops))
     return text, Sources(f"{spec.generator}, N = {N}", None, {"n_four_bar.urdf": urdf})
 
 
 _UP = "1.5707963267948966"
 
 _MECHANISM = """\
-# N-four-bar: unit squares in a row that share their verticals, any number N of them; here N = {N}.
+# N-four-bar: unit squares in a row that share their verticals, any number N of them up to {most}; here N = {N}.
 name = "n_four_bar"
 urdf = "n_four_bar.urdf"
 gravity = [0.0, -9.81, 0.0]

@@ -32,7 +32,12 @@ def shipped() -> list[str]:
 
 def is_path(name: str) -> bool:
     """Whether a mechanism or scene is given by path: it exists, or ends in .toml."""
-    return name.endswith(".toml") or Path(name).exists()
+    if name.endswith(".toml"):
+        return True
+    try:
+        return Path(name).exists()
+    except OSError:  # longer than a file system takes
+        return False
 
 
 def mechanism_file(name: str | Path) -> Path:

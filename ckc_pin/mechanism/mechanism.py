@@ -142,7 +142,9 @@ class Mechanism:
         """
         unknown = [name for name in values if name not in names]
         if unknown:
-            raise InputError(f"{what}: no coordinate {unknown[0]!r} here; there are {', '.join(names)}")
+            known = unknown[0] in self.coordinates and tuple(names) == tuple(self.independent)
+            says = f"{unknown[0]!r} follows from the loops" if known else f"no coordinate {unknown[0]!r} here"
+            raise InputError(f"{what}: {says}; there are {', '.join(names)}")
         missing = [name for name in names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")

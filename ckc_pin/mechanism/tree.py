@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-MOST = 300  # coordinates; Pinocchio's workspace takes about 100 n^3 bytes whatever it is used for, 2.6 GB here
+MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
 

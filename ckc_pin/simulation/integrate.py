@@ -220,7 +220,8 @@ class Stepper:
             self.failure = error
             return np.full_like(y, np.nan)
         if not np.all(np.isfinite(derivative)):
-            self.failure = NumericalError("the right-hand side is not finite", t=t)
+            if self.failure is None or np.all(np.isfinite(y)):  # else the reason is what made y so
+                self.failure = NumericalError("the right-hand side is not finite", t=t)
             if at_start:
                 raise self.failure
         self._recent.append((t, y.copy(), derivative))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ckc_pin import InputError, load
 from tests.contract.helpers.bad import Bad, expect
 
 CHECK = ("check", "bar")
@@ -145,3 +146,8 @@ frame_b = "world"
 def test_bad_mechanism(case: Bad, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
     expect(case, bar)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_name_too_long_for_a_file_is_no_mechanism() -> None:
+    with pytest.raises(InputError, match=r"no mechanism 'xxx.*shipped: andrews"):
+        load("x" * 5000)
