@@ -274,7 +274,11 @@ def _handles(found: SingularityMap) -> list[Any]:
         name = found.path.name.replace("$", r"\$")
         handles.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
     if len(found.axes) == 2 and not all(sheet.reached.all() for sheet in found.sheets):
-        handles.append(Patch(color=UNREACHED, label=f"not reached in this {_what(found)}"))
+        handles.append(
+            Patch(
+                color=UNREACHED, label=f"not reached in this {_what(found)}".replace("in this branch", "on this branch")
+            )
+        )
     elif found.space == "joint" and not found.counts.all():
         handles.append(Patch(color=UNREACHED, label="not reached on any branch shown"))
     return handles

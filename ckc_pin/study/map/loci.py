@@ -28,8 +28,9 @@ __all__ = ["LocusSystem", "find_loci", "seen"]
 
 SPARSE = 64  # cells along an axis that are looked at for starts
 TRIES = 12  # starts of one sheet that lead nowhere
-STEP = 0.03  # rad or m along a curve
+STEP = 0.04  # rad or m along a curve
 LONGEST = 3000  # points of a curve
+NEAR = 0.35  # of the mechanism's size: cells next to the end of a sheet look that much alike
 SPREAD = 2.0  # times what the cells around differ: what looks less alike lies on another branch
 ALIKE = 3.0  # times as far as the nearest sheet: still on this one too
 GAP = 4  # points
@@ -155,7 +156,7 @@ def _search(
         at, null, left = system.solve(start, system.null_vector(start), iterations=25)
         solved = left <= max(EXACT, system.mechanism.tolerance)
         if solved and not _known(system, at, serial, found):
-            locus = _follow(system, serial, at, null, grids)
+            locus = _follow(system, serial, at, null, grids, edges)
             if locus.on[which].any():
                 found.append(locus)
                 _close(open_, places, spacing, grid.domain, locus, which, serial)
@@ -210,7 +211,9 @@ def _known(system: LocusSystem, at: Kinematics, serial: bool, found: list[_Found
     return False
 
 
-def _follow(system: LocusSystem, serial: bool, at: Kinematics, null: Array, grids: Sequence[Grid]) -> _Found:
+def _follow(
+    system: LocusSystem, serial: bool, at: Kinematics, null: Array, grids: Sequence[Grid], edges: bool
+) -> _Found:
     """Trace the curve through a solution, classify it, and see which sheets show it."""
     mechanism, domain = system.mechanism, grids[0].domain
     kind = _kind(system, serial, at, null)
@@ -221,7 +224,7 @@ def _follow(system: LocusSystem, serial: bool, at: Kinematics, null: Array, grid
     look = shapes(mechanism, curve.q_tree)
     told, _ = evaluate(mechanism.tree, domain.task.extended.closure, curve.q_tree)
     place = told[:, domain.task.rows[domain.over]]
-    return _Found(serial, kind, curve, look, place, seen(place, look, grids))
+    return _Found(serial, kind, curve, look, place, seen(place, look, grids, edges))
 
 
 def _kind(system: LocusSystem, serial: bool, at: Kinematics, null: Array) -> Kind:
@@ -233,8 +236,11 @@ def _kind(system: LocusSystem, serial: bool, at: Kinematics, null: Array) -> Kin
     return "serial" if rank == mechanism.rank else "rank loss"
 
 
-def seen(place: Array, look: Array, grids: Sequence[Grid]) -> BoolArray:
-    """Which points of a curve (m, axes) lie on which sheet: where the cells around look alike, shape (sheets, m)."""
+def seen(place: Array, look: Array, grids: Sequence[Grid], ends: bool = False) -> BoolArray:
+    """Which points of a curve (m, axes) lie on which sheet: where the cells around look alike, shape (sheets, m).
+
+    Where a sheet `ends` on it a mechanism moves fast, and the last cells may all be on one side at some distance.
+    """
     domain = grids[0].domain
     mechanism = domain.task.extended.mechanism
     away = np.full((len(grids), len(place)), np.inf)
@@ -243,10 +249,10 @@ def seen(place: Array, look: Array, grids: Sequence[Grid]) -> BoolArray:
         near = np.full((*block.shape, look.shape[1]), np.nan)
         there = grid.reached[block]
         near[there] = shapes(mechanism, grid.q_tree[block[there]])
-        known = np.flatnonzero(np.sum(there, axis=1) > 1)
+        known = np.flatnonzero(np.any(there, axis=1))
         gap = np.nanmin(np.max(np.abs(near[known] - look[known][:, None]), axis=2), axis=1)
         spread = np.max(np.nanmax(near[known], axis=1) - np.nanmin(near[known], axis=1), axis=1)
-        away[sheet, known] = np.where(gap <= SPREAD * spread, gap, np.inf)
+        away[sheet, known] = np.where(gap <= (NEAR * mechanism.size if ends else SPREAD * spread), gap, np.inf)
     inside = np.ones(len(place), bool)
     for k, axis in enumerate(domain.axes):
         inside &= axis.turns | ((place[:, k] >= axis.low) & (place[:, k] <= axis.high))

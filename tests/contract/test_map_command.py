@@ -1,0 +1,73 @@
+"""`ckc map`: its JSON, its figures, and one message with exit code 2 for what cannot be mapped."""
+
+import numpy as np
+import pytest
+
+from tests.contract.helpers.command import ckc
+
+KEYS = {
+    "mechanism", "space", "point", "axes", "held", "measure", "branches", "more_branches", "loci", "desired", "seconds",
+    "notes",
+}  # fmt: skip
+
+
+def test_numbers_and_figures(tmp_path):
+    found = ckc("map", "four_bar", "--cells", "16", "--out", str(tmp_path / "new"), "--json")
+    assert found.code == 0
+    assert set(found.json) >= KEYS
+    assert [branch["reached"] for branch in found.json["branches"]] == [1.0, 1.0]  # its crank turns
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["map_joint.png", "map_joint.svg"]
+    place = ckc("map", "four_bar", "--cells", "16", "--space", "cartesian", "--out", str(tmp_path))
+    assert place.code == 0
+    assert (tmp_path / "map_cartesian.png").stat().st_size > 10_000
+    assert "place of coupler" in place.out
+
+
+def test_of_two_freedoms_for_people(tmp_path):
+    found = ckc("map", "five_bar", "--cells", "16", "--scene", "set_point", "--out", str(tmp_path))
+    assert found.code == 0
+    assert "0.993864982" in found.out
+    assert f"{np.pi - 0.993864982:.9f}" in found.out
+    assert "type 2, closed" in found.out
+    assert "desired, five_bar/set_point" in found.out
+    assert (tmp_path / "map_joint.svg").read_text(encoding="utf-8").startswith("<?xml")
+
+
+NO_LOOP = """name = "arm"
+urdf = "arm.urdf"
+"""
+ARM = """<robot name="arm"><link name="base"/><link name="a"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="turn" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>"""
+LOCKED = NO_LOOP + '[[loop]]\nname = "bolt"\ntype = "weld"\nframe_a = "a"\nframe_b = "base"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "says"),
+    [
+        (LOCKED, (), "d = 0"),
+        (NO_LOOP, (), "it has no loops"),
+        (NO_LOOP, ("--space", "cartesian"), "it has no loops"),
+    ],
+)
+def test_mechanisms_that_have_no_map(tmp_path, text, options, says):
+    (tmp_path / "arm.urdf").write_text(ARM, encoding="utf-8")
+    (tmp_path / "mechanism.toml").write_text(text, encoding="utf-8")
+    found = ckc("map", str(tmp_path / "mechanism.toml"), *options, "--json")
+    assert found.code == 2
+    assert found.json["status"] == "error"
+    assert says in found.json["message"]
+
+
+def test_no_point_for_the_cartesian_space():
+    found = ckc("map", "n_four_bar", "--space", "cartesian", "--point", "nowhere")
+    assert found.code == 2
+    assert found.out == ""
+    assert found.err.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    found = ckc("map", "five_bar", "--out", str(tmp_path / "file"))
+    assert found.code == 2
+    assert "no folder that can be written to" in found.err
