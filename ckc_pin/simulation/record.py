@@ -11,7 +11,9 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.systems import System
 
-__all__ = ["Recorder"]
+__all__ = ["Recorder", "Watch"]
+
+Watch = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
 
 class Recorder:
@@ -24,6 +26,8 @@ class Recorder:
         (t, terms) to the actuators' effort.
     lyapunov : callable or None
         (t, terms, w) to the controller's Lyapunov function.
+    watch : callable or None
+        Told each output instant as soon as it is recorded.
     """
 
     def __init__(
@@ -31,8 +35,9 @@ class Recorder:
         system: System,
         effort: Callable[[float, Terms], Effort],
         lyapunov: Callable[[float, Terms, Array], float] | None,
+        watch: Watch | None = None,
     ) -> None:
-        self.system, self.effort, self.lyapunov = system, effort, lyapunov
+        self.system, self.effort, self.lyapunov, self.watch = system, effort, lyapunov, watch
         self.rows: dict[str, list[Array | float]] = {
             name: [] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
         }
@@ -69,6 +74,8 @@ class Recorder:
         self.max_phi = max(self.max_phi, float(np.abs(terms.phi - w).max(initial=0.0)))
         drift_rate = terms.at.J @ velocity - system.w_dot(t)
         self.max_phi_dot = max(self.max_phi_dot, float(np.abs(drift_rate).max(initial=0.0)))
+        if self.watch is not None:
+            self.watch(t, np.asarray(values["q_tree"]))
 
     def arrays(self) -> dict[str, Array]:
         """Return the rows as arrays."""

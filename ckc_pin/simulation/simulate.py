@@ -21,7 +21,7 @@ from ckc_pin.simulation.clock import Clock, Legs
 from ckc_pin.simulation.events import Event, Events
 from ckc_pin.simulation.integrate import BudgetError, Stepper
 from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.record import Recorder
+from ckc_pin.simulation.record import Recorder, Watch
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
@@ -41,6 +41,7 @@ def simulate(
     controller: Controller | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
+    watch: Watch | None = None,
     profile: bool = False,
 ) -> Run:
     """Run a scene.
@@ -57,6 +58,8 @@ def simulate(
         Functions of the state to watch, beside the scene's events.
     progress : callable, optional
         Called as progress(t, t_end) after each accepted step.
+    watch : callable, optional
+        Called as watch(t, q_tree) at each output instant, q_tree by coordinate, shape (n,).
     profile : bool
         Keep a tally of the terms evaluated in `Run.profile`.
 
@@ -88,7 +91,7 @@ def simulate(
         with one_blas_thread():
             clock = Clock(plant.controller, ready.system, scene.spec.t_end)
             stepper = Stepper(ready.system, ready.method, scene.spec.solver, clock.ends[0])
-            recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None))
+            recorder = Recorder(ready.system, plant.effort, getattr(plant.controller, "lyapunov", None), watch)
             recorder.add(0.0, stepper.y)
             status, message = _steps(stepper, recorder, times, watched, clock, progress)
     finally:
