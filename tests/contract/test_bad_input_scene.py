@@ -88,7 +88,7 @@ START = [
     _value("initial.q={theta_1=3.1, theta_3=0.0}", "the start theta_1 = 3.1, theta_3 = 0 is out of reach"),
     _value("initial.q.theta_2=40.0", "initial.q: the loops do not close near the given theta_2", "leave them out"),
     _value("initial.q_dot.theta_9=1", "initial.q_dot: ", "'theta_9'", "theta_1, theta_3"),
-    _value("initial.q_dot.theta_2=1", "initial.q_dot: ", "'theta_2'", "theta_1, theta_3"),
+    _value("initial.q_dot.theta_2=1", "initial.q_dot: 'theta_2' follows from the loops", "theta_1, theta_3"),
     _value("initial.q_dot.theta_1=inf", f"initial.q_dot.theta_1 = inf: {FINITE}"),
     _value("initial.w=[0.1, 0.1]", "initial.w: only the SPF can start off phi = 0, not 'dae'"),
     Bad("w of the reduced", _set("initial.w=[0.1, 0.1]", "formulation=reduced"), ["initial.w", "not 'reduced'"]),
