@@ -15,7 +15,7 @@ from ckc_pin.mechanism.freedoms import count_freedoms, idle_coordinates
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.rank import rank_of
+from ckc_pin.mechanism.rank import choose_dependent, rank_of
 from ckc_pin.mechanism.sigma import Sigma, sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
@@ -23,10 +23,15 @@ from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 from ckc_pin.mechanism.urdf import TreeText, merge
 
-__all__ = ["Mechanism"]
+__all__ = ["HELD_IN_PART", "Mechanism"]
 
 EXACT = 1e-10  # |phi| in units of the mechanism's size that a closed mechanism of exact data reaches
 ROUNDED = 1e-5  # the same when the numbers in the files are rounded to six digits: 2.35619 rad is 5e-6 off
+
+HELD_IN_PART = (
+    "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
+    '(at = "assembled"), runs as a DAE (formulation = "dae"), and has no controller'
+)
 
 
 class Mechanism:
@@ -111,7 +116,14 @@ class Mechanism:
         ----------
         q : (d,) array
             The independent coordinates, rad or m.
+
+        Raises
+        ------
+        InputError
+            The loops hold a free root in part: its place is no function of numbers q.
         """
+        if self.splits_root:
+            raise InputError(f"{self.name}: {HELD_IN_PART}")
         start = start or self.assembled
         if self.tree.flat:
             step = q - start.q_tree[self.tree.place[self.partition.q]]
@@ -230,11 +242,9 @@ class Mechanism:
         chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
         best = [self.coordinates[k] for k in sorted(every - (chosen or set()))]
         remedy = f"; {', '.join(best) or 'none'} would do" if chosen is not None else ""
-        if self.spec.independent is None and chosen is None:
-            raise MechanismError(
-                f"{self.sources.name}: no choice of q keeps the six coordinates of a free root together; "
-                "weld the root, or let the loops hold it entirely or not at all"
-            )
+        if chosen is None:  # no choice keeps the six coordinates of a free root together
+            pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
+            best = [self.coordinates[k] for k in sorted(every - set([] if pivoted is None else pivoted.tolist()))]
         names = list(self.spec.independent) if self.spec.independent is not None else best
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
@@ -250,12 +260,13 @@ class Mechanism:
                 f"independent: {', '.join(names)} cannot parametrise the mechanism where it is assembled "
                 f"(phi_z is singular there){remedy}"
             )
-        for _, v_at in self.tree.free:
-            inside = sum(v_at <= k < v_at + 6 for k in at)
-            if 0 < inside < 6:
-                raise MechanismError(
-                    f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
-                )
+        self.splits_root = any(0 < sum(v_at <= k < v_at + 6 for k in at) < 6 for _, v_at in self.tree.free)
+        if self.splits_root and chosen is not None:
+            raise MechanismError(
+                f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
+            )
+        if self.splits_root:
+            self.warnings.append(HELD_IN_PART)
         self.independent = tuple(names)
         self.dependent = tuple(self.coordinates[k] for k in z)
         self.partition = Partition(at, z)

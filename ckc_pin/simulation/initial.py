@@ -51,6 +51,8 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
     q_dot = mechanism.vector(initial.q_dot, mechanism.independent, "initial.q_dot", fill=0.0)
     if initial.at is not None:
         at = mechanism.assembled if initial.at == "assembled" else stable_equilibrium(mechanism)
+        if mechanism.splits_root and not np.any(w):
+            return Start(at, q_dot, w)
         return Start(_close(mechanism, mechanism.independent_part(at.q_tree), at, w), q_dot, w)
     q = mechanism.vector(
         {k: x for k, x in initial.q.items() if k not in mechanism.dependent},

@@ -14,7 +14,7 @@ from ckc_pin.control.sampled import Held, Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load, mechanism_file
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.scene import Scene, SolverSpec
@@ -147,6 +147,8 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
     actuation = Actuation(mechanism, limit)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
+    if mechanism.splits_root and (controller is not None or scene.spec.formulation != "dae"):
+        raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
     start = find_start(mechanism, scene)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     if controller is not None:

@@ -1,0 +1,77 @@
+"""A free root that the loops hold in part: a rigid body on a ball joint, against a pendulum and a spinning top."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin import InputError, check, load, simulate, terms
+from tests.conftest import assert_close
+
+BODY = """<robot name="b"><link name="body"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+MECHANISM = """name = "top"
+[[tree]]
+file = "b.urdf"
+root = "free"
+[[loop]]
+name = "ball"
+type = "point"
+frame_a = "body"
+frame_b = "world"
+"""
+SCENE = 'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n[initial]\nat = "assembled"\n'
+
+
+@pytest.fixture
+def top(tmp_path: Path) -> Path:
+    (tmp_path / "b.urdf").write_text(BODY)
+    (tmp_path / "mechanism.toml").write_text(MECHANISM)
+    (tmp_path / "default.scene.toml").write_text(SCENE)
+    return tmp_path
+
+
+def test_it_swings_as_a_pendulum(top: Path) -> None:
+    """About y: (0.02 + 1 * 0.1^2) angle'' = 1 * 9.81 * 0.1 cos(angle), from level."""
+    run = simulate(top / "default.scene.toml", {"solver.rtol": 1e-10})
+    angle = solve_ivp(lambda t, y: [y[1], 0.981 * np.cos(y[0]) / 0.03], (0, 1), [0, 0], rtol=1e-12, atol=1e-13)
+    rotation = run.q_tree[-1]
+    assert_close(np.sin(rotation[4]), np.sin(angle.y[0, -1]), 1e-8)
+    assert_close(run.v_tree[-1], [0, 0, 0, 0, angle.y[1, -1], 0], 1e-7)
+    assert run.max_phi <= 1e-12
+
+
+def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical(top: Path) -> None:
+    spin = {"root.rx": 20.0, "root.rz": 1.0}
+    run = simulate(top / "default.scene.toml", {"solver.rtol": 1e-10, "initial.q_dot": spin})
+    assert run.status == "done"
+    assert_close(run.energy, run.energy[0], 1e-7)
+    # inertia about the pivot times the angular velocity in the body's axes, turned to the world
+    inertia = np.diag([0.01, 0.03, 0.04])
+    vertical = []
+    for row, v in zip(run.q_tree, run.v_tree, strict=True):
+        rotvec = row[3:]
+        angle = float(np.linalg.norm(rotvec))
+        axis = rotvec / angle if angle else np.zeros(3)
+        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        vertical.append(float((rotation @ inertia @ v[3:])[2]))
+    assert np.ptp(vertical) < 1e-7
+    assert np.ptp(run.v_tree[:, 3]) > 1e-3  # it does not just spin
+
+
+@pytest.mark.parametrize("changes", [{"formulation": "reduced"}, {"formulation": "spf"}, {"initial.at": "equilibrium"}])
+def test_what_needs_numbers_q_is_refused(top: Path, changes: dict[str, str]) -> None:
+    with pytest.raises(InputError, match=r"hold a free root in part.*runs as a DAE"):
+        simulate(top / "default.scene.toml", changes)
+
+
+def test_check_says_so(top: Path) -> None:
+    found = check(top / "mechanism.toml")
+    assert (found.d, found.rank) == (3, 3)
+    assert any("hold a free root in part" in warning for warning in found.warnings)
+    with pytest.raises(InputError, match="hold a free root in part"):
+        terms(load(top / "mechanism.toml"), {"root.rx": 0.1, "root.ry": 0.0, "root.rz": 0.0})
