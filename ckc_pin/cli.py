@@ -53,6 +53,7 @@ Begin with
   ckc check five_bar                           freedoms, partition, assembled configuration
   ckc run five_bar/tracking --out runs/first   simulate; run.npz and figures go to the folder
   ckc play runs/first                          watch it in the browser
+  ckc COMMAND --help                           what a command does, with examples
 """
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
@@ -64,6 +65,9 @@ Set = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the scene; may be given many times."),
 ]
 Runs = Annotated[list[Path], typer.Argument(help="Run files, or folders that hold a run.npz.", metavar="RUN...")]
+
+Port = Annotated[int, typer.Option("--port", help="Port on 127.0.0.1; 0: any free one.")]
+Open = Annotated[bool, typer.Option("--open", help="Open your browser too.")]
 
 
 def _examples(*lines: str) -> str:
@@ -171,14 +175,34 @@ def plot(runs: Runs, out: Annotated[Path, typer.Option("--out", help="Folder for
         print(path)
 
 
-@app.command(epilog=_examples("ckc play runs/spf"))
+@app.command(
+    epilog=_examples(
+        "ckc play runs/spf",
+        "ckc play runs/reduced runs/spf --speed 0.5 --gap 1000",
+        "ckc play runs/spf --html spf.html",
+    )
+)
 def play(
     runs: Runs,
-    speed: Annotated[float, typer.Option(help="Playback speed, 1 is real time.", min=1e-6)] = 1.0,
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0: any free one.", min=0, max=65535)] = 0,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write one file that plays from disk instead.")
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Playback speed, 1 is real time.")] = 1.0,
+    gap: Annotated[float, typer.Option("--gap", help="Draw the gaps of the loops so many times larger.")] = 0.0,
+    meshes: Annotated[
+        Path | None, typer.Option("--meshes", metavar="FOLDER", help="The mechanism's folder, for its mesh files.")
+    ] = None,
+    port: Port = 0,
+    open_browser: Open = False,
 ) -> None:
-    """Play runs back in the browser through meshcat, on this machine only."""
-    ckc_pin.play(*[ckc_pin.Run.load(path) for path in runs], speed=speed, port=port)
+    """Play runs back in the browser through meshcat, on this machine only; several lie on each other."""
+    loaded = [ckc_pin.Run.load(path) for path in runs]
+    if html is None:
+        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, port=port, open_browser=open_browser)
+        return
+    from ckc_pin.view.player import save_html
+
+    print(f"written: {save_html(loaded, html, speed=speed, gap=gap, meshes=meshes)}")
 
 
 @app.command(

@@ -6,21 +6,49 @@ listens on every interface, and its commands are a few dictionaries of three.js'
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 from ckc_pin.view.visuals import Colour
 
-__all__ = ["Command", "Stage", "body", "material", "polyline", "set_animation", "set_property", "set_transform"]
+__all__ = [
+    "Command",
+    "Stage",
+    "Track",
+    "body",
+    "material",
+    "polyline",
+    "say",
+    "set_animation",
+    "set_property",
+    "set_transform",
+    "surface",
+]
 
 Command = dict[str, Any]
 
-_FLOAT32 = 0x17  # msgpack-lite's extension type of a Float32Array
+_UINT32, _FLOAT32 = 0x16, 0x17  # msgpack-lite's extension types of a Uint32Array and a Float32Array
 _TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # three.js's cylinders lie along y
+
+# What three.js animates, by property.
+_KINDS = {"position": "vector3", "quaternion": "quaternion", "scale": "vector3", "visible": "bool"}
+
+
+@dataclass(frozen=True)
+class Track:
+    """How an object moves: at times (m,), s, the values of some of its properties.
+
+    These are "position" and "scale" (m, 3), "quaternion" (m, 4) as x, y, z, w, and "visible" (m,) of bool.
+    """
+
+    path: str
+    times: Array
+    values: Mapping[str, Array | BoolArray]
 
 
 class Stage:
@@ -78,6 +106,16 @@ def polyline(path: str, points: Array, colour: Colour, opacity: float = 1.0) -> 
     return _object(path, "Line", geometry, {"type": "LineBasicMaterial", **look}, np.eye(4))
 
 
+def surface(path: str, corners: Array, faces: IntArray, placement: Array, look: dict[str, Any]) -> Command:
+    """Draw a triangulated surface: corners (m, 3), faces (k, 3) of their numbers; each triangle is seen as flat."""
+    position = {"itemSize": 3, "type": "Float32Array", "array": _floats(corners), "normalized": False}
+    numbers = msgspec.msgpack.Ext(_UINT32, np.ascontiguousarray(faces, dtype="<u4").tobytes())
+    data = {"attributes": {"position": position}, "index": {"type": "Uint32Array", "array": numbers}}
+    return _object(
+        path, "Mesh", {"type": "BufferGeometry", "data": data}, look | {"flatShading": True, "side": 2}, placement
+    )
+
+
 def set_transform(path: str, matrix: Array) -> Command:
     """Place what is at a path, and everything below it, in its parent."""
     return {"type": "set_transform", "path": path, "matrix": _columns(matrix)}
@@ -88,23 +126,29 @@ def set_property(path: str, name: str, value: Any) -> Command:
     return {"type": "set_property", "path": path, "property": name, "value": value}
 
 
-def set_animation(tracks: Iterable[tuple[str, Array, Array, Array]]) -> Command:
+def say(text: str) -> Command:
+    """Write a line of plain text below the caption; understood by our page, not by the viewer."""
+    return {"type": "say", "path": "", "text": text}
+
+
+def set_animation(tracks: Iterable[Track], speed: float = 1.0) -> Command:
     """Make the viewer move things by itself, once, with a time slider.
 
     Parameters
     ----------
-    tracks : iterable of (path, times, positions, quaternions)
-        (m,), (m, 3) and (m, 4) arrays; seconds of playback; x, y, z, w.
+    tracks : iterable of Track
+        In the run's own time, which the slider shows.
+    speed : float
+        How much of it goes by in a second: the viewer's timeScale, which our page sets.
     """
     animations = []
-    for path, times, positions, quaternions in tracks:
-        ways = (("position", "vector3", positions), ("quaternion", "quaternion", quaternions))
+    for track in tracks:
         clip_tracks = [
-            {"name": f".{name}", "type": kind, "times": _floats(times), "values": _floats(values)}
-            for name, kind, values in ways
+            {"name": f".{name}", "type": _KINDS[name], "times": _floats(track.times), "values": _values(values)}
+            for name, values in track.values.items()
         ]
-        animations.append({"path": path, "clip": {"fps": 1, "name": "run", "tracks": clip_tracks}})
-    options = {"play": True, "repetitions": 1, "clampWhenFinished": True}
+        animations.append({"path": track.path, "clip": {"fps": 1, "name": "run", "tracks": clip_tracks}})
+    options = {"play": True, "repetitions": 1, "clampWhenFinished": True, "timeScale": speed}
     return {"type": "set_animation", "path": "", "animations": animations, "options": options}
 
 
@@ -123,6 +167,10 @@ def _object(path: str, kind: str, geometry: dict[str, Any], look: dict[str, Any]
 def _columns(matrix: Array) -> list[float]:
     columns: list[float] = matrix.T.ravel().tolist()
     return columns
+
+
+def _values(values: Array | BoolArray) -> Any:
+    return values.tolist() if values.dtype == bool else _floats(values.astype(float))
 
 
 def _floats(values: Array) -> msgspec.msgpack.Ext:

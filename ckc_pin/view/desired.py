@@ -11,10 +11,10 @@ from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Wanted", "desired_along"]
+__all__ = ["Poses", "Wanted", "desired_along", "desired_poses"]
 
 
 @dataclass(frozen=True)
@@ -51,3 +51,35 @@ def desired_along(run: Run) -> Wanted | None:
     desired: Desired = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
     sampled = np.array([desired(float(t))[:2] for t in run.t])
     return Wanted("tracking", sampled[:, 0], sampled[:, 1])
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the mechanism should have been, at some output instants of a run.
+
+    Attributes
+    ----------
+    q_tree : (m, nq) array
+        Configurations of the tree, Pinocchio's q; where there is none, the last one before.
+    exists : (m,) array of bool
+        Whether the mechanism can have what is desired, on the branch of the run.
+    """
+
+    q_tree: Array
+    exists: BoolArray
+
+
+def desired_poses(run: Run, rows: IntArray) -> Poses | None:
+    """Return sigma(q_d) at output instants of a run, or None where its scene has no controller."""
+    wanted = desired_along(run)
+    if wanted is None:
+        return None
+    mechanism = run.mechanism
+    at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[rows[0]]))
+    poses, exists = [], []
+    for q_d in wanted.q[rows]:
+        found = mechanism.sigma(q_d, at)
+        exists.append(found.verdict == "converged")
+        at = found.at if exists[-1] else at
+        poses.append(at.q_tree)
+    return Poses(np.array(poses), np.array(exists))

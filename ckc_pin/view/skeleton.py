@@ -12,7 +12,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Motion", "Stick", "is_planar", "motion", "placements", "sticks", "upward", "viewpoint"]
+__all__ = ["Motion", "Stick", "configurations", "is_planar", "placements", "sticks", "upward", "viewpoint"]
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
 
@@ -45,10 +45,10 @@ def placements(mechanism: Mechanism, q_tree: Array) -> Motion:
     return Motion(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
 
 
-def motion(run: Run, rows: IntArray | slice = slice(None)) -> Motion:
-    """Return the placements along a run, at all or some of its output instants."""
+def configurations(run: Run, rows: IntArray | slice = slice(None)) -> Array:
+    """Return the configurations of the tree (m, nq), Pinocchio's q, at all or some output instants of a run."""
     tree = run.mechanism.tree
-    return placements(run.mechanism, np.array([tree.from_coordinates(numbers) for numbers in run.q_tree[rows]]))
+    return np.array([tree.from_coordinates(numbers) for numbers in run.q_tree[rows]])
 
 
 def sticks(mechanism: Mechanism) -> list[Stick]:

@@ -1,8 +1,9 @@
-"""What a mechanism looks like: the boxes, cylinders and spheres of its URDFs, read from the texts a run carries."""
+"""What a mechanism looks like: the shapes of its URDFs, read from the texts a run carries."""
 
 from __future__ import annotations
 
 import math
+import posixpath
 from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
@@ -19,24 +20,26 @@ __all__ = ["SHAPES", "Colour", "Visual", "visuals"]
 
 Colour = tuple[float, float, float]
 
-SHAPES = {"box": ("size", 3), "cylinder": ("radius length", 2), "sphere": ("radius", 1)}
+SHAPES = {"box": ("size", 3), "cylinder": ("radius length", 2), "sphere": ("radius", 1), "mesh": ("scale", 3)}
 
 
 @dataclass(frozen=True)
 class Visual:
-    """A primitive on a body.
+    """A primitive or a mesh on a body.
 
     Attributes
     ----------
     link : str
     joint : int
         The body, by its joint; 0: the world.
-    shape : "box", "cylinder" (along z) or "sphere"
+    shape : "box", "cylinder" (along z), "sphere" or "mesh"
     size : tuple of float
-        x, y, z; radius, length; radius. Metres.
+        x, y, z; radius, length; radius; in metres. Of a mesh its scale along x, y, z.
     placement : (4, 4) array
         In the body's axes.
     colour : (r, g, b) in 0 ... 1, or None where the URDF has none
+    file : str
+        Of a mesh: its name in the mechanism's folder, or package://...
     """
 
     link: str
@@ -45,10 +48,11 @@ class Visual:
     size: tuple[float, ...]
     placement: Array
     colour: Colour | None
+    file: str = ""
 
 
 def visuals(mechanism: Mechanism) -> list[Visual]:
-    """Return the primitives of all links; meshes and unknown shapes are left out.
+    """Return the shapes of all links; those that nobody knows are left out.
 
     Raises
     ------
@@ -72,13 +76,20 @@ def _of_tree(mechanism: Mechanism, text: str, source: str, prefix: str) -> Itera
             if shape is None:
                 continue
             attributes, count = SHAPES[shape.tag]
-            size = tuple(x for key in attributes.split() for x in _numbers(shape, key, "", where))
-            if len(size) != count or min(size) <= 0:
+            default = "1 1 1" if shape.tag == "mesh" else ""
+            size = tuple(x for key in attributes.split() for x in _numbers(shape, key, default, where))
+            if len(size) != count or (min(size) <= 0 and shape.tag != "mesh"):  # a mesh may be mirrored
                 raise InputError(f"{where}: a {shape.tag} needs {attributes.replace(' ', ' and ')} above zero")
             material = element.find("material")
             colour = None if material is None else _colour(material, where) or materials.get(material.get("name"))
             placement = _homogeneous(frame.rotation, frame.translation) @ _origin(element, where)
-            yield Visual(name, frame.joint, shape.tag, size, placement, colour)
+            yield Visual(name, frame.joint, shape.tag, size, placement, colour, _mesh_file(shape, source))
+
+
+def _mesh_file(shape: Element, source: str) -> str:
+    """Return the name of a mesh file, which a URDF gives beside itself."""
+    file = shape.get("filename", "")
+    return file if "://" in file else posixpath.join(posixpath.dirname(source), file)
 
 
 def _shape(visual: Element) -> Element | None:

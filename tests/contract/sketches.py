@@ -22,6 +22,8 @@ ARM = f"""
 </robot>
 """
 
+START_OF_ARM = '[initial.q]\nturn = 0.1\nlift = 0.1\n"reach$/1" = 0.1\n'
+
 # A four-bar in the x-z plane: crank 0.2, coupler 0.5, rocker 0.4, base 0.5 m.
 FOUR_BAR = f"""
 <robot name="four_bar">
@@ -36,6 +38,7 @@ FOUR_BAR = f"""
     <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/></joint>
 </robot>
 """
+START_OF_FOUR_BAR = "[initial.q]\nalpha = -0.5\n"
 FOUR_BAR_LOOP = """
 independent = ["alpha"]
 [q_guess]

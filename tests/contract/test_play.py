@@ -26,13 +26,12 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 import ckc_pin
 from ckc_pin.errors import InputError
 from ckc_pin.view import commands
-from ckc_pin.view.player import KEYFRAMES, play, scene
+from ckc_pin.view.drawing import FEWEST, scene
+from ckc_pin.view.player import play
 from ckc_pin.view.server import ViewServer
-from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
+from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_ARM, write_scene
 
-L_PROXIMAL, BASE = 0.2794, 0.3048  # of five_bar
-
-START_OF_ARM = '[initial.q]\nturn = 0.1\nlift = 0.1\n"reach$/1" = 0.1\n'
+L_PROXIMAL, L_DISTAL, BASE = 0.2794, 0.3048, 0.3048  # of five_bar
 
 Server = Callable[..., ViewServer]
 
@@ -97,8 +96,9 @@ def tracks(drawing: list[dict]) -> dict[str, tuple[np.ndarray, np.ndarray, np.nd
     (animation,) = [c for c in drawing if c["type"] == "set_animation"]
     found = {}
     for one in animation["animations"]:
-        position, quaternion = one["clip"]["tracks"]
-        assert (position["name"], quaternion["name"]) == (".position", ".quaternion")
+        position, quaternion = (one["clip"]["tracks"] * 2)[:2]
+        if (position["name"], quaternion["name"]) != (".position", ".quaternion"):
+            continue
         assert one["clip"]["fps"] == 1  # times are seconds
         times = floats(position["times"], 1)[:, 0]
         found[one["path"]] = times, floats(position["values"], 3), floats(quaternion["values"], 4)
@@ -188,9 +188,13 @@ def test_links_have_their_shapes_and_are_told_apart_by_colour(tracking):
     assert len(set(colours.values())) == 4
 
 
+def opacities(drawing: list[dict]) -> dict[str, float]:
+    return {path: obj["materials"][0].get("opacity", 1) for path, obj in objects(drawing).items()}
+
+
 def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
     drawing = scene([tracking, swing])
-    opacity = {path: obj["materials"][0].get("opacity", 1) for path, obj in objects(drawing).items()}
+    opacity = {path: x for path, x in opacities(drawing).items() if "/desired/" not in path}
     first, second = "/world/1: five_bar%2Ftracking: reduced", "/world/2: five_bar%2Fswing: DAE"
     assert {opacity[path] for path in opacity if path.startswith(first)} == {1}
     assert {opacity[path] for path in opacity if path.startswith(second)} == {0.4}
@@ -200,13 +204,62 @@ def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
     assert moved[f"{second}/joint:theta_1"][0][-1] == pytest.approx(2.0)
 
 
-def test_keyframes_are_thinned_to_the_speed(swing):
+def test_the_spf_lies_translucent_on_the_reduced_model_whatever_the_order(serve, run, tracking):
+    server = serve(run("five_bar/tracking"), tracking)
+    with urlopen(server.url) as answer:
+        page = answer.read().decode()
+    assert "<p>reduced</p><p>translucent: SPF, ε = 10⁻⁴</p><p>gray: desired</p>" in page
+    opacity = opacities(watch(server, len(server.stage.messages())))
+    assert {x for path, x in opacity.items() if path.startswith("/world/2: SPF")} == {0.4}
+
+
+def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
+    drawing = scene([tracking])
+    root, moved = "/world/1: reduced/desired", tracks(drawing)
+    assert {x for path, x in opacities(drawing).items() if path.startswith(root)} == {0.22}
+    assert not [path for path in objects(drawing) if path.startswith(f"{root}/base")]
+    t = tracking.t
+    theta_1, theta_3 = np.pi / 3 * np.sin(t), np.pi / 4 * (1 - np.cos(t))
+    left = L_PROXIMAL * np.column_stack([np.cos(theta_1), np.sin(theta_1)])
+    right = [BASE, 0] + L_PROXIMAL * np.column_stack([np.cos(theta_3), np.sin(theta_3)])
+    between = right - left
+    gap = np.linalg.norm(between, axis=1, keepdims=True)
+    below = np.column_stack([between[:, 1], -between[:, 0]]) / gap
+    tip = 0.5 * (left + right) + below * np.sqrt(L_DISTAL**2 - 0.25 * gap**2)
+    for joint, elbow in (("theta_2", left), ("theta_4", right)):
+        times, position, quaternion = moved[f"{root}/joint:{joint}"]
+        np.testing.assert_allclose(times, t, atol=1e-6)
+        np.testing.assert_allclose(position[:, :2], elbow, atol=1e-6)
+        np.testing.assert_allclose((position + rotated(quaternion, np.array([L_DISTAL, 0, 0])))[:, :2], tip, atol=1e-6)
+
+
+def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
+    changes = {"controller.desired.theta_1.harmonics": [[2.2, 10.0, 0.0]], "t_end": 0.3, "formulation": "reduced"}
+    drawing = scene([ckc_pin.simulate("five_bar/tracking", changes)])
+    (animation,) = [c for c in drawing if c["type"] == "set_animation"]
+    (hidden,) = [a for a in animation["animations"] if a["path"].endswith("/desired")]
+    (track,) = hidden["clip"]["tracks"]
+    assert (track["name"], track["type"]) == (".visible", "bool")
+    t = floats(track["times"], 1)[:, 0]
+    theta_1, theta_3 = 2.2 * np.sin(10 * t), np.pi / 4 * (1 - np.cos(t))
+    left = np.column_stack([np.cos(theta_1), np.sin(theta_1)])
+    apart = L_PROXIMAL * (np.column_stack([np.cos(theta_3), np.sin(theta_3)]) - left) + [BASE, 0]
+    reached = np.linalg.norm(apart, axis=1) < 2 * L_DISTAL
+    assert track["values"] == reached.tolist()
+    assert {True, False} == set(track["values"])
+
+
+def test_all_output_instants_are_keyframes_unless_there_are_very_many(swing):
     for speed in (0.25, 1.0, 10.0):
-        times = tracks(scene([swing], speed))["/world/1: DAE/joint:theta_1"][0]
-        assert times[0] == 0
-        assert times[-1] == pytest.approx(2.0 / speed)
-        assert len(times) <= min(len(swing.t), 2.0 / speed * KEYFRAMES + 2)
-        assert np.diff(times).max() < max(1.1 * 0.01 / speed, 2.0 / KEYFRAMES)
+        drawing = scene([swing], speed=speed)
+        times = tracks(drawing)["/world/1: DAE/joint:theta_1"][0]
+        np.testing.assert_allclose(times, swing.t, atol=1e-6)
+        assert drawing[-1]["options"]["timeScale"] == speed
+    many = ckc_pin.simulate("five_bar/swing", {"t_end": 0.5, "solver.output_dt": 1e-4})
+    times = tracks(scene([many]))["/world/1: DAE/joint:theta_1"][0]
+    assert (times[0], times[-1]) == (0.0, 0.5)
+    assert len(times) == FEWEST
+    assert np.diff(times).max() < 2.0 * 0.5 / FEWEST
 
 
 def test_quaternions_are_continuous(tmp_path):
@@ -503,7 +556,8 @@ def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
     saved = swing.save(tmp_path / "run.npz")
     code = (
         "import sys, ckc_pin\n"
-        "from ckc_pin.view.player import play, scene\n"
+        "from ckc_pin.view.drawing import scene\n"
+        "from ckc_pin.view.player import play\n"
         f"run = ckc_pin.Run.load({str(saved)!r})\n"
         "scene([run])\n"
         "assert not {'tornado', 'meshcat', 'matplotlib', 'yourdfpy'} & set(sys.modules)\n"
@@ -516,6 +570,12 @@ def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
 def test_a_browser_that_cannot_be_opened_is_said(swing, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("webbrowser.open", lambda url: bool(asked.append(url)))
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with play(swing, open_browser=True, block=False) as server:
+        assert not asked  # one for terminals would take ours
+    assert f"no display here; open {server.url}" in capsys.readouterr().err
+    monkeypatch.setenv("DISPLAY", ":7")
     with play(swing, open_browser=True, block=False) as server:
         assert asked == [server.url]
     assert f"open {server.url} in yours" in capsys.readouterr().err

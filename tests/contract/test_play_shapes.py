@@ -1,0 +1,199 @@
+"""Playback of meshes, and of the gaps of loops."""
+
+from __future__ import annotations
+
+import base64
+import struct
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin.view.drawing import scene
+from ckc_pin.view.gaps import gaps
+from ckc_pin.view.player import play, save_html
+from ckc_pin.view.skeleton import configurations
+from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, write_scene
+
+TETRAHEDRON = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+
+
+def stl(path: Path) -> None:
+    """A tetrahedron in binary STL."""
+    path.parent.mkdir(exist_ok=True)
+    triangles = [struct.pack("<12fH", 0, 0, 0, *TETRAHEDRON[list(face)].ravel(), 0) for face in FACES]
+    path.write_bytes(bytes(80) + struct.pack("<I", len(FACES)) + b"".join(triangles))
+
+
+def objects(drawing: list[dict]) -> dict[str, dict]:
+    return {c["path"]: c["object"] for c in drawing if c["type"] == "set_object"}
+
+
+def crank_with(mesh: str) -> str:
+    visual = f'<visual><origin xyz="0 0 0.3"/><geometry>{mesh}</geometry></visual>'
+    return FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{visual}')
+
+
+def bar(folder: Path, mesh: str) -> ckc_pin.Run:
+    return ckc_pin.simulate(write_scene(folder, crank_with(mesh), FOUR_BAR_LOOP, START_OF_FOUR_BAR, 0.02))
+
+
+def triangles(drawing: list[dict]) -> np.ndarray:
+    """Corners (k, 3, 3) of the only mesh, in the axes of its body."""
+    (drawn,) = [obj for path, obj in objects(drawing).items() if "/link:crank/" in path]
+    (geometry,) = drawn["geometries"]
+    assert geometry["type"] == "BufferGeometry"
+    corners = np.frombuffer(geometry["data"]["attributes"]["position"]["array"].data, "<f4").reshape(-1, 3)
+    faces = geometry["data"]["index"]
+    assert faces["array"].code == 0x16
+    placement = np.array(drawn["object"]["matrix"]).reshape(4, 4).T
+    numbers = np.frombuffer(faces["array"].data, "<u4").reshape(-1, 3)
+    return (corners @ placement[:3, :3].T + placement[:3, 3])[numbers]
+
+
+def in_order(corners: np.ndarray) -> np.ndarray:
+    """Triangles as sorted rows, so that the order in a file does not matter."""
+    return np.array(sorted(np.sort(t.round(6), axis=0).ravel().tolist() for t in corners))
+
+
+def test_a_mesh_is_drawn_where_its_link_is(tmp_path):
+    run = bar(tmp_path / "m", '<mesh filename="shapes/crank.stl" scale="2 1 1"/>')
+    stl(tmp_path / "m" / "shapes" / "crank.stl")
+    expected = np.array([TETRAHEDRON[list(face)] * [2, 1, 1] + [0, 0, 0.3] for face in FACES])
+    np.testing.assert_allclose(in_order(triangles(scene([run]))), in_order(expected), atol=1e-6)
+
+
+def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, capsys):
+    saved = bar(tmp_path / "m", '<mesh filename="package://mine/shapes/crank.stl"/>').save(tmp_path / "run.npz")
+    stl(tmp_path / "m" / "shapes" / "crank.stl")
+    run = ckc_pin.Run.load(saved)
+    page = save_html(run, tmp_path / "sticks.html")
+    assert capsys.readouterr().err == (
+        "meshes missing, so sticks: package://mine/shapes/crank.stl; --meshes FOLDER says where they are\n"
+    )
+    assert [path for path in objects(scene([run])) if "/joint:alpha/rod:" in path]
+    drawing = scene([run], meshes=tmp_path / "m")
+    assert not [path for path in objects(drawing) if "/joint:alpha/rod:" in path]
+    expected = np.array([TETRAHEDRON[list(face)] + [0, 0, 0.3] for face in FACES])
+    np.testing.assert_allclose(in_order(triangles(drawing)), in_order(expected), atol=1e-6)
+    whole = save_html(run, tmp_path / "meshes.html", meshes=tmp_path / "m")
+    assert capsys.readouterr().err == ""
+    assert page.read_bytes() != whole.read_bytes()
+    with pytest.raises(ckc_pin.InputError, match=r"no such folder; give the one that the mechanism\.toml is in"):
+        save_html(run, tmp_path / "x.html", meshes=tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "name", ["../crank.stl", "a/../../crank.stl", "{absolute}", "file://{absolute}", "link.stl", ""]
+)
+def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
+    stl(tmp_path / "outside" / "crank.stl")
+    (tmp_path / "outside" / "crank.stl").rename(tmp_path / "crank.stl")
+    run = bar(tmp_path / "m", f'<mesh filename="{name.format(absolute=tmp_path / "crank.stl")}"/>')
+    (tmp_path / "m" / "link.stl").symlink_to(tmp_path / "crank.stl")
+    drawn = objects(scene([run]))
+    assert not [path for path in drawn if "/link:crank/" in path]
+    assert [path for path in drawn if "/joint:alpha/rod:" in path]
+
+
+@pytest.mark.parametrize("content", [b"", b"solid \n garbage", bytes(80) + struct.pack("<I", 2**31), b"\xff" * 200])
+def test_a_damaged_mesh_is_a_stick(tmp_path, content):
+    run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
+    (tmp_path / "m" / "crank.stl").write_bytes(content)
+    drawn = objects(scene([run]))
+    assert not [path for path in drawn if "/link:crank/" in path]
+    assert [path for path in drawn if "/joint:alpha/rod:" in path]
+
+
+def test_links_of_a_robot_of_meshes_have_them(tmp_path):
+    run = ckc_pin.simulate("two_ur5", {"t_end": 0.01})
+    drawn = objects(scene([run]))
+    meshes = [path for path, obj in drawn.items() if obj["geometries"][0]["type"] == "BufferGeometry"]
+    assert len([path for path in meshes if "/link:" in path]) == 14  # seven links each
+    assert not [path for path in drawn if "/rod:" in path]
+
+
+# --- gaps ----------------------------------------------------------------------------------------
+
+
+def test_gaps_are_what_the_loop_holds_at_zero(run):
+    off = run("five_bar/swing", formulation="spf", initial__w=[2e-3, -1e-3], t_end=0.05)
+    mechanism = off.mechanism
+    found = gaps(mechanism, configurations(off))
+    assert list(found) == ["elbow"]
+    np.testing.assert_allclose(found["elbow"][:, :2], off.phi, atol=1e-15)  # its rows are x and y of the world
+    assert np.abs(off.phi[0]).max() == pytest.approx(2e-3)
+    assert not np.any(found["elbow"][:, 2])
+
+
+def test_gap_of_a_distance_is_along_its_rod(tmp_path):
+    rod = """
+[[loop]]
+name = "rod"
+type = "distance"
+length = 0.55
+frame_a = {link = "a", xyz = [0.1, 0.0, 0.0]}
+frame_b = {link = "world", xyz = [0.0, 0.6, 0.2]}
+"""
+    start = '[initial.q]\nlift = 0.1\n"reach$/1" = 0.1\n'
+    run = ckc_pin.simulate(write_scene(tmp_path / "m", ARM, rod, start, 0.01))
+    q = np.array([[0.4, 0.1, 0.1]])
+    tip, end = np.array([0.1 * np.cos(0.4), 0.1 * np.sin(0.4), 0]), np.array([0, 0.6, 0.2])
+    r = tip - end
+    configuration = run.mechanism.tree.from_coordinates(q[0])[None]
+    expected = r * (1 - 0.55 / np.linalg.norm(r))
+    np.testing.assert_allclose(gaps(run.mechanism, configuration)["rod"][0], expected, atol=1e-14)
+
+
+def test_magnified_gaps_run_from_frame_b(run):
+    off = run("five_bar/swing", formulation="spf", initial__w=[2e-3, -1e-3], t_end=0.05)
+    drawing = scene([off], gap=50.0)
+    root = next(path for path in objects(drawing) if "/gap:elbow" in path).rpartition("/gap")[0]
+    rod = f"{root}/gap:elbow/way"
+    assert objects(drawing)[f"{rod}/rod"]["geometries"][0]["height"] == 1.0
+    (animation,) = [c for c in drawing if c["type"] == "set_animation"]
+    way = {a["path"]: {t["name"]: t["values"] for t in a["clip"]["tracks"]} for a in animation["animations"]}
+
+    def values(path: str, name: str, columns: int) -> np.ndarray:
+        return np.frombuffer(way[path][name].data, "<f4").reshape(-1, columns).astype(float)
+
+    angles = off.q_tree[:, off.column("theta_3")] + off.q_tree[:, off.column("theta_4")]
+    third = off.q_tree[:, off.column("theta_3")]
+    x = 0.3048 + 0.2794 * np.cos(third) + 0.3048 * np.cos(angles)
+    b = np.column_stack([x, 0.2794 * np.sin(third) + 0.3048 * np.sin(angles)])
+    np.testing.assert_allclose(values(rod, ".position", 3)[:, :2], b, atol=1e-6)
+    end = values(f"{root}/gap:elbow/end", ".position", 3)
+    np.testing.assert_allclose(end[:, :2] - b, 50 * off.phi, atol=1e-6)
+    length = values(rod, ".scale", 3)
+    np.testing.assert_allclose(length[:, 2], 50 * np.linalg.norm(off.phi, axis=1), atol=1e-6)
+    assert not [path for path in objects(scene([off])) if "/gap:" in path]  # only on request
+
+
+@pytest.mark.parametrize("gap", [-1.0, float("nan"), float("inf")])
+def test_a_gap_that_is_none(run, gap):
+    with pytest.raises(ckc_pin.InputError, match="gap = "):
+        play(run("five_bar/swing"), gap=gap, block=False)
+
+
+# --- one file ------------------------------------------------------------------------------------
+
+
+def test_a_file_that_cannot_be_written(run, tmp_path):
+    with pytest.raises(ckc_pin.InputError, match=r"cannot be written: .*; choose a file in a folder that exists"):
+        save_html(run("five_bar/swing"), tmp_path / "nowhere" / "x.html")
+
+
+def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
+    path = write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, 0.01)
+    hostile = path.rename(path.with_name("<script>alert(1)<.scene.toml"))
+    run = ckc_pin.simulate(hostile)
+    text = save_html(run, tmp_path / "x.html", speed=0.5).read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;" in text.split("</title>")[0]
+    data = text.split('<script type="text/plain" id="scene">')[1].split("</script>")[0]
+    several = msgspec.msgpack.decode(base64.b64decode(data, validate=True))
+    assert several["type"] == "several"
+    assert several["commands"] == msgspec.msgpack.decode(msgspec.msgpack.encode(scene([run], speed=0.5)))
