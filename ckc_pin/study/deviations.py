@@ -9,7 +9,7 @@ solution, while the plant has its own z.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,49 +18,67 @@ from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.integrate import Stepper
-from ckc_pin.simulation.prepare import prepare, scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.systems.level_set import LevelSet
 
-__all__ = ["PERIOD", "Deviation", "OwnSigma", "Track", "deviation", "instants", "track"]
+__all__ = ["PERIOD", "Deviation", "FromLast", "OwnSigma", "Track", "deviation", "instants", "track"]
 
 PERIOD = 2 * np.pi  # s, of eq. 21
 SAMPLES = 128  # in a period
 SETTLED = 1  # period after which the start is forgotten
 
 
-class OwnSigma:
-    """A controller that solves sigma itself, to a tolerance, from its solution at the last accepted step.
+class FromLast:
+    """sigma solved from its solution at the last accepted step, and only to a tolerance.
 
     Parameters
     ----------
-    inner : Controller
-        Gets the terms at that z instead of the plant's.
+    mechanism : Mechanism
+    start : Kinematics
     tolerance : float
-        Largest |phi| that it takes for closed, m.
+        Largest |phi| that is taken for closed, m.
     """
 
-    def __init__(self, inner: Controller, tolerance: float) -> None:
-        self.inner, self.tolerance = inner, tolerance
-        self._last: Kinematics | None = None
+    def __init__(self, mechanism: Mechanism, start: Kinematics, tolerance: float) -> None:
+        self._mechanism, self._last, self._tolerance = mechanism, start, tolerance
+
+    def at(self, q: Array) -> Kinematics:
+        """Return the configuration at q, shape (d,)."""
+        step = np.zeros(self._mechanism.n)
+        step[self._last.partition.q] = q - self._mechanism.independent_part(self._last.q_tree)
+        return newton(self._last.moved(step), 0.0, self._tolerance).at
+
+    def keep(self, q: Array) -> Kinematics:
+        """Return the configuration at the q of an accepted step: where the next ones start."""
+        self._last = self.at(q)
+        return self._last
+
+
+class OwnSigma:
+    """A controller whose z is its own, not the plant's: the inner controller gets the terms there."""
+
+    def __init__(self, inner: Controller, sigma: FromLast) -> None:
+        self.inner, self.sigma = inner, sigma
 
     def u(self, t: float, terms: Terms) -> Array:
         """Return the inner controller's force with this controller's z."""
-        at = self._solve(terms)
+        at = self.sigma.at(terms.q)
         return self.inner.u(t, Terms(terms.mechanism, at, at.rho @ terms.q_dot))
 
-    def keep(self, terms: Terms) -> Kinematics:
-        """Return this controller's z, from which it starts from now on."""
-        self._last = self._solve(terms)
-        return self._last
 
-    def _solve(self, terms: Terms) -> Kinematics:
-        start = self._last or terms.at
-        step = np.zeros(terms.mechanism.n)
-        step[start.partition.q] = terms.q - terms.mechanism.independent_part(start.q_tree)
-        return newton(start.moved(step), 0.0, self.tolerance).at
+@dataclass
+class Loose(LevelSet):
+    """The reduced model whose z, the controller's as well, is solved `FromLast`."""
+
+    sigma: FromLast | None = None
+
+    def _close(self, t: float, numbers: Array, w: Array, tolerance: float) -> Kinematics:
+        return super()._close(t, numbers, w, tolerance) if self.sigma is None else self.sigma.at(numbers)
 
 
 @dataclass(frozen=True)
@@ -92,7 +110,7 @@ def track(
     times : (m,) array
         From 0 on; the run ends with the last.
     tolerance : float, optional
-        Largest |phi| that the plant's sigma takes for closed, m.
+        Largest |phi| that the reduced model's sigma takes for closed, solved `FromLast`, m.
     own : float, optional
         The same of a sigma that the controller solves by itself.
 
@@ -102,31 +120,30 @@ def track(
         The run does not get there.
     """
     loaded = load_scene(scene, {**changes, "t_end": float(times[-1])})
-    controller = OwnSigma(_controller(loaded), own) if own is not None else None
-    prepared = prepare(loaded, controller)
+    prepared, sigma = prepare(loaded), None
+    if own is not None:
+        if prepared.plant.controller is None:
+            raise InputError(f"{loaded.name}: a scene with a controller is needed")
+        sigma = FromLast(prepared.mechanism, prepared.start.at, own)
+        prepared = prepare(loaded, OwnSigma(prepared.plant.controller, sigma))
+    system = prepared.system
     if tolerance is not None:
-        prepared.mechanism.tolerance = tolerance
-    system, place = prepared.system, prepared.mechanism.partition.q
+        assert isinstance(system, LevelSet)
+        sigma = FromLast(prepared.mechanism, prepared.start.at, tolerance)
+        system = Loose(**{x.name: getattr(system, x.name) for x in fields(system)}, sigma=sigma)
     stepper = Stepper(system, prepared.method, loaded.spec.solver, float(times[-1]))
     first = system.terms(0.0, stepper.y)
-    q, opened = [prepared.mechanism.independent_part(first.q_tree)], np.abs(first.phi)
+    q, opened = [first.q], np.abs(first.phi)
     while stepper.solver.status == "running":
         step = stepper.step()
         while len(q) < len(times) and times[len(q)] <= step.t:
             at = system.terms(float(times[len(q)]), step.interpolant(float(times[len(q)])))
-            q.append(prepared.mechanism.tree.to_coordinates(at.q_tree)[place])
+            q.append(at.q)
             opened = np.maximum(np.abs(at.phi), opened)
-        if controller is not None:
-            kept = controller.keep(system.terms(step.t, stepper.solver.y))
+        if sigma is not None:
+            kept = sigma.keep(system.terms(step.t, stepper.solver.y).q)
             opened = np.maximum(np.abs(kept.phi), opened)
     return Track(np.array(q), float(opened.max()))
-
-
-def _controller(scene: Scene) -> Controller:
-    controller = scene_controller(scene, scene_mechanism(scene))
-    if controller is None:
-        raise InputError(f"{scene.name}: a scene with a controller is needed")
-    return controller
 
 
 @dataclass(frozen=True)
