@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import sys
 import tempfile
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -132,6 +134,7 @@ def terms(
     epilog=_examples(
         "ckc run five_bar/tracking --out runs/spf",
         "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
+        "ckc run five_bar/tracking --meshcat --speed 1",
     )
 )
 def run(
@@ -139,17 +142,37 @@ def run(
     changes: Set = None,
     out: Out = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print which terms were evaluated, how often.")] = False,
+    meshcat: Annotated[bool, typer.Option("--meshcat", help="Show it in the browser while it computes.")] = False,
+    speed: Annotated[
+        float | None, typer.Option("--speed", help="With --meshcat: 1 is real time; absent: as it is computed.")
+    ] = None,
+    port: Port = 0,
+    open_browser: Open = False,
     as_json: Json = False,
 ) -> None:
     """Simulate a scene."""
+    _check_view_options(meshcat, speed, port, open_browser)
     scene = ckc_pin.load_scene(what, read_changes("--set", changes or []))
     if scene.spec.controller is not None:
         for warning in ckc_pin.check(scene).warnings:
             errors.print(f"warning: {warning}")
     if out is not None:
         _make_folder(out)
-    with _progress_bar(scene.name) as progress:
-        finished = ckc_pin.simulate(scene, progress=progress, profile=profile)
+    with ExitStack() as stack:
+        view = stack.enter_context(_view(scene, speed, port, open_browser)) if meshcat else None
+        with _progress_bar(scene.name) as progress:
+            watch = None if view is None else view.watch
+            finished = ckc_pin.simulate(scene, progress=progress, watch=watch, profile=profile)
+        code = _report(finished, out, profile, as_json)
+        if view is not None and finished.status != "interrupted":
+            with suppress(KeyboardInterrupt):
+                view.finish(finished, stay=errors.is_terminal)
+    if code != DONE:
+        raise typer.Exit(code)
+
+
+def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: bool) -> int:
+    """Write and print a run; return the exit code."""
     stop = _write(finished, out) if out is not None else None
     if profile:
         errors.print(profile_table(finished))
@@ -159,11 +182,25 @@ def run(
         _print_table(run_table(finished))
         if out is not None:
             print(f"written to {out}")
+    sys.stdout.flush()  # a view may keep the command alive
     if finished.status != "done":
         errors.print(finished.message)
-        raise typer.Exit(STOPPED if finished.status == "stopped" else _interrupted(finished.message))
-    if stop is not None:
-        raise typer.Exit(_interrupted(str(stop)))
+        return STOPPED if finished.status == "stopped" else _interrupted(finished.message)
+    return DONE if stop is None else _interrupted(str(stop))
+
+
+def _check_view_options(meshcat: bool, speed: float | None, port: int, open_browser: bool) -> None:
+    given = [name for name, x in (("--speed", speed), ("--port", port), ("--open", open_browser)) if x]
+    if given and not meshcat:
+        raise InputError(f"{given[0]} goes with --meshcat; give both")
+    if speed is not None and not (math.isfinite(speed) and speed > 0):
+        raise InputError(f"--speed {speed:g}: it must be above zero, 1 is real time")
+
+
+def _view(scene: ckc_pin.Scene, speed: float | None, port: int, open_browser: bool) -> Any:
+    from ckc_pin.view.live import live_view
+
+    return live_view(scene, speed, port, open_browser)
 
 
 @app.command(epilog=_examples("ckc plot runs/reduced runs/spf --out figures"))

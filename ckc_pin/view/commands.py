@@ -6,7 +6,7 @@ listens on every interface, and its commands are a few dictionaries of three.js'
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,20 +17,25 @@ from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 from ckc_pin.view.visuals import Colour
 
 __all__ = [
+    "SEVERAL",
     "Command",
     "Stage",
     "Track",
     "body",
+    "delete",
     "material",
     "polyline",
     "say",
     "set_animation",
     "set_property",
     "set_transform",
+    "several",
     "surface",
 ]
 
 Command = dict[str, Any]
+
+SEVERAL = "several"
 
 _UINT32, _FLOAT32 = 0x16, 0x17  # msgpack-lite's extension types of a Uint32Array and a Float32Array
 _TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # three.js's cylinders lie along y
@@ -64,9 +69,20 @@ class Stage:
         kind, path = command["type"], command["path"]
         if kind == "set_animation":
             self._animation = message
+        elif kind == "delete":
+            self._forget(path)
         else:
             self._messages[f"{kind} {command.get('property', '')}", path] = message
         return message
+
+    def _forget(self, path: str) -> None:
+        """Forget what is at a path and below, the last frame, and the animation."""
+        self._messages = {
+            key: message
+            for key, message in self._messages.items()
+            if not f"{key[1]}/".startswith(f"{path}/") and not key[0].startswith(SEVERAL)
+        }
+        self._animation = None
 
     def messages(self) -> list[bytes]:
         """Return the messages that draw the scene from nothing; the animation needs its objects and comes last."""
@@ -124,6 +140,16 @@ def set_transform(path: str, matrix: Array) -> Command:
 def set_property(path: str, name: str, value: Any) -> Command:
     """Set a property of a three.js object."""
     return {"type": "set_property", "path": path, "property": name, "value": value}
+
+
+def delete(path: str) -> Command:
+    """Take away what is at a path, and everything below it."""
+    return {"type": "delete", "path": path}
+
+
+def several(these: Sequence[Command]) -> Command:
+    """Draw several things in one message, a frame that the next one replaces; our page answers when it is shown."""
+    return {"type": SEVERAL, "path": "", "commands": list(these)}
 
 
 def say(text: str) -> Command:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from hashlib import sha256
 from html import escape
 from importlib.util import find_spec
@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from ckc_pin.errors import InputError
-from ckc_pin.view.commands import Command
+from ckc_pin.view.commands import Command, several
 
 __all__ = ["START_SCRIPT", "page", "standalone", "viewer_script"]
 
@@ -46,7 +46,11 @@ _PREPARE = """"use strict";
 var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
 function say(text) { document.getElementById("said").textContent = text; }
 viewer.handle_command = function (command) {
-  if (command.type === "several") { command.commands.forEach(viewer.handle_command); return; }
+  if (command.type === "several") {
+    command.commands.forEach(viewer.handle_command);
+    if (viewer.connection) { requestAnimationFrame(function () { viewer.connection.send("shown"); }); }
+    return;
+  }
   if (command.type === "say") { say(command.text); return; }
   MeshCat.Viewer.prototype.handle_command.call(viewer, command);
   if (command.type === "set_animation") {
@@ -82,7 +86,7 @@ def page(title: str, lines: Sequence[str]) -> str:
     return _page(title, lines, scripts)
 
 
-def standalone(title: str, lines: Sequence[str], drawing: Iterable[Command]) -> str:
+def standalone(title: str, lines: Sequence[str], drawing: Sequence[Command]) -> str:
     """Return a page with its scene and the viewer in it, which needs no server and no network.
 
     Its own policy lets it run its two scripts and load nothing.
@@ -93,7 +97,7 @@ def standalone(title: str, lines: Sequence[str], drawing: Iterable[Command]) -> 
         meshcat is not installed.
     """
     viewer = viewer_script().decode()
-    data = b64encode(msgspec.msgpack.encode({"type": "several", "commands": list(drawing)})).decode()
+    data = b64encode(msgspec.msgpack.encode(several(drawing))).decode()
     scripts = "\n".join(
         [
             f'<script type="text/plain" id="licenses">\n{_licenses()}</script>',

@@ -17,13 +17,13 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ckc_pin.errors import InputError
-from ckc_pin.view.commands import Command, Stage
+from ckc_pin.view.commands import SEVERAL, Command, Stage
 from ckc_pin.view.page import START_SCRIPT, viewer_script
 
 __all__ = ["ViewServer"]
 
 LOOPBACK = "127.0.0.1"
-MAX_INCOMING = 2**16  # bytes; viewers have nothing to say
+MAX_INCOMING = 2**16  # bytes; viewers have little to say
 GOODBYE = 0.5  # s that a viewer has to answer a closing handshake
 
 # Nothing is loaded from, or sent to, anywhere else. dat.gui writes its own style sheet.
@@ -86,10 +86,13 @@ class ViewServer:
         self._ready.wait()
 
     def send(self, command: Command) -> None:
-        """Draw: for the viewers that are there, and for those to come. From any thread."""
+        """Draw: for the viewers that are there, and for those to come. From any thread, which never waits.
+
+        `several` things make a frame: a viewer that has not shown the last one yet misses all but the newest.
+        """
         with self._drawing:
             message = self.stage.apply(command)
-        self._loop.call_soon_threadsafe(self._show, message)
+        self._loop.call_soon_threadsafe(self._show, message, command["type"] == SEVERAL)
 
     def stop(self) -> None:
         """Close every connection and the port; when this returns the thread is gone."""
@@ -118,15 +121,20 @@ class ViewServer:
         await server.close_all_connections()
         leaving = list(self.viewers)
         for viewer in leaving:
+            if viewer.newest is not None:
+                viewer.show(viewer.newest)
             viewer.close(1001, "stopped")
         if leaving:
             await asyncio.wait([asyncio.ensure_future(viewer.gone.wait()) for viewer in leaving], timeout=GOODBYE)
         for viewer in list(self.viewers):
             viewer.hang_up()
 
-    def _show(self, message: bytes) -> None:
+    def _show(self, message: bytes, frame: bool) -> None:
         for viewer in list(self.viewers):
-            viewer.show(message)
+            if frame:
+                viewer.show_frame(message)
+            else:
+                viewer.show(message)
 
     def welcome(self, viewer: _Viewer) -> None:
         """Draw the scene as it is for a viewer that has just come, and keep it informed."""
@@ -206,6 +214,8 @@ class _Viewer(_Guarded, WebSocketHandler):
         super().initialize(server)
         self.page = page
         self.gone = asyncio.Event()
+        self.busy = False  # with a frame
+        self.newest: bytes | None = None  # frame that came meanwhile
 
     async def get(self, *args: Any, **kwargs: Any) -> None:
         if self.request.headers.get("Upgrade", "").lower() == "websocket":
@@ -228,8 +238,19 @@ class _Viewer(_Guarded, WebSocketHandler):
             return
         sent.add_done_callback(_forget)
 
+    def show_frame(self, message: bytes) -> None:
+        """Show a frame now, or when the one before has been shown and no newer one has come."""
+        if self.busy:
+            self.newest = message
+            return
+        self.busy = True
+        self.show(message)
+
     def on_message(self, message: str | bytes) -> None:
-        pass
+        """Take any message for what our page says, that it has shown a frame."""
+        self.busy, newest, self.newest = False, self.newest, None
+        if newest is not None:
+            self.show_frame(newest)
 
     def on_close(self) -> None:
         self.server.viewers.discard(self)

@@ -7,14 +7,12 @@ import gc
 import os
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from http.client import HTTPConnection
-from pathlib import Path
 from urllib.request import urlopen
 
 import msgspec
@@ -29,6 +27,7 @@ from ckc_pin.view import commands
 from ckc_pin.view.drawing import FEWEST, scene
 from ckc_pin.view.player import play
 from ckc_pin.view.server import ViewServer
+from tests.contract.helpers.viewer import listening, raw_viewer, vanish
 from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_ARM, write_scene
 
 L_PROXIMAL, L_DISTAL, BASE = 0.2794, 0.3048, 0.3048  # of five_bar
@@ -444,20 +443,6 @@ def test_websockets_of_other_pages_are_refused(serve, swing):
         assert refused.value.code == 403
 
 
-def listening() -> set[str]:
-    """Addresses that this process listens on, from the kernel's tables."""
-    own = {
-        os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{n}")
-    }
-    found = set()
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if f"socket:[{fields[9]}]" in own and (table.startswith("udp") or fields[3] == "0A"):
-                found.add(fields[1])
-    return found
-
-
 def test_listens_on_loopback_only(serve, swing):
     before = listening()
     server = serve(swing)
@@ -495,22 +480,9 @@ def test_nothing_is_left_after_stop(swing):
         assert again.port == server.port
 
 
-def raw_viewer(server: ViewServer) -> socket.socket:
-    """A WebSocket opened by hand, which never answers anything."""
-    viewer = socket.create_connection(("127.0.0.1", server.port), timeout=20)
-    viewer.sendall(
-        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-    )
-    assert viewer.recv(12) == b"HTTP/1.1 101"
-    return viewer
-
-
 def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
     server = serve(swing)
-    viewer = raw_viewer(server)
-    viewer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close resets the connection
-    viewer.close()
+    vanish(raw_viewer(server))
     for _ in range(50):
         server.send(commands.polyline("/world/line", np.zeros((5000, 3)), (0, 0, 0)))
     deadline = time.monotonic() + 20

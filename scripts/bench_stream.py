@@ -1,0 +1,82 @@
+"""Prints right-hand sides per second of a run without a view, and with viewers of several kinds, best of several runs.
+
+Seconds are those of the clock, and those of the processor that the whole process took, its view's threads included; the
+second are the steadier where other work goes on. A viewer is a process of its own that speaks the browser's protocol: a
+fast one answers each frame at once, a slow one twice a second, and one that hangs reads nothing at all.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+
+import ckc_pin
+from ckc_pin.view.live import live_view
+
+SCENE = "five_bar/tracking"
+CHANGES = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.output_dt": 1e-3, "t_end": 3.0}
+RUNS = 6
+VIEWERS = {"no view": None, "no viewer": None, "a fast viewer": 0.0, "a slow viewer": 0.5, "a viewer that hangs": -1.0}
+
+VIEWER = """
+import asyncio, sys, time
+from tornado.websocket import WebSocketClosedError, websocket_connect
+
+async def look(url, pause):
+    connection = await websocket_connect(url, max_message_size=2**26)
+    frames = 0
+    print("here", flush=True)
+    if pause < 0:
+        time.sleep(3600)
+    try:
+        while (message := await connection.read_message()) is not None:
+            if b"several" in message[:40]:
+                frames += 1
+                await asyncio.sleep(pause)
+                await connection.write_message("shown")
+    except WebSocketClosedError:
+        pass
+    print(frames)
+
+asyncio.run(look(sys.argv[1], float(sys.argv[2])))
+"""
+
+
+def measure(name: str) -> tuple[float, float, str]:
+    """Right-hand sides per second of one run, by the clock and by the processor; frames that the viewer was sent."""
+    scene = ckc_pin.load_scene(SCENE, CHANGES)
+    viewer, pause = None, VIEWERS[name]
+    with ExitStack() as stack:
+        view = None if name == "no view" else stack.enter_context(live_view(scene, None))
+        if view is not None and pause is not None:
+            command = [sys.executable, "-c", VIEWER, view.server.url.replace("http", "ws"), str(pause)]
+            viewer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            viewer.stdout.readline()
+            time.sleep(0.5)
+        spent = time.process_time()
+        run = ckc_pin.simulate(scene, watch=None if view is None else view.watch)
+        spent = time.process_time() - spent
+    frames = "-"
+    if viewer is not None:
+        if pause < 0:
+            viewer.kill()
+        frames = viewer.communicate()[0].strip() or "-"
+    return run.stats["rhs"] / run.stats["wall_s"], run.stats["rhs"] / spent, frames
+
+
+def main() -> int:
+    """Print a Markdown table."""
+    print(f"{SCENE}, {CHANGES}\n")
+    print("| viewer | per second of the clock | of the processor | share | frames |\n|---|---|---|---|---|")
+    rounds = [{name: measure(name) for name in VIEWERS} for _ in range(RUNS)]  # in turn: other work falls on all
+    best = {name: [max(one[name][k] for one in rounds) for k in (0, 1)] for name in VIEWERS}
+    for name, (clock, processor) in best.items():
+        share = 100 * processor / best["no view"][1]
+        print(f"| {name} | {clock:,.0f} | {processor:,.0f} | {share:.1f} % | {rounds[-1][name][2]} |", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,47 @@
+"""A viewer made by hand, and what a process listens on."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+from pathlib import Path
+
+from ckc_pin.view.server import ViewServer
+
+__all__ = ["listening", "raw_viewer", "vanish"]
+
+
+def raw_viewer(server: ViewServer) -> socket.socket:
+    """A WebSocket opened by hand, which never answers anything."""
+    viewer = socket.create_connection(("127.0.0.1", server.port), timeout=20)
+    viewer.sendall(
+        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+    assert viewer.recv(12) == b"HTTP/1.1 101"
+    return viewer
+
+
+def vanish(viewer: socket.socket) -> None:
+    """Reset the connection, as when a machine goes down."""
+    viewer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    viewer.close()
+
+
+def listening(pid: int | str = "self") -> set[str]:
+    """Addresses that a process listens on, "IP:PORT" in hexadecimals as in the kernel's tables."""
+    folder = Path(f"/proc/{pid}")
+    own = set()
+    for name in os.listdir(folder / "fd"):
+        try:
+            own.add(os.readlink(folder / "fd" / name))
+        except FileNotFoundError:  # closed meanwhile
+            continue
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in (folder / "net" / table).read_text().splitlines()[1:]:
+            fields = line.split()
+            if f"socket:[{fields[9]}]" in own and (table.startswith("udp") or fields[3] == "0A"):
+                found.add(fields[1])
+    return found
