@@ -106,12 +106,16 @@ class LiveView:
             pause(max(0.0, self._began + float(run.t[-1]) / self.speed - perf_counter()))
         self.stop()
         if stay:
-            self.server.send(commands.delete(WORLD))
-            self.server.send(commands.say(""))
-            for command in drawing_of([run], speed=self.speed or 1.0):
-                self.server.send(command)
+            self.play_back(run)
             print(f"played back at {self.server.url}  (Ctrl-C ends)", file=sys.stderr, flush=True)
             Event().wait()
+
+    def play_back(self, run: Run) -> None:
+        """Put the playback of the run in the place of its last instant."""
+        self.server.send(commands.delete(WORLD))
+        self.server.send(commands.say(""))
+        for command in drawing_of([run], speed=self.speed or 1.0):
+            self.server.send(command)
 
     def stop(self) -> None:
         """Draw the last instant; nothing is drawn any more when this returns."""

@@ -92,7 +92,7 @@ class ViewServer:
         """
         with self._drawing:
             message = self.stage.apply(command)
-        self._loop.call_soon_threadsafe(self._show, message, command["type"] == SEVERAL)
+        self._loop.call_soon_threadsafe(self._show, message, command["type"])
 
     def stop(self) -> None:
         """Close every connection and the port; when this returns the thread is gone."""
@@ -129,12 +129,14 @@ class ViewServer:
         for viewer in list(self.viewers):
             viewer.hang_up()
 
-    def _show(self, message: bytes, frame: bool) -> None:
+    def _show(self, message: bytes, kind: str) -> None:
         for viewer in list(self.viewers):
-            if frame:
+            if kind == SEVERAL:
                 viewer.show_frame(message)
-            else:
-                viewer.show(message)
+                continue
+            if kind == "delete":  # nor is a frame to come that would draw it again
+                viewer.newest = None
+            viewer.show(message)
 
     def welcome(self, viewer: _Viewer) -> None:
         """Draw the scene as it is for a viewer that has just come, and keep it informed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 INERTIAL = """<inertial><origin xyz="0.1 0 0"/><mass value="1"/>
@@ -52,6 +53,17 @@ frame_a = {link = "coupler", xyz = [0.5, 0.0, 0.0]}
 frame_b = {link = "rocker", xyz = [0.4, 0.0, 0.0]}
 axis_a = [0.0, 1.0, 0.0]
 """
+
+
+TETRAHEDRON = ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
+FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+
+
+def tetrahedron(path: Path) -> None:
+    """Write a tetrahedron in binary STL."""
+    path.parent.mkdir(exist_ok=True)
+    triangles = [struct.pack("<12fH", 0, 0, 0, *(x for k in face for x in TETRAHEDRON[k]), 0) for face in FACES]
+    path.write_bytes(bytes(80) + struct.pack("<I", len(FACES)) + b"".join(triangles))
 
 
 def write_scene(folder: Path, urdf: str, mechanism: str, scene: str, t_end: float = 0.5) -> Path:

@@ -15,17 +15,16 @@ from ckc_pin.view.drawing import scene
 from ckc_pin.view.gaps import gaps
 from ckc_pin.view.player import play, save_html
 from ckc_pin.view.skeleton import configurations
-from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, write_scene
-
-TETRAHEDRON = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
-FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-
-
-def stl(path: Path) -> None:
-    """A tetrahedron in binary STL."""
-    path.parent.mkdir(exist_ok=True)
-    triangles = [struct.pack("<12fH", 0, 0, 0, *TETRAHEDRON[list(face)].ravel(), 0) for face in FACES]
-    path.write_bytes(bytes(80) + struct.pack("<I", len(FACES)) + b"".join(triangles))
+from tests.contract.sketches import (
+    ARM,
+    FACES,
+    FOUR_BAR,
+    FOUR_BAR_LOOP,
+    START_OF_FOUR_BAR,
+    TETRAHEDRON,
+    tetrahedron,
+    write_scene,
+)
 
 
 def objects(drawing: list[dict]) -> dict[str, dict]:
@@ -61,14 +60,14 @@ def in_order(corners: np.ndarray) -> np.ndarray:
 
 def test_a_mesh_is_drawn_where_its_link_is(tmp_path):
     run = bar(tmp_path / "m", '<mesh filename="shapes/crank.stl" scale="2 1 1"/>')
-    stl(tmp_path / "m" / "shapes" / "crank.stl")
-    expected = np.array([TETRAHEDRON[list(face)] * [2, 1, 1] + [0, 0, 0.3] for face in FACES])
+    tetrahedron(tmp_path / "m" / "shapes" / "crank.stl")
+    expected = np.array([np.array(TETRAHEDRON)[list(face)] * [2, 1, 1] + [0, 0, 0.3] for face in FACES])
     np.testing.assert_allclose(in_order(triangles(scene([run]))), in_order(expected), atol=1e-6)
 
 
 def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, capsys):
     saved = bar(tmp_path / "m", '<mesh filename="package://mine/shapes/crank.stl"/>').save(tmp_path / "run.npz")
-    stl(tmp_path / "m" / "shapes" / "crank.stl")
+    tetrahedron(tmp_path / "m" / "shapes" / "crank.stl")
     run = ckc_pin.Run.load(saved)
     page = save_html(run, tmp_path / "sticks.html")
     assert capsys.readouterr().err == (
@@ -77,7 +76,7 @@ def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, ca
     assert [path for path in objects(scene([run])) if "/joint:alpha/rod:" in path]
     drawing = scene([run], meshes=tmp_path / "m")
     assert not [path for path in objects(drawing) if "/joint:alpha/rod:" in path]
-    expected = np.array([TETRAHEDRON[list(face)] + [0, 0, 0.3] for face in FACES])
+    expected = np.array([np.array(TETRAHEDRON)[list(face)] + [0, 0, 0.3] for face in FACES])
     np.testing.assert_allclose(in_order(triangles(drawing)), in_order(expected), atol=1e-6)
     whole = save_html(run, tmp_path / "meshes.html", meshes=tmp_path / "m")
     assert capsys.readouterr().err == ""
@@ -90,8 +89,7 @@ def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, ca
     "name", ["../crank.stl", "a/../../crank.stl", "{absolute}", "file://{absolute}", "link.stl", ""]
 )
 def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
-    stl(tmp_path / "outside" / "crank.stl")
-    (tmp_path / "outside" / "crank.stl").rename(tmp_path / "crank.stl")
+    tetrahedron(tmp_path / "crank.stl")
     run = bar(tmp_path / "m", f'<mesh filename="{name.format(absolute=tmp_path / "crank.stl")}"/>')
     (tmp_path / "m" / "link.stl").symlink_to(tmp_path / "crank.stl")
     drawn = objects(scene([run]))

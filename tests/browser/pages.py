@@ -1,0 +1,126 @@
+"""Pages in a headless Chromium, and everything they did that a page must not do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+__all__ = ["Visit", "browser", "look_at"]
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "/Applications/Chromium.app/Contents/MacOS/Chromium")
+SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a graphics card
+SANDBOX = [] if os.getuid() else ["--no-sandbox"]  # Chromium's own does not run as root
+PATIENCE = 60.0  # s
+
+# Objects of meshcat's tree by path, their placements in the axes of /world, and what is seen of them.
+TREE = """() => {
+  const found = {};
+  viewer.scene.updateMatrixWorld(true);
+  const world = viewer.scene_tree.find(["world"]).object.matrixWorld.clone().invert();
+  (function walk(node, path) {
+    for (const [name, child] of Object.entries(node.children)) {
+      const one = child.object, here = path + "/" + name;
+      found[here] = {
+        type: one.type, visible: one.visible,
+        matrix: world.clone().multiply(one.matrixWorld).elements,
+        opacity: one.material ? one.material.opacity : null,
+        color: one.material && one.material.color ? one.material.color.getHex() : null,
+        corners: one.geometry ? one.geometry.attributes.position.count : null,
+      };
+      walk(child, here);
+    }
+  })(viewer.scene_tree, "");
+  return found;
+}"""
+
+# Moves the time slider and says where objects are then.
+SEEK = """([times, paths]) => {
+  viewer.animator.pause();
+  const world = viewer.scene_tree.find(["world"]).object;
+  return times.map(time => {
+    viewer.animator.seek(time);
+    viewer.scene.updateMatrixWorld(true);
+    const back = world.matrixWorld.clone().invert();
+    return paths.map(path => {
+      const one = viewer.scene_tree.find(path.split("/").filter(Boolean)).object;
+      return back.clone().multiply(one.matrixWorld).elements;
+    });
+  });
+}"""
+
+
+class Visit:
+    """A page, what it logged, and what it asked for."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        page.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: self.complaints.append(f"error: {error}"))
+        page.on("crash", lambda _: self.complaints.append("crash"))
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("websocket", lambda connection: self.requests.append(connection.url))
+
+    def until(self, condition: str) -> None:
+        """Wait for something to be true; the page's policy forbids that the browser itself evaluates it."""
+        deadline = time.monotonic() + PATIENCE
+        while not self.page.evaluate(f"() => Boolean({condition})"):
+            assert time.monotonic() < deadline, f"{condition}; {self.complaints}"
+            time.sleep(0.05)
+
+    def tree(self) -> dict[str, dict[str, Any]]:
+        """Objects by path."""
+        found: dict[str, dict[str, Any]] = self.page.evaluate(TREE)
+        return found
+
+    def placements(self, times: np.ndarray, paths: list[str]) -> np.ndarray:
+        """Placements (times, paths, 4, 4) in the axes of /world."""
+        columns = self.page.evaluate(SEEK, [times.tolist(), paths])
+        return np.swapaxes(np.array(columns).reshape(len(times), len(paths), 4, 4), 2, 3)
+
+    def caption(self) -> list[str]:
+        """The lines of words on the page."""
+        return [line for line in self.page.locator("#caption").inner_text().splitlines() if line]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """One Chromium for all tests of a file."""
+    where = next(filter(None, map(shutil.which, NAMES)), None)
+    assert where is not None, "no Chromium here: ./scripts/chromium installs it or says how"
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=where, args=[*SOFTWARE, *SANDBOX])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def look_at(browser: Browser) -> Iterator[Callable[..., Visit]]:
+    """Open an address, wait for its scene, and find at the end that the page has not complained about anything."""
+    visits: list[Visit] = []
+
+    @contextmanager
+    def closing() -> Iterator[None]:
+        yield
+        for visit in visits:
+            assert visit.complaints == []
+            visit.page.context.close()
+
+    def look(url: str, until: str = "viewer.animator.actions.length", offline: bool = False) -> Visit:
+        context = browser.new_context(viewport={"width": 960, "height": 540}, offline=offline)
+        visits.append(Visit(context.new_page()))
+        visits[-1].page.goto(url)
+        visits[-1].until(f"window.viewer && {until}")
+        return visits[-1]
+
+    with closing():
+        yield look
