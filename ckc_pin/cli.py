@@ -193,7 +193,12 @@ def _check_view_options(meshcat: bool, speed: float | None, port: int, open_brow
     given = [name for name, x in (("--speed", speed), ("--port", port), ("--open", open_browser)) if x]
     if given and not meshcat:
         raise InputError(f"{given[0]} goes with --meshcat; give both")
-    if speed is not None and not (math.isfinite(speed) and speed > 0):
+    if speed is not None:
+        _check_speed(speed)
+
+
+def _check_speed(speed: float) -> None:
+    if not (math.isfinite(speed) and speed > 0):
         raise InputError(f"--speed {speed:g}: it must be above zero, 1 is real time")
 
 
@@ -233,6 +238,7 @@ def play(
     open_browser: Open = False,
 ) -> None:
     """Play runs back in the browser through meshcat, on this machine only; several lie on each other."""
+    _check_speed(speed)
     loaded = [ckc_pin.Run.load(path) for path in runs]
     if html is None:
         ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, port=port, open_browser=open_browser)
