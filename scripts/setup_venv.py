@@ -1,11 +1,13 @@
 """Make .venv: exact versions, checked hashes, the project editable. Standard library only.
 
-`.venv/ckc_pin-setup` says what .venv was made from. It reads "unfinished" until everything is installed, so
-that what an interrupted start leaves behind is never taken as good.
+`.venv/ckc_pin-setup` says what .venv was made from, packages on its first line and the native core on its second. It
+reads "unfinished" until everything is installed, so that what an interrupted start leaves behind is never taken as
+good. Where the native core alone has changed, it alone is compiled again.
 """
 
 import fcntl
 import hashlib
+import os
 import shutil
 import subprocess
 import sys
@@ -17,6 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 STAMP = VENV / "ckc_pin-setup"
 CONSTRAINTS = ROOT / "constraints.txt"
+NATIVE = ROOT / "ckc_pin" / "native" / "src"
 UNFINISHED = "unfinished\n"
 SIZE = "1.5 GB"  # on disk; a quarter of it comes over the network
 
@@ -42,11 +45,24 @@ def main() -> None:
 
 
 def wanted_stamp() -> str:
-    """Everything that .venv depends on; the place too, since a virtual environment cannot be moved."""
-    digest = hashlib.sha256(f"{sys.version}\n{ROOT}\n".encode())
-    for path in (CONSTRAINTS, ROOT / "pyproject.toml", Path(__file__)):
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest() + "\n"
+    """Everything that .venv depends on; the place too, since a virtual environment cannot be moved.
+
+    Whether there is a compiler counts for the native core: with a new one it is worth another try.
+    """
+    packages = digest(f"{sys.version}\n{ROOT}\n", CONSTRAINTS, ROOT / "pyproject.toml", Path(__file__))
+    native = digest(f"{compiler()}\n", *sorted(NATIVE.iterdir()))
+    return f"{packages}\n{native}\n"
+
+
+def compiler() -> str | None:
+    return next(filter(None, map(shutil.which, (os.environ.get("CXX", "c++"), "c++", "g++", "clang++"))), None)
+
+
+def digest(text: str, *paths: Path) -> str:
+    total = hashlib.sha256(text.encode())
+    for path in paths:
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()
 
 
 def up_to_date() -> bool:
@@ -69,24 +85,39 @@ def one_at_a_time() -> Iterator[int]:
 
 
 def make(lock: int) -> None:
-    clear_away()
-    say(f"making .venv with Python {sys.version.split()[0]}: once only, a minute or more, {SIZE}")
-    VENV.mkdir()
+    packages = wanted_stamp().splitlines()[0]
+    if not (STAMP.exists() and STAMP.read_text().startswith(packages)):
+        clear_away()
+        say(f"making .venv with Python {sys.version.split()[0]}: once only, a minute or more, {SIZE}")
+        VENV.mkdir()
+        STAMP.write_text(UNFINISHED)
+        with removed_on_failure():
+            run_quietly(lock, "venv", [sys.executable, "-I", "-m", "venv", str(VENV)])
+            # Wheels only: building a source package would fetch a build backend whose hash nobody checks.
+            hashed = ["--require-hashes", "--only-binary=:all:", "--progress-bar=off", "-r", str(CONSTRAINTS)]
+            run_with_progress(lock, "pip", [*pip(), *hashed])
     STAMP.write_text(UNFINISHED)
-    try:
-        run_quietly(lock, "venv", [sys.executable, "-I", "-m", "venv", str(VENV)])
-        pip = [str(VENV / "bin" / "python"), "-I", "-m", "pip", "--disable-pip-version-check", "install"]
-        # Wheels only: building a source package would fetch a build backend whose hash nobody checks.
-        hashed = ["--require-hashes", "--only-binary=:all:", "--progress-bar=off", "-r", str(CONSTRAINTS)]
-        run_with_progress(lock, "pip", [*pip, *hashed])
+    with_core = "with the native core, a minute or two" if compiler() else "without a native core: no C++ compiler"
+    say(f"installing ckc_pin {with_core}")
+    with removed_on_failure():
         editable = ["--no-deps", "--no-build-isolation", "--no-index", "--editable", str(ROOT)]
-        run_quietly(lock, "pip", [*pip, *editable])
+        run_quietly(lock, "pip", [*pip(), *editable])
         STAMP.write_text(wanted_stamp())
+    say("done")
+
+
+def pip() -> list[str]:
+    return [str(VENV / "bin" / "python"), "-I", "-m", "pip", "--disable-pip-version-check", "install"]
+
+
+@contextmanager
+def removed_on_failure() -> Iterator[None]:
+    try:
+        yield
     except BaseException:
         with suppress(OSError):
             remove_venv()
         raise
-    say("done")
 
 
 def clear_away() -> None:

@@ -1,0 +1,202 @@
+#include "core.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+namespace ckc {
+
+constexpr double singular = 1e-12;  // relative size of the last pivot of J^T at which its rank counts as lost
+
+static std::vector<Indices> full(int size) {
+  Indices every(size);
+  std::iota(every.begin(), every.end(), 0);
+  return std::vector<Indices>(size, every);
+}
+
+Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_)
+    : tree(model, std::move(place)),
+      rows(tree, std::move(closure)),
+      springs(tree, std::move(table)),
+      n(tree.n),
+      d(0),
+      rank(rank_),
+      qr_(n, std::max(rows.closure.rows, 1)) {
+  const int m = rows.closure.rows;
+  q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
+  C_tree.setZero(n, n);
+  x_.setZero(n), y_.setZero(n), residual_.setZero(m);
+  transposed_.setZero(n, m), whole_.setZero(n, n), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
+  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank, n - rank, full(n - rank));
+  qr_work_.setZero(n), small_.setZero(std::max(rank, n - rank)), small_b_.setZero(n - rank);
+}
+
+void Core::split(Indices q_, Indices z_) {
+  q = std::move(q_), z = std::move(z_);
+  d = static_cast<int>(q.size());
+  const int m = rows.closure.rows, k = static_cast<int>(z.size());
+  Indices at(n, -1);
+  for (int j = 0; j < k; ++j) at[z[j]] = j;
+  std::vector<Indices> pattern(m);
+  for (int i = 0; i < m; ++i)
+    for (int j : rows.pattern[i])
+      if (at[j] >= 0) pattern[i].push_back(at[j]);
+  phi_z.shape(m, k, pattern);
+  phi_z_matrix_.setZero(m, k), D_factor.shape(d, d, full(d));
+  rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
+}
+
+void Core::set(In q_tree_) {
+  q_tree = q_tree_;
+  tree.set(q_tree);
+  rows.set(tree, q_tree);
+}
+
+void Core::factor() {
+  rows.jacobian(tree);
+  for (size_t j = 0; j < z.size(); ++j) phi_z_matrix_.col(j) = rows.J.col(z[j]);
+  phi_z.compute(phi_z_matrix_);
+}
+
+void Core::reduce() {
+  for (int k = 0; k < d; ++k) {
+    residual_ = -rows.J.col(q[k]);
+    phi_z.solve(residual_, z_);
+    for (int i = 0; i < d; ++i) rho(q[i], k) = 0.0;
+    rho(q[k], k) = 1.0;
+    for (size_t i = 0; i < z.size(); ++i) rho(z[i], k) = z_(i);
+  }
+}
+
+void Core::D_times(In x, Out product) const {
+  const Matrix& D_tree = tree.D();
+  product.setZero();
+  for (int j = 0; j < n; ++j) {
+    double sum = 0.0;
+    for (int i : tree.ancestors[j]) {
+      if (i == j) continue;
+      product(i) += D_tree(i, j) * x(j);
+      sum += D_tree(i, j) * x(i);
+    }
+    product(j) += sum + D_tree(j, j) * x(j);
+  }
+}
+
+void Core::velocity(In q_dot, Out v) const {
+  v.setZero();
+  for (int k = 0; k < d; ++k) v += q_dot(k) * rho.col(k);
+}
+
+void Core::reduced(In force, Out generalized) const {
+  for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
+}
+
+void Core::inertia() {
+  tree.inertia(q_tree);
+  for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
+  for (int i = 0; i < d; ++i)
+    for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
+  D_factor.compute(D);
+}
+
+void Core::bias(In v) {
+  v_tree = v;
+  bias_tree = tree.bias(q_tree, v_tree);
+  rows.rates(tree);
+  rows.bias(tree, J_dot_v);
+  if (springs.any || springs.any_damping) springs.set(tree);
+  if (springs.any) {
+    x_.setZero();
+    springs.add_elastic(tree, q_tree, x_);
+    bias_tree -= x_;
+  }
+}
+
+void Core::coriolis(In v) {
+  v_tree = v;
+  C_tree = tree.coriolis(q_tree, v_tree);
+  h_tree = tree.gravity(q_tree);
+  tree.bias(q_tree, v_tree);
+  rows.rates(tree);
+  rows.jacobian_dot(tree, tree.jacobian_dot(q_tree, v_tree));
+  if (springs.any || springs.any_damping) springs.set(tree);
+  if (springs.any) {
+    x_.setZero();
+    springs.add_elastic(tree, q_tree, x_);
+    h_tree -= x_;
+  }
+}
+
+void Core::C_times(In x, Out product) {
+  velocity(x, x_);  // rho x
+  residual_.noalias() = -rows.J_dot * x_;
+  phi_z.solve(residual_, z_);  // of rho_dot x
+  y_.noalias() = C_tree * x_;
+  x_.setZero();
+  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
+  D_times(x_, qr_work_);
+  y_ += qr_work_;
+  reduced(y_, product);
+}
+
+void Core::reduced_acceleration(In u_tree, Out q_ddot) {
+  residual_ = -J_dot_v;
+  phi_z.solve(residual_, z_);  // rho_dot q_dot, J rho = 0 differentiated
+  x_.setZero();
+  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
+  D_times(x_, y_);
+  x_ = u_tree - bias_tree - y_;
+  if (springs.any_damping) springs.add_damping(v_tree, x_);
+  reduced(x_, d_);
+  D_factor.solve(d_, q_ddot);
+}
+
+void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
+  C_times(q_dot, d_);
+  x_ = u_tree - h_tree;
+  if (springs.any_damping) springs.add_damping(v_tree, x_);
+  for (int k = 0; k < d; ++k) d_(k) = rho.col(k).dot(x_) - d_(k);
+  D_factor.solve(d_, q_ddot);
+}
+
+void Core::spf_z_dot(In q_dot, double epsilon, In w, Out z_dot) {
+  phi_z.solve(w, z_dot);
+  for (size_t i = 0; i < z.size(); ++i) z_dot(i) = rho.row(z[i]).dot(q_dot) - z_dot(i) / epsilon;
+}
+
+bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
+  const int m = rows.closure.rows;
+  rows.jacobian(tree);
+  x_.setZero();  // the shortest x with J x = -residual
+  if (m) {
+    transposed_ = rows.J.transpose();
+    qr_.compute(transposed_);
+    const auto& r = qr_.matrixQR();
+    if (rank && !(std::abs(r(rank - 1, rank - 1)) > singular * std::abs(r(0, 0)))) return false;
+    whole_.setIdentity();
+    qr_.householderQ().applyThisOnTheLeft(whole_, qr_work_);
+    for (int i = 0; i < rank; ++i) {  // R^T y = -residual, by rows
+      const int row = qr_.colsPermutation().indices()(i);
+      double value = -(J_dot_v(row) + correction(row));
+      for (int k = 0; k < i; ++k) value -= r(k, i) * small_(k);
+      small_(i) = value / r(i, i);
+      x_ += small_(i) * whole_.col(i);
+    }
+  } else {
+    whole_.setIdentity();
+  }
+  tangent_ = whole_.rightCols(n - rank);
+  for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
+  square_.noalias() = tangent_.transpose() * D_tangent_;
+  D_times(x_, y_);
+  y_ = u_tree - bias_tree - y_;
+  if (springs.any_damping) springs.add_damping(v_tree, y_);
+  square_factor_.compute(square_);
+  small_b_.noalias() = tangent_.transpose() * y_;
+  square_factor_.solve(small_b_, small_.head(n - rank));
+  acceleration = x_;
+  for (int k = 0; k < n - rank; ++k) acceleration += small_(k) * tangent_.col(k);
+  return true;
+}
+
+}  // namespace ckc

@@ -1,0 +1,65 @@
+// A mechanism's terms at one state, and the formulations as functions of them.
+//
+// Everything is kept in the object and overwritten by the next state: nothing is allocated after construction.
+#pragma once
+
+#include <Eigen/QR>
+
+#include "linear.hpp"
+#include "rows.hpp"
+#include "springs.hpp"
+
+namespace ckc {
+
+class Core {
+ public:
+  Core(const std::string& model, Indices place, Closure closure, SpringTable springs, int rank);
+
+  void split(Indices q, Indices z);  // the partition q' = [q; z]
+
+  Tree tree;
+  Rows rows;
+  Springs springs;
+  int n, d, rank;
+  Indices q, z;
+
+  // --- at a configuration ---
+  void set(In q_tree);        // phi and placements
+  void factor();              // J and phi_z's factorization
+  void reduce();              // rho, eq. 5
+  Vector q_tree;
+  Factor phi_z;
+  Matrix rho;                 // (n, d)
+  void solve_z(In b, Out x) { phi_z.solve(b, x); }
+
+  // --- at a velocity ---
+  void inertia();             // D' and D
+  void bias(In v_tree);       // C'v + h' less springs, J_dot v
+  void coriolis(In v_tree);   // C', h' less springs and J_dot, each as a matrix
+  void D_times(In x, Out product) const;
+  void velocity(In q_dot, Out v) const;   // rho q_dot
+  void reduced(In force, Out generalized) const;  // rho^T force
+  void C_times(In x, Out product);        // after coriolis
+  Vector v_tree, bias_tree, h_tree, J_dot_v;
+  Matrix D, C_tree;
+  Factor D_factor;
+
+  // --- accelerations ---
+  // Eq. 6 at v' = rho q_dot; and at any v' that C takes its velocity from ("actual").
+  void reduced_acceleration(In u_tree, Out q_ddot);
+  void actual_acceleration(In u_tree, In q_dot, Out q_ddot);
+  void spf_z_dot(In q_dot, double epsilon, In w, Out z_dot);
+  // Eq. 1 by projection on the tangent space of the closure; false where J has lost rank.
+  bool dae_acceleration(In u_tree, In correction, Out acceleration);
+
+ private:
+  Matrix phi_z_matrix_, D_rho_, tangent_, D_tangent_;
+  Vector x_, y_, residual_, z_, d_;
+  std::vector<Indices> every_;
+  Eigen::ColPivHouseholderQR<Matrix> qr_;
+  Matrix transposed_, whole_, square_;
+  Factor square_factor_;
+  Vector qr_work_, small_, small_b_;
+};
+
+}  // namespace ckc

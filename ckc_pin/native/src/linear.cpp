@@ -1,0 +1,128 @@
+#include "linear.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <utility>
+
+namespace ckc {
+
+void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
+  rows_ = rows, columns_ = columns, pattern_ = pattern;
+  Indices first(columns, rows);
+  for (int i = rows - 1; i >= 0; --i)
+    for (int j : pattern[i]) first[j] = i;
+  column_at_.resize(columns), place_of_.resize(columns);
+  std::iota(column_at_.begin(), column_at_.end(), 0);
+  std::stable_sort(column_at_.begin(), column_at_.end(), [&](int a, int b) { return first[a] < first[b]; });
+  for (int k = 0; k < columns; ++k) place_of_[column_at_[k]] = k;
+  work_.setZero(std::max(rows, columns));
+  if (rows == columns) {
+    lu_.setZero(rows, columns);
+    low_.resize(rows), high_.resize(rows), row_at_.resize(rows), below_.resize(rows);
+    for (auto& touched : below_) touched.reserve(rows);
+  } else {
+    qr_.setZero(rows, columns);
+    tau_.setZero(columns);
+  }
+}
+
+void Factor::compute(const Matrix& a) {
+  singular_ = false, sign_ = 1.0;
+  if (rows_ != columns_) {
+    qr_ = a;
+    return householder();
+  }
+  for (int i = 0; i < rows_; ++i) {
+    row_at_[i] = i;
+    lu_.row(i).setZero();
+    low_[i] = columns_, high_[i] = 0;
+    for (int j : pattern_[i]) {
+      const int k = place_of_[j];
+      lu_(i, k) = a(i, j);
+      low_[i] = std::min(low_[i], k), high_[i] = std::max(high_[i], k + 1);
+    }
+  }
+  eliminate();
+}
+
+void Factor::eliminate() {
+  for (int k = 0; k < rows_; ++k) {
+    int best = k;
+    double largest = -1.0;
+    for (int i = k; i < rows_; ++i) {
+      const int row = row_at_[i];
+      if (low_[row] > k) continue;
+      const double size = std::abs(lu_(row, k));
+      if (size > largest || std::isnan(size)) largest = size, best = i;
+    }
+    if (!(largest > 0.0)) singular_ = true;
+    if (best != k) std::swap(row_at_[k], row_at_[best]), sign_ = -sign_;
+    const int pivot = row_at_[k], end = high_[pivot];
+    const double diagonal = lu_(pivot, k);
+    if (diagonal < 0.0) sign_ = -sign_;
+    below_[k].clear();
+    for (int i = k + 1; i < rows_; ++i) {
+      const int row = row_at_[i];
+      if (low_[row] > k || lu_(row, k) == 0.0) continue;
+      const double factor = lu_(row, k) / diagonal;
+      lu_(row, k) = factor;
+      for (int j = k + 1; j < end; ++j) lu_(row, j) -= factor * lu_(pivot, j);
+      high_[row] = std::max(high_[row], end);
+      below_[k].push_back(row);
+    }
+  }
+}
+
+void Factor::householder() {
+  for (int k = 0; k < columns_; ++k) {
+    auto x = qr_.col(k).tail(rows_ - k);
+    const double norm = x.norm(), beta = x(0) > 0.0 ? -norm : norm;
+    if (!(norm > 0.0)) {
+      singular_ = true;
+      tau_(k) = 0.0;
+      continue;
+    }
+    tau_(k) = (beta - x(0)) / beta;
+    x.tail(rows_ - k - 1) /= x(0) - beta;
+    x(0) = beta;
+    for (int j = k + 1; j < columns_; ++j) {
+      auto y = qr_.col(j).tail(rows_ - k);
+      const auto v = x.tail(rows_ - k - 1);
+      const double along = tau_(k) * (y(0) + v.dot(y.tail(rows_ - k - 1)));
+      y(0) -= along;
+      y.tail(rows_ - k - 1) -= along * v;
+    }
+  }
+}
+
+void Factor::solve(In b, Out x) {
+  if (rows_ != columns_) {
+    work_.head(rows_) = b;
+    for (int k = 0; k < columns_; ++k) {
+      const auto v = qr_.col(k).tail(rows_ - k - 1);
+      const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+      work_(k) -= along;
+      work_.segment(k + 1, rows_ - k - 1) -= along * v;
+    }
+    for (int k = columns_ - 1; k >= 0; --k) {
+      const int rest = columns_ - k - 1;
+      work_(k) = (work_(k) - qr_.row(k).tail(rest).dot(work_.segment(k + 1, rest))) / qr_(k, k);
+    }
+    x = work_.head(columns_);
+    return;
+  }
+  work_.head(rows_) = b;
+  for (int k = 0; k < rows_; ++k) {
+    const double value = work_(row_at_[k]);
+    for (int row : below_[k]) work_(row) -= lu_(row, k) * value;
+  }
+  for (int k = rows_ - 1; k >= 0; --k) {
+    const int row = row_at_[k];
+    double value = work_(row);
+    for (int j = k + 1; j < high_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
+    x(column_at_[k]) = value / lu_(row, k);
+  }
+}
+
+}  // namespace ckc

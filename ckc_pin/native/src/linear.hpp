@@ -1,0 +1,39 @@
+// Factorizations without allocation after the first use.
+#pragma once
+
+#include "types.hpp"
+
+namespace ckc {
+
+// LU with row pivoting of a square matrix, QR of a tall one, with solves by either.
+//
+// The rows of a closure that hold one loop meet few columns. Each row keeps the interval of its entries that are not
+// zero, and elimination works on the intervals: with the columns in the order in which the rows meet them, loops
+// that are independent cost what each costs alone, and a chain of loops what a band costs.
+class Factor {
+ public:
+  // Columns in the order of the first row that meets them, by the pattern of a (rows, columns) matrix.
+  void shape(int rows, int columns, const std::vector<Indices>& pattern);
+  void compute(const Matrix& a);      // entries outside the pattern are not read
+  void solve(In b, Out x);            // least squares when tall
+  bool singular() const { return singular_; }
+  double determinant_sign() const { return sign_; }
+
+ private:
+  void eliminate();
+  void householder();
+
+  int rows_ = 0, columns_ = 0;
+  std::vector<Indices> pattern_;
+  Indices column_at_;                 // column_at_[k]: which column of the matrix is the k-th here
+  Indices place_of_;                  // its inverse
+  Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
+  Matrix qr_;
+  Vector tau_, work_;
+  Indices low_, high_, row_at_;       // intervals, and where pivoting put the rows
+  std::vector<Indices> below_;        // rows that elimination of a column touched, by original row
+  bool singular_ = false;
+  double sign_ = 1.0;
+};
+
+}  // namespace ckc

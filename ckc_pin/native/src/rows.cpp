@@ -1,0 +1,219 @@
+#include "rows.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <set>
+
+namespace ckc {
+
+namespace {
+
+Vector6 force(const Vector3& at, const Vector3& along) {
+  Vector6 w;
+  w << along, at.cross(along);
+  return w;
+}
+
+// The rate of `force`.
+Vector6 force_rate(const Vector3& at, const Vector3& along, const Vector3& at_dot, const Vector3& along_dot) {
+  Vector6 w;
+  w << along_dot, at_dot.cross(along) + at.cross(along_dot);
+  return w;
+}
+
+Vector6 torque(const Vector3& about) {
+  Vector6 w;
+  w << Vector3::Zero(), about;
+  return w;
+}
+
+Matrix3 skew(const Vector3& a) {
+  Matrix3 m;
+  m << 0, -a(2), a(1), a(2), 0, -a(0), -a(1), a(0), 0;
+  return m;
+}
+
+// c(theta) of Jlog(u) = 1 + [u]/2 + c [u]^2, and c'(theta)/theta; series near zero.
+void log_coefficient(const Vector3& u, double& c, double& c_rate) {
+  const double s = u.squaredNorm();
+  if (s < 0.01) {
+    c = 1.0 / 12 + s / 720 + s * s / 30240 + s * s * s / 1209600 + s * s * s * s / 47900160;
+    c_rate = 1.0 / 360 + s / 7560 + s * s / 201600 + s * s * s / 5987520;
+    return;
+  }
+  const double t = std::sqrt(s), cotangent = 1 / std::tan(t / 2), sine = std::sin(t / 2);
+  c = 1 / s - cotangent / (2 * t);
+  c_rate = (-2 / (s * t) + cotangent / (2 * s) + 1 / (4 * t * sine * sine)) / t;
+}
+
+}  // namespace
+
+Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
+  const Closure& c = closure;
+  pairs_ = static_cast<int>(c.point_joint.size()) / 2;
+  p_.resize(2 * pairs_), p_dot_.resize(2 * pairs_), r_.resize(pairs_), r_dot_.resize(pairs_);
+  e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
+  velocity_.resize(tree.joints);
+  wrenches_.resize(c.rows), pattern.resize(c.rows);
+  const auto joints = [&](int out, std::initializer_list<int> list) {
+    for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
+  };
+  for (const auto& row : c.components)
+    joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair], c.direction_joint[row.direction]});
+  for (const auto& row : c.dots) joints(row.out, {c.direction_joint[row.a], c.direction_joint[row.b]});
+  for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair]});
+  for (const auto& rows : c.logs)
+    for (int out : rows.out) joints(out, {rows.joint_a, rows.joint_b});
+  phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
+  for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
+  for (int i = 0; i < c.rows; ++i) {
+    std::set<int> columns;
+    for (const auto& wrench : wrenches_[i]) {
+      const auto& support = tree.support[wrench.joint];
+      columns.insert(support.begin(), support.end());
+    }
+    for (int j = 0; j < tree.n; ++j)
+      if (J(i, j) != 0.0) columns.insert(j);
+    pattern[i].assign(columns.begin(), columns.end());
+  }
+}
+
+void Rows::set(const Tree& tree, In q) {
+  const Closure& c = closure;
+  for (size_t k = 0; k < p_.size(); ++k)
+    p_[k] = tree.rotation(c.point_joint[k]) * c.point_local[k] + tree.translation(c.point_joint[k]);
+  for (int k = 0; k < pairs_; ++k) r_[k] = p_[k] - p_[pairs_ + k];
+  for (size_t k = 0; k < e_.size(); ++k) e_[k] = tree.rotation(c.direction_joint[k]) * c.direction_local[k];
+  for (const auto& row : c.components) {
+    const Vector3 &e = e_[row.direction], &r = r_[row.pair];
+    auto& w = wrenches_[row.out];
+    phi(row.out) = e.dot(r);
+    w[0].w = force(p_[row.pair], e);
+    w[1].w = -force(p_[pairs_ + row.pair], e);
+    w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
+  }
+  for (const auto& row : c.dots) {
+    auto& w = wrenches_[row.out];
+    phi(row.out) = e_[row.a].dot(e_[row.b]);
+    w[0].w = torque(e_[row.a].cross(e_[row.b]));
+    w[1].w = -w[0].w;
+  }
+  for (const auto& row : c.distances) {
+    const Vector3 along = r_[row.pair] / row.length;
+    auto& w = wrenches_[row.out];
+    phi(row.out) = (r_[row.pair].squaredNorm() - row.length * row.length) / (2 * row.length);
+    w[0].w = force(p_[row.pair], along);
+    w[1].w = -force(p_[pairs_ + row.pair], along);
+  }
+  for (const auto& row : c.affine) {
+    double value = -row.offset;
+    for (int j : pattern[row.out]) value += row.coefficients(j) * q(tree.place[j]);
+    phi(row.out) = value;
+  }
+  relative(tree);
+}
+
+void Rows::relative(const Tree& tree) {
+  for (const auto& rows : closure.logs) {
+    const Matrix3 r_a = tree.rotation(rows.joint_a) * rows.rotation_a;
+    const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
+    const Vector3 u = log3(r_a.transpose() * r_b);
+    double c, c_rate;
+    log_coefficient(u, c, c_rate);
+    const Matrix3 s = skew(u);
+    const Matrix3 m = (Matrix3::Identity() + s / 2 + c * s * s) * r_b.transpose();
+    for (int k = 0; k < 3; ++k) {
+      auto& w = wrenches_[rows.out[k]];
+      phi(rows.out[k]) = u(k);
+      w[1].w = torque(m.row(k));
+      w[0].w = -w[1].w;
+    }
+  }
+}
+
+void Rows::rates(const Tree& tree) {
+  const Closure& c = closure;
+  for (size_t k = 0; k < p_.size(); ++k) {
+    const Vector6 v = tree.velocity(c.point_joint[k]);
+    p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);
+  }
+  for (int k = 0; k < pairs_; ++k) r_dot_[k] = p_dot_[k] - p_dot_[pairs_ + k];
+  for (size_t k = 0; k < e_.size(); ++k)
+    e_dot_[k] = Vector3(tree.velocity(c.direction_joint[k]).tail<3>()).cross(e_[k]);
+  for (const auto& row : c.components) {
+    const int a = row.pair, b = pairs_ + row.pair;
+    const Vector3 &e = e_[row.direction], &e_dot = e_dot_[row.direction];
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = force_rate(p_[a], e, p_dot_[a], e_dot);
+    w[1].w_dot = -force_rate(p_[b], e, p_dot_[b], e_dot);
+    w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
+  }
+  for (const auto& row : c.dots) {
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = torque(e_dot_[row.a].cross(e_[row.b]) + e_[row.a].cross(e_dot_[row.b]));
+    w[1].w_dot = -w[0].w_dot;
+  }
+  for (const auto& row : c.distances) {
+    const int a = row.pair, b = pairs_ + row.pair;
+    const Vector3 along = r_[row.pair] / row.length, along_dot = r_dot_[row.pair] / row.length;
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = force_rate(p_[a], along, p_dot_[a], along_dot);
+    w[1].w_dot = -force_rate(p_[b], along, p_dot_[b], along_dot);
+  }
+  relative_rates(tree);
+}
+
+void Rows::relative_rates(const Tree& tree) {
+  for (const auto& rows : closure.logs) {
+    const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
+    const Vector3 omega_b = tree.velocity(rows.joint_b).tail<3>();
+    const Vector3 omega = omega_b - tree.velocity(rows.joint_a).tail<3>();
+    Vector3 u;
+    for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
+    double c, c_rate;
+    log_coefficient(u, c, c_rate);
+    const Matrix3 s = skew(u), j_log = Matrix3::Identity() + s / 2 + c * s * s;
+    const Vector3 u_dot = j_log * (r_b.transpose() * omega);
+    const Matrix3 s_dot = skew(u_dot);
+    const Matrix3 j_log_dot = s_dot / 2 + c_rate * u.dot(u_dot) * s * s + c * (s_dot * s + s * s_dot);
+    // d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
+    const Matrix3 m_dot = j_log_dot * r_b.transpose() - j_log * r_b.transpose() * skew(omega_b);
+    for (int k = 0; k < 3; ++k) {
+      auto& w = wrenches_[rows.out[k]];
+      w[1].w_dot = torque(m_dot.row(k));
+      w[0].w_dot = -w[1].w_dot;
+    }
+  }
+}
+
+void Rows::jacobian(const Tree& tree) {
+  const Matrix6x& columns = tree.jacobian();
+  for (int i = 0; i < closure.rows; ++i) {
+    if (wrenches_[i].empty()) continue;  // affine: it stays as it is
+    for (int j : pattern[i]) J(i, j) = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      for (int j : tree.support[wrench.joint]) J(i, j) += wrench.w.dot(columns.col(j));
+  }
+}
+
+void Rows::jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
+  const Matrix6x& columns = tree.jacobian();
+  for (int i = 0; i < closure.rows; ++i) {
+    for (int j : pattern[i]) J_dot(i, j) = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      for (int j : tree.support[wrench.joint])
+        J_dot(i, j) += wrench.w.dot(columns_dot.col(j)) + wrench.w_dot.dot(columns.col(j));
+  }
+}
+
+void Rows::bias(const Tree& tree, Out J_dot_v) const {
+  for (int i = 0; i < closure.rows; ++i) {
+    double value = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      if (wrench.joint)
+        value += wrench.w.dot(tree.acceleration(wrench.joint)) + wrench.w_dot.dot(tree.velocity(wrench.joint));
+    J_dot_v(i) = value;
+  }
+}
+
+}  // namespace ckc

@@ -1,0 +1,35 @@
+// Springs and dampers between frames or on joints, constant forces.
+#pragma once
+
+#include "tree.hpp"
+
+namespace ckc {
+
+struct SpringTable {
+  Indices point_joint;  // the ends A of all springs between frames, then the ends B
+  std::vector<Vector3> point_local;
+  Vector stiffness, rest_length, damping;  // (springs)
+  Vector joint_stiffness, joint_rest, joint_damping, constant;  // (n)
+};
+
+class Springs {
+ public:
+  Springs(const Tree& tree, SpringTable table);
+
+  bool any, any_damping;
+
+  void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
+  void add_elastic(const Tree& tree, In q, Out force) const;
+  void add_damping(In v, Out force) const;
+  void add_damping_gradient(Matrix& gradient) const;  // of the force along v'
+  double energy(const Tree& tree, In q) const;
+
+ private:
+  SpringTable table_;
+  int count_;
+  std::vector<Indices> pattern_;
+  Vector length_;
+  Matrix jacobian_;  // of the lengths, (springs, n)
+};
+
+}  // namespace ckc

@@ -1,0 +1,55 @@
+// The tree: Pinocchio's model and one workspace for it. The only file that sees Pinocchio is tree.cpp.
+#pragma once
+
+#include <memory>
+#include <string>
+
+#include "types.hpp"
+
+namespace ckc {
+
+// Pinocchio computes into one workspace: what `place` gives is read before the next call, what `bias` gives too.
+class Tree {
+ public:
+  // A model as Pinocchio serializes it, and where the coordinate of each tangent direction stands in q'.
+  Tree(const std::string& serialized, Indices place);
+  ~Tree();
+
+  int n, nq, joints;
+  bool flat;                      // n = nq: every joint is one number
+  Indices place;                  // (n)
+  std::vector<Indices> support;   // by joint: the tangent coordinates that move it, ascending
+  std::vector<Indices> ancestors; // by coordinate: those at or above it on its branch, where D' is not zero
+
+  // Placements of all joints, and the Jacobian in world axes.
+  void set(In q);
+  const Matrix6x& jacobian() const;
+  Matrix3 rotation(int joint) const;
+  Vector3 translation(int joint) const;
+
+  // D', upper triangle, with everything that `set` gives.
+  void inertia(In q);
+  const Matrix& D() const;
+
+  // C'v + h', and the spatial velocities of all joints with what of their accelerations is there at dv/dt = 0.
+  const Vector& bias(In q, In v);
+  Vector6 velocity(int joint) const;      // world axes, at the world's origin: (linear, angular)
+  Vector6 acceleration(int joint) const;  // J_dot v
+
+  const Vector& gravity(In q);               // h'
+  const Matrix& coriolis(In q, In v);        // C', Christoffel
+  const Matrix6x& jacobian_dot(In q, In v);  // d/dt of `jacobian`
+  double potential_energy(In q);
+
+ private:
+  struct Workspace;
+  std::unique_ptr<Workspace> own;
+};
+
+// The rotation vector of a rotation, angle at most pi.
+Vector3 log3(const Matrix3& rotation);
+
+// The version of Pinocchio that this was compiled against.
+std::string pinocchio_version();
+
+}  // namespace ckc

@@ -1,0 +1,105 @@
+"""The native core against the Python rooms: the same terms and right-hand sides at random states."""
+
+import numpy as np
+import pytest
+
+from ckc_pin.dynamics import Terms, dae_acceleration, reduced_acceleration
+from ckc_pin.mechanism.library import load, shipped
+from ckc_pin.native.tables import make_core
+
+STATES = 200
+SPREAD = 0.3  # rad or m around the assembled configuration, off the closure
+TREE = ("D_tree", "C_tree", "h_tree", "bias_tree")
+CLOSURE = ("phi", "rho", "rho_dot", "D", "C", "h")
+
+
+def _states(mechanism, seed=0):
+    """The assembled configuration, then others around it on which z is determined; velocities of any kind."""
+    random = np.random.default_rng(seed)
+    for k in range(STATES):
+        step = SPREAD * (k > 0) * random.standard_normal(mechanism.n)
+        at = mechanism.kinematics(mechanism.tree.integrate(mechanism.q_tree, step))
+        yield Terms(mechanism, at, random.standard_normal(mechanism.n)), random.standard_normal(mechanism.n)
+
+
+def _tolerance(terms):
+    """1e-12; what rounding makes of an ill-conditioned phi_z, 1e-10 at most, on either side."""
+    condition = np.linalg.cond(terms.at.phi_z) if terms.at.phi_z.size else 1.0
+    return float(np.clip(np.finfo(float).eps / 2 * condition, 1e-12, 1e-10))
+
+
+def _sizes(terms):
+    """What the terms of a sum amount to before they cancel: what a result can be accurate relative to."""
+    at = terms.at
+    rho = np.abs(at.rho)
+    inverse = np.abs(np.linalg.pinv(at.phi_z)) if at.phi_z.size else np.zeros((0, 0))
+    rho_dot = np.zeros_like(rho)
+    rho_dot[at.partition.z] = inverse @ np.abs(terms.J_dot) @ rho
+    sizes = {name: np.abs(getattr(terms, name)) for name in (*TREE, "J_dot", "D")}
+    sizes["phi"] = np.full(at.phi.shape, terms.mechanism.size)
+    sizes["rho"] = 1 + inverse @ np.abs(at.phi_q) if at.phi_q.size else rho
+    sizes["rho_dot"] = rho_dot
+    sizes["h"] = rho.T @ sizes["h_tree"]
+    sizes["C"] = rho.T @ (sizes["D_tree"] @ rho_dot + sizes["C_tree"] @ rho)
+    gravity = np.linalg.norm(terms.mechanism.tree.model.gravity.linear)  # taken off again on the native side
+    sizes["J_dot_v"] = np.abs(terms.J_dot) @ np.abs(terms.v_tree) + gravity
+    return {name: float(np.max(size, initial=1e-300)) for name, size in sizes.items()}
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_terms_are_pythons(name):
+    mechanism = load(name)
+    core = make_core(mechanism)
+    for terms, _ in _states(mechanism):
+        found, sizes, tolerance = core.terms(terms.q_tree, terms.v_tree), _sizes(terms), _tolerance(terms)
+        wanted = {quantity: getattr(terms, quantity) for quantity in (*TREE, *CLOSURE, "J_dot")}
+        wanted["J_dot_v"] = terms.J_dot @ terms.v_tree
+        for quantity, value in wanted.items():
+            assert np.abs(found[quantity] - value).max(initial=0.0) <= tolerance * sizes[quantity], quantity
+        assert np.abs(found["J"] - terms.at.J).max(initial=0.0) <= tolerance * np.abs(terms.at.J).max(initial=1.0)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_right_hand_sides_are_pythons(name):
+    mechanism = load(name)
+    core = make_core(mechanism)
+    for terms, u_tree in _states(mechanism, seed=1):
+        q_tree, v_tree = terms.q_tree, terms.v_tree
+        q_dot, tolerance = terms.q_dot, _tolerance(terms)
+        tangent = Terms(mechanism, terms.at, terms.at.rho @ q_dot)
+        force = float(np.abs(terms.rho.T).max() * (np.abs(u_tree) + np.abs(tangent.bias_tree)).max())
+        moving = np.abs(tangent.rho_dot @ q_dot).max() * np.abs(terms.D_tree).max() * np.abs(terms.rho).max()
+        size = np.abs(np.linalg.inv(terms.D)).max() * (force + moving) * mechanism.n
+        found = core.reduced_acceleration(q_tree, q_dot, tangent.v_tree, u_tree, False)
+        assert np.abs(found - reduced_acceleration(tangent, u_tree)).max() <= tolerance * size
+        found = core.reduced_acceleration(q_tree, q_dot, v_tree, u_tree, True)
+        assert np.abs(found - reduced_acceleration(terms, u_tree, q_dot)).max() <= tolerance * size
+        correction = terms.J_dot @ u_tree  # in the range of J, as every correction is
+        wanted = dae_acceleration(terms, u_tree, correction)
+        found = core.dae_acceleration(q_tree, v_tree, u_tree, correction)
+        assert np.abs(found - wanted).max() <= max(tolerance, 1e-11) * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_none_are_refused(bad):
+    mechanism = load("five_bar")
+    core = make_core(mechanism)
+    good = {"q_tree": mechanism.q_tree, "v_tree": np.zeros(4), "u_tree": np.zeros(4), "correction": np.zeros(2)}
+    for name, value in good.items():
+        spoilt = value.copy()
+        spoilt[-1] = bad
+        with pytest.raises(ValueError, match=f"{name}: a number is not finite"):
+            core.dae_acceleration(**{**good, name: spoilt})
+        with pytest.raises(ValueError, match=f"{name}: {len(value)} numbers are needed, got {len(value) + 1}"):
+            core.dae_acceleration(**{**good, name: np.append(value, 0.0)})
+
+
+@pytest.mark.parametrize(
+    ("q", "z", "says"),
+    [([0, 2], [1, 4], "4 is none of 0 to 3"), ([0, 2], [1, 2], "named twice"), ([0, 2], [1], "is missing"),
+     ([-1, 2], [1, 3], "-1 is none of"), ([2], [0, 1, 3], "more dependent coordinates than rows")],
+)  # fmt: skip
+def test_partitions_that_are_none_are_refused(q, z, says):
+    core = make_core(load("five_bar"))
+    with pytest.raises(ValueError, match=says):
+        core.split(q, z)
