@@ -312,6 +312,30 @@ def import_(
     _print_table(check_table(found) if found else f"check: {problem}")
 
 
+@app.command(epilog=_examples("ckc export five_bar --to mjcf > five_bar.xml", "ckc export mine --to mjcf --out models"))
+def export(
+    mechanism: Annotated[str, typer.Argument(help="A mechanism.", metavar="MECHANISM")],
+    to: Annotated[str, typer.Option("--to", help="mjcf: a model of MuJoCo.")] = "mjcf",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to; absent: print it.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Write a mechanism for another program, and say what moves otherwise there."""
+    from ckc_pin.mechanism import exporting
+
+    found = exporting.export(ckc_pin.load(mechanism), to)
+    written = [] if out is None else [exporting.write(found, out, overwrite)]
+    if as_json:
+        text = {} if written else {"text": found.text}
+        _print_json({"status": "done", "written": [str(path) for path in written], **text, "differs": found.differs})
+        return
+    print("\n".join(f"written: {path}" for path in written) if written else found.text)
+    for difference in found.differs:
+        (print if written else errors.print)(f"differs: {difference}")
+
+
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
     as_json = "--json" in sys.argv

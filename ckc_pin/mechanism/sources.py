@@ -1,4 +1,4 @@
-"""Where texts come from: a folder, a package of robots, or the texts that a saved run carries."""
+"""Where texts come from: a folder, a package of robots, or the texts that a saved run carries. And where they go."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.toml import read_text
 
-__all__ = ["Sources", "resolve"]
+__all__ = ["Sources", "resolve", "write_texts"]
 
 PACKAGE = "package://"
 
@@ -63,6 +63,26 @@ def resolve(file: str, folder: Path, where: str) -> Path:
             return path
     raise InputError(f"{where}: {file!r}: no package {package!r} is installed; example-robot-data is one: "
                      "pip install example-robot-data")  # fmt: skip
+
+
+def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list[Path]:
+    """Write texts by file name into a folder, which is made if it is not there.
+
+    Raises
+    ------
+    InputError
+        A file is there already and may not be replaced, or the folder cannot be written to.
+    """
+    there = [str(folder / file) for file in texts if (folder / file).exists()]
+    if there and not overwrite:
+        raise InputError(f"{' and '.join(there)}: there already; write elsewhere with --out DIR, or say --overwrite")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    return [folder / file for file in texts]
 
 
 def _shares() -> list[Path]:

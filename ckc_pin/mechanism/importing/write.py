@@ -10,9 +10,9 @@ from typing import Any
 
 import msgspec
 
-from ckc_pin.errors import InputError
 from ckc_pin.mechanism.importing.draft import Draft
 from ckc_pin.mechanism.library import MECHANISM_FILE
+from ckc_pin.mechanism.sources import write_texts
 
 __all__ = ["mechanism_text", "write"]
 
@@ -35,17 +35,8 @@ def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
     InputError
         A file is there already, or the folder cannot be written to.
     """
-    texts = {folder / MECHANISM_FILE: mechanism_text(draft), folder / draft.urdf_file: draft.urdf()}
-    there = [str(path) for path in texts if path.exists()]
-    if there and not overwrite:
-        raise InputError(f"{' and '.join(there)}: there already; write elsewhere with --out DIR, or say --overwrite")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, text in texts.items():
-            path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
-    return list(texts)
+    texts = {MECHANISM_FILE: mechanism_text(draft), draft.urdf_file: draft.urdf()}
+    return write_texts(folder, texts, overwrite)
 
 
 def mechanism_text(draft: Draft) -> str:

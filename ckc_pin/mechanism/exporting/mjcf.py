@@ -1,0 +1,159 @@
+"""MuJoCo's MJCF: bodies and joints from Pinocchio's tree, so that both programs have the same D', C' and h'."""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import numpy as np
+
+from ckc_pin.mechanism.exporting.mjcf_loops import Sites, add_loops, add_springs, numbers, quaternion
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["mjcf"]
+
+LEAST = 1e-12  # kg, kg m^2: MuJoCo refuses a moving body without
+THICKNESS = 0.03  # of the mechanism's size: the sticks that it is drawn with
+SHORT = 1e-6  # of the size: a stick of no length
+
+
+def mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
+    """Return a MuJoCo model, and what differs in it.
+
+    Joints, bodies and motors have the mechanism's names; body frames are Pinocchio's joint frames. The key
+    frame "assembled" is the assembled configuration.
+
+    Raises
+    ------
+    InputError
+        A loop that MuJoCo has no equality for.
+    """
+    root = Element("mujoco", model=mechanism.name)
+    SubElement(root, "compiler", angle="radian", autolimits="false")
+    SubElement(root, "option", gravity=numbers(mechanism.tree.model.gravity.linear))
+    world = SubElement(root, "worldbody")
+    bodies, order = _bodies(mechanism, world)
+    differs = ["loops are soft springs there: set solref and solimp of <equality>, and the time step, to taste"]
+    differs += _inertials(mechanism, bodies)
+    sites = Sites(bodies)
+    for name, frame in mechanism.points.items():
+        sites.add(name, frame)
+    differs += add_loops(mechanism, root, sites)
+    add_springs(mechanism, root, sites)
+    _draw(mechanism, bodies, sites)
+    _motors(mechanism, root)
+    key = SubElement(root, "keyframe")
+    SubElement(key, "key", name="assembled", qpos=numbers(_qpos(mechanism, order)))
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n", differs
+
+
+def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[int]]:
+    """Add a body for each joint; return them by joint (0: the world), and the joints in MuJoCo's order."""
+    model = mechanism.tree.model
+    children: dict[int, list[int]] = {}
+    for joint in range(1, model.njoints):
+        children.setdefault(int(model.parents[joint]), []).append(joint)
+    names, bodies, order = _body_names(mechanism), {0: world}, []
+    waiting = children.get(0, [])[::-1]
+    while waiting:
+        joint = waiting.pop()
+        placement = model.jointPlacements[joint]
+        place = {"pos": numbers(placement.translation), "quat": numbers(quaternion(placement.rotation))}
+        bodies[joint] = SubElement(bodies[int(model.parents[joint])], "body", {"name": names[joint]} | place)
+        _joint(mechanism, joint, bodies[joint])
+        order.append(joint)
+        waiting += children.get(joint, [])[::-1]
+    return [bodies[joint] for joint in range(model.njoints)], order
+
+
+def _body_names(mechanism: Mechanism) -> dict[int, str]:
+    """Name each body by the link that its joint carries, or by the joint where fixed joints made several one."""
+    names: dict[int, str] = {}
+    for link, frame in mechanism.frames.links.items():
+        if np.allclose(frame.rotation, np.eye(3)) and not frame.translation.any():
+            names.setdefault(frame.joint, link)
+    model = mechanism.tree.model
+    return {joint: names.get(joint, model.names[joint]) for joint in range(1, model.njoints)}
+
+
+def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
+    model, springs = mechanism.tree.model, mechanism.springs
+    joint, name = model.joints[number], model.names[number]
+    if joint.nv == 6:
+        SubElement(body, "freejoint", name=name)
+        return
+    data, at = joint.createData(), joint.idx_v
+    joint.calc(data, mechanism.tree.neutral())
+    along = np.asarray(data.S).reshape(6)
+    kind, axis = ("slide", along[:3]) if along[:3].any() else ("hinge", along[3:])
+    element = SubElement(body, "joint", name=name, type=kind, axis=numbers(axis))
+    if springs.joint_damping[at]:
+        element.set("damping", numbers(springs.joint_damping[at]))
+    if springs.joint_stiffness[at]:
+        element.set("stiffness", numbers(springs.joint_stiffness[at]))
+        element.set("springref", numbers(springs.joint_rest[at]))
+    if model.armature[at]:
+        element.set("armature", numbers(model.armature[at]))
+
+
+def _inertials(mechanism: Mechanism, bodies: list[Element]) -> list[str]:
+    """Give each body its mass; say which ones MuJoCo would have refused."""
+    light, impossible = [], []
+    for element, inertia in list(zip(bodies, mechanism.tree.model.inertias, strict=True))[1:]:
+        about_centre, mass = np.array(inertia.inertia), float(inertia.mass)
+        principal = np.linalg.eigvalsh(about_centre)
+        if mass < LEAST or principal[0] < LEAST:
+            light.append(element.get("name", ""))
+            mass, about_centre = max(mass, LEAST), about_centre + max(LEAST - principal[0], 0.0) * np.eye(3)
+        elif principal[0] + principal[1] < principal[2] * (1 - 1e-9):
+            impossible.append(element.get("name", ""))
+        full = about_centre[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        values = {"pos": numbers(inertia.lever), "mass": numbers(mass), "fullinertia": numbers(full)}
+        element.insert(0, Element("inertial", values))
+    says = []
+    if light:
+        says.append(f"{', '.join(light)}: mass and inertia raised to {LEAST:g}, the least that MuJoCo takes")
+    if impossible:
+        says.append(f"{', '.join(impossible)}: MuJoCo refuses this inertia, which breaks the triangle inequality")
+    return says
+
+
+def _draw(mechanism: Mechanism, bodies: list[Element], sites: Sites) -> None:
+    """Draw sticks from each joint to the joints and sites that it carries; they neither weigh nor touch."""
+    model, size = mechanism.tree.model, mechanism.size
+    look = {"contype": "0", "conaffinity": "0", "mass": "0", "rgba": "0.35 0.55 0.75 1"}
+    ends = [(int(model.parents[k]), model.jointPlacements[k].translation) for k in range(1, model.njoints)]
+    for joint, end in [*ends, *sites.places]:
+        if joint and np.linalg.norm(end) > SHORT * size:
+            stick = {"type": "capsule", "size": numbers(THICKNESS * size), "fromto": f"0 0 0 {numbers(end)}"}
+            SubElement(bodies[joint], "geom", stick | look)
+
+
+def _motors(mechanism: Mechanism, root: Element) -> None:
+    """Add a motor for each actuated joint, and one that needs no control for each constant force."""
+    constant = mechanism.springs.constant
+    if not mechanism.actuated and not constant.any():
+        return
+    actuators = SubElement(root, "actuator")
+    for name in mechanism.actuated:
+        SubElement(actuators, "motor", name=name, joint=name)
+    for k in np.flatnonzero(constant):
+        name = mechanism.coordinates[k]
+        force = {"gaintype": "fixed", "gainprm": "0", "biastype": "affine", "biasprm": f"{numbers(constant[k])} 0 0"}
+        SubElement(actuators, "general", {"name": f"force on {name}", "joint": name} | force)
+
+
+def _qpos(mechanism: Mechanism, order: list[int]) -> Array:
+    """The assembled configuration in MuJoCo's order; a free root's place is in the world, w first."""
+    model, q_tree = mechanism.tree.model, mechanism.q_tree
+    pose = Pose(mechanism.tree, mechanism.closure.anchors, q_tree)
+    values: list[float] = []
+    for joint in order:
+        at = model.joints[joint].idx_q
+        if model.joints[joint].nv == 6:
+            values += [*pose.translation[joint], *quaternion(pose.rotation[joint])]
+        else:
+            values.append(q_tree[at])
+    return np.array(values)

@@ -1,0 +1,232 @@
+"""`ckc export --to mjcf` against MuJoCo itself: the same tree, the same closure, the same forces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, Mechanism, load
+from ckc_pin.mechanism.exporting import export
+from tests.contract.helpers.command import ckc
+
+# flat trees, free roots, hinges, welds, redundant rows, couplings, massless links, constant forces, springs
+SHIPPED = ["five_bar", "andrews", "bricard", "stewart", "two_ur5", "slider_crank_spatial"]
+
+LINK = """<link name="{0}"><inertial><origin xyz="0.1 0.02 0.01"/><mass value="{1}"/>
+<inertia ixx="1e-3" iyy="2e-3" izz="2.5e-3" ixy="1e-4" ixz="0" iyz="-2e-4"/></inertial></link>"""
+MOVES = """<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><origin xyz="{4}" rpy="{5}"/>
+<axis xyz="{6}"/><dynamics damping="0.03"/><limit lower="-9" upper="9" effort="1" velocity="1"/></joint>"""
+
+SPATIAL = {
+    "s.urdf": "\n".join(
+        [
+            '<robot name="s"><link name="base"/>',
+            *(LINK.format(name, mass) for name, mass in (("crank", 1), ("rocker", 2), ("block", 0.5), ("wheel", 0.3))),
+            MOVES.format("a", "continuous", "base", "crank", "0 0 0", "0.1 0.2 0.3", "0 0.6 0.8"),
+            MOVES.format("b", "revolute", "base", "rocker", "0.5 0.1 0", "0 0 0.4", "0 1 0"),
+            MOVES.format("s", "prismatic", "rocker", "block", "0.1 0 0.1", "0.3 0 0", "1 0 0"),
+            MOVES.format("w", "continuous", "crank", "wheel", "0.2 0 0", "0 0 0", "1 0 0"),
+            "</robot>",
+        ]
+    ),
+    "mechanism.toml": """
+name = "s"
+urdf = "s.urdf"
+gravity = [1.0, 2.0, -9.0]
+actuated = ["a"]
+q_guess = {a = 0.3, b = -0.4}
+[[loop]]
+name = "rod"
+type = "distance"
+length = 0.45
+frame_a = {link = "crank", xyz = [0.2, 0, 0]}
+frame_b = {link = "block", xyz = [0.2, 0, 0]}
+[[coupling]]
+joint = "w"
+other = "a"
+ratio = -2.5
+offset = 0.3
+[[spring]]
+joint = "s"
+rest = 0.05
+stiffness = 300.0
+damping = 2.0
+[[spring]]
+frame_a = "base"
+frame_b = {link = "block", xyz = [0, 0.1, 0]}
+rest_length = 0.2
+stiffness = 40.0
+damping = 1.5
+[[force]]
+joint = "b"
+value = -0.7
+[[point]]
+name = "tip"
+frame = {link = "block", xyz = [0.2, 0, 0]}
+""",
+}
+
+
+@pytest.fixture(scope="module")
+def spatial(tmp_path_factory: pytest.TempPathFactory) -> Mechanism:
+    return load(write(tmp_path_factory.mktemp("spatial"), SPATIAL))
+
+
+class Peer:
+    """MuJoCo's model of a mechanism, set to Pinocchio's states."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.tree = mechanism.tree
+        self.model: Any = mujoco.MjModel.from_xml_string(export(mechanism, "mjcf").text)
+        self.data: Any = mujoco.MjData(self.model)
+
+    def put(self, q_tree: Any, v_tree: Any) -> Any:
+        """Set a state; return the map from Pinocchio's velocities to MuJoCo's."""
+        model, data = self.tree.model, self.tree.data
+        pin.forwardKinematics(model, data, q_tree)
+        velocities = np.zeros((self.model.nv, self.tree.n))
+        for k in range(1, model.njoints):
+            joint, there = model.joints[k], self.model.joint(model.names[k])
+            at, to = there.qposadr[0], there.dofadr[0]
+            if joint.nv == 1:
+                self.data.qpos[at] = q_tree[joint.idx_q]
+                velocities[to, joint.idx_v] = 1.0
+            else:  # MuJoCo: position, w, x, y, z; linear velocity in the world's axes, angular in the body's
+                rotation = data.oMi[k].rotation
+                x, y, z, w = pin.Quaternion(rotation).coeffs()
+                self.data.qpos[at : at + 7] = [*data.oMi[k].translation, w, x, y, z]
+                velocities[to : to + 3, joint.idx_v : joint.idx_v + 3] = rotation
+                velocities[to + 3 : to + 6, joint.idx_v + 3 : joint.idx_v + 6] = np.eye(3)
+        self.data.qvel[:] = velocities @ v_tree
+        mujoco.mj_forward(self.model, self.data)
+        return velocities
+
+
+@pytest.fixture(params=[*SHIPPED, "spatial"])
+def mechanism(request: pytest.FixtureRequest, spatial: Mechanism) -> Mechanism:
+    return spatial if request.param == "spatial" else load(request.param)
+
+
+def states(mechanism: Mechanism) -> list[tuple[Any, Any]]:
+    random = np.random.default_rng(3)
+    q_tree = [mechanism.tree.integrate(mechanism.q_tree, random.normal(size=mechanism.n)) for _ in range(4)]
+    return [(x, random.normal(size=mechanism.n)) for x in q_tree]
+
+
+def assert_same(ours: Any, theirs: Any, tolerance: float = 1e-9) -> None:
+    assert np.abs(ours - theirs).max() < tolerance * max(1e-3, np.abs(theirs).max())
+
+
+def test_the_tree_is_the_same(mechanism: Mechanism) -> None:
+    peer, tree = Peer(mechanism), mechanism.tree
+    for q_tree, v_tree in states(mechanism):
+        to = peer.put(q_tree, v_tree)
+        M = np.zeros((peer.model.nv, peer.model.nv))
+        mujoco.mj_fullM(peer.model, peer.data, M)
+        D = pin.crba(tree.model, tree.data, q_tree)
+        assert_same(to.T @ M @ to, np.triu(D) + np.triu(D, 1).T)
+        if tree.flat:  # a free root's axes turn, and the bias with them
+            assert_same(to.T @ peer.data.qfrc_bias, pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree))
+
+
+def test_springs_dampers_and_constant_forces_are_the_same(mechanism: Mechanism) -> None:
+    peer, springs = Peer(mechanism), mechanism.springs
+    for q_tree, v_tree in states(mechanism):
+        to = peer.put(q_tree, v_tree)
+        force = springs.elastic_force(q_tree) + springs.damping_force(q_tree, v_tree)
+        assert_same(to.T @ (peer.data.qfrc_passive + peer.data.qfrc_actuator), force)
+
+
+def test_the_closure_is_the_same(mechanism: Mechanism) -> None:
+    """Closed where it is closed here, and for the same motions."""
+    peer = Peer(mechanism)
+    to = peer.put(mechanism.q_tree, np.zeros(mechanism.n))
+    rows = peer.data.efc_J.reshape(-1, peer.model.nv)[: peer.data.ne] @ to
+    assert np.abs(peer.data.efc_pos[: peer.data.ne]).max() < 1e-9 * mechanism.size
+    assert np.linalg.matrix_rank(rows, tol=1e-9) == mechanism.rank
+    assert np.abs(rows @ mechanism.assembled.rho).max() < 1e-9
+    assert_same(peer.model.key("assembled").qpos, peer.data.qpos)
+
+
+def test_points_are_sites_and_joints_have_motors(spatial: Mechanism) -> None:
+    peer = Peer(spatial)
+    for q_tree, v_tree in states(spatial):
+        peer.put(q_tree, v_tree)
+        assert_same(peer.data.site("tip").xpos, spatial.point_positions(q_tree)["tip"])
+    assert peer.model.actuator("a").trnid[0] == peer.model.joint("a").id
+    assert_same(peer.model.opt.gravity, [1.0, 2.0, -9.0])
+
+
+def test_a_swing_is_the_same_as_far_as_springs_can_close_loops() -> None:
+    peer = Peer(load("five_bar"))
+    run = ckc_pin.simulate("five_bar/swing", {"t_end": 0.3})
+    peer.model.opt.timestep, peer.model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    peer.model.eq_solref[:] = [2e-4, 1.0]
+    peer.put(run.q_tree[0], run.v_tree[0])
+    for _ in range(3000):
+        mujoco.mj_step(peer.model, peer.data)
+    ends = [peer.data.joint(name).qpos[0] for name in run.coordinates]
+    assert np.abs(run.q_tree[-1] - run.q_tree[0]).max() > 0.1
+    assert np.abs(ends - run.q_tree[-1]).max() < 1e-3
+
+
+def test_it_comes_back(tmp_path: Path) -> None:
+    assert ckc("export", "five_bar", "--to", "mjcf", "--out", str(tmp_path)).code == 0
+    assert ckc("import", str(tmp_path / "five_bar.xml"), "--out", str(tmp_path / "back")).code == 0
+    q = {"theta_1": -1.2, "theta_3": -1.9}
+    here, back = (ckc_pin.terms(load(x), q) for x in ("five_bar", tmp_path / "back"))
+    assert_same(back.D, here.D, 1e-7)
+
+
+def test_printed_or_written(tmp_path: Path) -> None:
+    printed = ckc("export", "five_bar")
+    assert printed.code == 0
+    assert mujoco.MjModel.from_xml_string(printed.out).nv == 4
+    assert "differs: loop elbow" in printed.err
+    written = ckc("export", "five_bar", "--out", str(tmp_path / "m"), "--json").json
+    assert written["written"] == [str(tmp_path / "m" / "five_bar.xml")]
+    assert (tmp_path / "m" / "five_bar.xml").read_text(encoding="utf-8") == printed.out.rstrip("\n") + "\n"
+    again = ckc("export", "five_bar", "--out", str(tmp_path / "m"))
+    assert again.code == 2
+    assert "there already" in again.err
+    assert ckc("export", "five_bar", "--out", str(tmp_path / "m"), "--overwrite").code == 0
+
+
+def write(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_a_plane_that_is_left_is_refused(tmp_path: Path) -> None:
+    text = SPATIAL["mechanism.toml"].replace('"distance"\nlength = 0.45', '"point_2d"')
+    mechanism = load(write(tmp_path, SPATIAL | {"mechanism.toml": text}))
+    with pytest.raises(InputError, match="loop 'rod': MuJoCo has no equality for a point_2d whose frames leave"):
+        export(mechanism, "mjcf")
+
+
+@pytest.mark.parametrize("kind", ["cylindrical", "universal", "prismatic"])
+def test_loops_that_mujoco_has_not_are_refused(kind: str, tmp_path: Path) -> None:
+    axis = [0.0, float(kind == "universal"), 1.0]
+    text = f"""
+name = "held"
+tree = [{{file = "b.urdf", root = "free"}}]
+loop = [{{name = "hold", type = "{kind}", frame_a = "world", frame_b = "b", axis_b = {axis}}}]
+"""
+    mechanism = load(
+        write(tmp_path, {"b.urdf": f'<robot name="b">{LINK.format("b", 1)}</robot>', "mechanism.toml": text})
+    )
+    with pytest.raises(InputError, match=f"loop 'hold': MuJoCo has no equality for type '{kind}'; it has for point"):
+        export(mechanism, "mjcf")
+
+
+def test_another_format_is_refused() -> None:
+    refused = ckc("export", "five_bar", "--to", "sdf")
+    assert refused.code == 2
+    assert "no format 'sdf'; there are mjcf" in refused.err
