@@ -9,13 +9,20 @@ Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and 
 `control`, `simulation`, and side by side `study` and `view`. README.md says where each equation lives.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.mechanism import Mechanism, load
+from ckc_pin.mechanism.point import Point
 from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, check, load_scene, simulate
+
+if TYPE_CHECKING:
+    from ckc_pin.mechanism.mapped import SingularityMap
 
 __all__ = [
     "Check",
@@ -25,6 +32,7 @@ __all__ = [
     "Mechanism",
     "MechanismError",
     "NumericalError",
+    "Point",
     "Run",
     "Sampled",
     "Scene",
@@ -35,6 +43,7 @@ __all__ = [
     "load_scene",
     "play",
     "simulate",
+    "singularity_map",
     "terms",
 ]
 
@@ -46,3 +55,10 @@ def play(*runs: Run, **options: Any) -> Any:
     from ckc_pin.view.player import play as play_runs
 
     return play_runs(runs, **options)
+
+
+def singularity_map(mechanism: Mechanism | str | Path, **options: Any) -> SingularityMap:
+    """Map where a mechanism can go and is singular; see `ckc_pin.study.map.singularity_map`, which this loads."""
+    from ckc_pin.study.map import singularity_map as compute
+
+    return compute(mechanism, **options)

@@ -254,6 +254,7 @@ def play(
         "ckc map five_bar --scene tracking --out figures",
         "ckc map five_bar --space cartesian --out figures",
         "ckc map delta --space cartesian --over x,z --out figures",
+        "ckc map delta --space cartesian --sections 6 --out figures",
     ),
 )
 def map_(
@@ -263,24 +264,40 @@ def map_(
     space: Annotated[str, typer.Option("--space", help="joint, or cartesian: where a point goes.")] = "joint",
     point: Annotated[str | None, typer.Option("--point", help="A [[point]]; absent: the first one.")] = None,
     cells: Annotated[int, typer.Option("--cells", help="Along each axis.")] = 200,
+    sections: Annotated[
+        int | None, typer.Option("--sections", metavar="N", help="With three freedoms: N heights of the point.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the figure.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Where a mechanism can go and where it is singular, branch by branch (the paper's Fig. 2)."""
-    from ckc_pin.study.map import map_plain, map_table, singularity_map
+    """Where it can go and where it is singular, branch by branch (Fig. 2)."""
+    from ckc_pin.study import map as maps
     from ckc_pin.view.map_figure import require_figures, save_map
+    from ckc_pin.view.sections_figure import save_sections
 
     if out is not None:
         _make_folder(out)
         require_figures()
+    if sections is not None and (space != "cartesian" or scene is not None):
+        raise InputError("--sections goes with --space cartesian, and without --scene")
     axes = None if over is None else [name.strip() for name in over.split(",")]
-    found = singularity_map(mechanism, scene=scene, space=space, over=axes, point=point, cells=cells)
+    with _progress_bar(f"map of {mechanism}", "{task.percentage:.0f} %") as bar:
+        progress = None if bar is None else lambda part: bar(part, 1.0)
+        if sections is None:
+            one = ckc_pin.singularity_map(
+                mechanism, scene=scene, space=space, over=axes, point=point, cells=cells, progress=progress
+            )
+        else:
+            stack = maps.workspace_sections(
+                mechanism, point=point, over=axes or ("x", "y"), count=sections, cells=cells, progress=progress
+            )
     if as_json:
-        _print_json(map_plain(found))
+        _print_json(maps.map_plain(one) if sections is None else maps.sections_plain(stack))
     else:
-        _print_table(map_table(found))
-    for path in save_map(found, out) if out is not None else []:
-        (errors.print if as_json else print)(f"written: {path}")
+        _print_table(maps.map_table(one) if sections is None else maps.sections_table(stack))
+    if out is not None:
+        for path in save_map(one, out) if sections is None else save_sections(stack, out):
+            (errors.print if as_json else print)(f"written: {path}")
 
 
 @app.command("import", epilog=_examples("ckc import cassie.xml --out mechanisms/cassie"))
@@ -433,8 +450,8 @@ def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
 class _progress_bar:
     """A bar on a terminal, nothing in a pipe."""
 
-    def __init__(self, title: str) -> None:
-        self.title = title
+    def __init__(self, title: str, says: str = "t = {task.completed:.2f} s") -> None:
+        self.title, self.says = title, says
         self.bar: Any = None
 
     def __enter__(self) -> Any:
@@ -442,7 +459,7 @@ class _progress_bar:
             return None
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("t = {task.completed:.2f} s"))
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(self.says))
         self.bar = Progress(*columns, TimeRemainingColumn(), console=errors, transient=True)
         task = self.bar.add_task(self.title, total=1.0)
         self.bar.start()

@@ -17,7 +17,7 @@ from ckc_pin.view.labels import symbol
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_map", "require_figures", "save_map"]
+__all__ = ["det_label", "draw_map", "draw_sheet", "handles", "look", "require_figures", "save_map", "write"]
 
 UNREACHED = "#C9C9C9"
 COLOURS = "PuOr"  # its middle is singular, and its sides are told apart by every eye
@@ -40,15 +40,19 @@ def save_map(found: SingularityMap, folder: Path, formats: Sequence[str] = ("png
     InputError
         A folder that cannot be written, matplotlib missing.
     """
-    figure = draw_map(found)
-    paths = [folder / f"map_{found.space}.{suffix}" for suffix in formats]
+    return write(draw_map(found), folder, f"map_{found.space}", formats)
+
+
+def write(figure: Figure, folder: Path, stem: str, formats: Sequence[str]) -> list[Path]:
+    """Write a figure in several formats (InputError where the folder cannot be written)."""
+    paths = [folder / f"{stem}.{suffix}" for suffix in formats]
     for path in paths:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with _look():
+            with look():
                 figure.savefig(path, dpi=style.DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
         except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+            raise InputError(f"{path}: cannot be written: {error.strerror}; choose another folder") from None
     return paths
 
 
@@ -60,16 +64,17 @@ def draw_map(found: SingularityMap) -> Figure:
     InputError
         matplotlib missing.
     """
-    with _look():
+    with look():
         return _plane(found) if len(found.axes) == 2 else _line(found)
 
 
 def require_figures() -> None:
     """Find out before a computation, not after it, whether it can be drawn (InputError)."""
-    _look()
+    look()
 
 
-def _look() -> Any:
+def look() -> Any:
+    """Our style on matplotlib's defaults (InputError where matplotlib is missing)."""
     try:
         from matplotlib import style as styles
     except ModuleNotFoundError:
@@ -89,42 +94,42 @@ def _plane(found: SingularityMap) -> Figure:
     figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
     most = max(float(np.nanmax(np.abs(sheet.det_phi_z))) for sheet in found.sheets)
     panels = []
-    for k, sheet in enumerate(found.sheets):
+    for k in range(len(found.sheets)):
         ax = figure.add_subplot(rows, columns, k + 1)
         panels.append(ax)
-        ax.set_facecolor(UNREACHED)
-        ax.grid(False)
-        first, second = found.axes
-        edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in found.axes]
-        shown = ax.pcolormesh(
-            *edges,
-            sheet.det_phi_z.T,
-            cmap=COLOURS,
-            vmin=-PALER * most,
-            vmax=PALER * most,
-            shading="flat",
-            rasterized=True,
-        )
-        for locus in found.loci:
-            _locus(ax, found.axes, locus, k)
-        if found.path is not None:
-            _path(ax, found, k)
-        ax.set(
-            xlim=(first.low, first.high),
-            ylim=(second.low, second.high),
-            aspect="equal" if first.unit == second.unit else "auto",
-        )
-        ax.set(xlabel=_axis_label(found, first), ylabel=_axis_label(found, second))
-        for axis, ticks in ((first, ax.set_xticks), (second, ax.set_yticks)):
-            if axis.turns:
-                ticks(np.pi * np.arange(-1, 1.1, 0.5), ["$-π$", "$-π/2$", "0", "$π/2$", "$π$"])
+        shown = draw_sheet(ax, found, k, most)
         ax.set_title(_panel_title(found, k))
-    unit = f", {found.measure_unit.replace('^', '$^{')}}}$" if "^" in found.measure_unit else (
-        f", {found.measure_unit}" if found.measure_unit else "")  # fmt: skip
-    label = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
-    figure.colorbar(shown, ax=panels, label=label + unit, shrink=0.85)
-    figure.legend(handles=_handles(found), loc="outside lower left", ncols=columns, handlelength=2.8)
+    figure.colorbar(shown, ax=panels, label=det_label(found), shrink=0.85)
+    figure.legend(handles=handles(found), loc="outside lower left", ncols=columns, handlelength=2.8)
     return figure
+
+
+def draw_sheet(ax: Any, found: SingularityMap, k: int, most: float) -> Any:
+    """Draw a sheet into an axes: what is reached, the loci, the trajectory; `most` is the largest |det phi_z|."""
+    ax.set_facecolor(UNREACHED)
+    ax.grid(False)
+    first, second = found.axes
+    edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in found.axes]
+    colours = {"cmap": COLOURS, "vmin": -PALER * most, "vmax": PALER * most}
+    shown = ax.pcolormesh(*edges, found.sheets[k].det_phi_z.T, **colours, shading="flat", rasterized=True)
+    for locus in found.loci:
+        _locus(ax, found.axes, locus, k)
+    if found.path is not None:
+        _path(ax, found, k)
+    aspect = "equal" if first.unit == second.unit else "auto"
+    ax.set(xlim=(first.low, first.high), ylim=(second.low, second.high), aspect=aspect)
+    ax.set(xlabel=_axis_label(found, first), ylabel=_axis_label(found, second))
+    for axis, ticks in ((first, ax.set_xticks), (second, ax.set_yticks)):
+        if axis.turns:
+            ticks(np.pi * np.arange(-1, 1.1, 0.5), ["$-π$", "$-π/2$", "0", "$π/2$", "$π$"])
+    return shown
+
+
+def det_label(found: SingularityMap) -> str:
+    """Label the colours."""
+    unit = found.measure_unit.replace("^", "$^{") + "}$" * ("^" in found.measure_unit)
+    name = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
+    return f"{name}, {unit}" if unit else name
 
 
 def _tall(found: SingularityMap) -> float:
@@ -201,10 +206,8 @@ def _line(found: SingularityMap) -> Figure:
             level = np.full(len(found.path.at), 0.0)
             _curve(ax, [axis, Axis("", "", 0, 0, False, level)], np.column_stack([found.path.at, level]), zorder=5,
                    **DESIRED)  # fmt: skip
-        unit = f", {found.measure_unit}".replace("^2", "²") if found.measure_unit else ""
-        name = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
-        ax.set(xlabel=_axis_label(found, axis), ylabel=name + unit, xlim=(axis.low, axis.high))
-    figure.legend(handles=_handles(found), loc="outside lower left", ncols=2, handlelength=2.8)
+        ax.set(xlabel=_axis_label(found, axis), ylabel=det_label(found), xlim=(axis.low, axis.high))
+    figure.legend(handles=handles(found), loc="outside lower left", ncols=2, handlelength=2.8)
     return figure
 
 
@@ -255,30 +258,31 @@ def _axis_label(found: SingularityMap, axis: Axis) -> str:
     return f"${axis.name}$, m" if found.space == "cartesian" else f"{symbol(axis.name)}, {axis.unit}"
 
 
-def _handles(found: SingularityMap) -> list[Any]:
+def handles(found: SingularityMap) -> list[Any]:
+    """Return the legend of what a map shows."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = []
+    shown: list[Any] = []
     for kind in LABELS:
         some = [locus for locus in found.loci if locus.kind == kind and locus.on.any()]
         if some:
             dots = all(np.ptp(locus.at, axis=0).max() < POINT for locus in some) and len(found.axes) == 2
             look = {"color": LOOKS[kind]["color"], "marker": "o", "linestyle": "none"} if dots else LOOKS[kind]
-            handles.append(Line2D([], [], label=LABELS[kind], **look))
+            shown.append(Line2D([], [], label=LABELS[kind], **look))
     if len(found.axes) == 1:
         what = _what(found)
-        handles += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
+        shown += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
                     for k in range(len(found.sheets))]  # fmt: skip
     if found.path is not None:
         name = found.path.name.replace("$", r"\$")
-        handles.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
+        shown.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
     if len(found.axes) == 2 and not all(sheet.reached.all() for sheet in found.sheets):
-        handles.append(
+        shown.append(
             Patch(
                 color=UNREACHED, label=f"not reached in this {_what(found)}".replace("in this branch", "on this branch")
             )
         )
     elif found.space == "joint" and not found.counts.all():
-        handles.append(Patch(color=UNREACHED, label="not reached on any branch shown"))
-    return handles
+        shown.append(Patch(color=UNREACHED, label="not reached on any branch shown"))
+    return shown

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path as FilePath
 from time import perf_counter
 
@@ -14,15 +13,16 @@ from ckc_pin.mechanism.extended import Extended, Task, extend, find_point
 from ckc_pin.mechanism.following import nodes_at, solutions
 from ckc_pin.mechanism.library import load
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.many import ManyPoses
-from ckc_pin.mechanism.mapped import Axis, Locus, Sheet, SingularityMap
+from ckc_pin.mechanism.mapped import Axis, SingularityMap
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.study.map.approach import add_path, read_wanted
 from ckc_pin.study.map.domain import Domain, joint_axis, middles, reach
 from ckc_pin.study.map.loci import find_loci
-from ckc_pin.study.map.sheet import HURRIED, Grid, fill
+from ckc_pin.study.map.progress import Progress, Steps
+from ckc_pin.study.map.sheet import HURRIED, fill
+from ckc_pin.study.map.value import located, map_value, name_of
 
 __all__ = ["singularity_map"]
 
@@ -43,6 +43,7 @@ def singularity_map(
     over: Sequence[str] | None = None,
     point: str | None = None,
     cells: int = 200,
+    progress: Progress | None = None,
 ) -> SingularityMap:
     """Map where a mechanism can go, and where it is singular.
 
@@ -60,6 +61,8 @@ def singularity_map(
         The point whose serial singularities are wanted, default the first one. Without any [[point]] there are none.
     cells : int
         Along each axis; rounded up to a multiple of 8.
+    progress : callable, optional
+        Called as progress(part done).
 
     Raises
     ------
@@ -87,28 +90,23 @@ def singularity_map(
         task, chosen, names = _task(extended, over, planar)
         _refuse_large(task, cells, len(chosen))
         starts, more = _branches(task)
+        steps = Steps(progress, 1 + len(starts) * 3)
         domain = _window(task, chosen, names, starts, cells) if planar else _joints(task, chosen, names, cells)
-        grids = [fill(domain, start) for start in starts]
+        steps.step()
+        grids = [steps.after(fill(domain, start)) for start in starts]
         grids = [grid for grid in grids if grid.reached.any()]
         if not grids:
             raise InputError(f"{mechanism.name}: no cell of the map is reached from where it is assembled")
         seconds = perf_counter() - began
-        loci = [_located(extended, locus) for locus in find_loci(extended, domain, grids, planar)]
+        loci = [located(extended, locus) for locus in find_loci(extended, domain, grids, planar, steps)]
         path = None if wanted is None else add_path(wanted, mechanism, grids, loci, planar)
-        square = mechanism.assembled.phi_z.shape[0] == mechanism.assembled.phi_z.shape[1]
-        start = grids[0].told[np.flatnonzero(grids[0].reached)[0]]
-        return SingularityMap(
-            mechanism=mechanism.name,
-            space="cartesian" if cartesian else "joint",
-            point=extended.point,
-            axes=domain.axes,
-            held={_name(task, k): float(np.round(start[k], 12)) + 0.0 for k in domain.held},
-            measure="det phi_z" if square else "sigma_min(phi_z)",
-            measure_unit=_unit(mechanism) if square else "",
-            sheets=tuple(_sheet(extended, grid, square) for grid in grids),
-            more_branches=more,
-            loci=tuple(loci),
+        return map_value(
+            extended,
+            "cartesian" if cartesian else "joint",
+            grids,
+            loci,
             path=path,
+            more_branches=more,
             seconds=seconds,
             notes=notes,
         )
@@ -150,7 +148,7 @@ def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tu
         )
     if cartesian:
         task = Task(extended, extended.fixing)
-        valid = [_name(task, k) for k in range(mechanism.d) if extended.fixing[k] < extended.place[0] + 3]
+        valid = [name_of(task, k) for k in range(mechanism.d) if extended.fixing[k] < extended.place[0] + 3]
         if not valid:
             raise InputError(f"{mechanism.name}: the point {extended.point!r} stands still as assembled; name another")
     else:
@@ -162,15 +160,8 @@ def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tu
         raise InputError(f"over: no coordinate {unknown[0]!r} to map over; there are {', '.join(valid)}")
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
         raise InputError(f"over: one or two different names of {', '.join(valid)}")
-    labels = [_name(task, k) for k in range(mechanism.d)]
+    labels = [name_of(task, k) for k in range(mechanism.d)]
     return task, np.array([labels.index(name) for name in names], np.intp), names
-
-
-def _name(task: Task, k: int) -> str:
-    extended, row = task.extended, int(task.rows[k])
-    if len(extended.place) and row >= extended.place[0]:
-        return extended.axis(row)
-    return extended.mechanism.independent[k]
 
 
 def _refuse_large(task: Task, cells: int, axes: int) -> None:
@@ -213,41 +204,3 @@ def _box(task: Task, chosen: IntArray, names: Sequence[str], low: Array, high: A
         for name, a, b in zip(names, low, high, strict=True)
     )
     return Domain(task, chosen, axes)
-
-
-def _sheet(extended: Extended, grid: Grid, square: bool) -> Sheet:
-    mechanism, shape = extended.mechanism, grid.domain.shape
-    inside = np.flatnonzero(grid.reached)
-    phi_z = grid.J[inside][:, : len(extended.loops)][:, :, mechanism.partition.z]
-    det = np.full(len(grid.reached), np.nan)
-    det[inside] = np.linalg.det(phi_z) if square else np.linalg.svd(phi_z, compute_uv=False)[:, -1]
-    place = np.full((len(grid.reached), 3), np.nan)
-    if extended.point is not None:
-        place[inside] = positions(extended, grid.q_tree[inside])
-    return Sheet(
-        reached=grid.reached.reshape(shape),
-        det_phi_z=det.reshape(shape),
-        q_tree=grid.q_tree.reshape(*shape, -1),
-        point=None if extended.point is None else place.reshape(*shape, 3),
-    )
-
-
-def positions(extended: Extended, q_tree: Array) -> Array:
-    """World positions of the point at configurations (count, nq), shape (count, 3)."""
-    mechanism = extended.mechanism
-    frame = mechanism.points[str(extended.point)]
-    pose = ManyPoses(mechanism.tree, mechanism.closure.anchors, q_tree)
-    joints = mechanism.tree.model.njoints
-    rotation = pose.rotation.reshape(-1, joints, 3, 3)[:, frame.joint]
-    return np.asarray(rotation @ frame.translation + pose.translation.reshape(-1, joints, 3)[:, frame.joint])
-
-
-def _located(extended: Extended, locus: Locus) -> Locus:
-    return locus if extended.point is None else replace(locus, point=positions(extended, locus.q_tree))
-
-
-def _unit(mechanism: Mechanism) -> str:
-    """The unit of det phi_z: metres for each row that is a length, over those of the columns that are."""
-    power = int(np.sum(mechanism.closure.in_metres(mechanism.tree)))
-    power -= int(np.sum(mechanism.tree.in_metres[mechanism.partition.z]))
-    return "" if power == 0 else "m" if power == 1 else f"m^{power}"

@@ -20,6 +20,7 @@ from ckc_pin.mechanism.mapped import Kind, Locus
 from ckc_pin.mechanism.rank import rank_of, scaled
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 from ckc_pin.study.map.domain import Domain
+from ckc_pin.study.map.progress import Steps
 from ckc_pin.study.map.sheet import Grid
 from ckc_pin.study.singular_curve import SingularCurve, trace
 from ckc_pin.study.singularities import EXACT, SingularSystem, classify
@@ -100,7 +101,9 @@ class _Found:
     on: BoolArray
 
 
-def find_loci(extended: Extended, domain: Domain, grids: Sequence[Grid], cartesian: bool) -> list[Locus]:
+def find_loci(
+    extended: Extended, domain: Domain, grids: Sequence[Grid], cartesian: bool, steps: Steps | None = None
+) -> list[Locus]:
     """Find the singular configurations that the sheets of a map show.
 
     Parameters
@@ -112,6 +115,8 @@ def find_loci(extended: Extended, domain: Domain, grids: Sequence[Grid], cartesi
         Filled.
     cartesian : bool
         Whether the sheets end where the point is serially singular, instead of where phi_z is.
+    steps : Steps, optional
+        Told each sheet that has been searched, once for each of the two kinds.
     """
     found: list[_Found] = []
     held, values = _held(extended, domain, grids[0])
@@ -119,6 +124,8 @@ def find_loci(extended: Extended, domain: Domain, grids: Sequence[Grid], cartesi
         system = LocusSystem(extended, serial, held, values)
         for grid in grids:
             _search(system, serial, grid, grids, found, edges=serial == cartesian)
+            if steps is not None:
+                steps.step()
     found.sort(key=lambda locus: (("locked", "fold", "rank loss", "serial").index(locus.kind), *locus.at[0]))
     return [
         Locus(

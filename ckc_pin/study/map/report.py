@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from rich.text import Text
 
 from ckc_pin.mechanism.mapped import LABELS, Locus, Path, SingularityMap
 
-__all__ = ["map_plain", "map_table"]
+__all__ = ["map_plain", "map_table", "sections_plain", "sections_table"]
 
 POINT = 1e-9  # of the map's units: a locus no larger is a point
 
@@ -60,6 +61,28 @@ def map_table(found: SingularityMap) -> Group:
     if found.path is not None:
         parts += ["", *_desired(found, found.path)]
     return Group(*parts, *(Text(note) for note in found.notes))
+
+
+def sections_plain(found: Sequence[SingularityMap]) -> dict[str, Any]:
+    """Return sections of a workspace as JSON-ready data."""
+    return {"mechanism": found[0].mechanism, "point": found[0].point, "sections": [map_plain(one) for one in found]}
+
+
+def sections_table(found: Sequence[SingularityMap]) -> Group:
+    """Return sections of a workspace for people."""
+    first = found[0]
+    over = ", ".join(f"{a.name} {a.low:.4g} ... {a.high:.4g} {a.unit}" for a in first.axes)
+    cell = float(np.prod([(a.high - a.low) / len(a.values) for a in first.axes]))
+    (held,) = first.held
+    table = _table(f"{held}, m", "area reached, m²", f"{first.measure} from", "to", "singular curves")
+    for one in found:
+        (sheet,) = one.sheets
+        kinds = [_short(locus) for locus in one.loci if locus.on.any()]
+        curves = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+        table.add_row(f"{one.held[held]:.4f}", f"{cell * np.sum(sheet.reached):.4f}",
+                      f"{np.nanmin(sheet.det_phi_z):.4g}", f"{np.nanmax(sheet.det_phi_z):.4g}", curves)  # fmt: skip
+    head = f"{first.mechanism}, place of {first.point} in sections of the working mode as assembled: {over}"
+    return Group(Text(head), Text(f"{first.seconds:.2f} s"), "", table)
 
 
 def _branches(found: SingularityMap) -> Table:

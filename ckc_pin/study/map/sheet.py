@@ -6,17 +6,20 @@ tried from its neighbours. So nearly all starts are close by, and thousands of c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ckc_pin.mechanism.following import SHORTEST, Nodes, follow, nodes_at
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.study.map.domain import Domain
 
-__all__ = ["HURRIED", "Grid", "fill"]
+__all__ = ["CORNERS", "HURRIED", "SIDES", "Grid", "fill", "flood"]
 
 HURRIED = 0.5  # of a way: cells that take shorter pieces wait until all easy ones are done
 COARSE = 12  # cells along an axis that a coarse grid has at least
-NEIGHBOURS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 class Grid:
@@ -61,9 +64,9 @@ def fill(domain: Domain, start: Array, shortest: float = SHORTEST) -> Grid:
     nodes, arrived = follow(domain.task, first[np.zeros(len(near), np.intp)], domain.told(way))
     grid.put(grid.flat(near[arrived]), nodes[arrived])
     while True:
-        _flood(grid, stride, HURRIED)
+        flood(grid, stride, HURRIED)
         if stride == 1:
-            _flood(grid, stride, shortest)
+            flood(grid, stride, shortest)
             return grid
         stride //= 2
 
@@ -81,12 +84,20 @@ def _cells(shape: tuple[int, int], stride: int) -> IntArray:
     return np.column_stack([first.ravel(), second.ravel()])
 
 
-def _flood(grid: Grid, stride: int, shortest: float) -> None:
-    """Try the neighbours, `stride` cells away, of all reached cells, then of the newly reached ones, and so on."""
-    cells = _cells(grid.domain.shape, stride)
-    frontier = cells[grid.reached[grid.flat(cells)]]
+def flood(
+    grid: Grid, stride: int, shortest: float, numbers: IntArray | None = None, ways: Sequence[tuple[int, int]] = SIDES
+) -> None:
+    """Try the neighbours, `stride` cells away, of reached cells, then of the newly reached ones, and so on.
+
+    Of all of them, or of those with the numbers given.
+    """
+    if numbers is None:
+        cells = _cells(grid.domain.shape, stride)
+        frontier = cells[grid.reached[grid.flat(cells)]]
+    else:
+        frontier = np.column_stack(np.divmod(numbers, grid.domain.shape[1]))
     while len(frontier):
-        new = [_spread(grid, frontier, np.array(direction) * stride, shortest) for direction in NEIGHBOURS]
+        new = [_spread(grid, frontier, np.array(direction) * stride, shortest) for direction in ways]
         frontier = np.concatenate(new)
 
 

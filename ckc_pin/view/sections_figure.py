@@ -1,0 +1,67 @@
+"""A workspace of three dimensions as a figure: a panel for each section, from the lowest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ckc_pin.mechanism.mapped import SingularityMap
+from ckc_pin.view.map_figure import det_label, draw_sheet, handles, look, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_sections", "save_sections"]
+
+COLUMNS = 3
+
+
+def save_sections(found: Sequence[SingularityMap], folder: Path, formats: Sequence[str] = ("png", "svg")) -> list[Path]:
+    """Draw sections and write them as map_sections.
+
+    Raises
+    ------
+    InputError
+        A folder that cannot be written, matplotlib missing.
+    """
+    return write(draw_sections(found), folder, "map_sections", formats)
+
+
+def draw_sections(found: Sequence[SingularityMap]) -> Figure:
+    """Return the figure of sections.
+
+    Raises
+    ------
+    InputError
+        matplotlib missing.
+    """
+    with look():
+        from matplotlib.figure import Figure
+
+        first = found[0]
+        columns = min(len(found), COLUMNS)
+        rows = -(-len(found) // columns)
+        wide, high = (axis.high - axis.low for axis in first.axes)
+        tall = float(np.clip(high / wide, 0.4, 1.6))
+        figure = Figure(figsize=(3.3 * columns + 1.2, 3.2 * rows * tall + 1.3), layout="constrained")
+        name = first.mechanism.replace("$", r"\$")
+        (held,) = first.held
+        title = f"{name}, workspace of {first.point}: sections across {held}, working mode as assembled"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+        most = max(float(np.nanmax(np.abs(one.sheets[0].det_phi_z))) for one in found)
+        cell = float(np.prod([(axis.high - axis.low) / len(axis.values) for axis in first.axes]))
+        panels = [figure.add_subplot(rows, columns, k + 1) for k in range(len(found))]
+        for k, (ax, one) in enumerate(zip(panels, found, strict=True)):
+            shown = draw_sheet(ax, one, 0, most)
+            ax.set_title(f"${held}$ = {one.held[held]:.3f} m: {cell * np.sum(one.sheets[0].reached):.3f} m²")
+            if k % columns:
+                ax.set_ylabel("")
+            if k + columns < len(found):
+                ax.set_xlabel("")
+        figure.colorbar(shown, ax=panels, label=det_label(first), shrink=0.85)
+        legend = {handle.get_label(): handle for one in found for handle in handles(one)}
+        figure.legend(handles=list(legend.values()), loc="outside lower left", ncols=2, handlelength=2.8)
+        return figure
