@@ -213,7 +213,7 @@ def plot(runs: Runs, out: Annotated[Path, typer.Option("--out", help="Folder for
     """Figures of one or several runs."""
     from ckc_pin.view.figures import plot as plot_runs
 
-    for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out):
+    for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg")):
         print(path)
 
 

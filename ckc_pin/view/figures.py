@@ -51,7 +51,8 @@ def plot(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[str] 
     Returns
     -------
     list of Path
-        The files: ``set_point``, ``tracking``, ``own`` or ``motion``, and for controlled runs ``..._checks``.
+        The files: ``set_point``, ``tracking``, ``own`` or ``motion``; each with ``_snapshots``; for controlled runs
+        with ``_checks``, what tells whether to trust them.
 
     Raises
     ------
@@ -85,6 +86,7 @@ def draw(runs: Run | Sequence[Run]) -> dict[str, Figure]:
             figures[stem] = _LAYOUTS[group.kind](group)
             if group.kind != "motion":
                 figures[f"{stem}_checks"] = _checks(group)
+            figures[f"{stem}_snapshots"] = _snapshots(group)
     return figures
 
 
@@ -179,15 +181,29 @@ def _motion(group: Group) -> Figure:
 
 
 def _checks(group: Group) -> Figure:
-    """What tells whether to trust a run: residual, energy, Lyapunov function."""
+    """What tells whether to trust a run: residual, loop forces, energy, Lyapunov function."""
     monitored = any(run.lyapunov is not None for run in group.runs)
-    figure, axes = _sheet(group, ["closure residual", "energy"] + ["Lyapunov function"] * monitored)
+    titles = ["closure residual", "loop forces", "energy"] + ["Lyapunov function"] * monitored
+    figure, axes = _sheet(group, titles)
     _residual(axes[0], group)
-    panels.scalar(axes[1], group, lambda run: run.energy, "$E$, J")
+    panels.loop_forces(axes[1], group)
+    panels.scalar(axes[2], group, lambda run: run.energy, "$E$, J")
     if monitored:
-        panels.scalar(axes[2], group, _lyapunov, "$V$, J")
-        _logarithmic(axes[2])
+        panels.scalar(axes[3], group, _lyapunov, "$V$, J")
+        _logarithmic(axes[3])
     _legend(figure, group, [], by_run=True)
+    return figure
+
+
+def _snapshots(group: Group) -> Figure:
+    """Poses at equal times; of a motion without control, which has no checks, the loop forces too."""
+    which = f", {group.labels[0]}" if len(group.runs) > 1 else ""
+    forces = ["loop forces"] * (group.kind == "motion")
+    figure, axes = _sheet(group, [f"snapshots{which}", *forces], (7.2 + 5.0 * len(forces), 5.4))
+    figure.colorbar(panels.snapshots(axes[0], group), ax=axes[0], label="t, s", shrink=0.85)
+    if forces:
+        panels.loop_forces(axes[1], group)
+        _legend(figure, group, [])
     return figure
 
 
@@ -197,17 +213,17 @@ _LAYOUTS = {"set_point": _set_point, "tracking": _tracking, "own": _tracking, "m
 # --- parts ---------------------------------------------------------------------------------------
 
 
-def _sheet(group: Group, titles: Sequence[str]) -> tuple[Figure, list[Any]]:
+def _sheet(group: Group, titles: Sequence[str], size: tuple[float, float] | None = None) -> tuple[Figure, list[Any]]:
     from matplotlib.figure import Figure
 
     rows, columns = (2, 2) if len(titles) == 4 else (1, len(titles))
-    figure = Figure(figsize=(5.2 * columns, 3.7 * rows + 0.7), layout="constrained")
+    figure = Figure(figsize=size or (5.2 * columns, 3.7 * rows + 0.7), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.09, h_pad=0.07)  # type: ignore[union-attr, call-arg]
     name = group.mechanism.name.replace("$", r"\$")
     figure.suptitle(f"{name}: {TITLES[group.kind]}", x=0.01, ha="left", fontsize=12, fontweight="bold")
     axes = [figure.add_subplot(rows, columns, k) for k in range(1, len(titles) + 1)]
     for letter, ax, title in zip("abcd", axes, titles, strict=False):
-        ax.set_title(f"{letter})  {title}")
+        ax.set_title(f"{letter})  {title}" if len(titles) > 1 else title)
     return figure, axes
 
 

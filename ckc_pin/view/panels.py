@@ -17,10 +17,13 @@ from ckc_pin.view.desired import Wanted
 from ckc_pin.view.labels import run_labels, symbol, units
 from ckc_pin.view.skeleton import Motion, placements, sticks, viewpoint
 
-__all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "rates", "scalar"]
+__all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "loop_forces", "rates",
+           "scalar", "snapshots"]  # fmt: skip
 
 SETTLED = 0.01  # of the error at the start
 DOTS = 40  # of a desired curve
+SNAPSHOTS = 9
+LOOPS_NAMED = 6  # more would hide their curves
 INITIAL, TARGET, PATH = style.COLOURS[:3]
 
 
@@ -144,6 +147,28 @@ def scalar(ax: Any, group: Group, values: Callable[[Run], Array], label: str, do
     _time(ax, group, label, max(float(run.t[-1]) for run in group.runs))
 
 
+def loop_forces(ax: Any, group: Group) -> None:
+    """Draw the size of each loop's force over time, N: of its multipliers those of rows that are lengths."""
+    mechanism = group.mechanism
+    metres = mechanism.closure.in_metres(mechanism.tree)
+    loops = [loop for loop, _ in mechanism.closure.names]
+    holding = list(dict.fromkeys(loop for loop, held in zip(loops, metres, strict=True) if held))
+    colours = style.colours(holding)
+    for run, line in zip(group.runs, group.lines, strict=True):
+        for loop, forces in run.loop_forces().items():
+            if loop in holding:
+                own = metres[[name == loop for name in loops]]
+                ax.plot(run.t, np.linalg.norm(forces[:, own], axis=1), color=colours[loop], **line)
+    _time(ax, group, r"$|\lambda|$, N")
+    if not holding:
+        ax.text(0.5, 0.5, "no loop holds points together", ha="center", va="center", transform=ax.transAxes)
+    shown = holding if len(holding) <= LOOPS_NAMED else [holding[0], holding[-1]]
+    for loop in shown:
+        ax.plot([], [], color=colours[loop], label=loop.replace("$", r"\$"))
+    if shown:
+        ax.legend(loc="upper right", ncols=min(len(shown), 3), fontsize=8)
+
+
 def effort_symbol(group: Group) -> str:
     """Return u where the actuators are the independent joints, as in the paper, else tau."""
     return "u" if group.runs[0].actuated == group.independent else r"\tau"
@@ -238,7 +263,29 @@ def linkage(ax: Any, group: Group) -> None:
     ax.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_linkage(ax: Any, mechanism: Mechanism, at: Motion, view: Array, colour: str) -> None:
+def snapshots(ax: Any, group: Group) -> Any:
+    """Draw the first run's poses at equal times, from dark to light, and the ways of its points; return the colours."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    mechanism, run = group.mechanism, group.runs[0]
+    view = viewpoint(mechanism)[:2]
+    for path in run.points.values():
+        ax.plot(*(view @ path[run.t <= group.shown].T), color=style.GREY, linewidth=1.0, linestyle=":")
+    shades = ScalarMappable(Normalize(0.0, group.shown or 1.0), colormaps["viridis"])
+    for t in np.linspace(0.0, group.shown, SNAPSHOTS):
+        row = run.at(float(t))
+        q_tree = mechanism.tree.from_coordinates(run.q_tree[row])
+        _draw_linkage(ax, mechanism, placements(mechanism, q_tree[None]), view, shades.to_rgba(run.t[row]))
+    ax.set_xlabel(_axis_name(view[0], "across"))
+    ax.set_ylabel(_axis_name(view[1], "up"))
+    ax.margins(0.06)
+    ax.set_aspect("equal", adjustable="datalim")
+    return shades
+
+
+def _draw_linkage(ax: Any, mechanism: Mechanism, at: Motion, view: Array, colour: Any) -> None:
     for stick in sticks(mechanism):
         ends = view @ np.vstack([at.of(stick.joint, stick.start), at.of(stick.end_joint, stick.end)]).T
         base = stick.joint == stick.end_joint == 0

@@ -98,12 +98,16 @@ def test_torque_maxima_stand_beside_the_papers(tracking):
 def test_legend_covers_no_panel(tracking, set_point, swing):
     for name, figure in draw([*tracking, set_point, swing]).items():
         figure.draw_without_rendering()
+        if not figure.legends:  # snapshots of one run
+            continue
         (legend,) = figure.legends
         box = legend.get_window_extent()
         assert not [ax for ax in figure.axes if ax.get_tightbbox().overlaps(box)], name
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1, name
-        own = [ax.get_legend().get_window_extent() for ax in figure.axes if ax.get_legend()]
-        assert not [1 for ax in figure.axes for box in own if ax.get_window_extent().shrunk(0.99, 0.99).overlaps(box)]
+        own = {ax: ax.get_legend().get_window_extent() for ax in figure.axes if ax.get_legend()}
+        for owner, box in own.items():
+            inside = [ax for ax in figure.axes if ax.get_window_extent().shrunk(0.99, 0.99).overlaps(box)]
+            assert inside == [] or (inside == [owner] and "loop forces" in owner.get_title(loc="left"))
 
 
 def test_trajectory_from_a_csv_is_rebuilt_from_the_saved_run_alone(tmp_path):
@@ -160,12 +164,15 @@ def test_fig_3_errors_are_q_minus_q_d(set_point):
 
 
 def test_checks_show_residual_energy_and_lyapunov_function(set_point):
-    residual, energy, lyapunov = draw(set_point)["set_point_checks"].axes
+    residual, forces, energy, lyapunov = draw(set_point)["set_point_checks"].axes
     assert residual.get_yscale() == lyapunov.get_yscale() == "log"
     drawn = lines(residual)[0][1]
     expected = np.abs(set_point.phi - set_point.w).max(axis=1)
     np.testing.assert_array_equal(drawn[expected > 0], expected[expected > 0])
     np.testing.assert_array_equal(lines(energy)[0][1], set_point.energy)
+    loop = set_point.loop_forces()["elbow"]
+    np.testing.assert_allclose(lines(forces)[0][1], np.hypot(*loop.T), rtol=1e-12)
+    assert [text.get_text() for text in forces.get_legend().get_texts()] == ["elbow"]
     shown = lines(lyapunov)[0][1]
     np.testing.assert_array_equal(shown[:30], set_point.lyapunov[:30])
 
@@ -174,13 +181,35 @@ def test_checks_show_residual_energy_and_lyapunov_function(set_point):
 
 
 def test_motion_without_control(swing):
-    (name,) = figures = draw(swing)
-    assert name == "motion"
-    joints, rates, drift, residual = figures[name].axes
+    figures = draw(swing)
+    assert list(figures) == ["motion", "motion_snapshots"]
+    joints, rates, drift, residual = figures["motion"].axes
     assert len(lines(joints)) == len(lines(rates)) == 4
     power = int(drift.get_ylabel().split("{")[1].split("}")[0])
     np.testing.assert_allclose(lines(drift)[0][1] * 10.0**power, swing.energy - swing.energy[0], rtol=1e-12)
     assert residual.get_yscale() == "log"
+
+
+def test_snapshots_are_poses_at_equal_times(swing):
+    poses, forces, colours = draw(swing)["motion_snapshots"].axes
+    assert colours.get_ylabel() == "t, s"
+    assert forces.get_ylabel() == r"$|\lambda|$, N"
+    ends = np.hstack([line for line in lines(poses, style="-") if line.shape == (2, 2)]).T
+    for t in np.linspace(0.0, 2.0, 9):
+        q = swing.q_tree[swing.at(t)]
+        for foot, angle in ((0.0, q[0]), (BASE, q[2])):
+            elbow = [foot + L_PROXIMAL * np.cos(angle), L_PROXIMAL * np.sin(angle)]
+            assert np.linalg.norm(ends - elbow, axis=1).min() < 1e-12
+
+
+def test_loop_forces_are_those_of_rows_that_are_lengths(tmp_path):
+    run = ckc_pin.simulate("three_rrr", {"t_end": 0.02})
+    figure = draw(run)["motion_snapshots"]
+    shown = [line[1] for line in lines(figure.axes[1], style="-") if len(line[1]) == len(run.t)]
+    forces = run.loop_forces()
+    assert len(shown) == len(forces)
+    for drawn, loop in zip(shown, forces.values(), strict=True):
+        np.testing.assert_allclose(drawn, np.linalg.norm(loop[:, :2], axis=1), rtol=1e-12)
 
 
 def test_one_freedom_gets_a_phase_plane(tmp_path):
@@ -225,7 +254,7 @@ lift = 0.1
     assert errors.get_ylabel() == "$q - q_d$, rad or m"
     assert len(lines(linkage, VERMILLION, "-")) == 4  # a, b, c to its centre of mass, and the slide's way
     written = plot(run, tmp_path / "out", ("png", "svg"))  # the residual of no loop is zero: no logarithm
-    assert {path.stem for path in written} == {"set_point", "set_point_checks"}
+    assert {path.stem for path in written} == {"set_point", "set_point_checks", "set_point_snapshots"}
 
 
 def test_a_controller_of_ones_own(tmp_path):
@@ -235,21 +264,22 @@ def test_a_controller_of_ones_own(tmp_path):
 
     run = ckc_pin.simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, controller=Damper())
     figures = draw(run)
-    assert list(figures) == ["own", "own_checks"]
-    assert len(figures["own_checks"].axes) == 2  # it has no Lyapunov function
+    assert list(figures) == ["own", "own_checks", "own_snapshots"]
+    assert len(figures["own_checks"].axes) == 3  # it has no Lyapunov function
     np.testing.assert_array_equal(lines(figures["own"].axes[1], BLUE)[0][1], run.tau[:, 0])
 
 
 def test_runs_of_two_mechanisms_get_a_figure_each(swing, tmp_path):
     other = ckc_pin.simulate("five_bar_as_printed/swing", {"t_end": 0.1})
-    assert list(draw([swing, other])) == ["five_bar_motion", "five_bar_as_printed_motion"]
+    stems = ["five_bar_motion", "five_bar_as_printed_motion"]
+    assert list(draw([swing, other])) == [f"{stem}{more}" for stem in stems for more in ("", "_snapshots")]
 
 
 def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
     run = tracking[0]
     rows = {name: getattr(run, name)[:1] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
     stopped = replace(run, status="stopped", lyapunov=run.lyapunov[:1], **rows)
-    assert len(plot(stopped, tmp_path)) == 2
+    assert len(plot(stopped, tmp_path)) == 3
     texts = [text.get_text() for text in draw(stopped)["tracking"].legends[0].get_texts()]
     assert "SPF, ε = 10⁻⁴ (stopped at 0 s)" in texts
 
@@ -298,7 +328,9 @@ def test_pyplot_stays_out(tmp_path):
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["motion.pdf", "motion.png", "motion.svg"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"motion{more}.{suffix}" for more in ("", "_snapshots") for suffix in ("pdf", "png", "svg")
+    ]
 
 
 def test_bad_input(swing, tmp_path):
