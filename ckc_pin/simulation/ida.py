@@ -141,7 +141,10 @@ class Ida:
         self.njev = int(done.njev)
         if not done.success:
             self.status = "failed"
-            return f"IDA: {done.message}"
+            return f"SUNDIALS gave up: {done.message}"
+        if not done.t > self.t:
+            self.status = "failed"
+            return "the step became so short that t does not change any more"
         self.t_old, self.t = self.t, float(done.t)
         self.step_size = self.t - self.t_old
         self.y = np.array(done.y[: 2 * self.n])

@@ -259,7 +259,7 @@ class Stepper:
         """Say why the solver gave up: the closure's own verdict where there is one."""
         if self.failure is not None:
             return NumericalError(str(self.failure), t=self.t, q_tree=self.failure.q_tree)
-        reason = message[0].lower() + message[1:].rstrip(".")
+        reason = (message if message[:2].isupper() else message[0].lower() + message[1:]).rstrip(".")
         nearly = nearly_singular(self.system.terms(self.t, self.solver.y).at, 1e-3)
         return NumericalError(f"{nearly}; {reason}" if nearly else reason, t=self.t)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from ckc_pin import Run, simulate
 from ckc_pin.errors import InputError
@@ -14,6 +16,11 @@ from ckc_pin.simulation.integrate import Stepper
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
 from tests.regression.reference import trajectory
+
+
+def _flat(t: float, y: Any) -> float:
+    return float(y[0])
+
 
 TOLS = (1e-6, 1e-8, 1e-10)
 
@@ -70,11 +77,16 @@ def test_ida_meets_events_and_budgets() -> None:
     assert stopped.stats["rhs"] == 201
 
 
-def test_ida_stops_where_J_loses_rank() -> None:
-    run = simulate("n_four_bar", {"mechanism.N": 1, "solver.method": "IDA", "solver.rtol": 1e-8, "t_end": 1.0})
+@pytest.mark.parametrize(("N", "rtol"), [(1, 1e-8), (4, 1e-10), (4, 1e-12)])
+def test_ida_stops_where_J_loses_rank(N: int, rtol: float) -> None:
+    """Also where its steps become so short that t does not change any more."""
+    changes = {"mechanism.N": N, "solver.method": "IDA", "solver.rtol": rtol, "t_end": 1.0}
+    run = simulate("n_four_bar", {**changes, "solver.output_dt": 0.1})
+    k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
+    flat = solve_ivp(lambda t, y: [y[1], -k * np.cos(y[0])], (0, 1), [np.pi / 2, -1.0], rtol=1e-10, events=_flat)
     assert run.status == "stopped"
-    assert run.t[-1] < 0.7085
-    assert run.message
+    assert run.t[-1] == pytest.approx(flat.t_events[0][0], abs=0.02)
+    assert run.message.startswith("stopped at t = 0.7")
 
 
 def test_without_sundials_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
