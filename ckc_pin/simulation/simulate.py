@@ -79,7 +79,6 @@ def simulate(
         scene = load_scene(scene, changes)
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
-    started = perf_counter()
     times = _output_instants(scene)
     ready = prepare(scene, controller)
     mechanism, plant = ready.mechanism, ready.plant
@@ -87,6 +86,7 @@ def simulate(
     watched = Events(scene.spec.event, events, mechanism)
     tally = Tally() if profile else None
     mechanism.tree.tally = tally
+    started = perf_counter()  # loading and assembling are not the run's work
     try:
         with one_blas_thread():
             clock = Clock(plant.controller, ready.system, scene.spec.t_end)

@@ -1,0 +1,1 @@
+"""Error against run time: the same work by every formulation and method here, and by the programs people use."""

@@ -1,0 +1,46 @@
+"""Other programs on the same mechanism: each a module with `PROGRAM`, `missing`, `version`, `settings`, `compute`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from ckc_pin.study.report.row import Motion
+from ckc_pin.study.report.work import Work
+
+__all__ = ["Peer", "peers"]
+
+
+class Peer(Protocol):
+    """What the report asks of a program."""
+
+    name: str
+
+    def missing(self, work: Work) -> str | None:
+        """Why it cannot do a work; None where it can."""
+        ...
+
+    def version(self) -> str:
+        """Its version."""
+        ...
+
+    def settings(self, quick: bool) -> Iterator[str]:
+        """Names of the settings it is tried with, from coarse to fine steps."""
+        ...
+
+    def check(self, work: Work) -> str:
+        """How well it agrees with this program at the start, a sentence."""
+        ...
+
+    def compute(self, work: Work, setting: str, budget: float) -> Motion:
+        """Run a work; a run that would take longer than the budget, in s, is refused."""
+        ...
+
+
+def peers() -> list[Peer]:
+    """All programs there are wrappers for, whether installed or not."""
+    from ckc_pin.study.report.peers.ida import Ida
+    from ckc_pin.study.report.peers.mujoco import Mujoco
+    from ckc_pin.study.report.peers.pinocchio import Pinocchio
+
+    return [Mujoco(), Pinocchio(), Ida()]

@@ -1,0 +1,96 @@
+"""Pinocchio's constraintDynamics with its Baumgarte terms, stepped as in its own closed-loop examples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
+from ckc_pin.study.report.peers.stepping import divided, stepped
+from ckc_pin.study.report.row import Motion
+from ckc_pin.study.report.work import Work
+
+__all__ = ["Pinocchio"]
+
+STEPS = (5e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # s
+QUICK_STEPS = (5e-3, 1e-3, 1e-4)
+GAINS = (10.0, 100.0)  # K_p of the examples, 1/s^2, and a stiffer one; K_d = 2 sqrt(K_p)
+CLOSED_BY = {
+    "point": pin.ContactType.CONTACT_3D,
+    "point_2d": pin.ContactType.CONTACT_3D,
+    "weld": pin.ContactType.CONTACT_6D,
+}
+
+
+class Pinocchio:
+    """Semi-implicit Euler, v += a dt and q = q + v dt, with the constrained acceleration a."""
+
+    name = "Pinocchio constraintDynamics"
+
+    def missing(self, work: Work) -> str | None:
+        others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED_BY)
+        if work.controlled:
+            return "the controller is ours; only motions without one are compared"
+        if others or work.mechanism.spec.coupling:
+            return f"it has no constraint model for {', '.join(sorted(others)) or 'couplings'}"
+        if work.mechanism.springs.between_frames or work.mechanism.springs.joint_stiffness.any():
+            return "springs are no part of its models"
+        return None
+
+    def version(self) -> str:
+        return str(pin.__version__)
+
+    def settings(self, quick: bool) -> Iterator[str]:
+        for gain, dt in product(GAINS, QUICK_STEPS if quick else STEPS):
+            yield f"K_p {gain:g}, dt {dt:g}"
+
+    def check(self, work: Work) -> str:
+        return "the tree is the same model"
+
+    def compute(self, work: Work, setting: str, budget: float) -> Motion:
+        gain, dt = (float(part.split()[1]) for part in setting.split(", "))
+        mechanism, model = work.mechanism, work.mechanism.tree.model
+        data, constraints = model.createData(), _constraints(mechanism, gain)
+        constraint_data = pin.StdVec_RigidConstraintData()
+        constraint_data.extend(constraint.createData() for constraint in constraints)
+        pin.initConstraintDynamics(model, data, constraints, constraint_data)
+        settings = pin.ProximalSettings(1e-12, 1e-10, 10)  # loops with redundant rows need a small mu
+        tau, state = mechanism.springs.constant, {"q": np.empty(0), "v": np.empty(0)}
+        h = divided(work, dt)
+        start = find_start(mechanism, work.load())
+
+        def reset() -> None:
+            state["q"] = start.at.q_tree.copy()
+            state["v"] = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree.copy()
+
+        def step(many: int) -> None:
+            q, v = state["q"], state["v"]
+            for _ in range(many):
+                a = pin.constraintDynamics(model, data, q, v, tau, constraints, constraint_data, settings)
+                v = v + h * a
+                q = pin.integrate(model, q, h * v)
+            state["q"], state["v"] = q, v
+
+        def read() -> tuple[Array, Array]:
+            return mechanism.tree.to_coordinates(state["q"]), state["v"]
+
+        return stepped(work, dt, reset, step, read, budget)
+
+
+def _constraints(mechanism: Mechanism, gain: float) -> Any:
+    constraints = pin.StdVec_RigidConstraintModel()
+    for loop in mechanism.spec.loop:
+        a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
+        places = [pin.SE3(frame.rotation, frame.translation) for frame in (a, b)]
+        model = pin.RigidConstraintModel(
+            CLOSED_BY[loop.type], mechanism.tree.model, a.joint, places[0], b.joint, places[1], pin.ReferenceFrame.LOCAL
+        )
+        model.setBaumgarteCorrectorParameters(pin.BaumgarteCorrectorParameters(gain, 2 * np.sqrt(gain)))
+        constraints.append(model)
+    return constraints

@@ -1,0 +1,79 @@
+"""A program with a fixed step: stepped to each instant, timed without what is read out in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.study.report.row import Motion
+from ckc_pin.study.report.work import INSTANTS, Work
+
+__all__ = ["divided", "stepped"]
+
+TRIAL = 50  # steps, to foresee how long all take
+REPEATS = 3
+SHORT = 1.0  # s: what takes less is repeated
+
+State = tuple[Array, Array]  # q_tree, v_tree by coordinate
+
+
+def divided(work: Work, dt: float) -> float:
+    """Return the step nearest to dt of which whole ones lead from instant to instant."""
+    between = work.t_end / INSTANTS
+    return between / max(1, round(between / dt))
+
+
+def stepped(
+    work: Work,
+    dt: float,
+    reset: Callable[[], None],
+    step: Callable[[int], None],
+    state: Callable[[], State],
+    budget: float,
+) -> Motion:
+    """Run a work with a fixed step, the nearest to dt that divides the instants.
+
+    Parameters
+    ----------
+    reset : callable
+        Puts the program at the start.
+    step : callable
+        step(k) takes k steps.
+    state : callable
+        Returns q_tree and v_tree.
+    budget : float
+        s; where more is foreseen the run is refused.
+    """
+    many = round(work.t_end / INSTANTS / divided(work, dt))
+    reset()
+    began = perf_counter()
+    step(min(TRIAL, many))
+    foreseen = (perf_counter() - began) / min(TRIAL, many) * many * INSTANTS
+    if foreseen > budget:
+        none = np.empty((0, work.mechanism.n))
+        return Motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s", none, none, 0.0, 0.0)
+    walls: list[float] = []
+    while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
+        wall, states = _timed(lambda: step(many), reset, state)
+        walls.append(wall)
+    q_tree, v_tree = (np.array(rows) for rows in zip(*states, strict=True))
+    return Motion("done", "", q_tree, v_tree, min(walls), 0.0, steps=many * INSTANTS)
+
+
+def _timed(
+    advance: Callable[[], None], reset: Callable[[], None], state: Callable[[], State]
+) -> tuple[float, list[State]]:
+    """Advance from instant to instant; return the time that took and the states."""
+    reset()
+    states, wall = [state()], 0.0
+    for _ in range(INSTANTS):
+        began = perf_counter()
+        advance()
+        wall += perf_counter() - began
+        states.append(state())
+        if not np.all(np.isfinite(states[-1][0])):
+            break
+    return wall, states

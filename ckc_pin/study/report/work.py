@@ -1,0 +1,106 @@
+"""What is measured: motions of shipped mechanisms, and what is compared at which instants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.prepare import scene_mechanism
+from ckc_pin.simulation.scene import Scene, load_scene
+
+__all__ = ["WORKS", "Work"]
+
+INSTANTS = 10  # at which motions are compared, the end among them
+
+
+@dataclass(frozen=True)
+class Work:
+    """A motion to compute.
+
+    Attributes
+    ----------
+    key : str
+    says : str
+        In a few words.
+    scene : str
+    t_end : float
+        s.
+    changes : mapping
+        Values of the scene by dotted key.
+    point : str or None
+        The mechanism's point whose position is compared; None: all coordinates.
+    quick : bool
+        Part of the quick report.
+    """
+
+    key: str
+    says: str
+    scene: str
+    t_end: float
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    point: str | None = None
+    quick: bool = False
+
+    def load(self, **solver: Any) -> Scene:
+        """Return the scene, with values of its solver and formulation: load(formulation="dae", solver__rtol=1e-6)."""
+        own = {name.replace("__", "."): value for name, value in solver.items()}
+        return load_scene(
+            self.scene, {**self.changes, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **own}
+        )
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The mechanism, loaded once."""
+        return scene_mechanism(self.load())
+
+    @property
+    def controlled(self) -> bool:
+        """Whether a controller acts, so that energy is not conserved."""
+        return self.load().spec.controller is not None
+
+    @property
+    def instants(self) -> Array:
+        """When motions are compared, shape (INSTANTS + 1,), the start included, s."""
+        return np.linspace(0.0, self.t_end, INSTANTS + 1)
+
+    def observed(self, q_tree: Array) -> Array:
+        """What is compared of configurations by coordinate, (m, n): themselves, or (m, 3) positions of the point."""
+        if self.point is None:
+            return q_tree
+        from_coordinates, positions = self.mechanism.tree.from_coordinates, self.mechanism.point_positions
+        return np.array([positions(from_coordinates(row))[self.point] for row in q_tree])
+
+
+def _n_four_bar(N: int, quick: bool = False) -> Work:
+    row = f"N-four-bar, N = {N}, 10 s"
+    return Work(f"n_four_bar_{N}", row, "n_four_bar", 10.0, {"mechanism.N": N}, point="B0", quick=quick)
+
+
+def _tracking(epsilon: float, quick: bool = False) -> Work:
+    says = f"five-bar, tracking, 9.5 s, ε = {epsilon:.0e}"
+    return Work(f"tracking_{epsilon:.0e}", says, "five_bar/tracking", 9.5, {"epsilon": epsilon}, quick=quick)
+
+
+WORKS = (
+    Work("swing", "five-bar, free swing, 2 s", "five_bar/swing", 2.0, quick=True),
+    Work("swing_20", "five-bar, free swing, 20 s", "five_bar/swing", 20.0),
+    _tracking(1e-2),
+    _tracking(1e-4, quick=True),
+    _tracking(1e-8),
+    Work("set_point", "five-bar, set-point control, 9.5 s", "five_bar/set_point", 9.5),
+    Work("andrews", "Andrews' squeezer, 0.05 s", "andrews", 0.05, quick=True),
+    _n_four_bar(1),
+    _n_four_bar(4, quick=True),
+    _n_four_bar(16),
+    _n_four_bar(40),
+    Work("bricard", "Bricard's six-bar, 10 s", "bricard", 10.0),
+    Work("slider_crank", "slider-crank, 5 s", "slider_crank", 5.0),
+    Work("delta", "Delta, let go, 5 s", "delta", 5.0),
+    Work("two_ur5", "two UR5 on one bar, let go, 2 s", "two_ur5", 2.0),
+)

@@ -1,0 +1,239 @@
+"""The report: references against published values, rows that are kept as long as they hold, sentences that follow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin.errors import InputError
+from ckc_pin.study.report import make, ours
+from ckc_pin.study.report import table as tables
+from ckc_pin.study.report.figure import _front
+from ckc_pin.study.report.page import web
+from ckc_pin.study.report.peers import peers
+from ckc_pin.study.report.reference import Reference, reference
+from ckc_pin.study.report.row import Motion, Row, judged
+from ckc_pin.study.report.sentences import fastest, sentences
+from ckc_pin.study.report.table import Table, key
+from ckc_pin.study.report.work import WORKS, Work
+from tests.analytic.five_bar import FIVE_BAR, Q
+
+SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
+EVERY = {work.key: work for work in WORKS}
+
+
+@pytest.fixture(scope="module")
+def exact() -> Reference:
+    return reference(SHORT)
+
+
+# --- references ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("work", "B0"),
+    [
+        ("n_four_bar_1", [0.478385057760970559, 0.878150178791209301, 0.0]),
+        ("n_four_bar_40", [0.180512226686728390, 0.983572740582311575, 0.0]),
+    ],
+)
+def test_a_row_of_squares_ends_where_forty_digits_say(work: str, B0: list[float]) -> None:
+    """The elliptic functions with mpmath at forty digits; an integration by others agrees with them to 1e-11."""
+    found = reference(EVERY[work])
+    assert np.abs(found.values[-1] - B0).max() < 1e-13
+    assert np.abs(found.values[0] - [0, 1, 0]).max() < 1e-15
+
+
+def test_a_reference_knows_how_good_it_is(exact: Reference) -> None:
+    assert exact.values.shape == (11, 4)
+    assert 0 < exact.accuracy < 1e-11
+
+    def rate(t: float, y: Any) -> Any:
+        return np.concatenate([y[2:], FIVE_BAR.acceleration(FIVE_BAR.sigma(y[:2]), y[2:], np.zeros(2))])
+
+    start = np.concatenate(
+        [exact.values[0][Q], [SHORT.load().spec.initial.q_dot.get(x, 0.0) for x in ("theta_1", "theta_3")]]
+    )
+    numpy_run = solve_ivp(rate, (0.0, SHORT.t_end), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:2, -1]
+    assert np.abs(numpy_run - exact.values[-1][Q]).max() < 1e-10
+    assert "the reduced model at 1e-13 agrees" in exact.how
+
+
+# --- rows ---------------------------------------------------------------------------------------------------------
+
+
+def motion(q_tree: Any, v_tree: Any = None, status: str = "done") -> Motion:
+    return Motion(status, "", q_tree, np.zeros_like(q_tree) if v_tree is None else v_tree, 0.5, 0.1, steps=3)
+
+
+def test_errors_are_along_the_run_and_at_its_end(exact: Reference) -> None:
+    off = exact.values.copy()
+    off[4, 1] += 3e-3
+    off[-1, 2] -= 2e-4
+    row = judged("k", SHORT, "other", "s", motion(off), exact)
+    assert row.error_max == pytest.approx(3e-3, rel=1e-6)
+    assert row.error_end == pytest.approx(2e-4, rel=1e-6)
+    phi = [np.abs(FIVE_BAR.phi(q_tree)).max() for q_tree in off]
+    assert row.closure == pytest.approx(max(phi), rel=1e-6)
+
+
+@pytest.mark.parametrize("broken", ["stopped", "nan", "short"])
+def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> None:
+    values = exact.values[:5] if broken == "short" else exact.values.copy()
+    if broken == "nan":
+        values[-1, 0] = np.nan
+    row = judged("k", SHORT, "other", "s", motion(values, status="stopped" if broken == "stopped" else "done"), exact)
+    assert row.error_max is None
+    assert row.status != "done" or broken == "short"
+
+
+def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
+    setting = ours.Setting("dae, auto", {"formulation": "dae", "solver.rtol": 1e-8})
+    row = judged("k", SHORT, ours.PROGRAM, "s", ours.compute(SHORT, setting), exact)
+    assert row.error_max is not None
+    assert row.error_max < 1e-7
+    assert row.energy_drift is not None
+    assert row.energy_drift < 1e-6
+    settings = {
+        "MuJoCo": "RK4, stiff, dt 0.001",
+        "Pinocchio constraintDynamics": "K_p 10, dt 0.0001",
+        "SUNDIALS IDA": "rtol 1e-05",
+    }
+    for peer in peers():
+        assert peer.missing(SHORT) is None
+        assert settings[peer.name] in set(peer.settings(quick=False))
+        theirs = judged("k", SHORT, peer.name, "s", peer.compute(SHORT, settings[peer.name], 60.0), exact)
+        assert theirs.error_max is not None
+        assert theirs.error_max < 1e-3
+        assert theirs.error_max > row.error_max
+
+
+def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:
+    mujoco = peers()[0]
+    refused = judged("k", SHORT, "MuJoCo", "s", mujoco.compute(SHORT, "RK4, stiff, dt 1e-06", 1e-3), exact)
+    assert refused.status == "refused"
+    assert "the budget is" in refused.reason
+    assert refused.error_max is None
+
+
+def test_others_say_why_they_are_missing() -> None:
+    said = {peer.name: peer.missing(EVERY["tracking_1e-04"]) for peer in peers()}
+    assert said["MuJoCo"] == "the controller is ours; only motions without one are compared"
+    assert said["SUNDIALS IDA"] is None
+    assert {peer.name: peer.missing(EVERY["andrews"]) for peer in peers()}["Pinocchio constraintDynamics"] is not None
+
+
+# --- the table ----------------------------------------------------------------------------------------------------
+
+
+def row(**changes: Any) -> Row:
+    plain: dict[str, Any] = {
+        "key": "k", "work": "short", "program": ours.PROGRAM, "setting": "dae, auto, rtol 1e-06", "status": "done",
+        "reason": "", "error_end": 1e-8, "error_max": 1e-7, "closure": 1e-14, "energy_drift": None, "wall_s": 0.01,
+        "setup_s": 0.02, "steps": 10, "rhs": 100,
+    }  # fmt: skip
+    return Row(**(plain | changes))
+
+
+def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
+    written = [row(), row(key="l", status="stopped", reason='a "reason", with a comma', error_end=None, rhs=None)]
+    table = Table(tmp_path / "t.csv")
+    for line in written:
+        table.add(line)
+    assert list(Table(tmp_path / "t.csv").rows.values()) == written
+
+
+@pytest.mark.parametrize("text", ["no table", "key,work\n1,2\n", "\0", ",".join(Row.__struct_fields__) + "\nx"])
+def test_a_table_of_somebody_else_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="not a report's table"):
+        Table(tmp_path / "t.csv")
+
+
+def test_a_row_depends_on_scene_setting_program_code_and_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = key(SHORT, "p", "1", "s")
+    assert key(SHORT, "p", "1", "s") == base
+    longer = Work("short", SHORT.says, SHORT.scene, 0.2)
+    others = [
+        key(longer, "p", "1", "s"),
+        key(SHORT, "q", "1", "s"),
+        key(SHORT, "p", "2", "s"),
+        key(SHORT, "p", "1", "t"),
+    ]
+    monkeypatch.setattr(tables, "machine", lambda: "another")
+    others.append(key(SHORT, "p", "1", "s"))
+    monkeypatch.setattr(tables, "_code", lambda: "another")
+    others.append(key(SHORT, "p", "1", "s"))
+    assert len({base, *others}) == 7
+
+
+# --- sentences and the page ---------------------------------------------------------------------------------------
+
+
+def test_the_fastest_is_the_one_that_is_right_all_along() -> None:
+    slow, fast = row(wall_s=0.2), row(wall_s=0.1, error_max=2e-3)
+    failed = row(wall_s=0.01, status="stopped", error_max=None)
+    assert fastest([slow, fast, failed], 1e-6) is slow
+    assert fastest([slow, fast, failed], 1e-2) is fast
+    assert fastest([failed], 1e-2) is None
+
+
+def test_sentences_name_who_is_ahead_and_by_how_much() -> None:
+    good = Reference(np.zeros((11, 4)), 1e-10, "known")
+    here = [row(wall_s=0.2, error_max=1e-10)]
+    there = row(program="MuJoCo", setting="RK4", wall_s=0.05, error_max=1e-4)
+    said = list(sentences(SHORT, [*here, there], good))
+    assert said[0] == "To 1e-03: dae, auto, rtol 1e-06, 200 ms; MuJoCo (RK4) takes 50 ms, 4 times faster than here."
+    assert said[1] == "To 1e-06: dae, auto, rtol 1e-06, 200 ms; no other program gets there."
+    assert said[3] == "To 1e-12: not told, the reference is good to 1e-10."
+    slower = row(program="MuJoCo", setting="RK4", wall_s=0.6, error_max=1e-4)
+    assert next(sentences(SHORT, [*here, slower], good)).endswith("MuJoCo (RK4) takes 600 ms, 3 times as long.")
+    printed = [row(setting="spf, eq. 8, auto", wall_s=0.4), row(setting="reduced, auto", wall_s=0.1)]
+    assert "Eq. 8 as printed to 1e-06: 4 times the reduced model's time, it does not pay." in list(
+        sentences(SHORT, printed, good)
+    )
+
+
+def test_the_front_is_what_no_other_point_beats() -> None:
+    assert _front([(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (4.0, 2.0)]) == [(1.0, 5.0), (3.0, 1.0)]
+
+
+class Nobody:
+    """A program that is not there."""
+
+    name = "Nobody"
+
+    def missing(self, work: Work) -> str:
+        return "not installed: pip install nobody"
+
+    def settings(self, quick: bool) -> list[str]:
+        return ["never"]
+
+
+def test_a_report_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(make, "WORKS", (SHORT,))
+    monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody()])
+    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
+    monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", (1e-3,))
+    measured: list[str] = []
+    found = make.report(tmp_path / "r", quick=True, progress=measured.append)
+    assert len(found.rows["short"]) == 4 * 2 + 4
+    assert len(measured) == 1 + 12
+    assert [path.name for path in found.files] == ["report.html", "report.md", "report.csv", "short.png", "short.svg"]
+    text = (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
+    assert "Nobody : not compared, not installed" in text.replace("  ", " ")
+    html = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
+    assert 'src="data:image/png;base64,' in html
+    assert "http" not in html.replace("http-equiv", "")
+    measured.clear()
+    again = make.report(tmp_path / "r", quick=True, progress=measured.append)
+    assert again.rows == found.rows
+    assert measured == ["short: reference"]
+
+
+def test_a_page_is_escaped(tmp_path: Path) -> None:
+    assert "<script>" not in web("# \\<script>alert(1)\\</script>", tmp_path)
