@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin.errors import InputError
+from ckc_pin.simulation.simulate import simulate
 from ckc_pin.study.report import make, ours
 from ckc_pin.study.report import table as tables
 from ckc_pin.study.report.figure import _front
@@ -200,6 +202,22 @@ def test_sentences_name_who_is_ahead_and_by_how_much() -> None:
 
 def test_the_front_is_what_no_other_point_beats() -> None:
     assert _front([(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (4.0, 2.0)]) == [(1.0, 5.0), (3.0, 1.0)]
+
+
+def test_an_interrupt_ends_the_report_and_what_was_measured_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any) -> Any:
+        if len(Table(tmp_path / "report.csv").rows) == 1:
+            return replace(whole, status="interrupted", message="interrupted at t = 0.01 s by SIGTERM")
+        return whole
+
+    whole = simulate(SHORT.load())
+    monkeypatch.setattr(make, "WORKS", (SHORT,))
+    monkeypatch.setattr(ours, "simulate", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        make.report(tmp_path, quick=True)
+    assert len(Table(tmp_path / "report.csv").rows) == 1
 
 
 class Nobody:

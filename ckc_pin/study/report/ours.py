@@ -57,6 +57,8 @@ def compute(work: Work, setting: Setting) -> Motion:
         except CkcError as error:
             none = work.mechanism.q_tree[None, :0].reshape(0, work.mechanism.n)
             return Motion("refused", str(error), none, none, 0.0, perf_counter() - began)
+        if run.status == "interrupted":  # the report is, not only this run
+            raise KeyboardInterrupt("SIGTERM" if "SIGTERM" in run.message else "")
         walls.append(float(run.stats["wall_s"]))
         setup = perf_counter() - began - walls[-1]
         if run.status != "done" or walls[-1] > SHORT or len(walls) > REPEATS:

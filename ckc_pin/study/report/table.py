@@ -50,13 +50,15 @@ class Table:
     def write(self, keys: Iterable[str]) -> None:
         """Write the rows of these keys, and no others."""
         columns = Row.__struct_fields__
+        unfinished = self.path.with_suffix(".part")
         try:
-            with self.path.open("w", newline="", encoding="utf-8") as file:
+            with unfinished.open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file)
                 writer.writerow(columns)
                 for k in keys:
                     values = msgspec.to_builtins(self.rows[k])
                     writer.writerow(["" if values[name] is None else values[name] for name in columns])
+            unfinished.replace(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
