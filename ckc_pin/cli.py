@@ -105,7 +105,7 @@ def check(
     branches: Annotated[bool, typer.Option("--branches", help="List the assembly branches too.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Freedoms, rank, redundant rows, partition; for a scene whether its trajectory stays in the workspace."""
+    """Freedoms, rank, redundant rows, partition. For a scene also whether its trajectory stays in the workspace."""
     found = ckc_pin.check(what, branches=branches)
     if as_json:
         for warning in found.warnings:
@@ -211,7 +211,7 @@ def _view(scene: ckc_pin.Scene, speed: float | None, port: int, open_browser: bo
 
 @app.command(epilog=_examples("ckc plot runs/reduced runs/spf --out figures"))
 def plot(runs: Runs, out: Annotated[Path, typer.Option("--out", help="Folder for the figures.")] = Path()) -> None:
-    """Figures of one or several runs."""
+    """Figures of one or several runs, PNG and SVG."""
     from ckc_pin.view.figures import plot as plot_runs
 
     for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg")):
@@ -238,7 +238,7 @@ def play(
     port: Port = 0,
     open_browser: Open = False,
 ) -> None:
-    """Play runs back in the browser through meshcat, on this machine only; several lie on each other."""
+    """Watch runs in the browser, on this machine only. Several runs lie on each other."""
     _check_speed(speed)
     loaded = [ckc_pin.Run.load(path) for path in runs]
     if html is None:
@@ -271,7 +271,7 @@ def map_(
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for the figure.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Where it can go and where it is singular, branch by branch (Fig. 2)."""
+    """Where it can go and where it is singular. Branch by branch, as the paper's Fig. 2."""
     from ckc_pin.study import map as maps
     from ckc_pin.view.map_figure import require_figures, save_map
     from ckc_pin.view.sections_figure import save_sections
@@ -308,7 +308,7 @@ def import_(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write another format's robot as a mechanism.toml and a URDF, and say what was guessed and left out."""
+    """Take a robot from another format. Writes a mechanism.toml and a URDF, and says what was guessed and left out."""
     from ckc_pin.mechanism import importing
 
     draft = importing.read(file)
@@ -340,7 +340,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write a mechanism for another program, and say what moves otherwise there."""
+    """Write a mechanism for another program. Says what moves otherwise there."""
     from ckc_pin.mechanism import exporting
 
     found = exporting.export(ckc_pin.load(mechanism), to)

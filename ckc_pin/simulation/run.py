@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.library import MECHANISM_FILE, build
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
@@ -110,7 +110,8 @@ class Run:
     def loop_forces(self) -> dict[str, Array]:
         """Multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
 
-        For a point row: the force that the loop exerts on frame A, along the row's axis.
+        For a point row: the force that the loop exerts on frame A, along the row's axis. NaN where J has lost rank, so
+        that nothing determines them.
         """
         from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
         from ckc_pin.dynamics.terms import Terms
@@ -122,7 +123,10 @@ class Run:
             terms = Terms(mechanism, at, self.v_tree[k])
             u_tree = np.zeros(mechanism.n)
             u_tree[mechanism.actuated_at] = self.tau[k]
-            forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
+            try:
+                forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
+            except NumericalError:
+                forces[k] = np.nan
         loops = [loop for loop, _ in mechanism.closure.names]
         return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}
 
@@ -173,8 +177,11 @@ class Run:
         if path.is_dir():
             path = path / "run.npz"
         if not path.is_file():
-            raise InputError(f"{path}: no such run file")
-        coordinates, arrays, meta = read_run(path)
+            raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one")
+        try:
+            coordinates, arrays, meta = read_run(path)
+        except InputError as error:
+            raise InputError(f"{error}; ckc run SCENE --out DIR writes a new one") from None
         rest: dict[str, Any] = {"lyapunov": None, **arrays} | {name: getattr(meta, name) for name in META}
         for name in ("max_phi", "max_phi_dot"):
             rest[name] = np.nan if rest[name] is None else rest[name]

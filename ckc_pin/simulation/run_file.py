@@ -155,6 +155,9 @@ def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Ar
     for name, array in arrays.items():
         if array.shape != (rows, *wanted[name]) or array.dtype != np.float64 or not rows:
             raise InputError(f"{path}: damaged: {name} is {array.shape} {array.dtype}, which does not fit the rest")
+    for name in ("t", "q_tree"):
+        if not np.all(np.isfinite(arrays[name])):
+            raise InputError(f"{path}: damaged: {name} holds numbers that are not finite")
     if not np.all(np.diff(arrays["t"]) > 0):
         raise InputError(f"{path}: damaged: t does not increase")
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
@@ -49,10 +48,8 @@ def scene(runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: 
     Raises
     ------
     InputError
-        A run that cannot be drawn: not finite, or a shape of its URDF that cannot be.
+        A shape of a URDF that cannot be.
     """
-    for run in runs:
-        _require_finite(run)
     rows = [_keyframes(run.t, speed) for run in runs]
     poses = [configurations(run, at) for run, at in zip(runs, rows, strict=True)]
     motions = [placements(run.mechanism, q) for run, q in zip(runs, poses, strict=True)]
@@ -132,10 +129,3 @@ def _quaternions(rotations: Array) -> Array:
     jumps = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
     return quaternions
-
-
-def _require_finite(run: Run) -> None:
-    if not (np.all(np.isfinite(run.t)) and np.all(np.isfinite(run.q_tree))):
-        raise InputError(
-            f"{run.scene_name}: this run holds numbers that are not finite and cannot be drawn; run it again"
-        )

@@ -351,3 +351,9 @@ def test_json_knows_no_nan_and_no_infinity() -> None:
 
 def test_a_name_that_no_terminal_can_show_is_no_error() -> None:
     assert ckc("check", "\udcff.toml", "--json").json["message"].endswith("no such mechanism file")
+
+
+def test_no_summary_of_a_command_is_cut_off():
+    listed = ckc("--help").out.split("Commands:")[1]
+    assert "..." not in listed
+    assert "(Fig" not in listed

@@ -224,6 +224,11 @@ TAMPERED: dict[str, tuple[Callable[[Contents], None], str]] = {
     "no rows": (_array("t", np.zeros(0)), "damaged"),
     "a time of two dimensions": (_array("t", np.zeros((11, 1))), "t is (11, 1)"),
     "time that stands still": (_array("t", np.zeros(11)), "t does not increase"),
+    "a configuration that is no number": (
+        _array("q_tree", np.full((11, 4), np.nan)),
+        "q_tree holds numbers that are not",
+    ),
+    "an endless time": (_array("t", np.append(np.arange(10.0), np.inf)), "t holds numbers that are not finite"),
     "a pickle": (_array("energy", np.array([Payload()] * 11, dtype=object)), "damaged"),
 }
 
@@ -239,6 +244,16 @@ def test_a_tampered_file_is_refused(what: str, saved: Path) -> None:
         Run.load(saved)
     assert str(error.value).startswith(f"{saved}: ")
     assert says in str(error.value)
+    assert str(error.value).endswith("; ckc run SCENE --out DIR writes a new one")
+
+
+def test_loop_forces_are_no_numbers_where_nothing_determines_them() -> None:
+    run = simulate("n_four_bar", {"mechanism.N": 1, "t_end": 0.02})
+    q_tree = run.q_tree.copy()
+    q_tree[1] = 0.0  # all bars in line
+    (forces,) = dataclasses.replace(run, q_tree=q_tree).loop_forces().values()
+    assert np.all(np.isnan(forces[1]))
+    np.testing.assert_array_equal(np.delete(forces, 1, 0), np.delete(next(iter(run.loop_forces().values())), 1, 0))
 
 
 @pytest.mark.parametrize("length", [0, 10, 1000, -1])
