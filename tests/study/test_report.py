@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,7 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
     assert row.energy_drift < 1e-6
     settings = {
         "MuJoCo": "RK4, stiff, dt 0.001",
+        "Drake": "dt 0.0001",
         "Pinocchio constraintDynamics": "K_p 10, dt 0.0001",
         "SUNDIALS IDA": "rtol 1e-05",
     }
@@ -112,6 +114,16 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
         assert theirs.error_max is not None
         assert theirs.error_max < 1e-3
         assert theirs.error_max > row.error_max
+
+
+@pytest.mark.parametrize("work", ["swing", "andrews", "bricard", "slider_crank"])
+def test_others_are_set_up_as_the_same_tree(work: str) -> None:
+    """Mass matrix and bias at the start: the least that makes a comparison one."""
+    for peer in (peer for peer in peers() if peer.name in ("MuJoCo", "Drake")):
+        assert peer.missing(EVERY[work]) is None
+        mass, bias = (float(x) for x in re.findall(r"to (\d\S*e[-+]\d+)", peer.check(EVERY[work])))
+        assert mass < 1e-9
+        assert bias < 1e-9
 
 
 def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:

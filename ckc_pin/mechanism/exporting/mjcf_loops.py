@@ -19,7 +19,7 @@ from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Sites", "add_loops", "add_springs", "numbers", "quaternion"]
+__all__ = ["Sites", "add_loops", "add_springs", "in_one_plane", "numbers", "quaternion"]
 
 POSES = 5  # random ones, at which a planar loop has to stay in its plane
 FLAT = 1e-9  # of the size: how well
@@ -74,7 +74,7 @@ def add_loops(mechanism: Mechanism, root: Element, sites: Sites) -> list[str]:
             _hinge(mechanism, loop, a, b, equality, sites)
             differs.append(f"loop {loop.name}: a hinge is two points of its axis there, {mechanism.size:.3g} m apart")
         elif loop.type == "point_2d":
-            b = _in_one_plane(mechanism, loop, a, b)
+            b = in_one_plane(mechanism, loop, a, b)
             _equality(equality, "connect", loop.name, sites.add(f"{loop.name}.a", a), sites.add(f"{loop.name}.b", b))
             differs.append(f"loop {loop.name}: all three components of the point are closed there")
         elif loop.type == "distance":
@@ -132,7 +132,7 @@ def _further(frame: Frame, axis: Array, along: float) -> Frame:
     return Frame(frame.joint, frame.rotation, frame.translation + frame.rotation @ axis * along)
 
 
-def _in_one_plane(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame) -> Frame:
+def in_one_plane(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame) -> Frame:
     """Move B into A's plane, where the third component never changes; refuse a loop that leaves it."""
     tree, random = mechanism.tree, np.random.default_rng(1)
     axis = np.array(loop.axis_a) / np.linalg.norm(loop.axis_a)

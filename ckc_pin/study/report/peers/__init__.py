@@ -39,8 +39,9 @@ class Peer(Protocol):
 
 def peers() -> list[Peer]:
     """All programs there are wrappers for, whether installed or not."""
+    from ckc_pin.study.report.peers.drake import Drake
     from ckc_pin.study.report.peers.ida import Ida
     from ckc_pin.study.report.peers.mujoco import Mujoco
     from ckc_pin.study.report.peers.pinocchio import Pinocchio
 
-    return [Mujoco(), Pinocchio(), Ida()]
+    return [Mujoco(), Drake(), Pinocchio(), Ida()]

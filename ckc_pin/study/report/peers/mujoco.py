@@ -17,8 +17,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.exporting import export
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import find_start
-from ckc_pin.study.report.peers.stepping import divided, stepped
+from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
@@ -60,7 +59,7 @@ class Mujoco:
         import mujoco
 
         tree = work.mechanism.tree
-        q_tree, v_tree = _start(work)
+        q_tree, v_tree = start_of(work)
         model = _model(work.mechanism)
         data = mujoco.MjData(model)
         joints = _Joints(work.mechanism, model)
@@ -92,7 +91,7 @@ class Mujoco:
             model.eq_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a run that blew up is not to start again
         data, joints = mujoco.MjData(model), _Joints(work.mechanism, model)
-        q_tree, v_tree = _start(work)
+        q_tree, v_tree = start_of(work)
 
         def reset() -> None:
             mujoco.mj_resetData(model, data)
@@ -170,8 +169,3 @@ def _model(mechanism: Mechanism) -> Any:
 
 def _silent(message: str) -> None:
     """Pass over a warning: a run that became unstable is told by its numbers."""
-
-
-def _start(work: Work) -> tuple[Array, Array]:
-    start = find_start(work.mechanism, work.load())
-    return start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree

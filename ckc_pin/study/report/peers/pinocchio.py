@@ -11,8 +11,7 @@ import pinocchio as pin
 
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import find_start
-from ckc_pin.study.report.peers.stepping import divided, stepped
+from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
@@ -63,11 +62,9 @@ class Pinocchio:
         settings = pin.ProximalSettings(1e-12, 1e-10, 10)  # loops with redundant rows need a small mu
         tau, state = mechanism.springs.constant, {"q": np.empty(0), "v": np.empty(0)}
         h = divided(work, dt)
-        start = find_start(mechanism, work.load())
 
         def reset() -> None:
-            state["q"] = start.at.q_tree.copy()
-            state["v"] = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree.copy()
+            state["q"], state["v"] = start_of(work)
 
         def step(many: int) -> None:
             q, v = state["q"], state["v"]

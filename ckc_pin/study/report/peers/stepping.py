@@ -8,16 +8,23 @@ from time import perf_counter
 import numpy as np
 
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import INSTANTS, Work
 
-__all__ = ["divided", "stepped"]
+__all__ = ["divided", "start_of", "stepped"]
 
 TRIAL = 50  # steps, to foresee how long all take
 REPEATS = 3
 SHORT = 1.0  # s: what takes less is repeated
 
 State = tuple[Array, Array]  # q_tree, v_tree by coordinate
+
+
+def start_of(work: Work) -> State:
+    """Return Pinocchio's q_tree and the v_tree that a work starts with."""
+    start = find_start(work.mechanism, work.load())
+    return start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
 
 
 def divided(work: Work, dt: float) -> float:

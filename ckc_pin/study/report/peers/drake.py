@@ -1,0 +1,210 @@
+"""Drake: a discrete plant with its own loop constraints, which it has in discrete time only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.exporting.mjcf_loops import in_one_plane
+from ckc_pin.mechanism.frames import Frame
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rows import Affine
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
+from ckc_pin.study.report.row import Motion
+from ckc_pin.study.report.work import Work
+
+__all__ = ["Drake"]
+
+STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)  # s
+QUICK_STEPS = (3e-3, 1e-3, 3e-4)
+CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
+
+
+class Drake:
+    """A MultibodyPlant built joint by joint from Pinocchio's tree, loops by ball, weld and distance constraints."""
+
+    name = "Drake"
+
+    def missing(self, work: Work) -> str | None:
+        try:
+            metadata.version("drake")
+        except metadata.PackageNotFoundError:
+            return "not installed: pip install 'ckc_pin[peers]'"
+        others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED)
+        if work.controlled:
+            return "the controller is ours; only motions without one are compared"
+        if others:
+            return f"it has no constraint for {', '.join(sorted(others))}"
+        if work.mechanism.tree.free:
+            return "free roots are not set up in it"
+        try:
+            _Plant(work.mechanism, 1e-3)
+        except (InputError, RuntimeError) as error:
+            return str(error)
+        return None
+
+    def version(self) -> str:
+        return metadata.version("drake")
+
+    def settings(self, quick: bool) -> Iterator[str]:
+        for dt in QUICK_STEPS if quick else STEPS:
+            yield f"dt {dt:g}"
+
+    def check(self, work: Work) -> str:
+        """Compare D' and the bias at the start."""
+        import pinocchio as pin
+
+        plant, tree = _Plant(work.mechanism, 1e-3), work.mechanism.tree
+        context = plant.plant.CreateDefaultContext()
+        q_tree, v_tree = start_of(work)
+        plant.put(context, q_tree, v_tree)
+        D = pin.crba(tree.model, tree.data, q_tree)
+        D = np.triu(D) + np.triu(D, 1).T
+        bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
+        M = plant.plant.CalcMassMatrixViaInverseDynamics(context)[np.ix_(plant.at, plant.at)]
+        gravity = plant.plant.CalcGravityGeneralizedForces(context)
+        theirs = (plant.plant.CalcBiasTerm(context) - gravity)[plant.at]
+        mass, off = np.abs(M - D).max() / np.abs(D).max(), np.abs(theirs - bias).max()
+        return f"D' agrees to {mass:.0e}, the bias to {off / max(float(np.abs(bias).max()), 1e-12):.0e}"
+
+    def compute(self, work: Work, setting: str, budget: float) -> Motion:
+        from pydrake.systems.analysis import Simulator
+
+        dt = float(setting.removeprefix("dt "))
+        plant = _Plant(work.mechanism, divided(work, dt))
+        q_tree, v_tree = start_of(work)
+        running: dict[str, Any] = {}
+
+        def reset() -> None:
+            context = plant.plant.CreateDefaultContext()
+            plant.plant.get_applied_generalized_force_input_port().FixValue(context, plant.constant)
+            plant.put(context, q_tree, v_tree)
+            running["simulator"], running["t"] = Simulator(plant.plant, context), 0.0
+            running["simulator"].Initialize()
+
+        def step(many: int) -> None:
+            running["t"] += many * plant.dt
+            running["simulator"].AdvanceTo(running["t"])
+
+        def state() -> tuple[Array, Array]:
+            return plant.state(running["simulator"].get_context())
+
+        return stepped(work, dt, reset, step, state, budget)
+
+
+class _Plant:
+    """A mechanism as Drake's plant."""
+
+    def __init__(self, mechanism: Mechanism, dt: float) -> None:
+        from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
+
+        self.mechanism, self.dt = mechanism, dt
+        self.plant: Any = MultibodyPlant(dt)
+        self.plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)  # which has constraints
+        self.plant.mutable_gravity_field().set_gravity_vector(mechanism.tree.model.gravity.linear)
+        self._bodies: list[Any] = [self.plant.world_body()]
+        self._joints: list[Any] = []
+        for k in range(1, mechanism.tree.model.njoints):
+            self._add(k)
+        self._close()
+        self._spring()
+        self.plant.Finalize()
+        self.at = [int(joint.velocity_start()) for joint in self._joints]
+        self.constant = np.zeros(self.plant.num_velocities())
+        self.constant[self.at] = mechanism.springs.constant
+
+    def put(self, context: Any, q_tree: Array, v_tree: Array) -> None:
+        """Set a state."""
+        q, v = np.zeros(len(self.at)), np.zeros(len(self.at))
+        q[self.at], v[self.at] = q_tree, v_tree
+        self.plant.SetPositions(context, q)
+        self.plant.SetVelocities(context, v)
+
+    def state(self, context: Any) -> tuple[Array, Array]:
+        """Return q_tree and v_tree by coordinate."""
+        return self.plant.GetPositions(context)[self.at], self.plant.GetVelocities(context)[self.at]
+
+    def _add(self, k: int) -> None:
+        """Add the body that joint k carries, and the joint."""
+        from pydrake.multibody.tree import (
+            FixedOffsetFrame,
+            PrismaticJoint,
+            RevoluteJoint,
+            RotationalInertia,
+            SpatialInertia,
+        )
+
+        model = self.mechanism.tree.model
+        name, inertia, placement = model.names[k], model.inertias[k], model.jointPlacements[k]
+        moments = np.array(inertia.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        spatial = SpatialInertia.MakeFromCentralInertia(inertia.mass, inertia.lever, RotationalInertia(*moments))
+        body = self.plant.AddRigidBody(f"{name} body", spatial)
+        place = _placed(placement)
+        parent = self._bodies[int(model.parents[k])].body_frame()
+        frame = self.plant.AddFrame(FixedOffsetFrame(f"{name} frame", parent, place))
+        joint, data = model.joints[k], model.joints[k].createData()
+        joint.calc(data, self.mechanism.tree.neutral())
+        along = np.asarray(data.S).reshape(6)
+        kind, axis = (PrismaticJoint, along[:3]) if along[:3].any() else (RevoluteJoint, along[3:])
+        make: Callable[..., Any] = kind
+        damping = float(self.mechanism.springs.joint_damping[joint.idx_v])
+        self._bodies.append(body)
+        self._joints.append(self.plant.AddJoint(make(name, frame, body.body_frame(), axis, damping=damping)))
+
+    def _close(self) -> None:
+        """Add the loops and couplings."""
+        mechanism, plant = self.mechanism, self.plant
+        for loop in mechanism.spec.loop:
+            a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
+            b = in_one_plane(mechanism, loop, a, b) if loop.type == "point_2d" else b
+            first, second = self._bodies[a.joint], self._bodies[b.joint]
+            if loop.type == "weld":
+                plant.AddWeldConstraint(first, _placed(a), second, _placed(b))
+            elif loop.type == "distance":
+                plant.AddDistanceConstraint(first, a.translation, second, b.translation, loop.length)
+            else:
+                plant.AddBallConstraint(first, a.translation, second, b.translation)
+            if loop.type == "hinge":  # a second point of the axis
+                ends = [_along(a, loop.axis_a, mechanism.size), _along(b, loop.axis_b, mechanism.size)]
+                plant.AddBallConstraint(first, ends[0], second, ends[1])
+        for group in mechanism.closure.groups:
+            for row, offset in zip(group.matrix, group.offset, strict=True) if isinstance(group, Affine) else ():
+                k = int(np.flatnonzero(row == 1)[0])
+                other = next((int(j) for j in np.flatnonzero(row) if j != k), None)
+                if other is None:
+                    raise InputError("a coupling with ratio 0 has no counterpart in it")
+                plant.AddCouplerConstraint(self._joints[k], self._joints[other], -row[other], offset)
+
+    def _spring(self) -> None:
+        """Add springs between frames; those on joints have an element for hinges only."""
+        from pydrake.multibody.tree import LinearSpringDamper, RevoluteJoint, RevoluteSpring
+
+        mechanism, springs = self.mechanism, self.mechanism.springs
+        for spring in mechanism.spec.spring:
+            if spring.frame_a is None or spring.frame_b is None:
+                continue
+            a, b = (mechanism.frames.find(frame, "spring") for frame in (spring.frame_a, spring.frame_b))
+            ends = (self._bodies[a.joint], a.translation, self._bodies[b.joint], b.translation)
+            force: Callable[..., Any] = LinearSpringDamper
+            self.plant.AddForceElement(force(*ends, spring.rest_length or 0.0, spring.stiffness, spring.damping))
+        for k in np.flatnonzero(springs.joint_stiffness):
+            if not isinstance(self._joints[k], RevoluteJoint):
+                raise InputError("a spring on a prismatic joint has no counterpart in it")
+            nominal, stiffness = float(springs.joint_rest[k]), float(springs.joint_stiffness[k])
+            self.plant.AddForceElement(RevoluteSpring(self._joints[k], nominal, stiffness))
+
+
+def _placed(frame: Any) -> Any:
+    """Return a frame or a placement as Drake's."""
+    from pydrake.math import RigidTransform, RotationMatrix
+
+    return RigidTransform(RotationMatrix(frame.rotation), frame.translation)
+
+
+def _along(frame: Frame, axis: tuple[float, float, float], size: float) -> Array:
+    return frame.translation + frame.rotation @ np.array(axis) / np.linalg.norm(axis) * size
