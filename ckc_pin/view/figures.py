@@ -130,7 +130,7 @@ def _write(figure: Figure, path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=style.DPI, metadata=dates.get(path.suffix[1:]))
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be written: {error.strerror}; choose another folder") from None
     return path
 
 

@@ -72,9 +72,11 @@ def singularity_map(
     named = mechanism if isinstance(mechanism, str | FilePath) else mechanism.name
     mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
     if mechanism.d == 0:
-        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: there is nothing to map")
+        raise InputError(
+            f"{mechanism.name}: d = 0, the loops leave no freedom, there is nothing to map; leave out a loop"
+        )
     if not mechanism.dependent:
-        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere: there is nothing to map")
+        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere; map one that has")
     if not CELLS[0] <= cells <= CELLS[1]:
         raise InputError(f"cells = {cells}: from {CELLS[0]} to {CELLS[1]} along an axis")
     if space not in ("joint", "cartesian"):

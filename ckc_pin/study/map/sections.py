@@ -76,7 +76,7 @@ def workspace_sections(
     """
     mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
     if not mechanism.dependent:
-        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere: there is nothing to map")
+        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere; map one that has")
     for name, value, (least, most) in (("sections", count, COUNTS), ("cells", cells, CELLS)):
         if not least <= value <= most:
             raise InputError(f"{name} = {value}: from {least} to {most}")
