@@ -104,6 +104,7 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
     settings = {
         "MuJoCo": "RK4, stiff, dt 0.001",
         "Drake": "dt 0.0001",
+        "Exudyn": "GeneralizedAlpha, dt 0.001",
         "Pinocchio constraintDynamics": "K_p 10, dt 0.0001",
         "SUNDIALS IDA": "rtol 1e-05",
     }

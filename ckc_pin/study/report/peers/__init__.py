@@ -40,8 +40,9 @@ class Peer(Protocol):
 def peers() -> list[Peer]:
     """All programs there are wrappers for, whether installed or not."""
     from ckc_pin.study.report.peers.drake import Drake
+    from ckc_pin.study.report.peers.exudyn import Exudyn
     from ckc_pin.study.report.peers.ida import Ida
     from ckc_pin.study.report.peers.mujoco import Mujoco
     from ckc_pin.study.report.peers.pinocchio import Pinocchio
 
-    return [Mujoco(), Drake(), Pinocchio(), Ida()]
+    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), Ida()]

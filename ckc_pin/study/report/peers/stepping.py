@@ -54,20 +54,30 @@ def stepped(
     budget : float
         s; where more is foreseen the run is refused.
     """
+    none = np.empty((0, work.mechanism.n))
     many = round(work.t_end / INSTANTS / divided(work, dt))
     reset()
     began = perf_counter()
-    step(min(TRIAL, many))
+    try:
+        step(min(TRIAL, many))
+    except Exception as error:  # whatever a program raises where its solver fails
+        return Motion("failed", _said(error), none, none, 0.0, 0.0)
     foreseen = (perf_counter() - began) / min(TRIAL, many) * many * INSTANTS
     if foreseen > budget:
-        none = np.empty((0, work.mechanism.n))
         return Motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s", none, none, 0.0, 0.0)
     walls: list[float] = []
     while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
-        wall, states = _timed(lambda: step(many), reset, state)
+        try:
+            wall, states = _timed(lambda: step(many), reset, state)
+        except Exception as error:
+            return Motion("failed", _said(error), none, none, 0.0, 0.0)
         walls.append(wall)
     q_tree, v_tree = (np.array(rows) for rows in zip(*states, strict=True))
     return Motion("done", "", q_tree, v_tree, min(walls), 0.0, steps=many * INSTANTS)
+
+
+def _said(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _timed(
