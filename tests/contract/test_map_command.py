@@ -26,6 +26,7 @@ def test_numbers_and_figures(tmp_path):
 def test_of_two_freedoms_for_people(tmp_path):
     found = ckc("map", "five_bar", "--cells", "16", "--scene", "set_point", "--out", str(tmp_path))
     assert found.code == 0
+    assert found.err == ""  # no progress in a pipe
     assert "0.993864982" in found.out
     assert f"{np.pi - 0.993864982:.9f}" in found.out
     assert "type 2, closed" in found.out
@@ -57,6 +58,21 @@ def test_mechanisms_that_have_no_map(tmp_path, text, options, says):
     assert found.code == 2
     assert found.json["status"] == "error"
     assert says in found.json["message"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["delta", "--sections", "4"], "--sections goes with --space cartesian"),
+        (["delta", "--space", "cartesian", "--sections", "4", "--scene", "circle"], "and without --scene"),
+        (["delta", "--space", "cartesian", "--sections", "99"], "sections = 99: from 2 to 24"),
+        (["five_bar", "--space", "cartesian", "--sections", "4"], "map two coordinates instead"),
+    ],
+)
+def test_sections_that_cannot_be(words, says):
+    found = ckc("map", *words)
+    assert (found.code, found.out) == (2, "")
+    assert says in found.err
 
 
 def test_no_point_for_the_cartesian_space():

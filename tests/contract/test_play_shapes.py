@@ -15,6 +15,7 @@ from ckc_pin.view.drawing import scene
 from ckc_pin.view.gaps import gaps
 from ckc_pin.view.player import play, save_html
 from ckc_pin.view.skeleton import configurations
+from tests.contract.helpers.command import ckc
 from tests.contract.sketches import (
     ARM,
     FACES,
@@ -195,3 +196,28 @@ def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
     several = msgspec.msgpack.decode(base64.b64decode(data, validate=True))
     assert several["type"] == "several"
     assert several["commands"] == msgspec.msgpack.decode(msgspec.msgpack.encode(scene([run], speed=0.5)))
+
+
+def test_the_command_writes_the_same_file(run, tmp_path):
+    saved = run("five_bar/swing").save(tmp_path / "run.npz")
+    found = ckc("play", str(saved), "--html", str(tmp_path / "x.html"), "--gap", "100", "--speed", "2")
+    assert (found.code, found.out, found.err) == (0, f"written: {tmp_path / 'x.html'}\n", "")
+    own = save_html(ckc_pin.Run.load(saved), tmp_path / "own.html", gap=100.0, speed=2.0)
+    assert own.read_bytes() == (tmp_path / "x.html").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--speed", "0"], "--speed 0: it must be above zero, 1 is real time"),
+        (["--gap", "-1"], "play: gap = -1.0; it says how many times larger gaps are drawn, 0 draws none"),
+        (["--port", "70000"], "port 70000: choose one from 1 to 65535, or 0 for any free one"),
+        (["--meshes", "nowhere"], "play: meshes = nowhere: no such folder; give the one that the mechanism.toml is in"),
+        (["--html", "no/where.html"], "no/where.html: cannot be written: No such file or directory; choose a file in"),
+    ],
+)
+def test_what_the_command_cannot_do_is_said_in_one_line(run, tmp_path, words, says):
+    found = ckc("play", str(run("five_bar/swing").save(tmp_path / "run.npz")), *words)
+    assert (found.code, found.out) == (2, "")
+    assert found.err.startswith(f"error: {says}")
+    assert found.err.count("\n") == 1
