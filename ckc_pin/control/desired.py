@@ -62,18 +62,23 @@ class Table:
     t : (m,) array
         Increasing times, at least six.
     q : (m, d) array
+
+    Attributes
+    ----------
+    spline : scipy.interpolate.BSpline
+        q_d.
     """
 
     def __init__(self, t: Array, q: Array) -> None:
         from scipy.interpolate import make_interp_spline
 
-        self._q = make_interp_spline(t, q, k=5)
-        self._q_dot = self._q.derivative()
+        self.spline = make_interp_spline(t, q, k=5)
+        self._q_dot = self.spline.derivative()
         self._q_ddot = self._q_dot.derivative()
         self.end = float(t[-1])
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
-        return self._q(t), self._q_dot(t), self._q_ddot(t)
+        return self.spline(t), self._q_dot(t), self._q_ddot(t)
 
 
 def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sources) -> Harmonics | Table:

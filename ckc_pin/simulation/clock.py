@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from ckc_pin.control.controllers import Controller
 from ckc_pin.control.sampled import Sampled
@@ -24,6 +24,8 @@ class Legs:
 
     Attributes
     ----------
+    burst : callable or None
+        Steps as far as it can by itself, before each single step.
     good : (t, y)
         After an accepted step its end; what the system made of that once it is settled.
     """
@@ -31,6 +33,7 @@ class Legs:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.guard = RankGuard(stepper)
+        self.burst: Callable[[], None] | None = None
         self.good: tuple[float, Array] = (stepper.t, stepper.y)
 
     def aim(self, t_end: float) -> None:
@@ -48,6 +51,10 @@ class Legs:
         """Step to the end of the leg; each step but the last is settled once it has been looked at."""
         stepper = self.stepper
         while stepper.solver.status == "running":
+            if self.burst is not None:
+                self.burst()
+                if stepper.solver.status != "running":
+                    break
             step = self.guard.step()
             self.good = (step.t, stepper.solver.y)
             yield step

@@ -82,11 +82,11 @@ class Stepper:
         self.method = self._choose(jacobian, t_end) if method == "auto" else method
         rtol = bdf_rtol(spec.rtol) if method == "auto" and self.method == "BDF" else spec.rtol
         atol = spec.atol if spec.atol is not None else spec.rtol / 100
-        self._options: dict[str, Any] = {"rtol": rtol, "atol": atol * rtol / spec.rtol}
+        self.options: dict[str, Any] = {"rtol": rtol, "atol": atol * rtol / spec.rtol}
         if spec.max_step:
-            self._options["max_step"] = spec.max_step
+            self.options["max_step"] = spec.max_step
         if self.method in ("BDF", "Radau") and jacobian is not None:
-            self._options["jac"] = self._jacobian
+            self.options["jac"] = self._jacobian
         self._class: Any = self._ida if self.method == "IDA" else getattr(scipy.integrate, self.method)
         self.solver = self._solver(0.0, self.y, t_end)
         self._budgeted = True
@@ -99,7 +99,7 @@ class Stepper:
 
     def _solver(self, t: float, y: Array, t_end: float, **options: Any) -> Any:
         with np.errstate(all="ignore"):
-            solver = self._class(self._rhs, t, y, t_end, **self._options, **options)
+            solver = self._class(self._rhs, t, y, t_end, **self.options, **options)
         if self.method == "BDF":
             solver.newton_tol = NEWTON_TOL
         return solver
@@ -171,10 +171,18 @@ class Stepper:
 
     def refine(self, rtol: float) -> bool:
         """Take a finer tolerance from the next solver on; return whether it is finer than before."""
-        finer = rtol < self._options["rtol"]
+        finer = rtol < self.options["rtol"]
         if finer:
-            self._options.update(rtol=rtol, atol=min(self._options["atol"], rtol / 100))
+            self.options.update(rtol=rtol, atol=min(self.options["atol"], rtol / 100))
         return finer
+
+    def adopt(self, t: float, y: Array, f: Array, h_abs: float, before: tuple[float, Array]) -> None:
+        """Go on from (t, y) with rate f, where the native loop has stepped to; its last step began at `before`."""
+        solver = self.solver
+        solver.t, solver.y, solver.f, solver.h_abs, solver.t_old = t, y, f, h_abs, before[0]
+        self._before = before
+        if t >= solver.t_bound:
+            solver.status = "finished"
 
     def go_on(self, t: float, y: Array, length: float) -> None:
         """Go on from (t, y), which something else integrated to; the next step tries a length."""
@@ -233,6 +241,10 @@ class Stepper:
         self._times.add(t)
         if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
             raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
+        self.require_time()
+
+    def require_time(self) -> None:
+        """Raise BudgetError when max_wall_s is used up."""
         if self._budgeted and perf_counter() > self._deadline:
             raise BudgetError(f"the budget of max_wall_s = {self.spec.max_wall_s:g} s is used up")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,10 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load, mechanism_file
 from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.backend import takes_native
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.scene import Scene, SolverSpec
-from ckc_pin.simulation.systems import Dae, LevelSet, PrintedSpf, System
+from ckc_pin.simulation.systems import Dae, LevelSet, NativeDae, NativeLevelSet, NativePrintedSpf, PrintedSpf, System
 
 __all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
 
@@ -121,13 +123,15 @@ class Prepared:
     texts: dict[str, str]
 
 
-def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
+def prepare(scene: Scene, controller: Controller | None = None, *, measured: bool = False) -> Prepared:
     """Build everything that a scene needs before its first step.
 
     Parameters
     ----------
     controller : Controller, optional
         Takes the place of the scene's.
+    measured : bool
+        What Python evaluates is to be counted: "auto" does not take the native backend.
 
     Raises
     ------
@@ -154,7 +158,7 @@ def prepare(scene: Scene, controller: Controller | None = None) -> Prepared:
     if controller is not None:
         actuation.require_transmission(start.at)
     plant = Plant(controller, actuation)
-    system = make_system(mechanism, scene, start, plant)
+    system = make_system(mechanism, scene, start, plant, measured)
     return Prepared(mechanism, plant, system, _method(scene, system, plant), start, texts)
 
 
@@ -177,16 +181,21 @@ def _refuse_massless(terms: Terms) -> None:
     )
 
 
-def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) -> System:
+def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant, measured: bool = False) -> System:
     """Make the first-order system of a scene's formulation, at a start."""
     spec, force = scene.spec, plant.force
-    free = plant.controller is None  # of a controller that lives in the mechanism's own q
+    native = takes_native(mechanism, spec, measured)
+    controller, actuation = plant.controller, plant.actuation
+    free = controller is None  # of a controller that lives in the mechanism's own q
     slack = SLACK * spec.solver.rtol * mechanism.size
     if spec.formulation == "dae":
         v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
-        return Dae(mechanism, start.at, v_tree, force, *_closing(spec.solver))
+        projects, baumgarte = _closing(spec.solver)
+        dae = partial(NativeDae, controller=controller, actuation=actuation) if native else Dae
+        return dae(mechanism, start.at, v_tree, force, projects, baumgarte)
+    level_set = partial(NativeLevelSet, controller=controller, actuation=actuation) if native else LevelSet
     if spec.formulation == "reduced":
-        return LevelSet(
+        return level_set(
             mechanism,
             start.at,
             start.q_dot,
@@ -202,8 +211,9 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant) 
                 "solver: eq. 8 as printed integrates q and z as numbers, and the rotation of a free root is none; "
                 'give spf_equation = 17, or method = "auto"'
             )
-        return PrintedSpf(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
-    return LevelSet(
+        printed = partial(NativePrintedSpf, controller=controller, actuation=actuation) if native else PrintedSpf
+        return printed(mechanism, start.at, start.q_dot, force, spec.epsilon, spec.coriolis_velocity)
+    return level_set(
         mechanism,
         start.at,
         start.q_dot,

@@ -48,6 +48,10 @@ class RankGuard:
     ----------
     crossings : list of float
         When J lost rank, s.
+    end : (s, rate) or None
+        The least singular value at the end of the last step.
+    length : float
+        Of that step, s.
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -56,8 +60,8 @@ class RankGuard:
         self.rank = self.system.mechanism.rank
         self.dae = self.system if isinstance(self.system, Dae) and self.system.projects else None
         self.crossings: list[float] = []
-        self._end: tuple[float, float] | None = None  # s and its rate at the end of the last step
-        self._length = 0.0  # of that step
+        self.end: tuple[float, float] | None = None
+        self.length = 0.0
         self._inside: float | None = None  # when rank is lost within a step that was taken back
         self._reach = np.inf  # s; from farther away no leap is expected to be accurate
         self._attempts = 0
@@ -84,7 +88,7 @@ class RankGuard:
 
     def _stands(self, step: Step) -> bool:
         """Whether a step can be kept; if not it is taken back."""
-        (old, falling), (new, rising) = self._end or self._rate(step, step.t_old), self._rate(step, step.t)
+        (old, falling), (new, rising) = self.end or self._rate(step, step.t_old), self._rate(step, step.t)
         h = step.t - step.t_old
         if falling < 0 < rising and _tangents_meet(h, old, falling, new, rising) < DEEP * max(old, new):
             t, value = self._minimum(step.interpolant, step.t_old, step.t)
@@ -104,7 +108,7 @@ class RankGuard:
             raise self._lost(step, step.t, new)
         if rising > 0:
             self._attempts = 0
-        self._end, self._length = (new, rising), h
+        self.end, self.length = (new, rising), h
         return True
 
     # --- crossing --------------------------------------------------------------------------------
@@ -119,8 +123,8 @@ class RankGuard:
         self._inside = None
         if inside is not None:
             return inside - t
-        s, falling = self._end or (0.0, 0.0)
-        if falling >= 0 or not self._passes or s > -NEAR * self._length * falling:
+        s, falling = self.end or (0.0, 0.0)
+        if falling >= 0 or not self._passes or s > -NEAR * self.length * falling:
             return None
         y, rate, n = self.stepper.solver.y, self.stepper.solver.f, self.system.positions
 
@@ -141,7 +145,7 @@ class RankGuard:
             self._approach(left)
             return None
         starts = [(t, y)]
-        if left < 0.5 * self._length:  # so near J is ill-conditioned: rather from where the last step began
+        if left < 0.5 * self.length:  # so near J is ill-conditioned: rather from where the last step began
             starts.insert(0, stepper.before)
         self._attempts += 1
         for start in starts:
@@ -152,15 +156,15 @@ class RankGuard:
             self._approach(left)
             return None
         if stepper.refine(FINE) and t > 0 and stepper.solver.t_bound == self._first_leg:
-            self._end, self._length = self._again(t), t - stepper.before[0]
+            self.end, self.length = self._again(t), t - stepper.before[0]
             return None
         self.crossings.append(crossing)
         self._attempts = 0
         end = min(found.t, float(stepper.solver.t_bound))
         step = Step(t, end, found)
-        stepper.go_on(end, found(end), self._length or left)
+        stepper.go_on(end, found(end), self.length or left)
         stepper.steps += 1
-        self._end = self._rate(step, end)
+        self.end = self._rate(step, end)
         return step
 
     def _approach(self, left: float) -> None:

@@ -77,6 +77,25 @@ class Recorder:
         if self.watch is not None:
             self.watch(t, np.asarray(values["q_tree"]))
 
+    def extend(self, rows: Array) -> None:
+        """Take over what the native core has recorded, a row an instant (`Record` in record.hpp)."""
+        if not len(rows):
+            return
+        mechanism = self.system.mechanism
+        n, d, m = mechanism.n, mechanism.d, mechanism.closure.rows
+        widths = {"t": 1, "q_tree": n, "v_tree": n, "u": d, "phi": m, "w": m, "energy": 1, "lyapunov": 1}
+        parts = dict(zip(widths, np.split(rows, np.cumsum(list(widths.values())), axis=1), strict=False))
+        direct = mechanism.actuated == mechanism.independent
+        parts["tau"] = parts["u"] if direct else np.zeros((len(rows), len(mechanism.actuated)))
+        for name, kept in self.rows.items():
+            part = parts[name]
+            kept.extend(part[:, 0] if widths.get(name) == 1 and name in ("t", "energy", "lyapunov") else part)
+        if self.watch is not None:
+            for t, q_tree in zip(parts["t"][:, 0], parts["q_tree"], strict=True):
+                self.watch(float(t), q_tree)
+        self.max_phi = max(self.max_phi, float(rows[:, -2].max()))
+        self.max_phi_dot = max(self.max_phi_dot, float(rows[:, -1].max()))
+
     def arrays(self) -> dict[str, Array]:
         """Return the rows as arrays."""
         return {name: np.array(values, dtype=float) for name, values in self.rows.items()}

@@ -62,7 +62,7 @@ class SolverSpec(_Spec, frozen=True):
     output_dt: Positive | None = None
     projection: bool = True
     baumgarte: tuple[NonNegative, NonNegative] | None = None
-    backend: Literal["auto", "python"] = "auto"
+    backend: Literal["auto", "python", "native"] = "auto"
 
 
 class EventSpec(_Spec, frozen=True):

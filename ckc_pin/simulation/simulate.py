@@ -17,6 +17,7 @@ from ckc_pin.mechanism.lazy import Tally
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.burst import Burst, runs
 from ckc_pin.simulation.clock import Clock, Legs
 from ckc_pin.simulation.events import Event, Events
 from ckc_pin.simulation.integrate import BudgetError, Stepper
@@ -25,6 +26,7 @@ from ckc_pin.simulation.record import Recorder, Watch
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.systems import Native
 
 __all__ = ["Progress", "simulate"]
 
@@ -57,7 +59,7 @@ def simulate(
     events : sequence of Event, optional
         Functions of the state to watch, beside the scene's events.
     progress : callable, optional
-        Called as progress(t, t_end) after each accepted step.
+        Called as progress(t, t_end) after each accepted step, of native ones after each stretch (0.05 s or less).
     watch : callable, optional
         Called as watch(t, q_tree) at each output instant, q_tree by coordinate, shape (n,).
     profile : bool
@@ -80,7 +82,7 @@ def simulate(
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
     times = _output_instants(scene)
-    ready = prepare(scene, controller)
+    ready = prepare(scene, controller, measured=profile)
     mechanism, plant = ready.mechanism, ready.plant
     _refuse_too_much(mechanism, len(times))
     watched = Events(scene.spec.event, events, mechanism)
@@ -97,7 +99,7 @@ def simulate(
     finally:
         mechanism.tree.tally = None
     stats = {**stepper.stats(), "wall_s": perf_counter() - started,
-             "method": stepper.method, "backend": "python"}  # fmt: skip
+             "method": stepper.method, "backend": ready.system.backend}  # fmt: skip
     texts = {**mechanism.sources.texts, **scene.sources.texts, **ready.texts}
     run = Run(
         status=status,
@@ -162,6 +164,7 @@ def _steps(
 ) -> tuple[Status, str]:
     """Step to the end, recording on the way; say how it ended."""
     outputs, legs = _Outputs(recorder, times), Legs(stepper)
+    legs.burst = _burst(legs, outputs, events, clock, progress)
     try:
         for end in clock:
             legs.aim(end)
@@ -189,6 +192,29 @@ def _steps(
     with suppress(NumericalError):  # where not even that state has terms, the last output instant is the end
         recorder.add(*legs.good)
     return status, message
+
+
+def _burst(
+    legs: Legs, outputs: _Outputs, events: Events, clock: Clock, progress: Progress | None
+) -> Callable[[], None] | None:
+    """What takes plain steps natively; None where every step is to be looked at from Python."""
+    stepper, recorder = legs.stepper, outputs.recorder
+    system = stepper.system
+    if not (isinstance(system, Native) and system.crosses and runs(stepper)):
+        return None
+    if events.watches or not (recorder.lyapunov is None or system.controls):
+        return None
+    burst = Burst(stepper, legs.guard, recorder, outputs.times, clock.within)
+
+    def run() -> None:
+        more = True
+        while more:
+            outputs.due, more = burst.run(outputs.due)
+            legs.good = (stepper.t, stepper.solver.y)
+            if progress is not None:
+                progress(stepper.t, clock.t_end)
+
+    return run
 
 
 class _Outputs:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
+from time import sleep
 from typing import Any
 
 import msgspec
@@ -87,6 +88,8 @@ def watched(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[
     with live_view(scene, None) as view:
         assert view is not None
         thread, seen = beside(view.server.url, viewer)
+        while thread.is_alive() and not view.server.viewers:  # the run may be over before somebody looks
+            sleep(0.01)
         run = ckc_pin.simulate(scene, watch=view.watch)
     thread.join(20)
     assert not thread.is_alive()

@@ -2,4 +2,6 @@
 
 from ckc_pin.native import unavailable
 
-collect_ignore_glob = ["test_*.py"] if unavailable() else []
+
+def pytest_ignore_collect() -> bool | None:
+    return True if unavailable() else None

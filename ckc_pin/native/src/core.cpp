@@ -2,17 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 
 namespace ckc {
 
-constexpr double singular = 1e-12;  // relative size of the last pivot of J^T at which its rank counts as lost
-
-static std::vector<Indices> full(int size) {
-  Indices every(size);
-  std::iota(every.begin(), every.end(), 0);
-  return std::vector<Indices>(size, every);
-}
+// Relative size of the last pivot of J^T at which its rank counts as lost; and at which Python closes with care.
+constexpr double singular = 1e-12, weak = 1e-2;
 
 Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_)
     : tree(model, std::move(place)),
@@ -25,9 +19,9 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree.setZero(n, n);
-  x_.setZero(n), y_.setZero(n), residual_.setZero(m);
+  x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m);
   transposed_.setZero(n, m), whole_.setZero(n, n), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
-  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank, n - rank, full(n - rank));
+  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank, n - rank, full_pattern(n - rank));
   qr_work_.setZero(n), small_.setZero(std::max(rank, n - rank)), small_b_.setZero(n - rank);
 }
 
@@ -42,20 +36,23 @@ void Core::split(Indices q_, Indices z_) {
     for (int j : rows.pattern[i])
       if (at[j] >= 0) pattern[i].push_back(at[j]);
   phi_z.shape(m, k, pattern);
-  phi_z_matrix_.setZero(m, k), D_factor.shape(d, d, full(d));
+  D_factor.shape(d, d, full_pattern(d));
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
 
-void Core::set(In q_tree_) {
+void Core::set(In q_tree_, bool with_inertia) {
   q_tree = q_tree_;
-  tree.set(q_tree);
+  if (with_inertia)
+    tree.inertia(q_tree);
+  else
+    tree.set(q_tree);
+  D_here_ = with_inertia;
   rows.set(tree, q_tree);
 }
 
 void Core::factor() {
   rows.jacobian(tree);
-  for (size_t j = 0; j < z.size(); ++j) phi_z_matrix_.col(j) = rows.J.col(z[j]);
-  phi_z.compute(phi_z_matrix_);
+  phi_z.compute(rows.J, z);
 }
 
 void Core::reduce() {
@@ -92,7 +89,8 @@ void Core::reduced(In force, Out generalized) const {
 }
 
 void Core::inertia() {
-  tree.inertia(q_tree);
+  if (!D_here_) tree.inertia(q_tree);
+  D_here_ = true;
   for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
   for (int i = 0; i < d; ++i)
     for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
@@ -103,28 +101,19 @@ void Core::bias(In v) {
   v_tree = v;
   bias_tree = tree.bias(q_tree, v_tree);
   rows.rates(tree);
-  rows.bias(tree, J_dot_v);
+  rows.bias(J_dot_v);
   if (springs.any || springs.any_damping) springs.set(tree);
-  if (springs.any) {
-    x_.setZero();
-    springs.add_elastic(tree, q_tree, x_);
-    bias_tree -= x_;
-  }
+  if (!springs.any) return;
+  elastic_.setZero();
+  springs.add_elastic(tree, q_tree, elastic_);
+  bias_tree -= elastic_;
 }
 
-void Core::coriolis(In v) {
-  v_tree = v;
+void Core::coriolis() {
   C_tree = tree.coriolis(q_tree, v_tree);
+  rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);
-  tree.bias(q_tree, v_tree);
-  rows.rates(tree);
-  rows.jacobian_dot(tree, tree.jacobian_dot(q_tree, v_tree));
-  if (springs.any || springs.any_damping) springs.set(tree);
-  if (springs.any) {
-    x_.setZero();
-    springs.add_elastic(tree, q_tree, x_);
-    h_tree -= x_;
-  }
+  if (springs.any) h_tree -= elastic_;
 }
 
 void Core::C_times(In x, Out product) {
@@ -164,34 +153,46 @@ void Core::spf_z_dot(In q_dot, double epsilon, In w, Out z_dot) {
   for (size_t i = 0; i < z.size(); ++i) z_dot(i) = rho.row(z[i]).dot(q_dot) - z_dot(i) / epsilon;
 }
 
-bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
-  const int m = rows.closure.rows;
-  rows.jacobian(tree);
-  x_.setZero();  // the shortest x with J x = -residual
-  if (m) {
+bool Core::tangent_basis(In residual, double least) {
+  x_.setZero();  // the shortest one
+  whole_.setIdentity();
+  if (rows.closure.rows) {
     transposed_ = rows.J.transpose();
     qr_.compute(transposed_);
     const auto& r = qr_.matrixQR();
-    if (rank && !(std::abs(r(rank - 1, rank - 1)) > singular * std::abs(r(0, 0)))) return false;
-    whole_.setIdentity();
+    if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
     qr_.householderQ().applyThisOnTheLeft(whole_, qr_work_);
     for (int i = 0; i < rank; ++i) {  // R^T y = -residual, by rows
       const int row = qr_.colsPermutation().indices()(i);
-      double value = -(J_dot_v(row) + correction(row));
+      double value = -residual(row);
       for (int k = 0; k < i; ++k) value -= r(k, i) * small_(k);
       small_(i) = value / r(i, i);
       x_ += small_(i) * whole_.col(i);
     }
-  } else {
-    whole_.setIdentity();
   }
   tangent_ = whole_.rightCols(n - rank);
   for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
+  square_factor_.compute(square_);
+  return true;
+}
+
+bool Core::closing_step(In residual, Out x) {
+  if (!tangent_basis(residual, weak)) return false;
+  D_times(x_, y_);
+  small_b_.noalias() = tangent_.transpose() * y_;
+  square_factor_.solve(small_b_, small_.head(n - rank));
+  x = x_;
+  for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
+  return true;
+}
+
+bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
+  residual_ = J_dot_v + correction;
+  if (!tangent_basis(residual_, singular)) return false;
   D_times(x_, y_);
   y_ = u_tree - bias_tree - y_;
   if (springs.any_damping) springs.add_damping(v_tree, y_);
-  square_factor_.compute(square_);
   small_b_.noalias() = tangent_.transpose() * y_;
   square_factor_.solve(small_b_, small_.head(n - rank));
   acceleration = x_;

@@ -24,7 +24,7 @@ class Core {
   Indices q, z;
 
   // --- at a configuration ---
-  void set(In q_tree);        // phi and placements
+  void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
   void factor();              // J and phi_z's factorization
   void reduce();              // rho, eq. 5
   Vector q_tree;
@@ -35,7 +35,7 @@ class Core {
   // --- at a velocity ---
   void inertia();             // D' and D
   void bias(In v_tree);       // C'v + h' less springs, J_dot v
-  void coriolis(In v_tree);   // C', h' less springs and J_dot, each as a matrix
+  void coriolis();            // after `bias`: C', J_dot and h' less springs
   void D_times(In x, Out product) const;
   void velocity(In q_dot, Out v) const;   // rho q_dot
   void reduced(In force, Out generalized) const;  // rho^T force
@@ -49,13 +49,16 @@ class Core {
   void reduced_acceleration(In u_tree, Out q_ddot);
   void actual_acceleration(In u_tree, In q_dot, Out q_ddot);
   void spf_z_dot(In q_dot, double epsilon, In w, Out z_dot);
+  // The x with J x = -residual that is smallest in the metric of D'; false where J has lost rank, or nearly so.
+  bool closing_step(In residual, Out x);
   // Eq. 1 by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
 
  private:
-  Matrix phi_z_matrix_, D_rho_, tangent_, D_tangent_;
-  Vector x_, y_, residual_, z_, d_;
-  std::vector<Indices> every_;
+  bool tangent_basis(In residual, double least);  // tangent_, the factorized inertia on it, and x_: J x = -residual
+  bool D_here_ = false;  // whether the tree's D' is that of q_tree
+  Matrix D_rho_, tangent_, D_tangent_;
+  Vector x_, y_, elastic_, residual_, z_, d_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Matrix transposed_, whole_, square_;
   Factor square_factor_;

@@ -19,52 +19,67 @@ void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
     lu_.setZero(rows, columns);
-    low_.resize(rows), high_.resize(rows), row_at_.resize(rows), below_.resize(rows);
+    high_.assign(rows, 0), row_at_.resize(rows), below_.resize(rows), beginning_.assign(rows, {});
     for (auto& touched : below_) touched.reserve(rows);
+    active_.reserve(rows);
+    for (int i = 0; i < rows; ++i) {
+      int low = rows;
+      for (int j : pattern[i]) low = std::min(low, place_of_[j]);
+      if (low < rows) beginning_[low].push_back(i);
+    }
   } else {
     qr_.setZero(rows, columns);
     tau_.setZero(columns);
   }
 }
 
-void Factor::compute(const Matrix& a) {
-  singular_ = false, sign_ = 1.0;
+void Factor::compute(const Matrix& a, const Indices& columns) {
+  const auto at = [&](int j) { return columns.empty() ? j : columns[j]; };
+  singular_ = false;
   if (rows_ != columns_) {
-    qr_ = a;
+    for (int j = 0; j < columns_; ++j) qr_.col(j) = a.col(at(j));
     return householder();
   }
   for (int i = 0; i < rows_; ++i) {
-    row_at_[i] = i;
-    lu_.row(i).setZero();
-    low_[i] = columns_, high_[i] = 0;
+    lu_.row(i).head(high_[i]).setZero();  // what the last time left
+    high_[i] = 0;
     for (int j : pattern_[i]) {
       const int k = place_of_[j];
-      lu_(i, k) = a(i, j);
-      low_[i] = std::min(low_[i], k), high_[i] = std::max(high_[i], k + 1);
+      lu_(i, k) = a(i, at(j));
+      high_[i] = std::max(high_[i], k + 1);
     }
   }
   eliminate();
 }
 
+std::vector<Indices> full_pattern(int size) {
+  Indices every(size);
+  std::iota(every.begin(), every.end(), 0);
+  return std::vector<Indices>(size, every);
+}
+
 void Factor::eliminate() {
+  active_.clear();
   for (int k = 0; k < rows_; ++k) {
-    int best = k;
+    active_.insert(active_.end(), beginning_[k].begin(), beginning_[k].end());
+    size_t best = 0;
     double largest = -1.0;
-    for (int i = k; i < rows_; ++i) {
-      const int row = row_at_[i];
-      if (low_[row] > k) continue;
-      const double size = std::abs(lu_(row, k));
+    for (size_t i = 0; i < active_.size(); ++i) {
+      const double size = std::abs(lu_(active_[i], k));
       if (size > largest || std::isnan(size)) largest = size, best = i;
     }
     if (!(largest > 0.0)) singular_ = true;
-    if (best != k) std::swap(row_at_[k], row_at_[best]), sign_ = -sign_;
-    const int pivot = row_at_[k], end = high_[pivot];
-    const double diagonal = lu_(pivot, k);
-    if (diagonal < 0.0) sign_ = -sign_;
     below_[k].clear();
-    for (int i = k + 1; i < rows_; ++i) {
-      const int row = row_at_[i];
-      if (low_[row] > k || lu_(row, k) == 0.0) continue;
+    if (active_.empty()) {  // by its pattern alone
+      row_at_[k] = k;
+      continue;
+    }
+    const int pivot = active_[best], end = high_[pivot];
+    active_.erase(active_.begin() + static_cast<std::ptrdiff_t>(best));
+    row_at_[k] = pivot;
+    const double diagonal = lu_(pivot, k);
+    for (int row : active_) {
+      if (lu_(row, k) == 0.0) continue;
       const double factor = lu_(row, k) / diagonal;
       lu_(row, k) = factor;
       for (int j = k + 1; j < end; ++j) lu_(row, j) -= factor * lu_(pivot, j);

@@ -14,10 +14,10 @@ class Factor {
  public:
   // Columns in the order of the first row that meets them, by the pattern of a (rows, columns) matrix.
   void shape(int rows, int columns, const std::vector<Indices>& pattern);
-  void compute(const Matrix& a);      // entries outside the pattern are not read
+  // Of columns of a matrix (all when none are named); entries outside the pattern are not read.
+  void compute(const Matrix& a, const Indices& columns = {});
   void solve(In b, Out x);            // least squares when tall
   bool singular() const { return singular_; }
-  double determinant_sign() const { return sign_; }
 
  private:
   void eliminate();
@@ -30,10 +30,14 @@ class Factor {
   Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
   Matrix qr_;
   Vector tau_, work_;
-  Indices low_, high_, row_at_;       // intervals, and where pivoting put the rows
-  std::vector<Indices> below_;        // rows that elimination of a column touched, by original row
+  Indices high_, row_at_;             // ends of the intervals, and where pivoting put the rows
+  std::vector<Indices> beginning_;    // by column: rows whose interval begins there
+  std::vector<Indices> below_;        // by column: rows that its elimination touched
+  Indices active_;                    // rows met and not yet pivots
   bool singular_ = false;
-  double sign_ = 1.0;
 };
+
+// The pattern of a full square matrix.
+std::vector<Indices> full_pattern(int size);
 
 }  // namespace ckc

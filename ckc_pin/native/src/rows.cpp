@@ -53,7 +53,7 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
   pairs_ = static_cast<int>(c.point_joint.size()) / 2;
   p_.resize(2 * pairs_), p_dot_.resize(2 * pairs_), r_.resize(pairs_), r_dot_.resize(pairs_);
   e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
-  velocity_.resize(tree.joints);
+  velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
   wrenches_.resize(c.rows), pattern.resize(c.rows);
   const auto joints = [&](int out, std::initializer_list<int> list) {
     for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
@@ -64,6 +64,11 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
   for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair]});
   for (const auto& rows : c.logs)
     for (int out : rows.out) joints(out, {rows.joint_a, rows.joint_b});
+  std::set<int> held(c.point_joint.begin(), c.point_joint.end());
+  held.insert(c.direction_joint.begin(), c.direction_joint.end());
+  for (const auto& rows : c.logs) held.insert(rows.joint_a), held.insert(rows.joint_b);
+  held.erase(0);  // the world does not move
+  held_.assign(held.begin(), held.end());
   phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
   for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
   for (int i = 0; i < c.rows; ++i) {
@@ -133,13 +138,14 @@ void Rows::relative(const Tree& tree) {
 
 void Rows::rates(const Tree& tree) {
   const Closure& c = closure;
+  for (int joint : held_) velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.acceleration(joint);
   for (size_t k = 0; k < p_.size(); ++k) {
-    const Vector6 v = tree.velocity(c.point_joint[k]);
+    const Vector6& v = velocity_[c.point_joint[k]];
     p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);
   }
   for (int k = 0; k < pairs_; ++k) r_dot_[k] = p_dot_[k] - p_dot_[pairs_ + k];
   for (size_t k = 0; k < e_.size(); ++k)
-    e_dot_[k] = Vector3(tree.velocity(c.direction_joint[k]).tail<3>()).cross(e_[k]);
+    e_dot_[k] = Vector3(velocity_[c.direction_joint[k]].tail<3>()).cross(e_[k]);
   for (const auto& row : c.components) {
     const int a = row.pair, b = pairs_ + row.pair;
     const Vector3 &e = e_[row.direction], &e_dot = e_dot_[row.direction];
@@ -166,8 +172,8 @@ void Rows::rates(const Tree& tree) {
 void Rows::relative_rates(const Tree& tree) {
   for (const auto& rows : closure.logs) {
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
-    const Vector3 omega_b = tree.velocity(rows.joint_b).tail<3>();
-    const Vector3 omega = omega_b - tree.velocity(rows.joint_a).tail<3>();
+    const Vector3 omega_b = velocity_[rows.joint_b].tail<3>();
+    const Vector3 omega = omega_b - velocity_[rows.joint_a].tail<3>();
     Vector3 u;
     for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
     double c, c_rate;
@@ -206,12 +212,11 @@ void Rows::jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
   }
 }
 
-void Rows::bias(const Tree& tree, Out J_dot_v) const {
+void Rows::bias(Out J_dot_v) const {
   for (int i = 0; i < closure.rows; ++i) {
     double value = 0.0;
     for (const auto& wrench : wrenches_[i])
-      if (wrench.joint)
-        value += wrench.w.dot(tree.acceleration(wrench.joint)) + wrench.w_dot.dot(tree.velocity(wrench.joint));
+      value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
     J_dot_v(i) = value;
   }
 }

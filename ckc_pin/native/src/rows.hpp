@@ -42,9 +42,9 @@ class Rows {
 
   void set(const Tree& tree, In q);  // phi and the wrenches, from the tree's placements
   void jacobian(const Tree& tree);
-  void rates(const Tree& tree);      // the wrenches' rates, from the tree's velocities
+  void rates(const Tree& tree);      // the wrenches' rates, from the tree's velocities and accelerations
   void jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
-  void bias(const Tree& tree, Out J_dot_v) const;  // from the tree's velocities and accelerations
+  void bias(Out J_dot_v) const;      // after `rates`
 
  private:
   void relative(const Tree& tree);
@@ -52,7 +52,8 @@ class Rows {
 
   int pairs_;
   std::vector<Vector3> p_, r_, e_, p_dot_, r_dot_, e_dot_;
-  std::vector<Vector6> velocity_;
+  Indices held_;  // joints that rows hold on to, and their motion
+  std::vector<Vector6> velocity_, acceleration_;
   std::vector<std::vector<Wrench>> wrenches_;  // by row
 };
 

@@ -66,7 +66,9 @@ const Vector& Tree::gravity(In q) { return pin::computeGeneralizedGravity(own->m
 
 const Matrix& Tree::coriolis(In q, In v) { return pin::computeCoriolisMatrix(own->model, own->data, q, v); }
 
-const Matrix6x& Tree::jacobian_dot(In q, In v) {
+const Matrix6x& Tree::jacobian_dot() const { return own->data.dJ; }
+
+const Matrix6x& Tree::jacobian_rate(In q, In v) {
   return pin::computeJointJacobiansTimeVariation(own->model, own->data, q, v);
 }
 

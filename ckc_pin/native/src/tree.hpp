@@ -38,7 +38,8 @@ class Tree {
 
   const Vector& gravity(In q);               // h'
   const Matrix& coriolis(In q, In v);        // C', Christoffel
-  const Matrix6x& jacobian_dot(In q, In v);  // d/dt of `jacobian`
+  const Matrix6x& jacobian_dot() const;      // after `coriolis`: d/dt of `jacobian`
+  const Matrix6x& jacobian_rate(In q, In v); // the same without C'
   double potential_energy(In q);
 
  private:

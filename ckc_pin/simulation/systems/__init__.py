@@ -9,11 +9,26 @@ system         y                    equations
 `PrintedSpf`   q, q_dot, z          eq. 8 as printed
 `Dae`          q', v'               eq. 1, its closure differentiated twice, projected
 ============== ==================== =====================================================
+
+`NativeLevelSet`, `NativePrintedSpf` and `NativeDae` are the same with their right-hand sides in C++.
 """
 
 from ckc_pin.simulation.systems.base import Counts, Force, System, nearly_singular
 from ckc_pin.simulation.systems.dae import Dae
 from ckc_pin.simulation.systems.level_set import LevelSet
+from ckc_pin.simulation.systems.native import Native, NativeDae, NativeLevelSet, NativePrintedSpf
 from ckc_pin.simulation.systems.printed_spf import PrintedSpf
 
-__all__ = ["Counts", "Dae", "Force", "LevelSet", "PrintedSpf", "System", "nearly_singular"]
+__all__ = [
+    "Counts",
+    "Dae",
+    "Force",
+    "LevelSet",
+    "Native",
+    "NativeDae",
+    "NativeLevelSet",
+    "NativePrintedSpf",
+    "PrintedSpf",
+    "System",
+    "nearly_singular",
+]

@@ -42,10 +42,15 @@ class System(Protocol):
         How many leading entries of y are positions whose rates are the next as many; 0 when they are not.
     projects : bool
         Whether `accept` edits the state.
+    backend : "python" or "native"
+        What evaluates the right-hand side.
     """
 
     mechanism: Mechanism
     counts: Counts
+
+    @property
+    def backend(self) -> str: ...
 
     @property
     def positions(self) -> int: ...

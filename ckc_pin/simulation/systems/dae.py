@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -35,6 +36,7 @@ class Dae:
     projects: bool = True
     baumgarte: tuple[float, float] | None = None
     counts: Counts = field(default_factory=Counts)
+    backend: ClassVar[str] = "python"
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.n if self.mechanism.tree.flat else 0

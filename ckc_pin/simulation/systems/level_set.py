@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -46,17 +47,21 @@ class LevelSet:
     slack: float = 0.0
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
+    backend: ClassVar[str] = "python"
 
     def __post_init__(self) -> None:
         tree = self.mechanism.tree
         self._d = self.mechanism.d
         self._on_manifold = self.w0 is None or not np.any(self.w0)
         self._zero = np.zeros(self.mechanism.closure.rows)
-        self._trail = Trail(self.initial, self.epsilon)
+        self._trail = self._new_trail(self.initial)
         self._chart = Chart(tree, self.mechanism.partition.q, self.initial.q_tree)
         # a free root among q is charted by rotation vectors, and the chart moves along between steps
         self.projects = not self._chart.plain
         self.positions = self._d if self._chart.plain else 0
+
+    def _new_trail(self, start: Kinematics) -> Trail:
+        return Trail(start, self.epsilon)
 
     def start(self) -> Array:
         return np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
@@ -158,7 +163,7 @@ class LevelSet:
 
     def _chart_from(self, at: Kinematics, q_dot: Array) -> Array:
         """Start the coordinates anew at a configuration."""
-        self._trail = Trail(at, self.epsilon)
+        self._trail = self._new_trail(at)
         self._chart = Chart(at.tree, at.partition.q, at.q_tree)
         return np.concatenate([self._chart.numbers(at.q_tree), q_dot])
 

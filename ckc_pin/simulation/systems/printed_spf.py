@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,6 +29,7 @@ class PrintedSpf:
     convention: CoriolisVelocity = "rho"
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
+    backend: ClassVar[str] = "python"
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.d

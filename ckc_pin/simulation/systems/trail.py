@@ -35,7 +35,7 @@ class Trail:
     """
 
     def __init__(self, start: Kinematics, epsilon: float = np.inf) -> None:
-        self.last = start
+        self._last = start
         self._epsilon = epsilon
         self._t: list[float] = []
         self._at: list[Kinematics] = []
@@ -43,9 +43,14 @@ class Trail:
         self._w = np.empty((KEPT, start.closure.rows))
         self._off = False  # whether any level was not zero
 
+    @property
+    def last(self) -> Kinematics:
+        """The configuration noted last."""
+        return self._last
+
     def add(self, t: float, at: Kinematics, v_tree: Array, w: Array) -> None:
         """Take note of a configuration closed on the level set w, moving with v_tree; the former one at t is lost."""
-        self.last = at
+        self._last = at
         if t in self._t:
             k = self._t.index(t)
         elif len(self._t) < KEPT:

@@ -1,0 +1,127 @@
+// The step loop as Python sees it. It runs without the interpreter's lock.
+#include <cmath>
+#include <memory>
+
+#include <nanobind/stl/pair.h>
+
+#include "bdf.hpp"
+#include "checks.hpp"
+#include "loop.hpp"
+
+namespace ckc {
+
+using namespace nb::literals;
+
+namespace {
+
+// A loop with all it works on.
+struct Run {
+  Run(System& system_, std::unique_ptr<Method> method_, Watch watch_)
+      : system(system_), method(std::move(method_)), watch(std::move(watch_)), record(system_.core),
+        loop(system_, *method, watch, record) {}
+
+  System& system;
+  std::unique_ptr<Method> method;
+  Watch watch;
+  Record record;
+  Loop loop;
+};
+
+Dop853::Table table_of(const nb::dict& given) {
+  const auto matrix = [&](const char* key) { return nb::cast<Matrix>(given[key]); };
+  const auto vector = [&](const char* key) { return nb::cast<Vector>(given[key]); };
+  return {matrix("A"), matrix("A_EXTRA"), matrix("D"), vector("B"), vector("C"), vector("C_EXTRA"), vector("E3"),
+          vector("E5")};
+}
+
+void begin(Run& run, double t, Given y, Given f, double h_abs) {
+  require(y, run.system.size, "y"), require(f, run.system.size, "f");
+  require(std::isfinite(t) && h_abs > 0, "a time and a positive step are needed");
+  Method& method = *run.method;
+  method.t = t, method.y = y, method.f = f, method.h_abs = h_abs;
+}
+
+Bdf& bdf_of(Run& run) {
+  Bdf* bdf = dynamic_cast<Bdf*>(run.method.get());
+  require(bdf, "differences: the method is not BDF");
+  return *bdf;
+}
+
+// BDF's memory: differences, a row each, order, steps of one length, and the Jacobian.
+void remember(Run& run, Matrix D, int order, int equal, Matrix J) {
+  Bdf& bdf = bdf_of(run);
+  const auto size = run.system.size;
+  require(order >= 1 && order <= Bdf::most && equal >= 0, "differences: an order of 1 to 5 is needed");
+  require(D.rows() == Bdf::most + 3 && D.cols() == size && D.topRows(order + 1).allFinite(),
+          "differences: eight rows are needed, as long as y");
+  require_square(J, size, "J");
+  bdf.now.D = D.transpose(), bdf.now.order = order, bdf.now.equal = equal, bdf.J = J;
+}
+
+nb::tuple memory(Run& run) {
+  const Bdf& bdf = bdf_of(run);
+  return nb::make_tuple(Matrix(bdf.now.D.transpose()), bdf.now.order, bdf.now.equal, bdf.J);
+}
+
+std::unique_ptr<Method> method_of(const std::string& name, const nb::dict& table, Tolerance tolerance, int size) {
+  if (name == "DOP853") return std::make_unique<Dop853>(table_of(table), tolerance, size);
+  require(name == "BDF", "method: DOP853 or BDF");
+  return std::make_unique<Bdf>(tolerance, nb::cast<double>(table["newton_tol"]), size);
+}
+
+// (why, rows): the instants recorded, a row each.
+nb::tuple go(Run& run, double t_bound, double min_step, long most_rhs, double seconds,
+             double last_output, Given times, long most_rows) {
+  Matrix rows(run.record.width, most_rows);
+  Vector instants = times;
+  Eigen::Index due = 0, filled = 0;
+  Why why;
+  {
+    nb::gil_scoped_release released;
+    why = run.loop.run({t_bound, min_step, most_rhs, seconds, last_output}, instants, due, rows, filled);
+  }
+  const char* names[] = {"finished", "pause", "python"};
+  return nb::make_tuple(names[static_cast<int>(why)], Matrix(rows.leftCols(filled).transpose()));
+}
+
+}  // namespace
+
+void bind_loop(nb::module_& m) {
+  nb::class_<Run>(m, "Loop")
+      .def("__init__",
+           [](Run* self, System& system, const std::string& method, const nb::dict& table, double rtol, double atol, double max_step,
+              Given row_scale, Given column_scale, double chart_margin) {
+             const Core& core = system.core;
+             require(row_scale, core.rows.closure.rows, "row_scale"), require(column_scale, core.n, "column_scale");
+             require(rtol > 0 && atol > 0 && max_step > 0, "tolerances must be positive");
+             new (self) Run(system, method_of(method, table, {rtol, atol, max_step}, system.size),
+                            Watch(core, row_scale, column_scale, chart_margin));
+           },
+           nb::keep_alive<1, 2>(), "system"_a, "method"_a, "table"_a, "rtol"_a, "atol"_a, "max_step"_a, "row_scale"_a,
+           "column_scale"_a, "chart_margin"_a)
+      .def("begin", &begin, "t"_a, "y"_a, "f"_a, "h_abs"_a)
+      .def("remember", &remember, "D"_a, "order"_a, "equal"_a, "J"_a)
+      .def("memory", &memory)
+      .def("go", &go, "t_bound"_a, "min_step"_a, "most_rhs"_a, "seconds"_a, "last_output"_a, "times"_a,
+           "most_rows"_a)
+      .def_prop_ro("t", [](const Run& run) { return run.method->t; })
+      .def_prop_ro("y", [](const Run& run) { return Vector(run.method->y); })
+      .def_prop_ro("f", [](const Run& run) { return Vector(run.method->f); })
+      .def_prop_ro("h_abs", [](const Run& run) { return run.method->h_abs; })
+      .def_prop_ro("before", [](const Run& run) { return nb::make_tuple(run.method->t_old, Vector(run.method->y_old)); })
+      .def_prop_ro("length", [](const Run& run) { return run.loop.length; })
+      .def_prop_rw(
+          "end",
+          [](const Run& run) { return nb::make_tuple(run.loop.end.value, run.loop.end.rate); },
+          [](Run& run, std::pair<double, double> end) {
+            run.loop.end = {end.first, end.second}, run.loop.begun = true;
+          })
+      .def("counts", [](Run& run) {  // since the last time: steps, refused ones, evaluations, Jacobians, factorizations of its own
+        Method& method = *run.method;
+        const auto found = nb::make_tuple(run.loop.steps, method.rejected, method.rhs, method.jacobians, method.lu);
+        run.loop.steps = method.rejected = method.rhs = method.jacobians = method.lu = 0;
+        return found;
+      });
+}
+
+}  // namespace ckc

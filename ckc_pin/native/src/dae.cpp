@@ -1,0 +1,88 @@
+#include "dae.hpp"
+
+#include <algorithm>
+
+namespace ckc {
+
+constexpr int most_steps = 10;
+
+static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
+
+Dae::Dae(Core& core_, double tolerance, bool projects, double alpha, double beta)
+    : System(core_, 2 * core_.n), tolerance_(tolerance), alpha_(alpha), beta_(beta), projects_(projects) {
+  needs_chart = false, crosses = projects;
+  q_tree_.setZero(core.n), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+}
+
+void Dae::set(In q_tree) {
+  core.set(q_tree, true);
+  if (drive.controls()) {
+    core.factor(), core.reduce(), core.inertia();
+  } else {
+    core.rows.jacobian(core.tree);
+  }
+}
+
+bool Dae::rhs(double t, In y, Out y_dot) {
+  const int n = core.n;
+  if (!y.allFinite()) return false;
+  set(y.head(n));
+  core.bias(y.tail(n));
+  for (int k = 0; k < core.d; ++k) q(k) = y(core.q[k]), q_dot(k) = y(n + core.q[k]);
+  drive.act(t, core, q, q_dot);
+  residual_.setZero();
+  if (alpha_ != 0.0 || beta_ != 0.0) {
+    residual_.noalias() = core.rows.J * core.v_tree;
+    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
+  }
+  counts.factorizations += 2;
+  y_dot.head(n) = y.tail(n);
+  return core.dae_acceleration(drive.u_tree, residual_, y_dot.tail(n)) && y_dot.allFinite();
+}
+
+bool Dae::project(In y) {
+  const int n = core.n;
+  q_tree_ = y.head(n);
+  set(q_tree_);
+  for (int k = 0; largest(core.rows.phi) > tolerance_; ++k) {
+    if (k == most_steps || !core.rows.phi.allFinite() || !core.closing_step(core.rows.phi, step_)) return false;
+    ++counts.newton, counts.factorizations += 2;
+    residual_.noalias() = core.rows.J * step_;
+    q_tree_ += step_;
+    set(q_tree_);
+    if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
+  }
+  residual_.noalias() = core.rows.J * y.tail(n);
+  if (!core.closing_step(residual_, step_)) return false;
+  velocity = y.tail(n) + step_;
+  return velocity.allFinite();
+}
+
+bool Dae::exact(double, In y) {
+  const int n = core.n;
+  if (projects_) {
+    if (!project(y)) return false;
+  } else {
+    set(y.head(n));
+    velocity = y.tail(n);
+  }
+  v_tree = velocity;
+  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.q[k]), q_dot(k) = velocity(core.q[k]);
+  return true;
+}
+
+bool Dae::accept(double, Out y, bool& changed) {
+  const int n = core.n;
+  changed = false;
+  if (!projects_) return true;
+  set(y.head(n));
+  residual_.noalias() = core.rows.J * y.tail(n);
+  const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
+  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return true;
+  if (!project(y)) return false;
+  y.head(n) = core.q_tree, y.tail(n) = velocity;
+  changed = true;
+  return true;
+}
+
+}  // namespace ckc

@@ -1,0 +1,27 @@
+// Eq. 1 as a DAE, y = (q', v'): put back on the closure after each step, or held near it by Baumgarte's terms.
+#pragma once
+
+#include "system.hpp"
+
+namespace ckc {
+
+class Dae : public System {
+ public:
+  // `alpha`, `beta` of Baumgarte's stabilisation, zero for none; flat trees only.
+  Dae(Core& core, double tolerance, bool projects, double alpha, double beta);
+
+  bool rhs(double t, In y, Out y_dot) override;
+  bool exact(double t, In y) override;
+  bool at_last(double t, In y) override { return exact(t, y); }
+  bool accept(double t, Out y, bool& changed) override;
+
+ private:
+  void set(In q_tree);  // the core at a configuration, with D' and what controllers need
+  bool project(In y);   // into core.q_tree and velocity, by the shortest steps in the metric of the inertia
+
+  double tolerance_, alpha_, beta_;
+  bool projects_;
+  Vector q_tree_, step_, residual_;
+};
+
+}  // namespace ckc

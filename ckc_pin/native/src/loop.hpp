@@ -1,0 +1,48 @@
+// The step loop: plain steps one after the other. Whatever else there is to a run is Python's, between two calls.
+#pragma once
+
+#include <chrono>
+
+#include "method.hpp"
+#include "record.hpp"
+#include "watch.hpp"
+
+namespace ckc {
+
+enum class Why {
+  finished,  // t_bound is reached
+  pause,     // time is up, or the rows are full
+  python,    // the next step, or what follows it, is not plain
+};
+
+struct Stretch {
+  double t_bound, min_step;
+  long most_rhs;       // evaluations left
+  double seconds;      // from now, to the next pause
+  double last_output;  // instants up to there
+};
+
+class Loop {
+ public:
+  Loop(System& system, Method& method, Watch& watch, Record& record)
+      : system_(system), method_(method), watch_(watch), record_(record), y_out_(method.y) {}
+
+  // Record the instants `times` from `due` on into rows, as many as there are.
+  Why run(const Stretch& stretch, In times, Eigen::Index& due, Eigen::Ref<Matrix> rows, Eigen::Index& filled);
+
+  long steps = 0;
+  Watch::Rank end;     // at the end of the last step
+  bool begun = false;  // whether `end` is known
+  double length = 0;   // of the last step
+
+ private:
+  bool outputs(const Stretch& stretch, In times, Eigen::Index& due, Eigen::Ref<Matrix> rows, Eigen::Index& filled);
+
+  System& system_;
+  Method& method_;
+  Watch& watch_;
+  Record& record_;
+  Vector y_out_;
+};
+
+}  // namespace ckc

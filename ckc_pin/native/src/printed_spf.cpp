@@ -1,0 +1,45 @@
+#include "printed_spf.hpp"
+
+#include <cmath>
+
+namespace ckc {
+
+PrintedSpf::PrintedSpf(Core& core_, double epsilon, bool actual, In w0)
+    : System(core_, core_.n + core_.d), epsilon_(epsilon), actual_(actual), w0_(w0) {
+  q_tree_.setZero(core.n), z_dot_.setZero(core.z.size());
+}
+
+bool PrintedSpf::exact(double t, In y) {
+  const int d = core.d;
+  for (int k = 0; k < d; ++k) q_tree_(core.tree.place[core.q[k]]) = y(k);
+  for (size_t k = 0; k < core.z.size(); ++k) q_tree_(core.tree.place[core.z[k]]) = y(2 * d + k);
+  core.set(q_tree_, true), core.factor(), core.reduce();
+  q = y.head(d), q_dot = y.segment(d, d);
+  w = w0_ * std::exp(-t / epsilon_);
+  core.spf_z_dot(q_dot, epsilon_, core.rows.phi, z_dot_);
+  core.velocity(q_dot, v_tree);
+  velocity = v_tree;
+  for (size_t k = 0; k < core.z.size(); ++k) velocity(core.z[k]) = z_dot_(k);
+  if (actual_) v_tree = velocity;
+  return true;
+}
+
+bool PrintedSpf::rhs(double t, In y, Out y_dot) {
+  const int d = core.d;
+  if (!y.allFinite() || !exact(t, y)) return false;
+  core.inertia();
+  core.bias(v_tree);
+  drive.act(t, core, q, q_dot);
+  counts.factorizations += 2;
+  y_dot.head(d) = q_dot;
+  if (actual_) {
+    core.coriolis();
+    core.actual_acceleration(drive.u_tree, q_dot, y_dot.segment(d, d));
+  } else {
+    core.reduced_acceleration(drive.u_tree, y_dot.segment(d, d));
+  }
+  y_dot.tail(z_dot_.size()) = z_dot_;
+  return y_dot.allFinite();
+}
+
+}  // namespace ckc

@@ -1,0 +1,105 @@
+#include "trail.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace ckc {
+
+Trail::Trail(const Core& core, double epsilon) : epsilon_(epsilon) {
+  for (Point& point : points_) {
+    point.q_tree.setZero(core.tree.nq), point.v_tree.setZero(core.n), point.w.setZero(core.rows.closure.rows);
+  }
+  level_.setZero(core.rows.closure.rows);
+}
+
+void Trail::start(const Core& core, In q_tree) {
+  for (Point& point : points_) point.rho = core.rho, point.phi_z = core.phi_z;
+  dq_.setZero(core.d), z_.setZero(core.z.size());
+  count_ = 0, last_ = kept, off_ = false;
+  points_[kept].q_tree = q_tree;
+}
+
+void Trail::add(double t, const Core& core, In q_tree, In v_tree, In w) {
+  int k = 0;
+  while (k < count_ && points_[k].t != t) ++k;
+  if (k == kept) {  // the furthest
+    k = 0;
+    for (int i = 1; i < kept; ++i)
+      if (std::abs(points_[i].t - t) > std::abs(points_[k].t - t)) k = i;
+  } else if (k == count_) {
+    ++count_;
+  }
+  Point& point = points_[k];
+  point.t = t, point.q_tree = q_tree, point.v_tree = v_tree, point.w = w, point.rho = core.rho;
+  point.level = !w.isZero(0);
+  off_ = off_ || point.level;
+  if (off_) point.phi_z = core.phi_z;
+  last_ = k;
+}
+
+void Trail::predict(double t, In q, const Core& core, In w, Out q_tree) {
+  const auto far = [&](const Point& point) {
+    double most = 0.0;
+    for (int k = 0; k < core.d; ++k)
+      most = std::max(most, std::abs(q(k) - point.q_tree(core.tree.place[core.q[k]])));
+    return most;
+  };
+  int nearest = last_;
+  for (int k = 0; k < count_; ++k)
+    if (k == 0 || far(points_[k]) < far(points_[nearest])) nearest = k;
+  Point& base = points_[nearest];
+  int chosen[nodes] = {nearest};
+  double a[nodes] = {1.0}, b[nodes] = {0.0};
+  const int count = count_ ? foretelling(t, nearest, chosen, a, b) : 1;
+  q_tree = base.q_tree;
+  for (int i = 0; i < count; ++i)
+    q_tree += a[i] * (points_[chosen[i]].q_tree - base.q_tree) + b[i] * points_[chosen[i]].v_tree;
+  for (int k = 0; k < core.d; ++k) dq_(k) = q(k) - q_tree(core.tree.place[core.q[k]]);
+  for (int z : core.z) q_tree(core.tree.place[z]) += base.rho.row(z).dot(dq_);
+  for (int k = 0; k < core.d; ++k) q_tree(core.tree.place[core.q[k]]) = q(k);
+  if (!off_ || !count_) return;
+  level_ = w;
+  for (int i = 0; i < count; ++i) level_ -= (a[i] - b[i] / epsilon_) * points_[chosen[i]].w;  // w_dot = -w / epsilon
+  base.phi_z.solve(level_, z_);
+  for (size_t k = 0; k < core.z.size(); ++k) q_tree(core.tree.place[core.z[k]]) += z_(k);
+}
+
+int Trail::foretelling(double t, int nearest, int* chosen, double* a, double* b) const {
+  int order[kept];
+  for (int k = 0; k < count_; ++k) order[k] = k;
+  const auto away = [&](int k) { return std::abs(points_[k].t - t); };
+  const int most = std::min(count_, nodes);
+  std::partial_sort(order, order + most, order + count_, [&](int i, int k) {
+    return away(i) < away(k) || (away(i) == away(k) && i < k);
+  });
+  if (away(order[0]) > 0.0) {
+    for (int count = most; count > 1; --count) {
+      double times[nodes], sum = 0.0;
+      bool level = false;
+      for (int i = 0; i < count; ++i) times[i] = points_[order[i]].t, level = level || points_[order[i]].level;
+      hermite_weights(times, count, t, a, b);
+      for (int i = 0; i < count; ++i) sum += std::abs(a[i]);
+      if ((!level || away(order[count - 1]) < resolved * epsilon_) && sum < largest_weight) {
+        std::copy(order, order + count, chosen);
+        return count;
+      }
+    }
+  }
+  chosen[0] = nearest, a[0] = 1.0, b[0] = 0.0;  // to first order in q, whatever the time
+  return 1;
+}
+
+void hermite_weights(const double* times, int count, double t, double* a, double* b) {
+  for (int i = 0; i < count; ++i) {
+    double basis = 1.0, slope = 0.0;
+    for (int j = 0; j < count; ++j) {
+      if (j == i) continue;
+      basis *= (t - times[j]) / (times[i] - times[j]);
+      slope += 1.0 / (times[i] - times[j]);
+    }
+    a[i] = (1.0 - 2.0 * (t - times[i]) * slope) * basis * basis;
+    b[i] = (t - times[i]) * basis * basis;
+  }
+}
+
+}  // namespace ckc

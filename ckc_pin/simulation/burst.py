@@ -1,0 +1,125 @@
+"""Plain steps one after the other in the native core, until something calls for Python.
+
+Events, changes of the partition, positions where J loses rank, budgets, whatever does not converge: the loop returns
+where its last plain step ended, and the next step is Python's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.native import core
+from ckc_pin.simulation.integrate import Stepper
+from ckc_pin.simulation.rank_guard import RankGuard
+from ckc_pin.simulation.record import Recorder
+from ckc_pin.simulation.systems.base import CHART_MARGIN
+from ckc_pin.simulation.systems.level_set import SWITCH_MARGIN, LevelSet
+
+__all__ = ["Burst", "runs"]
+
+PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
+ROWS = 20_000  # instants recorded in one go
+UNLIMITED = 2**62
+
+
+class Burst:
+    """Runs a stepper natively as far as that goes.
+
+    Parameters
+    ----------
+    stepper : Stepper
+        Of a native system that knows what acts.
+    guard : RankGuard
+        Learns how far J is from losing rank.
+    recorder : Recorder
+    times : array
+        All output instants.
+    within : callable
+        (until, end of the leg) to the last instant whose output may be recorded.
+    """
+
+    def __init__(
+        self,
+        stepper: Stepper,
+        guard: RankGuard,
+        recorder: Recorder,
+        times: Array,
+        within: Callable[[float, float], float],
+    ) -> None:
+        self.stepper, self.guard, self.recorder, self.times, self.within = stepper, guard, recorder, times, within
+        self.system: Any = stepper.system
+        self._made_for: tuple[Any, ...] = ()
+        self._tables = _coefficients(stepper)
+
+    def run(self, due: int) -> tuple[int, bool]:
+        """Step on; return which output instant is the next, and whether there is more to be done natively."""
+        loop, stepper = self._loop(), self.stepper
+        solver = stepper.solver
+        self.system.refresh()
+        loop.begin(stepper.t, solver.y, getattr(solver, "f", solver.y), solver.h_abs)
+        if stepper.method == "BDF":
+            loop.remember(solver.D, solver.order, solver.n_equal_steps, solver.J)
+        if self.guard.end is not None:
+            loop.end = self.guard.end
+        end = float(solver.t_bound)
+        why, rows = loop.go(
+            end,
+            stepper.spec.min_step,
+            UNLIMITED if stepper.spec.max_rhs is None else stepper.spec.max_rhs - stepper.rhs_count,
+            PAUSE,
+            self.within(end, end),
+            self.times[due:],
+            min(ROWS, len(self.times) - due),
+        )
+        self.system.book(self.system.counts)
+        self.recorder.extend(rows)
+        steps, rejected, rhs, jacobians, factorizations = loop.counts()
+        stepper.rejected += rejected
+        stepper.rhs_count += rhs
+        solver.njev += jacobians
+        solver.nlu += factorizations
+        if steps:
+            stepper.steps += steps
+            self.guard.end, self.guard.length = loop.end, loop.length
+            stepper.adopt(loop.t, loop.y, loop.f, loop.h_abs, loop.before)
+            if stepper.method == "BDF":
+                solver.D, solver.order, solver.n_equal_steps, solver.J = loop.memory()
+                solver.LU = None
+        stepper.require_time()
+        return due + len(rows), why == "pause" and steps > 0
+
+    def _loop(self) -> Any:
+        options = self.stepper.options
+        made_for = (self.system.native, options["rtol"], options["atol"])
+        if made_for != self._made_for:
+            self._made_for = made_for
+            mechanism = self.system.mechanism
+            rows = np.where(mechanism.closure.in_metres(mechanism.tree), 1.0 / mechanism.size, 1.0)
+            columns = np.where(mechanism.tree.in_metres, mechanism.size, 1.0)
+            margin = SWITCH_MARGIN if getattr(self.system, "may_switch", False) else CHART_MARGIN
+            self._made = core().Loop(
+                self.system.native, self.stepper.method, self._tables, options["rtol"], options["atol"],
+                options.get("max_step", np.inf), rows, columns, margin,
+            )  # fmt: skip
+        return self._made
+
+
+def runs(stepper: Stepper) -> bool:
+    """Whether the native core has a stepper's method: the explicit one, and BDF where the Jacobian is known."""
+    return stepper.method == "DOP853" or (
+        stepper.method == "BDF" and isinstance(stepper.system, LevelSet) and "jac" in stepper.options
+    )
+
+
+def _coefficients(stepper: Stepper) -> dict[str, Any]:
+    """SciPy's own, so that both backends take the same steps."""
+    if stepper.method == "BDF":
+        return {"newton_tol": float(stepper.solver.newton_tol)}
+    from scipy.integrate import DOP853
+
+    names = ("A", "A_EXTRA", "D", "B", "C", "C_EXTRA", "E3", "E5")
+    return {name: np.asfortranarray(getattr(DOP853, name), dtype=float) for name in names}

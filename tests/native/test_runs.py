@@ -1,0 +1,120 @@
+"""Runs in the native core and in Python: the same motion, the same ending, the same account of the work."""
+
+import numpy as np
+import pytest
+
+from ckc_pin import InputError, simulate
+from ckc_pin.control.controllers import SetPoint
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.systems import Native
+
+RTOL = 1e-8
+TRACKING = {"solver.method": "DOP853", "solver.spf_equation": 17}
+OFF = {"initial.w": [0.01, -0.02], "epsilon": 1e-2}
+
+RUNS = [
+    ("five_bar/swing", {"t_end": 1.0}),
+    ("five_bar/swing", {"formulation": "reduced", "t_end": 1.0}),
+    ("five_bar/swing", {"formulation": "spf", **OFF, **TRACKING, "t_end": 0.3}),
+    ("five_bar/swing", {"formulation": "spf", **OFF, **TRACKING, "coriolis_velocity": "actual", "t_end": 0.3}),
+    ("five_bar/swing", {"formulation": "spf", **OFF, "solver.method": "DOP853", "t_end": 0.3}),
+    ("five_bar/swing", {"solver.projection": False, "solver.baumgarte": [20.0, 20.0], "t_end": 0.5}),
+    ("five_bar/tracking", {**TRACKING, "t_end": 0.3}),
+    ("five_bar/tracking", {**TRACKING, "t_end": 0.3, "controller.torque_limit": 3.0}),
+    ("five_bar/set_point", {"formulation": "reduced", "solver.method": "DOP853", "t_end": 0.5}),
+    ("five_bar/set_point", {"formulation": "dae", "solver.method": "DOP853", "t_end": 0.2}),
+    ("five_bar/set_point", {"controller.sample_time": 0.01, "controller.delay": 0.004, "t_end": 0.2}),
+    ("andrews/default", {"formulation": "reduced"}),
+    ("bricard/default", {}),
+    ("delta/default", {"t_end": 0.2}),
+    ("four_bar/turning", {"t_end": 0.5}),
+    ("n_four_bar/default", {"t_end": 0.3}),
+    ("three_rrr/default", {}),
+    ("three_rrr/circle", {**TRACKING, "t_end": 0.2}),
+    ("two_ur5/default", {"t_end": 0.2}),
+    ("stewart/default", {"t_end": 0.05}),
+    ("talos/default", {"t_end": 0.02}),
+]
+
+
+def _both(scene, changes):
+    return [simulate(scene, {**changes, "solver.rtol": RTOL, "solver.backend": b}) for b in ("python", "native")]
+
+
+@pytest.mark.parametrize(("scene", "changes"), RUNS)
+def test_runs_are_the_same(scene, changes):
+    python, native = _both(scene, changes)
+    assert (python.stats["backend"], native.stats["backend"]) == ("python", "native")
+    assert (native.status, native.message) == (python.status, python.message)
+    assert np.array_equal(native.t, python.t)
+    for name, factor in (("q_tree", 1), ("v_tree", 1), ("phi", 1), ("w", 1), ("energy", 10), ("u", 100), ("tau", 100)):
+        gap = np.abs(getattr(native, name) - getattr(python, name))
+        size = max(1.0, np.abs(getattr(python, name)).max(initial=0.0))
+        assert gap[-1].max(initial=0.0) <= factor * 10 * RTOL * size, name
+        assert gap.max(initial=0.0) <= factor * 100 * RTOL * size, name  # on the way: both are as far from the truth
+    if python.lyapunov is not None:
+        assert np.abs(native.lyapunov - python.lyapunov).max() <= 1e2 * RTOL * max(1.0, python.lyapunov.max())
+    for count in ("steps", "rhs"):
+        assert native.stats[count] == pytest.approx(python.stats[count], rel=0.1, abs=16)
+    assert native.max_phi <= max(2 * python.max_phi, 1e-12)
+
+
+def test_what_python_alone_knows_acts_natively_too():
+    """A controller of the caller's own, called once for each right-hand side, at the same states."""
+    scene = load_scene("five_bar/set_point", {"formulation": "reduced", "solver.method": "DOP853", "t_end": 0.2})
+
+    class Own:
+        def __init__(self, inner):
+            self.inner, self.calls = inner, 0
+
+        def u(self, t, terms):
+            self.calls += 1
+            return self.inner.u(t, terms)
+
+    inner = prepare(scene).plant.controller
+    assert isinstance(inner, SetPoint)
+    own = Own(inner)
+    theirs, mine = simulate(scene), simulate(scene, controller=own)
+    assert mine.stats["backend"] == "native"
+    assert np.abs(mine.q_tree - theirs.q_tree).max() < 10 * RTOL
+    assert own.calls >= mine.stats["rhs"]
+
+
+def test_a_budget_ends_a_native_run_as_it_ends_pythons():
+    for key, value in (("solver.max_rhs", 200), ("solver.min_step", 0.01)):
+        python, native = _both("five_bar/swing", {key: value, "formulation": "reduced"})
+        assert native.status == python.status == "stopped"
+        assert native.message.partition(": ")[2] == python.message.partition(": ")[2]
+        assert native.t[-1] == pytest.approx(python.t[-1], rel=0.05)
+        assert native.stats["rhs"] == python.stats["rhs"]
+
+
+def test_a_change_of_the_partition_is_pythons_and_the_run_goes_on():
+    thrown = {"formulation": "reduced", "t_end": 0.5, "initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0}}
+    python, native = _both("five_bar/swing", thrown)
+    assert native.stats["switches"] == python.stats["switches"] > 0
+    assert np.abs(native.q_tree[-1] - python.q_tree[-1]).max() < 10 * RTOL * np.abs(python.q_tree).max()
+
+
+def test_plain_steps_are_taken_without_python():
+    """All but the first evaluation and those by which SciPy chooses its first step."""
+    scene = load_scene("five_bar/swing", {"formulation": "reduced"})
+    system = prepare(scene).system
+    assert isinstance(system, Native)
+    assert system.crosses
+    calls, rhs = [], type(system).rhs
+    try:
+        type(system).rhs = lambda self, t, y: calls.append(t) or rhs(self, t, y)
+        run = simulate(scene)
+    finally:
+        type(system).rhs = rhs
+    assert run.stats["rhs"] > 1000
+    assert len(calls) == 3
+
+
+def test_native_by_name_says_why_it_cannot_be_had(monkeypatch):
+    monkeypatch.setattr("ckc_pin.simulation.backend.unavailable", lambda: "the native core was not built")
+    with pytest.raises(InputError, match=r'backend = "native" cannot be had: the native core was not built'):
+        simulate("five_bar/swing", {"solver.backend": "native"})
+    assert simulate("five_bar/swing", {"t_end": 0.01}).stats["backend"] == "python"
