@@ -78,7 +78,8 @@ void spline(System& system, Matrix Lambda, Matrix K_D, Vector breaks, std::vecto
 }
 
 // Seconds of a right-hand side, the least of several rounds over states of a motion, a row of (t, y) each; of
-// Pinocchio's own calls in it: kinematics for each Newton iterate, D' and C'v + h'; and Newton's corrections.
+// Pinocchio's own calls for its terms: J with its rate, D', C'v + h', and J for each of Newton's corrections; and how
+// many of those there were.
 nb::tuple seconds(System& system, Table states, int rounds) {
   require(states.cols() == 1 + system.size && states.rows() > 0 && rounds > 0, "states: rows of (t, y) are needed");
   using Clock = std::chrono::steady_clock;
@@ -105,7 +106,7 @@ nb::tuple seconds(System& system, Table states, int rounds) {
     }
     start = Clock::now();
     for (Eigen::Index k = 0; k < columns.cols(); ++k) {
-      core.tree.set(q_trees.col(k));
+      core.tree.jacobian_rate(q_trees.col(k), v_trees.col(k));
       core.tree.inertia(q_trees.col(k));
       core.tree.bias(q_trees.col(k), v_trees.col(k));
     }

@@ -95,7 +95,7 @@ void Rows::set(const Tree& tree, In q) {
     phi(row.out) = e.dot(r);
     w[0].w = force(p_[row.pair], e);
     w[1].w = -force(p_[pairs_ + row.pair], e);
-    w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
+    if (w[2].joint) w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
   }
   for (const auto& row : c.dots) {
     auto& w = wrenches_[row.out];
@@ -152,7 +152,7 @@ void Rows::rates(const Tree& tree) {
     auto& w = wrenches_[row.out];
     w[0].w_dot = force_rate(p_[a], e, p_dot_[a], e_dot);
     w[1].w_dot = -force_rate(p_[b], e, p_dot_[b], e_dot);
-    w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
+    if (w[2].joint) w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
   }
   for (const auto& row : c.dots) {
     auto& w = wrenches_[row.out];
@@ -216,7 +216,7 @@ void Rows::bias(Out J_dot_v) const {
   for (int i = 0; i < closure.rows; ++i) {
     double value = 0.0;
     for (const auto& wrench : wrenches_[i])
-      value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
+      if (wrench.joint) value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
     J_dot_v(i) = value;
   }
 }
