@@ -119,7 +119,7 @@ def track(
     NumericalError
         The run does not get there.
     """
-    loaded = load_scene(scene, {**changes, "t_end": float(times[-1])})
+    loaded = load_scene(scene, {**changes, "solver.backend": "python", "t_end": float(times[-1])})
     prepared, sigma = prepare(loaded), None
     if own is not None:
         if prepared.plant.controller is None:

@@ -10,13 +10,12 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
-from time import sleep
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from tornado.websocket import WebSocketClientConnection, websocket_connect
+from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
 
 import ckc_pin
 from ckc_pin.view import live
@@ -60,7 +59,8 @@ async def until_the_end(connection: WebSocketClientConnection, answer: bool) -> 
         if command["type"] == "several":
             frames.append(command)
             if answer:
-                await connection.write_message("shown")
+                with suppress(WebSocketClosedError):  # the run may be over by now
+                    await connection.write_message("shown")
     return frames
 
 
@@ -88,8 +88,6 @@ def watched(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[
     with live_view(scene, None) as view:
         assert view is not None
         thread, seen = beside(view.server.url, viewer)
-        while thread.is_alive() and not view.server.viewers:  # the run may be over before somebody looks
-            sleep(0.01)
         run = ckc_pin.simulate(scene, watch=view.watch)
     thread.join(20)
     assert not thread.is_alive()
