@@ -362,7 +362,7 @@ def report(
     ),
     as_json: Json = False,
 ) -> None:
-    """Error against run time: every formulation and method here, and the programs people use."""
+    """Error against run time. Every formulation and method here, and the programs people use."""
     from ckc_pin.study.report.make import report as make_report
 
     with errors.status("measuring") if errors.is_terminal else nullcontext() as status:
