@@ -22,6 +22,8 @@ RUNS = [
     ("five_bar/swing", {"solver.projection": False, "solver.baumgarte": [20.0, 20.0], "t_end": 0.5}),
     ("five_bar/tracking", {**TRACKING, "t_end": 0.3}),
     ("five_bar/tracking", {**TRACKING, "t_end": 0.3, "controller.torque_limit": 3.0}),
+    ("five_bar/tracking", {"t_end": 0.3}),
+    ("five_bar/set_point", {"t_end": 0.3}),
     ("five_bar/set_point", {"formulation": "reduced", "solver.method": "DOP853", "t_end": 0.5}),
     ("five_bar/set_point", {"formulation": "dae", "solver.method": "DOP853", "t_end": 0.2}),
     ("five_bar/set_point", {"controller.sample_time": 0.01, "controller.delay": 0.004, "t_end": 0.2}),
@@ -111,6 +113,27 @@ def test_plain_steps_are_taken_without_python():
         type(system).rhs = rhs
     assert run.stats["rhs"] > 1000
     assert len(calls) == 3
+
+
+@pytest.mark.parametrize("scene", ["five_bar/tracking", "five_bar/set_point", "three_rrr/circle"])
+def test_the_jacobian_is_pythons(scene):
+    system = prepare(load_scene(scene, {"solver.backend": "native"})).system
+    y = system.start() + 0.01 * np.random.default_rng(0).standard_normal(2 * system.mechanism.d)
+    wanted = system.jacobian(0.1, y, system.rhs)
+    assert np.abs(system.native.jacobian(0.1, y) - wanted).max() <= 1e-6 * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae", "spf"])
+def test_states_that_are_none_are_refused(formulation):
+    changes = {"formulation": formulation, "solver.backend": "native", "solver.method": "DOP853"}
+    system = prepare(load_scene("five_bar/swing", changes)).system
+    y = system.start()
+    for bad in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="y: a number is not finite"):
+            system.native.rhs(0.0, np.append(y[:-1], bad))
+    with pytest.raises(ValueError, match=f"y: {len(y)} numbers are needed, got {len(y) - 1}"):
+        system.native.rhs(0.0, y[:-1])
+    assert system.native.rhs(0.0, 1e300 * np.ones(len(y))) is None
 
 
 def test_native_by_name_says_why_it_cannot_be_had(monkeypatch):
