@@ -127,6 +127,17 @@ def test_others_are_set_up_as_the_same_tree(work: str) -> None:
         assert bias < 1e-9
 
 
+def test_both_backends_are_measured_where_there_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ours, "unavailable", lambda: None)
+    both = list(ours.settings(quick=True, budget=1.0))
+    assert len({setting.name for setting in both}) == len(both)
+    assert {setting.changes["solver.backend"] for setting in both} == {"auto", "python"}
+    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
+    alone = list(ours.settings(quick=True, budget=1.0))
+    assert 2 * len(alone) == len(both)
+    assert not any("Python" in setting.name for setting in alone)
+
+
 def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:
     mujoco = peers()[0]
     refused = judged("k", SHORT, "MuJoCo", "s", mujoco.compute(SHORT, "RK4, stiff, dt 1e-06", 1e-3), exact)
@@ -249,6 +260,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(make, "WORKS", (SHORT,))
     monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody()])
     monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
+    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", (1e-3,))
     measured: list[str] = []
     found = make.report(tmp_path / "r", quick=True, progress=measured.append)

@@ -29,7 +29,7 @@ def draw(work: Work, rows: Sequence[Row], folder: Path) -> list[str]:
     )
     for k, (name, own) in enumerate(families.items()):
         look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
-        line = "-" if name.startswith(PROGRAM) else "--"
+        line = "--" if not name.startswith(PROGRAM) else ":" if "in Python" in name else "-"
         for ax, _, cost in axes:
             points = [(x, max(row.error_max or 0.0, FLOOR)) for row in own if (x := cost(row))]
             ax.plot(*zip(*points, strict=True), linestyle="", markersize=3, alpha=0.25, **look) if points else None  # type: ignore[attr-defined]
@@ -45,7 +45,8 @@ def draw(work: Work, rows: Sequence[Row], folder: Path) -> list[str]:
 def _family(row: Row) -> str:
     if row.program != PROGRAM:
         return row.program
-    return f"{PROGRAM}, {'SPF, eq. 8' if row.setting.startswith('spf, eq. 8') else row.setting.split(',')[0]}"
+    formulation = "SPF, eq. 8" if row.setting.startswith("spf, eq. 8") else row.setting.split(",")[0]
+    return f"{PROGRAM}, {formulation}{', in Python' if 'in Python' in row.setting else ''}"
 
 
 def _front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

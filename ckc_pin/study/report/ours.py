@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from time import perf_counter
 from typing import Any
 
 from ckc_pin.errors import CkcError
+from ckc_pin.native import unavailable
 from ckc_pin.simulation.simulate import simulate
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
@@ -32,18 +34,21 @@ class Setting:
 
 
 def settings(quick: bool, budget: float) -> Iterator[Setting]:
-    """Every formulation, method and tolerance, at most `budget` seconds each; eq. 8 is a formulation of its own."""
+    """Every formulation, method and tolerance, both backends, `budget` seconds at most; eq. 8 is one of its own."""
     formulations = {
         "dae": {},
         "reduced": {},
         "spf": {"solver.spf_equation": 17},
         "spf, eq. 8": {"solver.spf_equation": 8},
     }
-    for name, own in formulations.items():
-        for method in QUICK_METHODS if quick else METHODS:
-            for rtol in QUICK_TOLERANCES if quick else TOLERANCES:
-                changes = {"formulation": name.split(",")[0], "solver.method": method, "solver.rtol": rtol}
-                yield Setting(f"{name}, {method}, rtol {rtol:.0e}", {**own, **changes, "solver.max_wall_s": budget})
+    backends = ("auto",) if unavailable() else ("auto", "python")
+    choices = product(formulations.items(), QUICK_METHODS if quick else METHODS, backends)
+    for (name, own), method, backend in choices:
+        where = ", in Python" if backend != backends[0] else ""
+        for rtol in QUICK_TOLERANCES if quick else TOLERANCES:
+            changes = {"formulation": name.split(",")[0], "solver.method": method, "solver.rtol": rtol}
+            limits = {"solver.backend": backend, "solver.max_wall_s": budget}
+            yield Setting(f"{name}, {method}{where}, rtol {rtol:.0e}", {**own, **changes, **limits})
 
 
 def compute(work: Work, setting: Setting) -> Motion:

@@ -88,8 +88,9 @@ def key(work: Work, program: str, version: str, setting: str) -> str:
 def _code() -> str:
     """Return a hash of the package's own files: a changed line makes old rows stale."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[2].rglob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sorted(Path(__file__).parents[2].rglob("*")):
+        if path.suffix in (".py", ".cpp", ".hpp"):
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
