@@ -111,22 +111,28 @@ def _unclosed(at: Kinematics, residual: Array) -> float:
     return float(np.abs(residual).max(initial=0.0))
 
 
-def predict(at: Kinematics, dq: Array) -> Kinematics:
-    """Move q by dq and z along with it to first order, z + rho_z dq."""
-    return at.moved(at.rho @ dq)
+def predict(at: Kinematics, dq: Array, dw: Array | None = None) -> Kinematics:
+    """Move q by dq, the level by dw, and z along with them to first order, z + rho_z dq + phi_z^-1 dw."""
+    step = at.rho @ dq
+    if dw is not None:
+        step[at.partition.z] += at.phi_z_factor.solve(dw)
+    return at.moved(step)
 
 
 def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
-    """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq.
+    """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq, and from its level to w.
 
     Each piece is predicted along rho and corrected by Newton; a piece that fails is halved. Following
     the line is what keeps the assembly branch: Newton from far away may close on another one.
     Where the line ends early, q is looked for from other starts, unless `anywhere` is False.
     """
     at, done, piece, iterations = start, 0.0, 1.0, 0
+    dw = w - start.phi
+    between_levels = bool(np.abs(dw).max(initial=0.0) > tolerance)
     while done < 1.0:
         piece = min(piece, 1.0 - done)
-        trial = newton(predict(at, piece * dq), w, tolerance)
+        level = w - (1.0 - done - piece) * dw if between_levels else w
+        trial = newton(predict(at, piece * dq, piece * dw if between_levels else None), level, tolerance)
         iterations += trial.iterations
         if trial.converged and _same_branch(at, trial.at):
             at, done, piece = trial.at, done + piece if piece < 1.0 - done else 1.0, 2.0 * piece

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ckc_pin.mechanism import Psi
+from ckc_pin.mechanism import Psi, sigma
 from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
 from tests.conftest import Pair, assert_close
 
@@ -69,6 +71,23 @@ def test_sigma_on_a_moved_level_set(pair: Pair) -> None:
         assert found.verdict == "converged"
         assert_close(reference.phi(found.at.q_tree), w, 1e-12)
         assert reference.s(found.at.q_tree) > 0
+
+
+def test_sigma_follows_from_level_to_level(pair: Pair) -> None:
+    """From phi = 0 to a base moved by nine tenths of what the links bear, and back, at one q and at another."""
+    mechanism, reference = pair
+    q = mechanism.q_tree[Q] + [0.3, -0.2]
+    away = -0.9 * (reference.l[1] + reference.l[3] - elbow_distance(reference, q))
+    w = np.array([-away, 0.0])
+    moved = replace(reference, base=reference.base - away)
+    for dq in ([0.0, 0.0], [-0.05, 0.02]):
+        start = mechanism.sigma(q).at
+        there = sigma(start, np.array(dq), w, mechanism.tolerance, anywhere=False)
+        assert there.verdict == "converged"
+        assert_close(turned(there.at.q_tree - moved.sigma(q + dq)), 0, 1e-11)
+        back = sigma(there.at, -np.array(dq), 0.0, mechanism.tolerance, anywhere=False)
+        assert back.verdict == "converged"
+        assert_close(turned(back.at.q_tree - reference.sigma(q)), 0, 1e-11)
 
 
 def test_sigma_from_the_other_branch_stays_there(pair: Pair) -> None:
