@@ -15,7 +15,7 @@ from ckc_pin.mechanism.freedoms import count_freedoms, idle_coordinates
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.rank import choose_dependent, rank_of
+from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.sigma import Sigma, sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
@@ -136,6 +136,15 @@ class Mechanism:
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]
+
+    def best_partition(self, at: Kinematics) -> Partition | None:
+        """Return the split whose phi_z is furthest from singular at a configuration, by a pivoted QR.
+
+        None where it would split the coordinates of a free root.
+        """
+        jacobian = scaled(at.J, self.tree, self.closure, self.size)
+        z = choose_dependent(jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free])
+        return None if z is None else Partition(np.setdiff1d(np.arange(self.n), z), z)
 
     def point_positions(self, q_tree: Array) -> dict[str, Array]:
         """World positions of the mechanism's named points, metres."""

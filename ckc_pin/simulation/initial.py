@@ -13,6 +13,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.systems import CHART_MARGIN, nearly_singular
 
 __all__ = ["Start", "find_start"]
 
@@ -83,9 +84,6 @@ def _branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
 
 def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinematics:
     found = mechanism.sigma(q, start, w)
-    if found.verdict == "converged" and not np.any(w):
-        _refuse_singular(mechanism, found.at)
-        return found.at
     if found.verdict == "converged":
         _refuse_contradiction(mechanism, found.at, w)
         return found.at
@@ -93,12 +91,25 @@ def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinem
     level = f" on phi = w = {w.tolist()}" if np.any(w) else ""
     if found.verdict == "singular":
         raise NumericalError(
-            f"the start {where}{level} is singular: {', '.join(mechanism.independent)} do not determine "
-            f"{', '.join(mechanism.dependent)} there; start elsewhere or choose other independent coordinates",
+            f"the start {where}{level} is singular: {_what_would_help(mechanism, found.at)}",
             t=0.0,
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(found.at.q_tree)),
         )
     raise InputError(f"initial: the start {where}{level} is out of reach: {found.reason}")
+
+
+def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
+    """Say what is singular; other independent coordinates help where J keeps its rank."""
+    best = mechanism.best_partition(at)
+    if best is not None and nearly_singular(Kinematics(at.tree, at.closure, best, at.q_tree), CHART_MARGIN) is None:
+        names = ", ".join(mechanism.coordinates[k] for k in best.q)
+        return (
+            f"{', '.join(mechanism.independent)} do not determine {', '.join(mechanism.dependent)} there; "
+            f"start elsewhere, or take other independent coordinates ({names} would do)"
+        )
+    return (
+        "J loses rank there, branches of the motion meet, and the loops do not say which one it takes; start elsewhere"
+    )
 
 
 def _refuse_contradiction(mechanism: Mechanism, at: Kinematics, w: Array) -> None:
@@ -108,14 +119,4 @@ def _refuse_contradiction(mechanism: Mechanism, at: Kinematics, w: Array) -> Non
         raise InputError(
             f"initial.w: no configuration has phi = w = {w.tolist()} (nearest miss {miss:.3g}): rows of the closure "
             f"follow from others ({', '.join(mechanism.redundant)}), and w contradicts them"
-        )
-
-
-def _refuse_singular(mechanism: Mechanism, at: Kinematics) -> None:
-    if len(mechanism.dependent) and at.sigma_min() <= 1e-9 * np.linalg.norm(at.J):
-        raise NumericalError(
-            f"the start is singular: phi_z has the singular value {at.sigma_min():.3g}; start elsewhere or choose "
-            "other independent coordinates",
-            t=0.0,
-            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
         )

@@ -298,8 +298,9 @@ class Stepper:
                 return np.asarray(dense[0](t))
 
             return own
-        n = self.system.positions
-        return _hermite(t_old, y_old, f_old, float(solver.t), solver.y.copy(), solver.f.copy(), n)
+        t_new, y_new = float(solver.t), solver.y.copy()
+        slopes = self.system.slope(t_old, y_old, f_old), self.system.slope(t_new, y_new, solver.f.copy())
+        return _hermite(t_old, y_old, slopes[0], t_new, y_new, slopes[1], self.system.positions)
 
 
 def _frozen_dense_output(solver: Any) -> Callable[[float], Array]:

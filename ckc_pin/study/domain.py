@@ -112,7 +112,7 @@ def off_manifold(mechanism: Mechanism, *, reachable: bool, count: int = STARTS, 
         verdict = mechanism.sigma(mechanism.independent_part(at.q_tree)).verdict
         if verdict != ("converged" if reachable else "out of reach"):
             continue
-        system = PrintedSpf(mechanism, at, np.zeros(mechanism.d), lambda t, terms: none, EPSILON)
+        system = PrintedSpf(mechanism, at, np.zeros(mechanism.d), lambda t, terms: none, EPSILON, at.phi)
         outcome = march(system, "Radau", 1e-5, LAYERS * EPSILON)
         gone = np.abs(outcome.terms.phi).max() <= 2 * np.exp(-LAYERS) * np.abs(at.phi).max() + 1e-7
         rows.append((at.sigma_min(), outcome.t / EPSILON, bool(gone and not outcome.stopped)))

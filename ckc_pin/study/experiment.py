@@ -101,7 +101,8 @@ class Problem:
 
     def printed_spf(self, epsilon: float) -> PrintedSpf:
         """Eq. 8 as printed, from phi = 0."""
-        return PrintedSpf(self.mechanism, self.at, self.q_dot, self.force, epsilon)
+        w0 = np.zeros(self.mechanism.closure.rows)
+        return PrintedSpf(self.mechanism, self.at, self.q_dot, self.force, epsilon, w0)
 
 
 def five_bar_problem(moving: bool) -> Problem:

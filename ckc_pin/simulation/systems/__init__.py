@@ -13,13 +13,14 @@ system         y                    equations
 `NativeLevelSet`, `NativePrintedSpf` and `NativeDae` are the same with their right-hand sides in C++.
 """
 
-from ckc_pin.simulation.systems.base import Counts, Force, System, nearly_singular
+from ckc_pin.simulation.systems.base import CHART_MARGIN, Counts, Force, System, nearly_singular
 from ckc_pin.simulation.systems.dae import Dae
 from ckc_pin.simulation.systems.level_set import LevelSet
 from ckc_pin.simulation.systems.native import Native, NativeDae, NativeLevelSet, NativePrintedSpf
 from ckc_pin.simulation.systems.printed_spf import PrintedSpf
 
 __all__ = [
+    "CHART_MARGIN",
     "Counts",
     "Dae",
     "Force",

@@ -18,6 +18,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Counts", "Force", "Gradient", "Rhs", "System", "nearly_singular", "require_chart", "spf_velocity"]
 
 CHART_MARGIN = 1e-5  # of |J|: phi_z's least singular value at which q has stopped to be a chart
+DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
 
 Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
 Gradient = Callable[[float, Terms], Array | None]  # d u / d q_dot at (t, terms); None where it is not known
@@ -69,6 +70,9 @@ class System(Protocol):
 
     def configuration(self, t: float, y: Array) -> Array:
         """Pinocchio's q at a state, as near as it is known without closing the loops, shape (nq,)."""
+
+    def slope(self, t: float, y: Array, f: Array) -> Array:
+        """y' at an accepted step, f = rhs(t, y), for interpolation."""
 
     def accept(self, t: float, y: Array) -> Array | None:
         """Take note of an accepted step; return y projected, or None when it stays as it is."""

@@ -81,6 +81,9 @@ class Dae:
     def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
         return None
 
+    def slope(self, t: float, y: Array, f: Array) -> Array:
+        return f
+
     def accept(self, t: float, y: Array) -> Array | None:
         if not self.projects:
             return None

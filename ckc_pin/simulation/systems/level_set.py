@@ -11,18 +11,16 @@ from ckc_pin.dynamics.formulations import CoriolisVelocity, reduced_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.chart import Chart
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.rank import choose_dependent, scaled
 from ckc_pin.mechanism.sigma import newton, sigma
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems.base import Counts, Force, Gradient, Rhs, require_chart, spf_velocity
+from ckc_pin.simulation.systems.base import DIFFERENCE, Counts, Force, Gradient, Rhs, require_chart, spf_velocity
 from ckc_pin.simulation.systems.trail import Trail
 
 __all__ = ["LevelSet"]
 
 SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
-DIFFERENCE = 1.5e-8  # step of forward differences, rad or m
 
 
 @dataclass
@@ -46,25 +44,30 @@ class LevelSet:
     may_switch: bool = False
     slack: float = 0.0
     counts: Counts = field(default_factory=Counts)
-    projects: bool = False
     backend: ClassVar[str] = "python"
 
     def __post_init__(self) -> None:
-        tree = self.mechanism.tree
         self._d = self.mechanism.d
         self._on_manifold = self.w0 is None or not np.any(self.w0)
         self._zero = np.zeros(self.mechanism.closure.rows)
-        self._trail = self._new_trail(self.initial)
-        self._chart = Chart(tree, self.mechanism.partition.q, self.initial.q_tree)
-        # a free root among q is charted by rotation vectors, and the chart moves along between steps
-        self.projects = not self._chart.plain
-        self.positions = self._d if self._chart.plain else 0
+        self._start = self._chart_from(self.initial, self.q_dot)
+        switched = self._switched(0.0, self._start)  # before a first step, whose error in a bad q nobody would see
+        self._start = self._start if switched is None else switched
+
+    @property
+    def projects(self) -> bool:
+        """A free root among q is charted by rotation vectors, and the chart moves along between steps."""
+        return not self._chart.plain
+
+    @property
+    def positions(self) -> int:
+        return self._d if self._chart.plain else 0
 
     def _new_trail(self, start: Kinematics) -> Trail:
         return Trail(start, self.epsilon)
 
     def start(self) -> Array:
-        return np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
+        return self._start.copy()
 
     def w(self, t: float) -> Array:
         """Eq. 17's second line, exact."""
@@ -147,16 +150,14 @@ class LevelSet:
             jacobian[d:, k] = (rhs(t, moved)[d:] - f[d:]) / (moved[k] - y[k])
         return jacobian
 
+    def slope(self, t: float, y: Array, f: Array) -> Array:
+        return f
+
     def accept(self, t: float, y: Array) -> Array | None:
-        at = self._trail.last
-        margin = at.sigma_min() / max(float(np.linalg.norm(at.J)), 1e-300)
-        if margin < SWITCH_MARGIN and self.may_switch:
-            better = self._better_partition(at, margin)
-            if better is not None:
-                terms = self.terms(t, y)
-                self.counts.switches += 1
-                return self._chart_from(Kinematics(at.tree, at.closure, better, terms.q_tree), terms.v_tree[better.q])
-        require_chart(at)
+        switched = self._switched(t, y)
+        if switched is not None:
+            return switched
+        require_chart(self._trail.last)
         if self._chart.plain:
             return None
         return self._chart_from(self.terms(t, y).at, y[self._d :])
@@ -167,13 +168,22 @@ class LevelSet:
         self._chart = Chart(at.tree, at.partition.q, at.q_tree)
         return np.concatenate([self._chart.numbers(at.q_tree), q_dot])
 
-    def _better_partition(self, at: Kinematics, margin: float) -> Partition | None:
-        """Return a split whose phi_z is clearly further from singular here, if there is one."""
-        tree, closure = self.mechanism.tree, self.mechanism.closure
-        jacobian = scaled(at.J, tree, closure, self.mechanism.size)
-        z = choose_dependent(jacobian, self.mechanism.rank, [np.arange(v, v + 6) for _, v in tree.free])
-        if z is None:
+    def _switched(self, t: float, y: Array) -> Array | None:
+        """Change the split where phi_z is nearly singular and another is clearly further from it; None to stay.
+
+        Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there it stays.
+        """
+        at = self._trail.last
+        if not self.may_switch or np.abs(self.w(t)).max(initial=0.0) > self.mechanism.tolerance:
             return None
-        split = Partition(np.setdiff1d(np.arange(tree.n), z), z)
-        gained = Kinematics(tree, closure, split, at.q_tree).sigma_min() / float(np.linalg.norm(at.J))
-        return split if gained > 2 * margin else None
+        size = max(float(np.linalg.norm(at.J)), 1e-300)
+        margin = at.sigma_min() / size
+        better = self.mechanism.best_partition(at) if margin < SWITCH_MARGIN else None
+        if better is None:
+            return None
+        terms = self.terms(t, y)
+        moved = Kinematics(at.tree, at.closure, better, terms.q_tree)
+        if moved.sigma_min() <= 2 * margin * size:
+            return None
+        self.counts.switches += 1
+        return self._chart_from(moved, terms.v_tree[better.q])

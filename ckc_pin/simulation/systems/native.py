@@ -141,7 +141,7 @@ class NativePrintedSpf(PrintedSpf, Native):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.core = make_core(self.mechanism)
-        self.drive(core().PrintedSpf(self.core, self.epsilon, self.convention == "actual", self._w0))
+        self.drive(core().PrintedSpf(self.core, self.epsilon, self.convention == "actual", self.w0))
 
     def rhs(self, t: float, y: Array) -> Array:
         derivative = self.evaluate(t, y, self.counts) if self.crosses else None

@@ -12,20 +12,21 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems.base import Counts, Force, Rhs, require_chart, spf_velocity
+from ckc_pin.simulation.systems.base import DIFFERENCE, Counts, Force, Rhs, require_chart, spf_velocity
 
 __all__ = ["PrintedSpf"]
 
 
 @dataclass
 class PrintedSpf:
-    """Eq. 8 as printed: y = (q, q_dot, z)."""
+    """Eq. 8 as printed: y = (q, q_dot, z), with phi = w0 at the start."""
 
     mechanism: Mechanism
     initial: Kinematics
     q_dot: Array
     force: Force
     epsilon: float
+    w0: Array
     convention: CoriolisVelocity = "rho"
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
@@ -36,20 +37,24 @@ class PrintedSpf:
         tree, partition = self.mechanism.tree, self.mechanism.partition
         self._d = self.mechanism.d
         self._q, self._z = tree.place[partition.q], tree.place[partition.z]
-        self._w0 = self.initial.phi
 
     def start(self) -> Array:
         q_tree = self.initial.q_tree
         return np.concatenate([q_tree[self._q], self.q_dot, q_tree[self._z]])
 
     def w(self, t: float) -> Array:
-        return self._w0 * np.exp(-t / self.epsilon)
+        return self.w0 * np.exp(-t / self.epsilon)
 
     def w_dot(self, t: float) -> Array:
         return -self.w(t) / self.epsilon
 
     def velocity(self, t: float, terms: Terms) -> Array:
-        return spf_velocity(terms, self.epsilon, terms.phi)
+        # with the exact w: what a tolerance leaves phi off by would be divided by epsilon
+        return spf_velocity(terms, self.epsilon, self.w(t))
+
+    def slope(self, t: float, y: Array, f: Array) -> Array:
+        z_dot = self.velocity(t, self.terms(t, y))[self.mechanism.partition.z]
+        return np.concatenate([f[: 2 * self._d], z_dot])
 
     def terms(self, t: float, y: Array) -> Terms:
         d = self._d
@@ -70,7 +75,25 @@ class PrintedSpf:
         return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
 
     def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
-        return None
+        """Forward differences, but exact in what epsilon divides, -phi_z^-1 d phi / epsilon.
+
+        That part would drown the rest in its rounding errors, and SciPy's differences, which shorten their steps
+        on it until nothing is left of them.
+        """
+        d, f, terms = self._d, rhs(t, y), self.terms(t, y)
+        phi, rho_z = terms.phi, terms.at.rho[terms.at.partition.z]
+        z_dot = spf_z_dot(terms.at, y[d : 2 * d], self.epsilon, phi)
+        jacobian = np.empty((len(y), len(y)))
+        for k in range(len(y)):
+            moved = y.copy()
+            moved[k] += DIFFERENCE * max(1.0, abs(float(y[k])))
+            step = moved[k] - y[k]
+            jacobian[: 2 * d, k] = (rhs(t, moved)[: 2 * d] - f[: 2 * d]) / step
+            at = self.terms(t, moved).at
+            jacobian[2 * d :, k] = (spf_z_dot(at, moved[d : 2 * d], self.epsilon, phi) - z_dot) / step
+        jacobian[2 * d :, :d] += rho_z / self.epsilon
+        jacobian[2 * d :, 2 * d :] -= np.eye(len(y) - 2 * d) / self.epsilon
+        return jacobian
 
     def accept(self, t: float, y: Array) -> Array | None:
         require_chart(self.terms(t, y).at)
