@@ -20,6 +20,7 @@ __all__ = [
     "CoriolisVelocity",
     "closing_step",
     "dae_acceleration",
+    "dae_rate_gradient",
     "multipliers",
     "reduced_acceleration",
     "spf_terms",
@@ -84,14 +85,14 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    residual : (rows,) array
+    residual : (rows,) array, or (rows, k)
         For example J_dot v'; with redundant rows consistent, as every motion makes it.
 
     Returns
     -------
     tangent : (n, d) array
         Orthonormal basis of the velocities that the loops allow.
-    particular : (n,) array
+    particular : (n,) array, or (n, k)
         The shortest x with J x = -residual.
 
     Raises
@@ -103,7 +104,7 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     rank = mechanism.rank
     normal, tangent, r, rows = null_space(terms.at.J, rank)
     if rank == 0:
-        return tangent, np.zeros(mechanism.n)
+        return tangent, np.zeros((mechanism.n, *residual.shape[1:]))
     pivots = np.abs(np.diagonal(r))
     if not pivots[-1] > SINGULAR * pivots[0]:
         raise NumericalError(
@@ -142,6 +143,25 @@ def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.
     force = u_tree - terms.bias_tree - terms.D_tree @ particular
     if terms.mechanism.springs.any_damping:
         force += terms.damping_force
+    inertia = tangent.T @ terms.D_tree @ tangent
+    return particular + tangent @ Factorization(inertia).solve(tangent.T @ force)
+
+
+def dae_rate_gradient(terms: Terms, u_gradient: Array) -> Array:
+    """Derivative of `dae_acceleration` along v', shape (n, n), on a tree of joints with one freedom each.
+
+    C' v' and J_dot v' are quadratic there: their derivatives are 2 C' and 2 J_dot.
+
+    Parameters
+    ----------
+    terms : Terms
+    u_gradient : (n, n) array
+        That of the actuators' forces on the tree.
+    """
+    tangent, particular = tangent_basis(terms, 2 * terms.J_dot)
+    force = u_gradient - 2 * terms.C_tree - terms.D_tree @ particular
+    if terms.mechanism.springs.any_damping:
+        force -= terms.mechanism.springs.damping_matrix(terms.q_tree)
     inertia = tangent.T @ terms.D_tree @ tangent
     return particular + tangent @ Factorization(inertia).solve(tangent.T @ force)
 

@@ -53,7 +53,6 @@ class Burst:
         self.stepper, self.guard, self.recorder, self.times, self.within = stepper, guard, recorder, times, within
         self.system: Any = stepper.system
         self._made_for: tuple[Any, ...] = ()
-        self._tables = _coefficients(stepper)
 
     def run(self, due: int) -> tuple[int, bool]:
         """Step on; return which output instant is the next, and whether there is more to be done natively."""
@@ -94,7 +93,7 @@ class Burst:
 
     def _loop(self) -> Any:
         options = self.stepper.options
-        made_for = (self.system.native, options["rtol"], options["atol"])
+        made_for = (self.system.native, self.stepper.method, options["rtol"], options["atol"])
         if made_for != self._made_for:
             self._made_for = made_for
             mechanism = self.system.mechanism
@@ -102,7 +101,7 @@ class Burst:
             columns = np.where(mechanism.tree.in_metres, mechanism.size, 1.0)
             margin = SWITCH_MARGIN if getattr(self.system, "may_switch", False) else CHART_MARGIN
             self._made = core().Loop(
-                self.system.native, self.stepper.method, self._tables, options["rtol"], options["atol"],
+                self.system.native, self.stepper.method, _coefficients(self.stepper), options["rtol"], options["atol"],
                 options.get("max_step", np.inf), rows, columns, margin,
             )  # fmt: skip
         return self._made

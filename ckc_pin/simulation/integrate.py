@@ -24,6 +24,7 @@ from ckc_pin.simulation.systems import Dae, System, nearly_singular
 __all__ = ["BudgetError", "Step", "Stepper"]
 
 ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
+DOUBT = 50  # steps
 RECENT = 12  # evaluations remembered: those of one Newton iteration and of one Jacobian
 NEWTON_TOL = 0.03  # of the local error; SciPy's own, rtol^0.5, takes a third more right-hand sides for nothing
 
@@ -60,8 +61,6 @@ class Stepper:
     """
 
     def __init__(self, system: System, method: str, spec: SolverSpec, t_end: float) -> None:
-        import scipy.integrate
-
         if system.projects and method not in ("auto", *ONE_STEP):
             raise InputError(
                 f"solver: {method} is a multistep method, and projection edits the state between steps, which "
@@ -79,23 +78,48 @@ class Stepper:
         self._rhs(0.0, self.y, at_start=True)
         self._known_jacobian: Array | None = None
         jacobian = self._jacobian(0.0, self.y) if method in ("auto", "BDF", "Radau") else None
-        self.method = self._choose(jacobian, t_end) if method == "auto" else method
-        rtol = bdf_rtol(spec.rtol) if method == "auto" and self.method == "BDF" else spec.rtol
-        atol = spec.atol if spec.atol is not None else spec.rtol / 100
-        self.options: dict[str, Any] = {"rtol": rtol, "atol": atol * rtol / spec.rtol}
-        if spec.max_step:
-            self.options["max_step"] = spec.max_step
-        if self.method in ("BDF", "Radau") and jacobian is not None:
-            self.options["jac"] = self._jacobian
-        self._class: Any = self._ida if self.method == "IDA" else getattr(scipy.integrate, self.method)
+        self._take(self._choose(jacobian, t_end) if method == "auto" else method, method == "auto", jacobian)
+        # eigenvalues at the start foretell nothing of what comes: DOP853 is doubted after so many steps
+        self._doubt = DOUBT if method == "auto" and self.method == "DOP853" else np.inf
         self.solver = self._solver(0.0, self.y, t_end)
         self._budgeted = True
         self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
 
-    def _choose(self, jacobian: Array | None, t_end: float) -> str:
+    def _choose(self, jacobian: Array | None, duration: float) -> str:
         """What "auto" stands for: implicit where nothing is known, but no multistep method where y is edited."""
-        method = choose(jacobian, t_end) if jacobian is not None and np.all(np.isfinite(jacobian)) else "Radau"
+        method = "Radau"
+        if jacobian is not None and np.all(np.isfinite(jacobian)):
+            method = choose(jacobian, duration, self.system.held)
+        if method == "BDF" and isinstance(self.system, Dae):
+            self.system.close_within()
         return "Radau" if method == "BDF" and self.system.projects else method
+
+    def _take(self, method: str, auto: bool, jacobian: Array | None) -> None:
+        """Take a method from the next solver on."""
+        import scipy.integrate
+
+        spec, self.method = self.spec, method
+        rtol = bdf_rtol(spec.rtol, self.system.held) if auto and method == "BDF" else spec.rtol
+        atol = spec.atol if spec.atol is not None else spec.rtol / 100
+        self.options: dict[str, Any] = {"rtol": rtol, "atol": atol * rtol / spec.rtol}
+        if spec.max_step:
+            self.options["max_step"] = spec.max_step
+        if method in ("BDF", "Radau") and jacobian is not None:
+            self.options["jac"] = self._jacobian
+        self._class: Any = self._ida if method == "IDA" else getattr(scipy.integrate, method)
+
+    def _reconsider(self) -> None:
+        """Look at the eigenvalues once more, and go on with another method if they ask for one."""
+        self._doubt *= 2
+        t, y = self.t, self.solver.y.copy()
+        jacobian = self._jacobian(t, y)
+        if jacobian is None or not np.all(np.isfinite(jacobian)):
+            return
+        method = self._choose(jacobian, self.solver.t_bound - t)
+        if method != self.method:
+            self._doubt, length = np.inf, self.solver.step_size
+            self._take(method, True, jacobian)
+            self._restart(t, y, length)
 
     def _solver(self, t: float, y: Array, t_end: float, **options: Any) -> Any:
         with np.errstate(all="ignore"):
@@ -158,6 +182,8 @@ class Stepper:
         elif projected is not None:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
+        if self.steps >= self._doubt and self.solver.status == "running":
+            self._reconsider()
 
     def rate(self, t: float, y: Array) -> Array:
         """Evaluate y' at (t, y), counted; NaN where it does not exist."""

@@ -192,7 +192,7 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant, 
         v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         projects, baumgarte = _closing(spec.solver)
         dae = partial(NativeDae, controller=controller, actuation=actuation) if native else Dae
-        return dae(mechanism, start.at, v_tree, force, projects, baumgarte)
+        return dae(mechanism, start.at, v_tree, force, projects, baumgarte, plant.u_rate_gradient)
     level_set = partial(NativeLevelSet, controller=controller, actuation=actuation) if native else LevelSet
     if spec.formulation == "reduced":
         return level_set(
@@ -240,6 +240,4 @@ def _method(scene: Scene, system: System, plant: Plant) -> str:
     if isinstance(system, PrintedSpf):
         return "Radau"
     feedback = plant.controller is not None and not isinstance(plant.controller, Held)
-    if isinstance(system, LevelSet) and not system.projects:
-        return "auto" if feedback or system.mechanism.springs.any_damping else "DOP853"
-    return "Radau" if feedback else "DOP853"
+    return "auto" if feedback or system.mechanism.springs.any_damping else "DOP853"

@@ -58,7 +58,7 @@ class RankGuard:
         self.stepper = stepper
         self.system = stepper.system
         self.rank = self.system.mechanism.rank
-        self.dae = self.system if isinstance(self.system, Dae) and self.system.projects else None
+        self.dae = self.system if isinstance(self.system, Dae) and self.system.closed else None
         self.crossings: list[float] = []
         self.end: tuple[float, float] | None = None
         self.length = 0.0

@@ -14,10 +14,10 @@ LIMITS = {
     ("five_bar/swing", "spf"): (1_450, 1.3),
     ("five_bar/swing", "dae"): (1_750, 0.3),
     ("five_bar/set_point", "reduced"): (2_050, 1.0),
-    ("five_bar/set_point", "dae"): (5_200, 0.3),
+    ("five_bar/set_point", "dae"): (1_600, 0.3),
     ("five_bar/tracking", "reduced"): (1_700, 1.0),
     ("five_bar/tracking", "spf"): (1_700, 1.0),
-    ("five_bar/tracking", "dae"): (10_300, 0.3),
+    ("five_bar/tracking", "dae"): (3_000, 1.7),  # BDF: closed in each right-hand side, not between steps
 }
 
 

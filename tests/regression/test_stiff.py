@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,12 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin import Run, simulate
 from ckc_pin.dynamics import Terms
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
 from ckc_pin.simulation.stiffness import choose
+from ckc_pin.simulation.systems import Dae
+from ckc_pin.study.stability.cases import GROUPS
+from ckc_pin.study.stability.cell import How, run_case
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, tracking
 from tests.conftest import assert_close
 
@@ -41,6 +47,41 @@ def test_the_error_along_tracking_is_the_tolerance(
     assert ours.stats["rhs"] <= BUDGETS[rtol]
     gap = np.abs(ours.q_tree[:, Q] - np.array([exact(t)[:2] for t in ours.t]))
     assert gap.max() <= 1.1 * rtol
+
+
+@pytest.mark.parametrize(("rtol", "budget"), [(1e-6, 1_600), (1e-8, 3_000)])
+def test_the_dae_does_as_well(
+    run: Callable[..., Run], exact: Callable[[float], Array], rtol: float, budget: int
+) -> None:
+    """On its closure at every output, though no step is edited."""
+    ours = run("five_bar/tracking", formulation="dae", solver__rtol=rtol, solver__output_dt=0.01)
+    assert ours.stats["method"] == "BDF"
+    assert ours.stats["rhs"] <= budget
+    assert np.abs(ours.q_tree[:, Q] - np.array([exact(t)[:2] for t in ours.t])).max() <= 1.1 * rtol
+    assert max(np.abs(FIVE_BAR.phi(q)).max() for q in ours.q_tree) <= 1e-12
+
+
+def test_the_jacobian_of_the_dae_is_that_of_its_right_hand_side() -> None:
+    """In all directions, those across the freedoms included, against central differences."""
+    system = prepare(load_scene("five_bar/tracking", {"formulation": "dae"})).system
+    assert isinstance(system, Dae)
+    system.close_within()
+    q_tree = FIVE_BAR.sigma(FIVE_BAR.equilibrium()[Q] + [0.4, -0.3])
+    y, h = np.concatenate([q_tree, FIVE_BAR.rho(q_tree) @ [1.0, -2.0]]), 1e-6
+    found = system.jacobian(0.3, y, system.rhs)
+    steps = h * np.eye(8)
+    slopes = [(system.rhs(0.3, y + step) - system.rhs(0.3, y - step)) / (2 * h) for step in steps]
+    assert_close(found, np.transpose(slopes), 1e-6, relative=True)
+    assert np.sum(np.abs(np.linalg.eigvals(found)) < 1e-3) == system.held == 4
+
+
+def test_what_becomes_stiff_on_the_way_is_noticed() -> None:
+    """A damper that grips while the spring beside it, stretched at the start, still pushes: at first modes grow."""
+    case = next(case for case in GROUPS["spring"]() if case.name == "line 1e+06 N/m, damped")
+    longer = {**case.changes, "t_end": 0.4, "solver.output_dt": 0.1}
+    auto, explicit = run_case(replace(case, changes=longer, how=(How("dae"), How("dae", "DOP853"))))
+    assert (auto.method, auto.verdict, explicit.verdict) == ("auto: BDF", "within", "within")
+    assert auto.rhs < 0.6 * explicit.rhs
 
 
 def test_a_controller_that_knows_no_gradient_costs_no_more() -> None:

@@ -45,6 +45,8 @@ class System(Protocol):
         Whether `accept` edits the state.
     backend : "python" or "native"
         What evaluates the right-hand side.
+    held : int
+        How many directions of y the closure holds still: as many eigenvalues of `jacobian` say nothing.
     """
 
     mechanism: Mechanism
@@ -58,6 +60,9 @@ class System(Protocol):
 
     @property
     def projects(self) -> bool: ...
+
+    @property
+    def held(self) -> int: ...
 
     def start(self) -> Array:
         """Initial y."""

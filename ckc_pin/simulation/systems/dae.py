@@ -8,13 +8,14 @@ from typing import ClassVar
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.dynamics.formulations import closing_step, dae_acceleration, tangent_basis
+from ckc_pin.dynamics.formulations import closing_step, dae_acceleration, dae_rate_gradient, tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems.base import Counts, Force, Rhs
+from ckc_pin.simulation.systems.base import DIFFERENCE, Counts, Force, Gradient, Rhs
 
 __all__ = ["Dae"]
 
@@ -26,6 +27,9 @@ WEAK = 1e-3  # of the largest singular value of J: below that a direction is not
 class Dae:
     """Eq. 1: y = (q', v'), position and velocity put back on the closure after each step if `projects`.
 
+    Or, after `close_within`, for methods that remember former states: the state is left alone, and put on the closure
+    wherever it is evaluated. What is off the closure then has no effect, and does not grow.
+
     `baumgarte` = (alpha, beta) lets what is off the closure decay instead: phi_ddot + 2 alpha phi_dot + beta^2 phi = 0.
     """
 
@@ -35,11 +39,23 @@ class Dae:
     force: Force
     projects: bool = True
     baumgarte: tuple[float, float] | None = None
+    u_rate_gradient: Gradient | None = None
     counts: Counts = field(default_factory=Counts)
     backend: ClassVar[str] = "python"
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.n if self.mechanism.tree.flat else 0
+        self.held = 2 * self.mechanism.rank
+        self.closes_within = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether what is read from a state is on the closure, in one way or the other."""
+        return self.projects or self.closes_within
+
+    def close_within(self) -> None:
+        """Leave the state alone from now on."""
+        self.projects, self.closes_within = False, True
 
     def start(self) -> Array:
         return np.concatenate([self.initial.q_tree, self.v_tree])
@@ -60,14 +76,18 @@ class Dae:
     def terms(self, t: float, y: Array) -> Terms:
         q_tree, v_tree = self._split(y)
         at = self.mechanism.kinematics(q_tree)
-        return self._projected(at, v_tree) if self.projects else Terms(self.mechanism, at, v_tree)
+        return self._projected(at, v_tree) if self.closed else Terms(self.mechanism, at, v_tree)
 
     def configuration(self, t: float, y: Array) -> Array:
         return self._split(y)[0]
 
     def rhs(self, t: float, y: Array) -> Array:
         q_tree, v_tree = self._split(y)
-        terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
+        if self.closes_within:
+            terms = self.terms(t, y)
+            v_tree = terms.v_tree
+        else:
+            terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
         self.counts.factorizations += 2
         rate = self.mechanism.tree.configuration_rate(q_tree, v_tree)
         return np.concatenate([rate, dae_acceleration(terms, self.force(t, terms), self._correction(terms))])
@@ -79,7 +99,30 @@ class Dae:
         return 2 * alpha * (terms.at.J @ terms.v_tree) + beta**2 * terms.phi
 
     def jacobian(self, t: float, y: Array, rhs: Rhs) -> Array | None:
-        return None
+        """Exact along v', where a closed loop is stiff; forward differences along the freedoms of q'.
+
+        Across the freedoms nothing changes, in the metric of the inertia in which the closure is kept.
+        """
+        if not self.closed or not self.mechanism.tree.flat:
+            return None
+        terms = self.terms(t, y)
+        gradient = self.u_rate_gradient(t, terms) if self.u_rate_gradient else None
+        if gradient is None:
+            return None
+        n, q = self.mechanism.n, self.mechanism.partition.q
+        u_gradient = np.zeros((n, n))
+        u_gradient[np.ix_(q, q)] = gradient
+        tangent, _ = tangent_basis(terms, np.zeros(self.mechanism.closure.rows))
+        heavy = tangent.T @ terms.D_tree
+        along = Factorization(heavy @ tangent).solve(heavy)  # coordinates of a velocity along the freedoms
+        f, jacobian = rhs(t, y), np.zeros((2 * n, 2 * n))
+        for direction, row in zip(tangent.T, along, strict=True):
+            moved = y.copy()
+            moved[:n] += DIFFERENCE * direction
+            jacobian[:, :n] += np.outer((rhs(t, moved) - f) / DIFFERENCE, row)
+        jacobian[:n, n:] = tangent @ along
+        jacobian[n:, n:] = dae_rate_gradient(terms, u_gradient) @ tangent @ along
+        return jacobian
 
     def slope(self, t: float, y: Array, f: Array) -> Array:
         return f

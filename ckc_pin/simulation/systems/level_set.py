@@ -20,7 +20,7 @@ from ckc_pin.simulation.systems.trail import Trail
 
 __all__ = ["LevelSet"]
 
-SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
+SWITCH_MARGIN = 0.1  # of |J|: where an uncontrolled run looks for a better q
 
 
 @dataclass
@@ -45,6 +45,7 @@ class LevelSet:
     slack: float = 0.0
     counts: Counts = field(default_factory=Counts)
     backend: ClassVar[str] = "python"
+    held: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         self._d = self.mechanism.d

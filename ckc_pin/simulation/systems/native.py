@@ -164,6 +164,8 @@ class NativeDae(Dae, Native):
             self.drive(core().Dae(self.core, self.mechanism.tolerance, self.projects, alpha, beta))
 
     def rhs(self, t: float, y: Array) -> Array:
+        if self.closes_within:
+            return super().rhs(t, y)
         derivative = self.evaluate(t, y, self.counts) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 

@@ -31,6 +31,7 @@ class PrintedSpf:
     counts: Counts = field(default_factory=Counts)
     projects: bool = False
     backend: ClassVar[str] = "python"
+    held: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
         self.positions = self.mechanism.d
