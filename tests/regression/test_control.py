@@ -18,9 +18,7 @@ from tests.regression.reference import FORMULATIONS, Trajectory, trajectory
 formulations = pytest.mark.parametrize("formulation", FORMULATIONS)
 
 
-# Tolerances that keep the errors below those of `assert_follows`; the reduced model's and the SPF's solver makes
-# errors of the size of rtol, the DAE's smaller ones.
-TIGHT = {"reduced": 1e-10, "spf": 1e-10, "dae": 1e-8}
+TIGHT = 1e-10  # keeps the errors, which are of the size of rtol, below those of `assert_follows`
 
 
 def assert_follows(ours: Run, reference: Trajectory) -> None:
@@ -36,9 +34,7 @@ def assert_follows(ours: Run, reference: Trajectory) -> None:
 
 @formulations
 def test_tracking(run: Callable[..., Run], formulation: str) -> None:
-    assert_follows(
-        run("five_bar/tracking", formulation=formulation, solver__rtol=TIGHT[formulation]), trajectory("tracking")
-    )
+    assert_follows(run("five_bar/tracking", formulation=formulation, solver__rtol=TIGHT), trajectory("tracking"))
 
 
 @formulations
@@ -61,7 +57,7 @@ def test_tracking_error_at_the_end(run: Callable[..., Run], formulation: str) ->
 def test_tracking_with_another_epsilon(run: Callable[..., Run]) -> None:
     """From a consistent start the SPF is the reduced model whatever epsilon is."""
     assert_follows(
-        run("five_bar/tracking", formulation="spf", epsilon=1e-3, solver__rtol=TIGHT["spf"]), trajectory("tracking")
+        run("five_bar/tracking", formulation="spf", epsilon=1e-3, solver__rtol=TIGHT), trajectory("tracking")
     )
 
 
@@ -79,7 +75,7 @@ def test_torque_maxima(run: Callable[..., Run], formulation: str) -> None:
 @formulations
 def test_set_point(run: Callable[..., Run], file: str, formulation: str) -> None:
     reference = trajectory(file)
-    assert_follows(run(reference.name, formulation=formulation, solver__rtol=TIGHT[formulation]), reference)
+    assert_follows(run(reference.name, formulation=formulation, solver__rtol=TIGHT), reference)
 
 
 @pytest.mark.parametrize("scene", ["five_bar/set_point", "five_bar/tracking"])
@@ -110,12 +106,14 @@ def test_tracking_with_a_model_whose_links_are_too_heavy(
     run: Callable[..., Run], tmp_path: Path, formulation: str
 ) -> None:
     model = heavy_model(tmp_path, "value|i[xyz][xyz]")
-    ours = run("five_bar/tracking", formulation=formulation, controller__model=model, solver__rtol=TIGHT[formulation])
+    ours = run("five_bar/tracking", formulation=formulation, controller__model=model, solver__rtol=TIGHT)
     assert_follows(ours, trajectory("tracking_heavy_links"))
 
 
 def test_tracking_with_a_model_whose_masses_alone_are_too_large(run: Callable[..., Run], tmp_path: Path) -> None:
-    ours = run("five_bar/tracking", formulation="dae", controller__model=heavy_model(tmp_path, "value"))
+    ours = run(
+        "five_bar/tracking", formulation="dae", controller__model=heavy_model(tmp_path, "value"), solver__rtol=TIGHT
+    )
     assert_follows(ours, trajectory("tracking_heavy_masses"))
 
 

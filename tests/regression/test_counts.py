@@ -17,7 +17,7 @@ LIMITS = {
     ("five_bar/set_point", "dae"): (1_600, 0.3),
     ("five_bar/tracking", "reduced"): (1_700, 1.0),
     ("five_bar/tracking", "spf"): (1_700, 1.0),
-    ("five_bar/tracking", "dae"): (3_000, 1.7),  # BDF: closed in each right-hand side, not between steps
+    ("five_bar/tracking", "dae"): (3_300, 1.7),  # BDF: closed in each right-hand side, not between steps
 }
 
 

@@ -49,7 +49,7 @@ def test_the_error_along_tracking_is_the_tolerance(
     assert gap.max() <= 1.1 * rtol
 
 
-@pytest.mark.parametrize(("rtol", "budget"), [(1e-6, 1_600), (1e-8, 3_000)])
+@pytest.mark.parametrize(("rtol", "budget"), [(1e-6, 1_600), (1e-8, 3_300)])
 def test_the_dae_does_as_well(
     run: Callable[..., Run], exact: Callable[[float], Array], rtol: float, budget: int
 ) -> None:

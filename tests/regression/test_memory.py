@@ -1,0 +1,48 @@
+"""Memory does not grow with steps: what a run keeps is its output instants."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import tracemalloc
+
+import pytest
+
+from ckc_pin import simulate
+
+EVERY = 10  # steps: when cycles are collected and memory is looked at
+SETTLED = 2  # looks, after which everything that is allocated once is there
+ALLOWED = 50  # bytes a step: a state of the five-bar, kept at each, would be 64 and an object's head
+
+
+@pytest.mark.parametrize(
+    ("scene", "changes"),
+    [
+        ("five_bar/swing", {"formulation": "reduced"}),
+        ("five_bar/swing", {"formulation": "spf", "initial.w": [0.01, -0.006], "epsilon": 0.1}),
+        ("five_bar/swing", {"formulation": "dae"}),
+        ("five_bar/tracking", {"formulation": "dae", "t_end": 0.5}),
+        ("five_bar/swing", {"formulation": "dae", "initial.q_dot": {"theta_1": 6.0, "theta_3": -6.0}}),
+    ],
+    ids=["reduced", "spf", "dae", "tracking, BDF", "across type 2"],
+)
+def test_memory_does_not_grow_with_steps(scene: str, changes: dict[str, object]) -> None:
+    sizes: list[int] = []
+
+    count = itertools.count(1)
+
+    def look(t: float, t_end: float) -> None:
+        if next(count) % EVERY == 0:
+            gc.collect()
+            sizes.append(tracemalloc.get_traced_memory()[0])
+
+    common = {"t_end": 1.5, "solver.output_dt": 100.0}
+    tracemalloc.start()
+    try:
+        run = simulate(scene, {**common, **changes}, progress=look)
+    finally:
+        tracemalloc.stop()
+    assert run.status == "done"
+    assert len(sizes) >= SETTLED + 3
+    grown = sizes[-1] - sizes[SETTLED]
+    assert grown < ALLOWED * EVERY * (len(sizes) - SETTLED)
