@@ -53,4 +53,4 @@ def bdf_rtol(rtol: float, held: int = 0) -> float:
     measured on the tracking of eq. 21: 7e-7 at 1e-6, 8e-10 at 1e-9. Of directions that a closure holds the errors
     are controlled too, though closing takes them away: there the same steps may be had for a larger tolerance.
     """
-    return max((9.0 if held else 2.3) * rtol**1.2, 100 * float(np.finfo(float).eps))
+    return max((6.0 if held else 2.3) * rtol**1.2, 100 * float(np.finfo(float).eps))

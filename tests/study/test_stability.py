@@ -182,7 +182,7 @@ def test_nine_in_ten_and_no_failure_are_asked_for() -> None:
 
 
 def test_page_and_table_say_what_was_found() -> None:
-    text = page(some_cells(), [], 1.0)
+    text = page(some_cells(), [])
     assert "**10 cells: 9 within, 1 stopped, 0 FAILED; 90.0 % within tolerance.**" in text
     assert "why it stopped" in text
     assert "| a\\|b |" in text

@@ -69,7 +69,7 @@ def _plain(value: object) -> object:
     return value
 
 
-def page(cells: Sequence[Cell], long_runs: Sequence[LongRun], minutes: float) -> str:
+def page(cells: Sequence[Cell], long_runs: Sequence[LongRun]) -> str:
     """Return docs/stability.md.
 
     Parameters
@@ -77,8 +77,6 @@ def page(cells: Sequence[Cell], long_runs: Sequence[LongRun], minutes: float) ->
     cells : sequence of Cell
         Groups together, in the order of `TITLES`.
     long_runs : sequence of LongRun
-    minutes : float
-        That all of it took.
     """
     own = sys.modules["ckc_pin"].__version__
     versions = ", ".join([f"ckc_pin {own}", *(f"{name} {version(name)}" for name in ("pin", "numpy", "scipy"))])
@@ -104,8 +102,8 @@ def page(cells: Sequence[Cell], long_runs: Sequence[LongRun], minutes: float) ->
         f"A run may take {BUDGET['solver.max_rhs']:,} right-hand sides. All that was measured, max |phi|, energy "
         "drift, steps and changes of the partition included, is in [stability.csv](stability.csv).",
         "",
-        f"Computed with {versions}, in {minutes:.0f} minutes by two processes. `./scripts/stability` writes this page "
-        "and the table again; `./scripts/stability GROUP` prints one group.",
+        f"Computed with {versions}; the cells took {sum(cell.cpu_s for cell in cells) / 60:.0f} minutes of processor "
+        "time. `./scripts/stability` writes this page and the table again; `./scripts/stability GROUP` prints a group.",
     ]
     for key, members in groups:
         lines += ["", f"## {TITLES[key]}", "", *_group(members)]

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from ckc_pin.study.stability.cases import GROUPS
@@ -32,9 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in options.group if name not in names]
     if unknown:
         parser.error(f"no group {unknown[0]!r}; there are {', '.join(names)}")
-    started = perf_counter()
     cells, long_runs = measure(options.group or names)
-    text = page(cells, long_runs, (perf_counter() - started) / 60)
+    text = page(cells, long_runs)
     if options.group:
         print(text)
     else:
