@@ -24,6 +24,7 @@ __all__ = ["Burst", "runs"]
 PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
 ROWS = 20_000  # instants recorded in one go
 UNLIMITED = 2**62
+STAGES = 12  # of DOP853
 
 
 class Burst:
@@ -68,7 +69,7 @@ class Burst:
         why, rows = loop.go(
             end,
             stepper.spec.min_step,
-            UNLIMITED if stepper.spec.max_rhs is None else stepper.spec.max_rhs - stepper.rhs_count,
+            self._allowed(),
             PAUSE,
             self.within(end, end),
             self.times[due:],
@@ -90,6 +91,15 @@ class Burst:
                 solver.LU = None
         stepper.require_time()
         return due + len(rows), why == "pause" and steps > 0
+
+    def _allowed(self) -> int:
+        """Right-hand sides up to the budget, or to about where the method is doubted."""
+        stepper, allowed = self.stepper, UNLIMITED
+        if stepper.spec.max_rhs is not None:
+            allowed = stepper.spec.max_rhs - stepper.rhs_count
+        if np.isfinite(stepper.doubt):
+            allowed = min(allowed, max(1, int(stepper.doubt) - stepper.steps) * STAGES)
+        return allowed
 
     def _loop(self) -> Any:
         options = self.stepper.options

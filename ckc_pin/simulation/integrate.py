@@ -80,7 +80,7 @@ class Stepper:
         jacobian = self._jacobian(0.0, self.y) if method in ("auto", "BDF", "Radau") else None
         self._take(self._choose(jacobian, t_end) if method == "auto" else method, method == "auto", jacobian)
         # eigenvalues at the start foretell nothing of what comes: DOP853 is doubted after so many steps
-        self._doubt = DOUBT if method == "auto" and self.method == "DOP853" else np.inf
+        self.doubt = DOUBT if method == "auto" and self.method == "DOP853" else np.inf
         self.solver = self._solver(0.0, self.y, t_end)
         self._budgeted = True
         self._retired = {"nlu": 0, "njev": 0}  # counts of solvers that a change of coordinates ended
@@ -110,14 +110,14 @@ class Stepper:
 
     def _reconsider(self) -> None:
         """Look at the eigenvalues once more, and go on with another method if they ask for one."""
-        self._doubt *= 2
+        self.doubt *= 2
         t, y = self.t, self.solver.y.copy()
         jacobian = self._jacobian(t, y)
         if jacobian is None or not np.all(np.isfinite(jacobian)):
             return
         method = self._choose(jacobian, self.solver.t_bound - t)
         if method != self.method:
-            self._doubt, length = np.inf, self.solver.step_size
+            self.doubt, length = np.inf, self.solver.step_size
             self._take(method, True, jacobian)
             self._restart(t, y, length)
 
@@ -182,7 +182,7 @@ class Stepper:
         elif projected is not None:
             solver.y = projected
             solver.f = self._rhs(self.t, projected)
-        if self.steps >= self._doubt and self.solver.status == "running":
+        if self.steps >= self.doubt and self.solver.status == "running":
             self._reconsider()
 
     def rate(self, t: float, y: Array) -> Array:

@@ -25,7 +25,8 @@ from ckc_pin.simulation.systems import Dae, LevelSet, NativeDae, NativeLevelSet,
 __all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
 
 DIFFERENCE = 1e-7  # rad/s or m/s
-SLACK = 1e-4  # of rtol and the size: how far a right-hand side may be off the closure; ratios of masses amplify it
+SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
+UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
@@ -187,7 +188,7 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant, 
     native = takes_native(mechanism, spec, measured)
     controller, actuation = plant.controller, plant.actuation
     free = controller is None  # of a controller that lives in the mechanism's own q
-    slack = SLACK * spec.solver.rtol * mechanism.size
+    slack = SLACK * spec.solver.rtol * mechanism.size * _evenness(mechanism, start)
     if spec.formulation == "dae":
         v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         projects, baumgarte = _closing(spec.solver)
@@ -225,6 +226,12 @@ def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant, 
         free,
         slack,
     )
+
+
+def _evenness(mechanism: Mechanism, start: Start) -> float:
+    """1, or how much better the closure has to be kept where inertias differ by more than `UNEVEN`."""
+    inertias = np.diagonal(Terms(mechanism, start.at, np.zeros(mechanism.n)).D_tree)
+    return min(1.0, UNEVEN * float(inertias.min()) / float(inertias.max()))
 
 
 def _closing(solver: SolverSpec) -> tuple[bool, tuple[float, float] | None]:

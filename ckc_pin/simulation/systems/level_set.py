@@ -20,7 +20,7 @@ from ckc_pin.simulation.systems.trail import Trail
 
 __all__ = ["LevelSet"]
 
-SWITCH_MARGIN = 0.1  # of |J|: where an uncontrolled run looks for a better q
+SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
 
 
 @dataclass

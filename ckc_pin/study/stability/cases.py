@@ -144,7 +144,7 @@ def speeds() -> Iterator[Case]:
             scene = _scene(EQUILIBRIUM, min(1.0, 5.0 / rate), (rate, ratio * rate))
             yield Case("speed", f"{rate:g} rad/s, {name}", "five_bar", scene, ByHand(PAPER), EVERY)
     for rate in (6.0, 9.0, 12.0):
-        scene = _scene(EQUILIBRIUM, 0.7, (rate, -rate))  # in two seconds errors grow ten thousand times
+        scene = _scene(EQUILIBRIUM, 0.5, (rate, -rate))  # in two seconds errors grow ten thousand times
         yield Case("speed", f"crossing type 2, {rate:g} rad/s", "five_bar", scene, ByHand(PAPER), EVERY)
 
 
