@@ -256,9 +256,9 @@ def test_a_bad_q_is_left_before_the_first_step() -> None:
 
 @pytest.mark.parametrize(("name", "formulation", "changes"), LONG[2:], ids=["swing", "across type 2"])
 def test_part_of_a_long_run(name: str, formulation: str, changes: dict[str, object]) -> None:
-    """A hundredth of the time, a hundredth of the drift."""
-    run = long_run(name, formulation, changes, 10.0)
+    """A tenth of the time, a tenth of the drift."""
+    run = long_run(name, formulation, changes, 100.0)
     assert run.outcome == "done"
-    assert run.drift <= 1e-10
+    assert run.drift <= 1e-9
     assert run.max_phi <= 1e-12
     assert (run.crossings > 5) == bool(changes)
