@@ -12,7 +12,8 @@ from ckc_pin import simulate
 
 EVERY = 10  # steps: when cycles are collected and memory is looked at
 SETTLED = 2  # looks, after which everything that is allocated once is there
-ALLOWED = 50  # bytes a step: a state of the five-bar, kept at each, would be 64 and an object's head
+# bytes a step: the smallest array, kept at each, takes 130; SciPy's BDF and NumPy keep up to 70 for reuse
+ALLOWED = {"DOP853": 50, "BDF": 120}
 
 
 @pytest.mark.parametrize(
@@ -28,7 +29,6 @@ ALLOWED = 50  # bytes a step: a state of the five-bar, kept at each, would be 64
 )
 def test_memory_does_not_grow_with_steps(scene: str, changes: dict[str, object]) -> None:
     sizes: list[int] = []
-
     count = itertools.count(1)
 
     def look(t: float, t_end: float) -> None:
@@ -37,13 +37,14 @@ def test_memory_does_not_grow_with_steps(scene: str, changes: dict[str, object])
             sizes.append(tracemalloc.get_traced_memory()[0])
 
     # the native core takes many steps between two looks, and its own test counts its allocations
-    common = {"t_end": 1.5, "solver.output_dt": 100.0, "solver.backend": "python"}
+    every = {"t_end": 1.5, "solver.output_dt": 100.0, "solver.backend": "python", **changes}
+    simulate(scene, every)  # what is loaded and kept at first use is there before memory is looked at
     tracemalloc.start()
     try:
-        run = simulate(scene, {**common, **changes}, progress=look)
+        run = simulate(scene, every, progress=look)
     finally:
         tracemalloc.stop()
     assert run.status == "done"
     assert len(sizes) >= SETTLED + 3
     grown = sizes[-1] - sizes[SETTLED]
-    assert grown < ALLOWED * EVERY * (len(sizes) - SETTLED)
+    assert grown < ALLOWED[run.stats["method"]] * EVERY * (len(sizes) - SETTLED)
