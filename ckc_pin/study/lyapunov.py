@@ -31,7 +31,7 @@ class Record:
     largest_increase : float
         Of the value from one output instant to the next, J; negative when it always falls.
     round_off : float
-        What rounding does to the value, J.
+        What rounding does to the value, and loops closed to the mechanism's tolerance, J.
     """
 
     t: Array
@@ -65,13 +65,16 @@ def record(run: Run, predicted: Callable[[int], float]) -> Record:
     if run.lyapunov is None:
         raise ValueError("the run's controller has no Lyapunov function")
     largest = max(float(np.abs(run.energy).max()), float(np.abs(run.lyapunov).max()))
+    # off the closure by phi the potential energy is off by lambda . phi, at both instants of a difference
+    forces = sum(np.abs(force).sum(axis=1) for force in run.loop_forces().values())
+    unclosed = 2 * run.mechanism.tolerance * float(np.max(forces))
     return Record(
         t=run.t,
         value=run.lyapunov,
         rate=derivative(run.t, run.lyapunov),
         predicted=np.array([predicted(k) for k in range(len(run.t))]),
         largest_increase=float(np.diff(run.lyapunov).max()),
-        round_off=ROUNDING * float(np.spacing(largest)),
+        round_off=ROUNDING * float(np.spacing(largest)) + unclosed,
     )
 
 

@@ -29,7 +29,7 @@ def draw_lyapunov(records: Mapping[str, Record], folder: Path) -> str:
         right.semilogy(record.t, np.maximum(-record.rate, 1e-18), style, color=colour, label=f"-dV_L/dt, {name}")
     last = list(records.values())[-1]
     right.semilogy(last.t, -last.predicted, color=BLACK, linewidth=0.8, label="q_dot^T K_V q_dot")
-    left.axhline(last.round_off, color=BLACK, linewidth=0.8, linestyle=":", label="rounding of its terms")
+    left.axhline(last.round_off, color=BLACK, linewidth=0.8, linestyle=":", label="rounding and closure")
     left.set(xlabel="t / s", ylabel="V_L / J", title="Lyapunov function of eq. 14", ylim=(1e-17, None))
     right.set(xlabel="t / s", ylabel="power / W", title="its rate, and what the paper says it is", ylim=(1e-12, None))
     for ax in (left, right):
