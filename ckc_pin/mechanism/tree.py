@@ -153,6 +153,15 @@ class Tree:
             )
         return rate
 
+    def axis(self, joint: int) -> tuple[Array, bool]:
+        """Return the axis of a one-freedom joint in its body, shape (3,), and whether it turns; else it slides."""
+        model = self.model.joints[joint]
+        data = model.createData()
+        model.calc(data, self.neutral())
+        along = np.asarray(data.S).reshape(6)
+        turns = not along[:3].any()
+        return (along[3:] if turns else along[:3]), turns
+
     def neutral(self) -> Array:
         """Return the configuration with all coordinates zero."""
         return np.asarray(pin.neutral(self.model))

@@ -84,11 +84,9 @@ def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
     if joint.nv == 6:
         SubElement(body, "freejoint", name=name)
         return
-    data, at = joint.createData(), joint.idx_v
-    joint.calc(data, mechanism.tree.neutral())
-    along = np.asarray(data.S).reshape(6)
-    kind, axis = ("slide", along[:3]) if along[:3].any() else ("hinge", along[3:])
-    element = SubElement(body, "joint", name=name, type=kind, axis=numbers(axis))
+    at = joint.idx_v
+    axis, turns = mechanism.tree.axis(number)
+    element = SubElement(body, "joint", name=name, type="hinge" if turns else "slide", axis=numbers(axis))
     if springs.joint_damping[at]:
         element.set("damping", numbers(springs.joint_damping[at]))
     if springs.joint_stiffness[at]:

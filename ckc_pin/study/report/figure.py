@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from ckc_pin.study.chart import COLOURS, chart, save
 from ckc_pin.study.report.ours import PROGRAM
@@ -23,7 +24,7 @@ def draw(work: Work, rows: Sequence[Row], folder: Path) -> list[str]:
         if row.error_max is not None and row.status == "done":
             families.setdefault(_family(row), []).append(row)
     figure, (by_time, by_work) = chart(columns=2)
-    axes: tuple[tuple[object, str, Callable[[Row], float | None]], ...] = (
+    axes: tuple[tuple[Any, str, Callable[[Row], float | None]], ...] = (
         (by_time, "time, s", lambda row: row.wall_s),
         (by_work, "right-hand sides (others: steps)", lambda row: row.rhs or row.steps),
     )
@@ -32,11 +33,11 @@ def draw(work: Work, rows: Sequence[Row], folder: Path) -> list[str]:
         line = "--" if not name.startswith(PROGRAM) else ":" if "in Python" in name else "-"
         for ax, _, cost in axes:
             points = [(x, max(row.error_max or 0.0, FLOOR)) for row in own if (x := cost(row))]
-            ax.plot(*zip(*points, strict=True), linestyle="", markersize=3, alpha=0.25, **look) if points else None  # type: ignore[attr-defined]
-            front = _front(points)
-            ax.plot(*zip(*front, strict=True), linestyle=line, markersize=5, label=name, **look) if front else None  # type: ignore[attr-defined]
+            if points:
+                ax.plot(*zip(*points, strict=True), linestyle="", markersize=3, alpha=0.25, **look)
+                ax.plot(*zip(*_front(points), strict=True), linestyle=line, markersize=5, label=name, **look)
     for ax, label, _ in axes:
-        ax.set(xscale="log", yscale="log", xlabel=label)  # type: ignore[attr-defined]
+        ax.set(xscale="log", yscale="log", xlabel=label)
     by_time.set(ylabel="largest error along the run, rad or m", title=work.says)
     by_time.legend(fontsize=8)
     return [save(figure, folder, f"{work.key}.{kind}") for kind in ("png", "svg")]

@@ -147,12 +147,9 @@ class _Plant:
         place = _placed(placement)
         parent = self._bodies[int(model.parents[k])].body_frame()
         frame = self.plant.AddFrame(FixedOffsetFrame(f"{name} frame", parent, place))
-        joint, data = model.joints[k], model.joints[k].createData()
-        joint.calc(data, self.mechanism.tree.neutral())
-        along = np.asarray(data.S).reshape(6)
-        kind, axis = (PrismaticJoint, along[:3]) if along[:3].any() else (RevoluteJoint, along[3:])
-        make: Callable[..., Any] = kind
-        damping = float(self.mechanism.springs.joint_damping[joint.idx_v])
+        axis, turns = self.mechanism.tree.axis(k)
+        make: Callable[..., Any] = RevoluteJoint if turns else PrismaticJoint
+        damping = float(self.mechanism.springs.joint_damping[model.joints[k].idx_v])
         self._bodies.append(body)
         self._joints.append(self.plant.AddJoint(make(name, frame, body.body_frame(), axis, damping=damping)))
 

@@ -174,11 +174,7 @@ class _System:
     def _joint(self, k: int) -> tuple[Array, bool]:
         """Add a joint; return its axis in the body, and whether it turns."""
         model = self.mechanism.tree.model
-        joint, data = model.joints[k], model.joints[k].createData()
-        joint.calc(data, self.mechanism.tree.neutral())
-        along = np.asarray(data.S).reshape(6)
-        turns = not along[:3].any()
-        axis = along[3:] if turns else along[:3]
+        axis, turns = self.mechanism.tree.axis(k)
         create = self._mbs.CreateRevoluteJoint if turns else self._mbs.CreatePrismaticJoint
         place = self._placements[k]
         bodies = [self._bodies[int(model.parents[k])], self._bodies[k]]
