@@ -15,6 +15,7 @@ class Peer(Protocol):
     """What the report asks of a program."""
 
     name: str
+    packaged: bool  # a program that is installed and called; not a loop that a user would have to write around one
 
     def missing(self, work: Work) -> str | None:
         """Why it cannot do a work; None where it can."""

@@ -29,6 +29,7 @@ class Drake:
     """A MultibodyPlant built joint by joint from Pinocchio's tree, loops by ball, weld and distance constraints."""
 
     name = "Drake"
+    packaged = True
 
     def missing(self, work: Work) -> str | None:
         try:

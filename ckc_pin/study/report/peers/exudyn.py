@@ -29,6 +29,7 @@ class Exudyn:
     """Index-2 formulations with the spectral radius that damps nothing."""
 
     name = "Exudyn"
+    packaged = True
 
     def missing(self, work: Work) -> str | None:
         mechanism = work.mechanism

@@ -16,6 +16,7 @@ class Ida:
     """What `method = "IDA"` runs: a residual in Python."""
 
     name = "SUNDIALS IDA"
+    packaged = True
 
     def missing(self, work: Work) -> str | None:
         try:

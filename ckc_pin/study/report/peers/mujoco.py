@@ -34,6 +34,7 @@ class Mujoco:
     """MuJoCo with the constraints' default settings, and as stiff as its manual lets them be."""
 
     name = "MuJoCo"
+    packaged = True
 
     def missing(self, work: Work) -> str | None:
         if not _installed():

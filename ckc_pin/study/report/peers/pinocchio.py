@@ -31,6 +31,7 @@ class Pinocchio:
     """Semi-implicit Euler, v += a dt and q = q + v dt, with the constrained acceleration a."""
 
     name = "Pinocchio constraintDynamics"
+    packaged = True
 
     def missing(self, work: Work) -> str | None:
         others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED_BY)
