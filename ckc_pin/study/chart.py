@@ -7,22 +7,33 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["BLACK", "COLOURS", "chart", "save"]
+__all__ = ["BLACK", "COLOURS", "chart", "save", "whole_decades"]
 
 # Okabe and Ito's colours, told apart by every eye; yellow is left out, which is hard to see as a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BLACK = "#000000"
 
 
-def chart(columns: int = 1) -> tuple[Any, Any]:
-    """Return a figure with a row of axes: (Figure, flat array of Axes)."""
+def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6)) -> tuple[Any, Any]:
+    """Return a figure with rows of axes, each of a size in inches: (Figure, flat array of Axes)."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4 * columns, 4.6), dpi=110, layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, columns))
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=110, layout="constrained")
+    axes = np.atleast_1d(figure.subplots(rows, columns)).flatten()
     for ax in axes:
         ax.grid(True, which="major", alpha=0.3)
     return figure, axes
+
+
+def whole_decades(ax: Any) -> None:
+    """End logarithmic axes at powers of ten, which alone have a label: those between run into each other."""
+    from matplotlib.ticker import NullFormatter
+
+    for axis, (low, high) in zip((ax.xaxis, ax.yaxis), ax.dataLim.get_points().T, strict=True):
+        if 0 < low <= high < np.inf:
+            ends = 10.0 ** np.floor(np.log10(0.9 * low)), 10.0 ** np.ceil(np.log10(1.1 * high))
+            ax.set(**{f"{axis.axis_name}lim": ends})
+        axis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Any, folder: Path, name: str) -> str:

@@ -13,14 +13,12 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.simulate import simulate
-from ckc_pin.study.report import make, ours
+from ckc_pin.study.report import growth, left_out, make, ours
 from ckc_pin.study.report import table as tables
-from ckc_pin.study.report.figure import _front
 from ckc_pin.study.report.page import web
 from ckc_pin.study.report.peers import peers
 from ckc_pin.study.report.reference import Reference, reference
 from ckc_pin.study.report.row import Motion, Row, judged
-from ckc_pin.study.report.sentences import fastest, sentences
 from ckc_pin.study.report.table import Table, key
 from ckc_pin.study.report.work import WORKS, Work
 from tests.analytic.five_bar import FIVE_BAR, Q
@@ -95,8 +93,8 @@ def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> N
 
 
 def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
-    setting = ours.Setting("dae, auto", {"formulation": "dae", "solver.rtol": 1e-8})
-    row = judged("k", SHORT, ours.PROGRAM, "s", ours.compute(SHORT, setting), exact)
+    setting = ours.Setting("dae", "auto", False, 1e-8)
+    row = judged("k", SHORT, ours.PROGRAM, setting.name, ours.compute(SHORT, setting.changes, 60.0), exact)
     assert row.error_max is not None
     assert row.error_max < 1e-7
     assert row.energy_drift is not None
@@ -129,13 +127,36 @@ def test_others_are_set_up_as_the_same_tree(work: str) -> None:
 
 def test_both_backends_are_measured_where_there_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ours, "unavailable", lambda: None)
-    both = list(ours.settings(quick=True, budget=1.0))
+    both = list(ours.settings(quick=True))
     assert len({setting.name for setting in both}) == len(both)
     assert {setting.changes["solver.backend"] for setting in both} == {"auto", "python"}
+    native, python = ([one for one in both if one.in_python == here] for here in (False, True))
+    assert len(native) == 4 * len(ours.QUICK_TOLERANCES)
+    assert len(python) == 4 * len(ours.QUICK_IN_PYTHON)
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    alone = list(ours.settings(quick=True, budget=1.0))
-    assert 2 * len(alone) == len(both)
-    assert not any("Python" in setting.name for setting in alone)
+    alone = list(ours.settings(quick=True))
+    assert len(alone) == len(native)
+    assert all("in Python" in setting.name for setting in alone)
+
+
+def test_a_row_tells_its_setting() -> None:
+    for setting in ours.settings(quick=False):
+        assert ours.of_row(row(setting=setting.name)) == setting
+
+
+def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
+    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
+    monkeypatch.setattr(make, "QUICK_BUDGET", make.Budget(native=1e-6, python=1e-6, peer=1e-6))
+    rows = list(make._Measured(SHORT, Table(tmp_path / "t.csv", Row), lambda said: None).ours(quick=True))
+    first, second = rows[:2]
+    assert first.status == "stopped"
+    assert "max_wall_s" in first.reason
+    assert second.status == "refused"
+    assert second.reason.startswith("not tried: at rtol 1e-03 the stopped at t = ")
+    assert second.error_max is None
 
 
 def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:
@@ -167,17 +188,17 @@ def row(**changes: Any) -> Row:
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     written = [row(), row(key="l", status="stopped", reason='a "reason", with a comma', error_end=None, rhs=None)]
-    table = Table(tmp_path / "t.csv")
+    table = Table(tmp_path / "t.csv", Row)
     for line in written:
         table.add(line)
-    assert list(Table(tmp_path / "t.csv").rows.values()) == written
+    assert list(Table(tmp_path / "t.csv", Row).rows.values()) == written
 
 
 @pytest.mark.parametrize("text", ["no table", "key,work\n1,2\n", "\0", ",".join(Row.__struct_fields__) + "\nx"])
 def test_a_table_of_somebody_else_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="not a report's table"):
-        Table(tmp_path / "t.csv")
+        Table(tmp_path / "t.csv", Row)
 
 
 def test_a_row_depends_on_scene_setting_program_code_and_machine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,42 +218,14 @@ def test_a_row_depends_on_scene_setting_program_code_and_machine(monkeypatch: py
     assert len({base, *others}) == 7
 
 
-# --- sentences and the page ---------------------------------------------------------------------------------------
-
-
-def test_the_fastest_is_the_one_that_is_right_all_along() -> None:
-    slow, fast = row(wall_s=0.2), row(wall_s=0.1, error_max=2e-3)
-    failed = row(wall_s=0.01, status="stopped", error_max=None)
-    assert fastest([slow, fast, failed], 1e-6) is slow
-    assert fastest([slow, fast, failed], 1e-2) is fast
-    assert fastest([failed], 1e-2) is None
-
-
-def test_sentences_name_who_is_ahead_and_by_how_much() -> None:
-    good = Reference(np.zeros((11, 4)), 1e-10, "known")
-    here = [row(wall_s=0.2, error_max=1e-10)]
-    there = row(program="MuJoCo", setting="RK4", wall_s=0.05, error_max=1e-4)
-    said = list(sentences(SHORT, [*here, there], good))
-    assert said[0] == "To 1e-03: dae, auto, rtol 1e-06, 200 ms; MuJoCo (RK4) takes 50 ms, 4 times faster than here."
-    assert said[1] == "To 1e-06: dae, auto, rtol 1e-06, 200 ms; no other program gets there."
-    assert said[3] == "To 1e-12: not told, the reference is good to 1e-10."
-    slower = row(program="MuJoCo", setting="RK4", wall_s=0.6, error_max=1e-4)
-    assert next(sentences(SHORT, [*here, slower], good)).endswith("MuJoCo (RK4) takes 600 ms, 3 times as long.")
-    printed = [row(setting="spf, eq. 8, auto", wall_s=0.4), row(setting="reduced, auto", wall_s=0.1)]
-    assert "Eq. 8 as printed to 1e-06: 4 times the reduced model's time, it does not pay." in list(
-        sentences(SHORT, printed, good)
-    )
-
-
-def test_the_front_is_what_no_other_point_beats() -> None:
-    assert _front([(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (4.0, 2.0)]) == [(1.0, 5.0), (3.0, 1.0)]
+# --- the report ---------------------------------------------------------------------------------------------------
 
 
 def test_an_interrupt_ends_the_report_and_what_was_measured_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: Any) -> Any:
-        if len(Table(tmp_path / "report.csv").rows) == 1:
+        if len(Table(tmp_path / "report.csv", Row).rows) == 1:
             return replace(whole, status="interrupted", message="interrupted at t = 0.01 s by SIGTERM")
         return whole
 
@@ -241,13 +234,14 @@ def test_an_interrupt_ends_the_report_and_what_was_measured_is_there(
     monkeypatch.setattr(ours, "simulate", interrupted)
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
         make.report(tmp_path, quick=True)
-    assert len(Table(tmp_path / "report.csv").rows) == 1
+    assert len(Table(tmp_path / "report.csv", Row).rows) == 1
 
 
 class Nobody:
     """A program that is not there."""
 
     name = "Nobody"
+    packaged = False
 
     def missing(self, work: Work) -> str:
         return "not installed: pip install nobody"
@@ -256,26 +250,85 @@ class Nobody:
         return ["never"]
 
 
-def test_a_report_is_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class Breaks:
+    """A program whose every run fails."""
+
+    name = "Breaks"
+    packaged = True
+
+    def missing(self, work: Work) -> None:
+        return None
+
+    def version(self) -> str:
+        return "0.1"
+
+    def settings(self, quick: bool) -> list[str]:
+        return ["always"]
+
+    def check(self, work: Work) -> str:
+        return "it agrees"
+
+    def compute(self, work: Work, setting: str, budget: float) -> Motion:
+        return Motion("failed", "it fell, over a comma", np.empty((0, 4)), np.empty((0, 4)), 0.0, 0.0)
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report of few settings."""
     monkeypatch.setattr(make, "WORKS", (SHORT,))
-    monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody()])
+    monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody(), Breaks()])
     monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", (1e-3,))
+    monkeypatch.setattr(left_out, "MODULES", {"json": ("import json", "an example"), "no_such": ("import no_such", "")})
+    row_of_squares = replace(growth.FAMILIES[0], quick=growth.FAMILIES[0].cases[:3])
+    monkeypatch.setattr(growth, "FAMILIES", (row_of_squares,))
+    monkeypatch.setattr(growth, "FORMULATIONS", {"reduced": {"formulation": "reduced"}})
+
+
+def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     measured: list[str] = []
     found = make.report(tmp_path / "r", quick=True, progress=measured.append)
-    assert len(found.rows["short"]) == 4 * 2 + 4
-    assert len(measured) == 1 + 12
-    assert [path.name for path in found.files] == ["report.html", "report.md", "report.csv", "short.png", "short.svg"]
+    assert len(found.rows["short"]) == 4 * 2 + 4 + 1
+    grown = 3 * len(growth.backends())
+    assert len(measured) == 1 + 13 + grown + 3
+    tables = ["report.csv", "growth.csv", "left_out.csv"]
+    figures = [f"{name}.{kind}" for name in ("report", "growth", "short") for kind in ("png", "svg")]
+    assert [path.name for path in found.files] == ["report.html", "report.md", *tables, *figures]
+    assert all(path.stat().st_size > 100 for path in found.files)
+
     text = (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
-    assert "Nobody : not compared, not installed" in text.replace("  ", " ")
+    assert "Nobody : not compared, not installed: pip install nobody." in text
+    assert "Breaks 0.1: it agrees." in text
     html = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
-    assert 'src="data:image/png;base64,' in html
+    assert html.count('src="data:image/png;base64,') == 3
     assert "http" not in html.replace("http-equiv", "")
+    failed = next(row for row in found.rows["short"] if row.program == "Breaks")
+    assert (failed.status, failed.reason) == ("failed", "it fell, over a comma")
+    assert failed in Table(tmp_path / "r" / "report.csv", Row).rows.values()
+    left = list(Table(tmp_path / "r" / "left_out.csv", left_out.LeftOut).rows.values())
+    assert [row.what for row in left if row.scene == ""] == ["json", "no_such"]
+    assert "No module named 'no_such'" in left[1].reason
+
     measured.clear()
     again = make.report(tmp_path / "r", quick=True, progress=measured.append)
     assert again.rows == found.rows
     assert measured == ["short: reference"]
+
+
+def test_a_stale_row_is_measured_again(tmp_path: Path, tiny: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of a report made by other code, however right it looks, is in this one."""
+    monkeypatch.setattr(make, "peers", lambda: [Breaks()])
+    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3,))
+    with monkeypatch.context() as then:
+        then.setattr(tables, "_code", lambda: "as it was")
+        old = make.report(tmp_path, quick=True)
+    new = make.report(tmp_path, quick=True)
+    for name, kind in (("report", Row), ("growth", growth.Growth), ("left_out", left_out.LeftOut)):
+        rows = Table(tmp_path / f"{name}.csv", kind).rows
+        assert rows
+        assert not {row.key for row in old.rows["short"]} & set(rows)
+    assert [row.setting for row in old.rows["short"]] == [row.setting for row in new.rows["short"]]
 
 
 def test_a_page_is_escaped(tmp_path: Path) -> None:

@@ -1,59 +1,159 @@
-"""Error against time and against right-hand sides, one figure a work."""
+"""Figures: error, closure and energy against time, by program and by formulation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ckc_pin.study.chart import COLOURS, chart, save
-from ckc_pin.study.report.ours import PROGRAM
+from ckc_pin.study.chart import BLACK, COLOURS, chart, save, whole_decades
+from ckc_pin.study.report.ours import PROGRAM, of_row
 from ckc_pin.study.report.row import Row
+from ckc_pin.study.report.sentences import here
 from ckc_pin.study.report.work import Work
 
-__all__ = ["draw"]
+__all__ = ["MAIN", "draw", "draw_main"]
 
+MAIN = ("swing", "andrews", "n_four_bar_16", "n_four_bar_4")  # the first three of them that were measured
 MARKERS = "osD^vPX<>"
-FLOOR = 1e-15  # an error of zero has no logarithm
+GRAY = "#666666"
+FLOOR = 1e-17  # a number of zero has no logarithm
+APART = 11.0  # points between the labels of two curves
+REACH = 130.0  # points: labels further apart do not meet
+NAMES = {"dae": "DAE", "reduced": "reduced model", "spf": "SPF, eq. 17", "spf, eq. 8": "SPF, eq. 8 as printed"}
+
+Number = Callable[[Row], float | None]
 
 
-def draw(work: Work, rows: Sequence[Row], folder: Path) -> list[str]:
-    """Draw each family's best: a formulation here, a program elsewhere; return the files, PNG and SVG."""
-    families: dict[str, list[Row]] = {}
-    for row in rows:
-        if row.error_max is not None and row.status == "done":
-            families.setdefault(_family(row), []).append(row)
-    figure, (by_time, by_work) = chart(columns=2)
-    axes: tuple[tuple[Any, str, Callable[[Row], float | None]], ...] = (
-        (by_time, "time, s", lambda row: row.wall_s),
-        (by_work, "right-hand sides (others: steps)", lambda row: row.rhs or row.steps),
+@dataclass(frozen=True)
+class Curve:
+    """Rows that no other one of the same family beats in both time and error, by falling error, and how they look."""
+
+    name: str
+    rows: tuple[Row, ...]
+    look: Mapping[str, Any]
+
+
+def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -> list[str]:
+    """Draw one work; return the files, PNG and SVG.
+
+    Parameters
+    ----------
+    work : Work
+    rows : sequence of Row
+    others : sequence of str
+        All other programs of the report, so that each has one look on all figures.
+    folder : Path
+    """
+    figure, axes = chart(columns=3, rows=2, size=(5.6, 4.2))
+    programs, formulations = list(_programs(rows, others)), list(_formulations(rows))
+    time = ("time, s", lambda row: row.wall_s)
+    error = ("largest error along the run, rad or m", lambda row: row.error_max)
+    _panel(axes[0], programs, time, error, "programs: error")
+    _panel(axes[1], programs, time, ("largest |φ|, m or rad", lambda row: row.closure), "programs: closure")
+    drift = ("largest energy drift / kinetic energy", lambda row: row.energy_drift)
+    _panel(axes[2], programs, time, drift, "programs: energy")
+    if work.controlled or not axes[2].lines:
+        axes[2].text(0.5, 0.5, "not kept here: something acts", ha="center", transform=axes[2].transAxes)
+    _panel(axes[3], formulations, time, error, f"{PROGRAM}: error")
+    _panel(axes[4], formulations, ("right-hand sides", lambda row: row.rhs), error, f"{PROGRAM}: error")
+    _panel(
+        axes[5], formulations, time, ("error at the end, rad or m", lambda row: row.error_end), f"{PROGRAM}: at the end"
     )
-    for k, (name, own) in enumerate(families.items()):
-        look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
-        line = "--" if not name.startswith(PROGRAM) else ":" if "in Python" in name else "-"
-        for ax, _, cost in axes:
-            points = [(x, max(row.error_max or 0.0, FLOOR)) for row in own if (x := cost(row))]
-            if points:
-                ax.plot(*zip(*points, strict=True), linestyle="", markersize=3, alpha=0.25, **look)
-                ax.plot(*zip(*_front(points), strict=True), linestyle=line, markersize=5, label=name, **look)
-    for ax, label, _ in axes:
-        ax.set(xscale="log", yscale="log", xlabel=label)
-    by_time.set(ylabel="largest error along the run, rad or m", title=work.says)
-    by_time.legend(fontsize=8)
+    figure.suptitle(work.says)
+    _name(figure, axes)
     return [save(figure, folder, f"{work.key}.{kind}") for kind in ("png", "svg")]
 
 
-def _family(row: Row) -> str:
-    if row.program != PROGRAM:
-        return row.program
-    formulation = "SPF, eq. 8" if row.setting.startswith("spf, eq. 8") else row.setting.split(",")[0]
-    return f"{PROGRAM}, {formulation}{', in Python' if 'in Python' in row.setting else ''}"
+def draw_main(
+    works: Sequence[Work], rows: Mapping[str, Sequence[Row]], others: Sequence[str], folder: Path
+) -> list[str]:
+    """Draw error against time of a few works side by side, by program; return the files."""
+    chosen = [work for key in MAIN for work in works if work.key == key][:3] or list(works[:3])
+    figure, axes = chart(columns=len(chosen), size=(5.6, 4.6))
+    for ax, work in zip(axes, chosen, strict=True):
+        curves = list(_programs(rows[work.key], others))
+        time, error = ("time, s", lambda row: row.wall_s), ("largest error, rad or m", lambda row: row.error_max)
+        _panel(ax, curves, time, error, work.says)
+    _name(figure, axes)
+    return [save(figure, folder, f"report.{kind}") for kind in ("png", "svg")]
 
 
-def _front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points that no other one beats in both cost and error."""
-    front: list[tuple[float, float]] = []
-    for cost, error in sorted(points):
-        if not front or error < front[-1][1]:
-            front.append((cost, error))
-    return front
+def _programs(rows: Sequence[Row], others: Sequence[str]) -> Iterator[Curve]:
+    """Each program's best: this one's backends, and the others."""
+    own = here(rows)
+    native = [row for row in own if not of_row(row).in_python]
+    python = [row for row in own if of_row(row).in_python]
+    yield Curve(PROGRAM, _front(native), {"color": BLACK, "marker": "o", "linewidth": 2.2})
+    yield Curve(f"{PROGRAM}, in Python", _front(python), {"color": GRAY, "marker": "o", "linestyle": ":"})
+    for k, name in enumerate(others):
+        look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[(k + 1) % len(MARKERS)]}
+        line = "--" if k < len(COLOURS) else "-."
+        yield Curve(name, _front([row for row in rows if row.program == name]), {**look, "linestyle": line})
+
+
+def _formulations(rows: Sequence[Row]) -> Iterator[Curve]:
+    """Each formulation's best, in the native core where there is one; and the best in Python."""
+    own = here(rows)
+    native = [row for row in own if not of_row(row).in_python]
+    for k, (key, name) in enumerate(NAMES.items()):
+        there = [row for row in native or own if of_row(row).formulation == key]
+        yield Curve(name, _front(there), {"color": COLOURS[k], "marker": MARKERS[k]})
+    if native:
+        python = [row for row in own if of_row(row).in_python]
+        yield Curve("the best in Python", _front(python), {"color": GRAY, "marker": "o", "linestyle": ":"})
+
+
+def _front(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the rows that no other one beats in both time and error."""
+    front: list[Row] = []
+    done = [row for row in rows if row.status == "done" and row.error_max is not None]
+    for row in sorted(done, key=lambda row: (row.wall_s, row.error_max)):
+        if not front or (row.error_max or 0.0) < (front[-1].error_max or 0.0):
+            front.append(row)
+    return tuple(front)
+
+
+def _panel(ax: Any, curves: Sequence[Curve], x: tuple[str, Number], y: tuple[str, Number], title: str) -> None:
+    ax.set(xscale="log", yscale="log", xlabel=x[0], ylabel=y[0], title=title)
+    for curve in curves:
+        points = [(a, max(b, FLOOR)) for row in curve.rows if (a := x[1](row)) and (b := y[1](row)) is not None]
+        if points:
+            ax.plot(*zip(*points, strict=True), **{"markersize": 4.5, "linewidth": 1.4, **curve.look}, label=curve.name)
+    whole_decades(ax)
+
+
+def _name(figure: Any, axes: Sequence[Any]) -> None:
+    """Write each curve's name beside its end, where that does not lie on another name."""
+    figure.draw_without_rendering()  # settles the layout, in which the labels are to be placed
+    for ax in axes:
+        scale = 72.0 / figure.dpi
+        ends = [ax.transData.transform((line.get_xdata()[-1], line.get_ydata()[-1])) * scale for line in ax.lines]
+        right = ax.bbox.x1 * scale
+        taken: list[tuple[float, float]] = []
+        for line, end in sorted(zip(ax.lines, ends, strict=True), key=lambda pair: pair[1][1]):
+            x, y = float(end[0]), float(end[1])
+            while any(abs(x - a) < REACH and abs(y - b) < APART for a, b in taken):
+                y += 1.0
+            taken.append((x, y))
+            inside = x + 6.0 * len(line.get_label()) < right
+            ax.annotate(
+                line.get_label(),
+                (line.get_xdata()[-1], line.get_ydata()[-1]),
+                xytext=(6 if inside else -6, y - float(end[1])),
+                textcoords="offset points",
+                ha="left" if inside else "right",
+                va="center",
+                fontsize=8,
+                color=_dark(line.get_color()),
+                bbox={"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
+            )
+
+
+def _dark(colour: str) -> str:
+    """Return a colour dark enough to be read as text on white."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    red, green, blue = to_rgb(colour)
+    return str(to_hex((0.62 * red, 0.62 * green, 0.62 * blue)))

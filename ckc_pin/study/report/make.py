@@ -1,25 +1,42 @@
-"""`ckc report`: runs the studies that have no row yet, then writes table, figures and page."""
+"""`ckc report`: runs the studies that have no row yet, then writes tables, figures and page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import msgspec
+
 from ckc_pin.errors import InputError
-from ckc_pin.study.report import ours
-from ckc_pin.study.report.figure import draw
-from ckc_pin.study.report.page import markdown, web
+from ckc_pin.simulation.prepare import scene_mechanism
+from ckc_pin.simulation.scene import load_scene
+from ckc_pin.study.report import growth, left_out, ours
+from ckc_pin.study.report.figure import draw, draw_main
+from ckc_pin.study.report.growth import Growth
+from ckc_pin.study.report.growth_said import draw_growth
+from ckc_pin.study.report.left_out import LeftOut
+from ckc_pin.study.report.page import Measured, PeerNote, markdown, web
 from ckc_pin.study.report.peers import Peer, peers
 from ckc_pin.study.report.reference import Reference, reference
 from ckc_pin.study.report.row import Motion, Row, judged
-from ckc_pin.study.report.table import Table, key
+from ckc_pin.study.report.table import Table, digest, key
 from ckc_pin.study.report.work import WORKS, Work
 
 __all__ = ["Report", "report"]
 
-BUDGET, QUICK_BUDGET = 60.0, 2.0  # s for one run
+
+@dataclass(frozen=True)
+class Budget:
+    """Seconds that one run may take, here, in Python, and in the other programs."""
+
+    native: float
+    python: float
+    peer: float
+
+
+BUDGET, QUICK_BUDGET = Budget(native=5.0, python=2.5, peer=10.0), Budget(native=2.0, python=1.0, peer=2.0)
 
 Progress = Callable[[str], None]  # what is being measured
 
@@ -31,7 +48,7 @@ class Report:
     Attributes
     ----------
     files : list of Path
-        The page in two forms, the table, the figures.
+        The page in two forms, the tables, the figures.
     rows : dict of str to list of Row
         By work.
     """
@@ -61,26 +78,37 @@ def report(out: Path, *, quick: bool = False, progress: Progress | None = None) 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {out}: cannot be made: {error.strerror}") from None
+    tell = progress or (lambda said: None)
     works = [work for work in WORKS if work.quick or not quick]
-    table, found, references = Table(out / "report.csv"), Report(), {}
+    table, found, references = Table(out / "report.csv", Row), Report(), {}
     others = peers()
     for work in works:
-        measured = _Measured(work, table, progress or (lambda said: None))
+        measured = _Measured(work, table, tell)
         found.rows[work.key] = [*measured.ours(quick), *(row for peer in others for row in measured.peer(peer, quick))]
         references[work.key] = measured.reference()
     table.write([row.key for rows in found.rows.values() for row in rows])
-    text = markdown(works, found.rows, references, [_checked(peer, works) for peer in others], quick)
-    figures = [name for work in works for name in draw(work, found.rows[work.key], out)]
+    notes = [_checked(peer, works) for peer in others]
+    grown, left = _grown(out, quick, tell), _left_out(out, works, quick, tell)
+    figures = _figures(works, found.rows, [peer.name for peer in others], grown, out)
+    text = markdown(Measured(works, found.rows, references, notes, left, grown, quick))
     for name, content in (("report.md", text), ("report.html", web(text, out))):
         (out / name).write_text(content, encoding="utf-8")
-    found.files = [out / name for name in ("report.html", "report.md", "report.csv", *figures)]
+    tables = ("report.csv", "growth.csv", "left_out.csv")
+    found.files = [out / name for name in ("report.html", "report.md", *tables, *figures)]
     return found
+
+
+def _figures(
+    works: list[Work], rows: dict[str, list[Row]], others: list[str], grown: list[Growth], out: Path
+) -> list[str]:
+    figures = [*draw_main(works, rows, others, out), *draw_growth(grown, rows, out)]
+    return [*figures, *(name for work in works for name in draw(work, rows[work.key], others, out))]
 
 
 class _Measured:
     """A work's rows, from the table where they are there already."""
 
-    def __init__(self, work: Work, table: Table, progress: Progress) -> None:
+    def __init__(self, work: Work, table: Table[Row], progress: Progress) -> None:
         self.work, self.table, self.progress = work, table, progress
         self._reference: Reference | None = None
 
@@ -91,13 +119,24 @@ class _Measured:
         return self._reference
 
     def ours(self, quick: bool) -> Iterator[Row]:
-        for setting in ours.settings(quick, QUICK_BUDGET if quick else BUDGET):
-            yield self._row(ours.PROGRAM, "", setting.name, partial(ours.compute, self.work, setting))
+        """Rows of this program; what used up its budget at one tolerance is not tried with a tighter one."""
+        budget = QUICK_BUDGET if quick else BUDGET
+        spent: dict[str, str] = {}
+        for setting in ours.settings(quick):
+            allowed = budget.python if setting.in_python else budget.native
+            compute = partial(ours.compute, self.work, setting.changes, allowed)
+            if setting.family in spent:
+                compute = partial(ours.refused, self.work, spent[setting.family])
+            row = self._row(ours.PROGRAM, "", setting.name, compute)
+            if ours.used_up(row):
+                spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
+            yield row
 
     def peer(self, peer: Peer, quick: bool) -> Iterator[Row]:
+        """Rows of another program."""
         if peer.missing(self.work) is not None:
             return
-        budget = QUICK_BUDGET if quick else BUDGET
+        budget = (QUICK_BUDGET if quick else BUDGET).peer
         for setting in peer.settings(quick):
             yield self._row(peer.name, peer.version(), setting, partial(peer.compute, self.work, setting, budget))
 
@@ -109,7 +148,7 @@ class _Measured:
         return self.table.rows[own]
 
 
-def _checked(peer: Peer, works: list[Work]) -> tuple[str, str, dict[str, str]]:
+def _checked(peer: Peer, works: list[Work]) -> PeerNote:
     said, version = {}, ""
     for work in works:
         missing = peer.missing(work)
@@ -118,4 +157,42 @@ def _checked(peer: Peer, works: list[Work]) -> tuple[str, str, dict[str, str]]:
             said[work.key] = peer.check(work)
         else:
             said[work.key] = f"not compared, {missing}"
-    return peer.name, version, said
+    return PeerNote(peer.name, version, peer.packaged, said)
+
+
+def _grown(out: Path, quick: bool, progress: Progress) -> list[Growth]:
+    """How cost grows: rows of the table, measured where it has none."""
+    table, found = Table(out / "growth.csv", Growth), []
+    for family, case, formulation, backend in growth.every_case(quick):
+        own = digest("growth", family.key, msgspec.to_builtins(case), formulation, backend)
+        if own not in table.rows:
+            progress(f"growth: {family.says}, {getattr(case, family.along)}, {formulation}, {backend}")
+            table.add(growth.measure(case, family, formulation, backend, own))
+        found.append(table.rows[own])
+    table.write([row.key for row in found])
+    return found
+
+
+def _left_out(out: Path, works: list[Work], quick: bool, progress: Progress) -> list[LeftOut]:
+    """What scenes leave out: rows of the table, measured where it has none."""
+    table = Table(out / "left_out.csv", LeftOut)
+    scenes = list(dict.fromkeys(work.load().name for work in works)) if quick else left_out.every_scene()
+    found: list[LeftOut] = []
+
+    def measured(names: Iterable[str], own: str, said: str, compute: Callable[[str], Iterator[LeftOut]]) -> None:
+        keys = [f"{own}.{name}" for name in names]
+        if not all(k in table.rows for k in keys):
+            progress(f"left out: {said}")
+            table.add(*compute(own))
+        found.extend(table.rows[k] for k in keys)
+
+    repeats = 1 if quick else left_out.REPEATS
+    costs = digest("module costs", repeats)
+    measured(left_out.MODULES, costs, "modules", partial(left_out.module_costs, repeats=repeats))
+    for name in scenes:
+        scene = load_scene(name)
+        content = [scene.plain(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
+        measured(left_out.MODULES, digest("modules", *content), name, partial(left_out.modules_of, name))
+        measured(left_out.TERMS, digest("terms", *content), name, partial(left_out.terms_of, name))
+    table.write([row.key for row in found])
+    return found

@@ -1,4 +1,4 @@
-"""The program itself: formulations, methods, tolerances."""
+"""The program itself: formulations, methods, tolerances, backends."""
 
 from __future__ import annotations
 
@@ -11,64 +11,107 @@ from typing import Any
 from ckc_pin.errors import CkcError
 from ckc_pin.native import unavailable
 from ckc_pin.simulation.simulate import simulate
-from ckc_pin.study.report.row import Motion
+from ckc_pin.study.report.row import Motion, Row
 from ckc_pin.study.report.work import Work
 
-__all__ = ["PROGRAM", "Setting", "compute", "settings"]
+__all__ = ["PROGRAM", "Setting", "compute", "of_row", "refused", "settings", "used_up"]
 
 PROGRAM = "ckc_pin"
-TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+FORMULATIONS: dict[str, dict[str, Any]] = {
+    "dae": {"formulation": "dae"},
+    "reduced": {"formulation": "reduced"},
+    "spf": {"formulation": "spf", "solver.spf_equation": 17},
+    "spf, eq. 8": {"formulation": "spf", "solver.spf_equation": 8},
+}
 METHODS = ("auto", "DOP853", "RK45", "Radau", "BDF", "LSODA")
-QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 QUICK_METHODS = ("auto",)
-SHORT = 1.0  # s: runs that take less are repeated
-REPEATS = 3
+TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
+IN_PYTHON = (1e-3, 1e-6, 1e-9, 1e-12)  # the same steps as the native core's: its times alone are new
+QUICK_IN_PYTHON = (1e-3, 1e-7, 1e-11)
+ENOUGH = 0.2  # s of runs, set-up included; up to then they are repeated
+REPEATS = 5
+LONG = 1.0  # s: one run of that is enough
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How a scene is run: a name, and values of it by dotted key."""
+    """How a scene is run: what the report calls it, and values of the scene by dotted key.
 
-    name: str
-    changes: dict[str, Any]
+    The name says it all, so that a row's setting can be read back: "dae, auto, in Python, rtol 1e-06".
+    """
+
+    formulation: str
+    method: str
+    in_python: bool
+    rtol: float
+
+    @property
+    def family(self) -> str:
+        """The name without the tolerance."""
+        return f"{self.formulation}, {self.method}{', in Python' if self.in_python else ''}"
+
+    @property
+    def name(self) -> str:
+        """The row's name of it."""
+        return f"{self.family}, rtol {self.rtol:.0e}"
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Values of the scene."""
+        backend = "python" if self.in_python else "auto"
+        solver = {"solver.method": self.method, "solver.rtol": self.rtol, "solver.backend": backend}
+        return {**FORMULATIONS[self.formulation], **solver}
 
 
-def settings(quick: bool, budget: float) -> Iterator[Setting]:
-    """Every formulation, method and tolerance, both backends, `budget` seconds at most; eq. 8 is one of its own."""
-    formulations = {
-        "dae": {},
-        "reduced": {},
-        "spf": {"solver.spf_equation": 17},
-        "spf, eq. 8": {"solver.spf_equation": 8},
-    }
-    backends = ("auto",) if unavailable() else ("auto", "python")
-    choices = product(formulations.items(), QUICK_METHODS if quick else METHODS, backends)
-    for (name, own), method, backend in choices:
-        where = ", in Python" if backend != backends[0] else ""
-        for rtol in QUICK_TOLERANCES if quick else TOLERANCES:
-            changes = {"formulation": name.split(",")[0], "solver.method": method, "solver.rtol": rtol}
-            limits = {"solver.backend": backend, "solver.max_wall_s": budget}
-            yield Setting(f"{name}, {method}{where}, rtol {rtol:.0e}", {**own, **changes, **limits})
+def of_row(row: Row) -> Setting:
+    """Read a row's setting back."""
+    family, _, rtol = row.setting.rpartition(", rtol ")
+    plain = family.removesuffix(", in Python")
+    formulation, _, method = plain.rpartition(", ")
+    return Setting(formulation, method, plain != family, float(rtol))
 
 
-def compute(work: Work, setting: Setting) -> Motion:
-    """Run a work; short runs are repeated, after one that warms up, and the fastest counts."""
+def settings(quick: bool) -> Iterator[Setting]:
+    """Every formulation, method and tolerance, both backends; eq. 8 as printed is a formulation of its own."""
+    methods = QUICK_METHODS if quick else METHODS
+    native, python = (QUICK_TOLERANCES, QUICK_IN_PYTHON) if quick else (TOLERANCES, IN_PYTHON)
+    ways = [(True, native)] if unavailable() else [(False, native), (True, python)]
+    for (in_python, tolerances), method, formulation in product(ways, methods, FORMULATIONS):
+        for rtol in tolerances:
+            yield Setting(formulation, method, in_python, rtol)
+
+
+def refused(work: Work, reason: str) -> Motion:
+    """Return the motion of a run that was not made."""
+    none = work.mechanism.q_tree[None, :0].reshape(0, work.mechanism.n)
+    return Motion("refused", reason, none, none, 0.0, 0.0)
+
+
+def used_up(row: Row) -> bool:
+    """Whether a run was stopped by its budget of time."""
+    return row.status == "stopped" and "max_wall_s" in row.reason
+
+
+def compute(work: Work, changes: dict[str, Any], budget: float) -> Motion:
+    """Run a work, stopped after a budget in s; short runs are repeated, after one that warms up, the fastest counts."""
+    limited = {**changes, "solver.max_wall_s": budget}
     walls: list[float] = []
-    setup = 0.0
+    started = perf_counter()
     while True:
         began = perf_counter()
         try:
-            run = simulate(work.load(**{name.replace(".", "__"): x for name, x in setting.changes.items()}))
+            run = simulate(work.load(**{name.replace(".", "__"): x for name, x in limited.items()}))
         except CkcError as error:
-            none = work.mechanism.q_tree[None, :0].reshape(0, work.mechanism.n)
-            return Motion("refused", str(error), none, none, 0.0, perf_counter() - began)
+            return refused(work, str(error))
         if run.status == "interrupted":  # the report is, not only this run
             raise KeyboardInterrupt("SIGTERM" if "SIGTERM" in run.message else "")
         walls.append(float(run.stats["wall_s"]))
         setup = perf_counter() - began - walls[-1]
-        if run.status != "done" or walls[-1] > SHORT or len(walls) > REPEATS:
+        enough = perf_counter() - started > ENOUGH and len(walls) > 1
+        if run.status != "done" or enough or walls[-1] > LONG or len(walls) > REPEATS:
             break
     stats = run.stats
-    method = f" ({stats['method']})" if "auto" in setting.name else ""
+    method = f" ({stats['method']})" if changes["solver.method"] == "auto" else ""
     reason = f"{run.message}{method}" if run.status != "done" else str(stats["method"])
     return Motion(run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["steps"], stats["rhs"])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.study.report.reference import Reference
+from ckc_pin.study.report.table import Keyed
 from ckc_pin.study.report.work import Work
 
 __all__ = ["Motion", "Row", "judged"]
@@ -42,10 +42,9 @@ class Motion:
     rhs: int | None = None
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
+class Row(Keyed, frozen=True, kw_only=True):
     """A line of the table. Errors in rad or m; energy drift in units of the largest kinetic energy."""
 
-    key: str
     work: str
     program: str
     setting: str

@@ -1,15 +1,15 @@
-"""What the numbers say, in words: the fastest way to each accuracy, and who has it."""
+"""What the numbers say of one work, in words: the fastest way to each accuracy, and who has it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from ckc_pin.study.report.ours import PROGRAM
 from ckc_pin.study.report.reference import Reference
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.work import Work
 
-__all__ = ["TARGETS", "fastest", "sentences"]
+__all__ = ["TARGETS", "eq_8_ratio", "fastest", "here", "milliseconds", "ratio", "sentences", "times"]
 
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 
@@ -20,45 +20,102 @@ def fastest(rows: Sequence[Row], target: float) -> Row | None:
     return min(good, key=lambda row: row.wall_s, default=None)
 
 
-def sentences(work: Work, rows: Sequence[Row], reference: Reference) -> Iterator[str]:
-    """Say for each accuracy which setting here and which other program gets there first, and what eq. 8 costs."""
-    ours = [row for row in rows if row.program == PROGRAM]
-    others = [row for row in rows if row.program != PROGRAM]
+def here(rows: Sequence[Row]) -> list[Row]:
+    """Rows of this program."""
+    return [row for row in rows if row.program == PROGRAM]
+
+
+def ratio(own: Row | None, other: Row | None) -> float | None:
+    """How many times as long the other takes; None without both."""
+    return other.wall_s / own.wall_s if own and other else None
+
+
+def sentences(work: Work, rows: Sequence[Row], reference: Reference, by_hand: Collection[str] = ()) -> Iterator[str]:
+    """Say for each accuracy which setting here and which other program gets there first, and what eq. 8 costs.
+
+    Parameters
+    ----------
+    work : Work
+    rows : sequence of Row
+        Of that work.
+    reference : Reference
+    by_hand : collection of str
+        Programs that are no packages: loops that a user would write around one. They are told apart.
+    """
+    ours = here(rows)
+    packaged = [row for row in rows if row.program != PROGRAM and row.program not in by_hand]
+    written = [row for row in rows if row.program in by_hand]
     for target in TARGETS:
         if target < reference.accuracy:
             yield f"To {target:.0e}: not told, the reference is good to {reference.accuracy:.0e}."
             continue
-        yield f"To {target:.0e}: {_compared(fastest(ours, target), fastest(others, target), bool(others))}"
-    yield from _eq_8(ours)
+        own = fastest(ours, target)
+        said = f"To {target:.0e}: {_compared(own, fastest(packaged, target), bool(packaged))}"
+        if written:
+            said += f" {_against(own, fastest(written, target))}"
+        yield said
+    yield from _eq_8(work, ours, reference)
 
 
-def _compared(here: Row | None, there: Row | None, any_others: bool) -> str:
-    if here is None and there is None:
-        return "nobody gets there." if any_others else "no setting tried gets there."
-    if here is None:
-        assert there is not None
-        return f"nothing here gets there; {_named(there)} does in {_time(there)}."
-    if there is None:
-        return f"{here.setting}, {_time(here)}{'; no other program gets there' if any_others else ''}."
-    ratio = there.wall_s / here.wall_s
-    verdict = f"{ratio:.2g} times as long" if ratio >= 1 else f"{1 / ratio:.2g} times faster than here"
-    return f"{here.setting}, {_time(here)}; {_named(there)} takes {_time(there)}, {verdict}."
+def _compared(own: Row | None, other: Row | None, any_others: bool) -> str:
+    if own is None and other is None:
+        return "no packaged program gets there, nor any setting here." if any_others else "no setting tried gets there."
+    if own is None:
+        assert other is not None
+        return f"nothing here gets there; {_named(other)} does in {milliseconds(other)}."
+    if other is None:
+        none = "; no packaged program gets there" if any_others else ""
+        return f"{own.setting}, {milliseconds(own)}{none}."
+    return f"{own.setting}, {milliseconds(own)}; {_named(other)} takes {milliseconds(other)}, {_verdict(own, other)}."
 
 
-def _eq_8(ours: Sequence[Row]) -> Iterator[str]:
+def _against(own: Row | None, other: Row | None) -> str:
+    """Say how a loop written by hand compares."""
+    if other is None:
+        return "The loop written by hand does not get there."
+    how = f", {_verdict(own, other)}" if own else ""
+    return f"Written by hand, {_named(other)} takes {milliseconds(other)}{how}."
+
+
+def _verdict(own: Row, other: Row) -> str:
+    found = other.wall_s / own.wall_s
+    return f"{times(found)} times as long" if found >= 1 else f"{times(1 / found)} times faster than here"
+
+
+def eq_8_ratio(ours: Sequence[Row], target: float) -> float | None:
+    """Time of the fastest run of eq. 8 as printed over that of the reduced model; None where one does not get there."""
+    printed = fastest([row for row in ours if row.setting.startswith("spf, eq. 8")], target)
+    reduced = fastest([row for row in ours if row.setting.startswith("reduced")], target)
+    return ratio(reduced, printed)
+
+
+def _eq_8(work: Work, ours: Sequence[Row], reference: Reference) -> Iterator[str]:
     """Say what eq. 8 as printed costs against the reduced model where both get there."""
-    for target in TARGETS[:3]:
-        printed = fastest([row for row in ours if row.setting.startswith("spf, eq. 8")], target)
-        reduced = fastest([row for row in ours if row.setting.startswith("reduced")], target)
-        if printed and reduced:
-            ratio = printed.wall_s / reduced.wall_s
-            pays = "pays" if ratio < 1 else "does not pay"
-            yield f"Eq. 8 as printed to {target:.0e}: {ratio:.2g} times the reduced model's time, it {pays}."
+    told = [target for target in TARGETS if target >= reference.accuracy]
+    found = {target: x for target in told if (x := eq_8_ratio(ours, target)) is not None}
+    if not any(row.setting.startswith("spf, eq. 8") for row in ours):
+        return
+    if not found:
+        yield f"Eq. 8 as printed at ε = {work.epsilon:.0e} gets to none of these accuracies."
+        return
+    parts = [f"{times(x)} times to {target:.0e}" for target, x in found.items()]
+    pays = [f"{target:.0e}" for target, x in found.items() if x < 1]
+    verdict = f"it pays to {', '.join(pays)}" if pays else "it does not pay"
+    said = f"takes, of the reduced model's time, {', '.join(parts)}: {verdict}"
+    yield f"Eq. 8 as printed at ε = {work.epsilon:.0e} {said}."
 
 
 def _named(row: Row) -> str:
     return f"{row.program} ({row.setting})"
 
 
-def _time(row: Row) -> str:
-    return f"{row.wall_s * 1e3:.3g} ms"
+def milliseconds(row: Row) -> str:
+    """A row's time for people."""
+    return f"{times(row.wall_s * 1e3)} ms"
+
+
+def times(x: float) -> str:
+    """A number for people: two digits, never as a power of ten."""
+    if x >= 10:
+        return f"{float(f'{x:.2g}' if x < 100 else f'{x:.3g}'):,.0f}"
+    return f"{x:.2g}"

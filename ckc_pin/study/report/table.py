@@ -1,4 +1,4 @@
-"""The report's rows on disk: a CSV that a stopped report goes on from, and in which no stale row looks right."""
+"""The report's rows on disk: CSVs that a stopped report goes on from, and in which no stale row looks right."""
 
 from __future__ import annotations
 
@@ -9,26 +9,36 @@ import platform
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from ckc_pin.errors import InputError
-from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.work import Work
 
-__all__ = ["Table", "key", "machine", "versions"]
+__all__ = ["Keyed", "Table", "digest", "key", "machine", "versions"]
 
 PACKAGES = ("pin", "numpy", "scipy")
 
 
-class Table:
+class Keyed(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of some kind; `key` is a hash of what it depends on."""
+
+    key: str
+
+
+R = TypeVar("R", bound=Keyed)
+
+
+class Table(Generic[R]):
     """Rows by key; each is on disk as soon as it is added.
 
     Parameters
     ----------
     path : Path
         Of the CSV; read if it is there.
+    kind : type
+        Of its rows, a flat msgspec.Struct.
 
     Raises
     ------
@@ -36,20 +46,19 @@ class Table:
         The file is not a report's, or cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kind: type[R]) -> None:
         self.path = path
-        self.rows: dict[str, Row] = {}
-        if path.exists():
-            self.rows = {row.key: row for row in _read(path)}
+        self._columns = [field.name for field in msgspec.structs.fields(kind)]
+        self.rows: dict[str, R] = {row.key: row for row in _read(path, kind)} if path.exists() else {}
 
-    def add(self, row: Row) -> None:
-        """Add a row."""
-        self.rows[row.key] = row
+    def add(self, *rows: R) -> None:
+        """Add rows."""
+        self.rows.update((row.key, row) for row in rows)
         self.write(self.rows)
 
     def write(self, keys: Iterable[str]) -> None:
         """Write the rows of these keys, and no others."""
-        columns = Row.__struct_fields__
+        columns = self._columns
         unfinished = self.path.with_suffix(".part")
         try:
             with unfinished.open("w", newline="", encoding="utf-8") as file:
@@ -63,15 +72,17 @@ class Table:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
 
-def _read(path: Path) -> list[Row]:
+def _read(path: Path, kind: type[R]) -> list[R]:
+    fields = msgspec.structs.fields(kind)
+    words = {field.name for field in fields if field.type is str}  # of other columns an empty cell is None
+    absent: dict[str, Any] = {field.name: "" if field.name in words else None for field in fields}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             lines = csv.DictReader(file)
-            if tuple(lines.fieldnames or ()) != Row.__struct_fields__:
+            if list(lines.fieldnames or ()) != list(absent):
                 raise ValueError("its columns are others")
-            plain = [{k: x for k, x in line.items() if x or k == "reason"} for line in lines]
-        defaults: dict[str, Any] = dict.fromkeys(Row.__struct_fields__)
-        return [msgspec.convert({**defaults, **line}, Row, strict=False) for line in plain]
+            plain = [{**absent, **{name: x for name, x in line.items() if x}} for line in lines]
+        return [msgspec.convert(line, kind, strict=False) for line in plain]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: not a report's table ({error}); move it away or give another --out") from None
 
@@ -80,8 +91,13 @@ def key(work: Work, program: str, version: str, setting: str) -> str:
     """Return what a row depends on as a hash: scene, texts, code, versions, machine, setting."""
     scene = work.load()
     texts = {**work.mechanism.sources.texts, **scene.sources.texts}
-    content = [scene.plain(), texts, _code(), versions(), machine(), program, version, setting]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return digest(scene.plain(), texts, program, version, setting)
+
+
+def digest(*content: Any) -> str:
+    """Return a hash of plain data, the package's code, the versions and the machine."""
+    whole = [*content, _code(), versions(), machine()]
+    return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @cache

@@ -37,6 +37,8 @@ class Work:
         The mechanism's point whose position is compared; None: all coordinates.
     quick : bool
         Part of the quick report.
+    planar : bool
+        All moves in one plane.
     """
 
     key: str
@@ -46,6 +48,7 @@ class Work:
     changes: Mapping[str, Any] = field(default_factory=dict)
     point: str | None = None
     quick: bool = False
+    planar: bool = True
 
     def load(self, **solver: Any) -> Scene:
         """Return the scene, with values of its solver and formulation: load(formulation="dae", solver__rtol=1e-6)."""
@@ -63,6 +66,11 @@ class Work:
     def controlled(self) -> bool:
         """Whether a controller acts, so that energy is not conserved."""
         return self.load().spec.controller is not None
+
+    @cached_property
+    def epsilon(self) -> float:
+        """Of the singular perturbation formulation."""
+        return float(self.load().spec.epsilon)
 
     @property
     def instants(self) -> Array:
@@ -99,8 +107,8 @@ WORKS = (
     _n_four_bar(4, quick=True),
     _n_four_bar(16),
     _n_four_bar(40),
-    Work("bricard", "Bricard's six-bar, 10 s", "bricard", 10.0),
+    Work("bricard", "Bricard's six-bar, 10 s", "bricard", 10.0, planar=False),
     Work("slider_crank", "slider-crank, 5 s", "slider_crank", 5.0),
-    Work("delta", "Delta, let go, 5 s", "delta", 5.0),
-    Work("two_ur5", "two UR5 on one bar, let go, 2 s", "two_ur5", 2.0),
+    Work("delta", "Delta, let go, 5 s", "delta", 5.0, planar=False),
+    Work("two_ur5", "two UR5 on one bar, let go, 2 s", "two_ur5", 2.0, planar=False),
 )

@@ -37,5 +37,4 @@ class Ida:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         rtol = float(setting.removeprefix("rtol "))
-        changes = {"formulation": "dae", "solver.method": "IDA", "solver.rtol": rtol, "solver.max_wall_s": budget}
-        return ours.compute(work, ours.Setting(setting, changes))
+        return ours.compute(work, {"formulation": "dae", "solver.method": "IDA", "solver.rtol": rtol}, budget)

@@ -1,0 +1,50 @@
+"""Seconds of one right-hand side, as the step loop of its backend calls it."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["motion", "seconds"]
+
+STATES = 20
+SLOWEST = 1e-3  # s between states: what an integrator's stages are apart, so that sigma has something to correct
+ROUNDS, MOST_ROUNDS = 3, 60
+LONG = 0.3  # s: that many rounds, of native ones
+
+
+def motion(system: Any, t_end: float, states: int = STATES) -> list[tuple[float, Array]]:
+    """Return the first states of a system's motion by the midpoint rule, as an integrator meets them."""
+    y, h = system.start(), min(SLOWEST, t_end / 2000)
+    found = []
+    for k in range(states):
+        found.append((k * h, y))
+        slope = system.rhs(k * h, y)
+        y = y + h * system.rhs((k + 0.5) * h, y + 0.5 * h * slope)
+    return found
+
+
+def seconds(system: Any, states: list[tuple[float, Array]]) -> float:
+    """Return the mean over states of a right-hand side's time, s, the least of several rounds.
+
+    A native system whose force crosses is timed inside its core, where the native step loop calls it.
+    """
+    with one_blas_thread():
+        if getattr(system, "crosses", False):
+            table = np.array([[t, *y] for t, y in states])
+            once = float(system.native.seconds(table, 1)[0])
+            rounds = int(np.clip(LONG / (once * len(states)), ROUNDS, MOST_ROUNDS))
+            return float(system.native.seconds(table, rounds)[0])
+        return min(_round(system, states) for _ in range(ROUNDS)) / len(states)
+
+
+def _round(system: Any, states: list[tuple[float, Array]]) -> float:
+    began = perf_counter()
+    for t, y in states:
+        system.rhs(t, y)
+    return perf_counter() - began
