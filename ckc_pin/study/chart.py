@@ -27,13 +27,11 @@ def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6
 
 def whole_decades(ax: Any) -> None:
     """End logarithmic axes at powers of ten, which alone have a label: those between run into each other."""
-    from matplotlib.ticker import NullFormatter
-
+    ax.minorticks_off()
     for axis, (low, high) in zip((ax.xaxis, ax.yaxis), ax.dataLim.get_points().T, strict=True):
         if 0 < low <= high < np.inf:
-            ends = 10.0 ** np.floor(np.log10(0.9 * low)), 10.0 ** np.ceil(np.log10(1.1 * high))
+            ends = 10.0 ** np.floor(np.log10(0.6 * low)), 10.0 ** np.ceil(np.log10(1.6 * high))
             ax.set(**{f"{axis.axis_name}lim": ends})
-        axis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Any, folder: Path, name: str) -> str:

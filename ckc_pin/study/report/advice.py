@@ -107,8 +107,8 @@ def _tolerance(family: str, works: Sequence[Work], rows: Rows) -> str:
     most = over[min(len(over) - 1, int(MOST * len(over)))]
     example = 1e-6 / most
     return (
-        f"Its largest error along a run is {times(over[len(over) // 2])} times rtol in the middle and less than "
-        f"{times(most)} times in nine runs of ten: for an error of 1e-06 rad or m give rtol = {_down(example):.0e}."
+        f"Its largest error along a run is up to {times(over[len(over) // 2])} times rtol in half of these runs and up "
+        f"to {times(most)} times in nine of ten: for an error of 1e-06 rad or m give rtol = {_down(example):.0e}."
     )
 
 

@@ -127,6 +127,7 @@ def _panel(ax: Any, curves: Sequence[Curve], x: tuple[str, Number], y: tuple[str
 def _name(figure: Any, axes: Sequence[Any]) -> None:
     """Write each curve's name beside its end, where that does not lie on another name."""
     figure.draw_without_rendering()  # settles the layout, in which the labels are to be placed
+    figure.set_layout_engine("none")
     for ax in axes:
         scale = 72.0 / figure.dpi
         ends = [ax.transData.transform((line.get_xdata()[-1], line.get_ydata()[-1])) * scale for line in ax.lines]

@@ -28,7 +28,7 @@ __all__ = ["Measured", "PeerNote", "markdown", "web"]
 STYLE = (
     "body{font:16px/1.5 sans-serif;color:#111;background:#fff;max-width:72rem;margin:2rem auto;padding:0 1rem}"
     "table{border-collapse:collapse;font-size:.85rem;display:block;overflow-x:auto}"
-    "td,th{border-bottom:1px solid #ddd;padding:.25rem .6rem;text-align:left}img{max-width:100%}"
+    "td,th{border-bottom:1px solid #ddd;padding:.25rem .6rem;text-align:left}th{white-space:nowrap}img{max-width:100%}"
     "h2{margin-top:2.5rem;border-top:1px solid #ddd;padding-top:1rem}"
 )
 
