@@ -17,44 +17,22 @@ from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.native import unavailable
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
+from ckc_pin.study.report.pace import motion, seconds
 
 SPF = {"formulation": "spf", "solver.spf_equation": 17}
 REDUCED = {"formulation": "reduced"}
 TIGHT = {"solver.rtol": 1e-8}
-STATES = 50
 
 
-def least(seconds: Callable[[], float], times: int) -> float:
-    return min(seconds() for _ in range(times))
+def least(once: Callable[[], float], times: int) -> float:
+    return min(once() for _ in range(times))
 
 
-def motion(system: Any, t_end: float) -> list[tuple[float, Any]]:
-    """States along a motion, as an integrator meets them, so that sigma has something to correct."""
-    y, h = system.start(), t_end / 2000
-    found = []
-    for k in range(STATES):
-        found.append((k * h, y))
-        slope = system.rhs(k * h, y)
-        y = y + h * system.rhs((k + 0.5) * h, y + 0.5 * h * slope)
-    return found
-
-
-def rhs_seconds(scene: str, changes: dict[str, Any], backend: str, rounds: int = 5) -> float:
+def rhs_seconds(scene: str, changes: dict[str, Any], backend: str) -> float:
     """Seconds of a right-hand side as the step loop of its backend calls it."""
     loaded = load_scene(scene, {**changes, "solver.backend": backend})
     system = prepare(loaded).system
-    states = motion(system, loaded.spec.t_end)
-    if backend == "native":
-        own, _, _ = system.native.seconds(np.array([[t, *y] for t, y in states]), 20 * rounds)
-        return float(own)
-
-    def once() -> float:
-        started = perf_counter()
-        for t, y in states:
-            system.rhs(t, y)
-        return (perf_counter() - started) / len(states)
-
-    return least(once, rounds)
+    return seconds(system, motion(system, loaded.spec.t_end))
 
 
 def rhs_ratio(scene: str, changes: dict[str, Any]) -> float:
@@ -63,7 +41,7 @@ def rhs_ratio(scene: str, changes: dict[str, Any]) -> float:
 
 def against_pinocchio() -> float:
     system: Any = prepare(load_scene("five_bar/swing", {**SPF, "solver.backend": "native"})).system
-    own, theirs, _ = system.native.seconds(np.array([[t, *y] for t, y in motion(system, 2.0)]), 1000)
+    own, theirs, _ = system.native.seconds(np.array([[t, *y] for t, y in motion(system, 2.0, 50)]), 1000)
     return float(own / theirs)
 
 
@@ -97,8 +75,8 @@ def threads_ratio() -> float:
     """Right-hand sides of two systems in two threads, against one after the other."""
     scene = load_scene("five_bar/swing", {**SPF, "solver.backend": "native"})
     systems: list[Any] = [prepare(scene).system for _ in range(2)]
-    states = np.array([[t, *y] for t, y in motion(systems[0], 2.0)])
-    motion(systems[1], 2.0)
+    states = np.array([[t, *y] for t, y in motion(systems[0], 2.0, 50)])
+    motion(systems[1], 2.0, 50)
 
     def work(system: Any) -> None:
         system.native.seconds(states, 10_000)
@@ -150,7 +128,7 @@ def main() -> int:
 
 
 def wide_ratio() -> float:
-    wide, narrow = (rhs_seconds("n_four_bar", {**REDUCED, "mechanism.N": N}, "native", 1) for N in (160, 40))
+    wide, narrow = (rhs_seconds("n_four_bar", {**REDUCED, "mechanism.N": N}, "native") for N in (160, 40))
     return wide / narrow
 
 

@@ -320,6 +320,8 @@ def test_a_stale_row_is_measured_again(tmp_path: Path, tiny: None, monkeypatch: 
     """Nothing of a report made by other code, however right it looks, is in this one."""
     monkeypatch.setattr(make, "peers", lambda: [Breaks()])
     monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3,))
+    monkeypatch.setattr(make, "_figures", lambda *everything: [])
+    monkeypatch.setattr(make, "web", lambda *everything: "")
     with monkeypatch.context() as then:
         then.setattr(tables, "_code", lambda: "as it was")
         old = make.report(tmp_path, quick=True)
