@@ -28,10 +28,10 @@ def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6
 def whole_decades(ax: Any) -> None:
     """End logarithmic axes at powers of ten, which alone have a label: those between run into each other."""
     ax.minorticks_off()
-    for axis, (low, high) in zip((ax.xaxis, ax.yaxis), ax.dataLim.get_points().T, strict=True):
+    for axis, room, (low, high) in zip("xy", (1.0, 1.6), ax.dataLim.get_points().T, strict=True):
         if 0 < low <= high < np.inf:
-            ends = 10.0 ** np.floor(np.log10(0.6 * low)), 10.0 ** np.ceil(np.log10(1.6 * high))
-            ax.set(**{f"{axis.axis_name}lim": ends})
+            ends = np.floor(np.log10(low / room) + 1e-9), np.ceil(np.log10(high * room) - 1e-9)
+            ax.set(**{f"{axis}lim": 10.0 ** np.array([ends[0], max(ends[1], ends[0] + 1)])})
 
 
 def save(figure: Any, folder: Path, name: str) -> str:

@@ -132,7 +132,7 @@ def test_both_backends_are_measured_where_there_are_two(monkeypatch: pytest.Monk
     assert {setting.changes["solver.backend"] for setting in both} == {"auto", "python"}
     native, python = ([one for one in both if one.in_python == here] for here in (False, True))
     assert len(native) == 4 * len(ours.QUICK_TOLERANCES)
-    assert len(python) == 4 * len(ours.QUICK_IN_PYTHON)
+    assert len(python) == 4 * len(ours.QUICK_FEW)
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     alone = list(ours.settings(quick=True))
     assert len(alone) == len(native)
@@ -147,7 +147,7 @@ def test_a_row_tells_its_setting() -> None:
 def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
+    monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     monkeypatch.setattr(make, "QUICK_BUDGET", make.Budget(native=1e-6, python=1e-6, peer=1e-6))
     rows = list(make._Measured(SHORT, Table(tmp_path / "t.csv", Row), lambda said: None).ours(quick=True))
@@ -277,7 +277,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report of few settings."""
     monkeypatch.setattr(make, "WORKS", (SHORT,))
     monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody(), Breaks()])
-    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3, 1e-6))
+    monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", (1e-3,))
     monkeypatch.setattr(left_out, "MODULES", {"json": ("import json", "an example"), "no_such": ("import no_such", "")})
@@ -319,7 +319,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
 def test_a_stale_row_is_measured_again(tmp_path: Path, tiny: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing of a report made by other code, however right it looks, is in this one."""
     monkeypatch.setattr(make, "peers", lambda: [Breaks()])
-    monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-3,))
+    monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3,)})
     monkeypatch.setattr(make, "_figures", lambda *everything: [])
     monkeypatch.setattr(make, "web", lambda *everything: "")
     with monkeypatch.context() as then:

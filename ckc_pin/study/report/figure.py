@@ -55,7 +55,8 @@ def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -
     drift = ("largest energy drift / kinetic energy", lambda row: row.energy_drift)
     _panel(axes[2], programs, time, drift, "programs: energy")
     if work.controlled or not axes[2].lines:
-        axes[2].text(0.5, 0.5, "not kept here: something acts", ha="center", transform=axes[2].transAxes)
+        axes[2].set_axis_off()
+        axes[2].text(0.5, 0.5, "energy is not kept here: something acts", ha="center", transform=axes[2].transAxes)
     _panel(axes[3], formulations, time, error, f"{PROGRAM}: error")
     _panel(axes[4], formulations, ("right-hand sides", lambda row: row.rhs), error, f"{PROGRAM}: error")
     _panel(
@@ -120,7 +121,11 @@ def _panel(ax: Any, curves: Sequence[Curve], x: tuple[str, Number], y: tuple[str
     for curve in curves:
         points = [(a, max(b, FLOOR)) for row in curve.rows if (a := x[1](row)) and (b := y[1](row)) is not None]
         if points:
-            ax.plot(*zip(*points, strict=True), **{"markersize": 4.5, "linewidth": 1.4, **curve.look}, label=curve.name)
+            ax.plot(
+                *zip(*points, strict=True),
+                **{"markersize": 4.5, "linewidth": 1.4, "clip_on": False, **curve.look},
+                label=curve.name,
+            )
     whole_decades(ax)
 
 

@@ -124,7 +124,7 @@ def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], f
                     continue
                 label = f"{name}, {WHERE[backend]}: ∝ {family.along}^{p:.1f}"
                 xs = sorted(points)
-                look = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4}
+                look = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4, "clip_on": False}
                 ax.plot(xs, [1e6 * points[x] for x in xs], LINES[backend], label=label, **look)
         ax.set(xscale="log", yscale="log", xlabel=family.along, title=family.says)
         ax.set_ylabel("one right-hand side, µs")
@@ -134,7 +134,7 @@ def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], f
         p = exponent({x: pair[0] for x, pair in own.items()}, whole=True)
         if p is not None:
             xs = sorted(own)
-            look = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4}
+            look = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4, "clip_on": False}
             last.plot(xs, [own[x][0] for x in xs], label=f"{name}: ∝ rtol^-{p:.2f}", **look)
     last.set(xscale="log", yscale="log", xlabel="1 / rtol", title=f"{work}, method auto")
     last.set_ylabel("right-hand sides of a run")

@@ -23,12 +23,15 @@ FORMULATIONS: dict[str, dict[str, Any]] = {
     "spf": {"formulation": "spf", "solver.spf_equation": 17},
     "spf, eq. 8": {"formulation": "spf", "solver.spf_equation": 8},
 }
-METHODS = ("auto", "DOP853", "RK45", "Radau", "BDF", "LSODA")
-QUICK_METHODS = ("auto",)
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
-IN_PYTHON = (1e-3, 1e-6, 1e-9, 1e-12)  # the same steps as the native core's: its times alone are new
-QUICK_IN_PYTHON = (1e-3, 1e-7, 1e-11)
+FEW = (1e-3, 1e-6, 1e-9, 1e-12)
+QUICK_FEW = (1e-3, 1e-7, 1e-11)
+# Few tolerances where SciPy's loop makes the steps, and in Python, whose steps are the native core's, but later.
+METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "BDF": TOLERANCES, "RK45": FEW, "Radau": FEW, "LSODA": FEW}
+QUICK_METHODS = {"auto": QUICK_TOLERANCES}
+IN_PYTHON = dict.fromkeys(("auto", "DOP853", "Radau", "BDF"), FEW)
+QUICK_IN_PYTHON = {"auto": QUICK_FEW}
 ENOUGH = 0.2  # s of runs, set-up included; up to then they are repeated
 REPEATS = 5
 LONG = 1.0  # s: one run of that is enough
@@ -74,12 +77,11 @@ def of_row(row: Row) -> Setting:
 
 def settings(quick: bool) -> Iterator[Setting]:
     """Every formulation, method and tolerance, both backends; eq. 8 as printed is a formulation of its own."""
-    methods = QUICK_METHODS if quick else METHODS
-    native, python = (QUICK_TOLERANCES, QUICK_IN_PYTHON) if quick else (TOLERANCES, IN_PYTHON)
-    ways = [(True, native)] if unavailable() else [(False, native), (True, python)]
-    for (in_python, tolerances), method, formulation in product(ways, methods, FORMULATIONS):
-        for rtol in tolerances:
-            yield Setting(formulation, method, in_python, rtol)
+    every, python = (QUICK_METHODS, QUICK_IN_PYTHON) if quick else (METHODS, IN_PYTHON)
+    for in_python, methods in [(True, every)] if unavailable() else [(False, every), (True, python)]:
+        for (method, tolerances), formulation in product(methods.items(), FORMULATIONS):
+            for rtol in tolerances:
+                yield Setting(formulation, method, in_python, rtol)
 
 
 def refused(work: Work, reason: str) -> Motion:
