@@ -25,6 +25,7 @@ from tests.analytic.five_bar import FIVE_BAR, Q
 
 SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
 EVERY = {work.key: work for work in WORKS}
+LOOP = "Pinocchio constraintDynamics, RKF78 in C++"
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
         "Pinocchio constraintDynamics": "K_p 10, dt 0.0001",
         "SUNDIALS IDA": "rtol 1e-05",
     }
-    for peer in peers():
+    for peer in (peer for peer in peers() if peer.name != LOOP):  # which has tests of its own
         assert peer.missing(SHORT) is None
         assert settings[peer.name] in set(peer.settings(quick=False))
         theirs = judged("k", SHORT, peer.name, "s", peer.compute(SHORT, settings[peer.name], 60.0), exact)
@@ -169,9 +170,12 @@ def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) 
 
 def test_others_say_why_they_are_missing() -> None:
     said = {peer.name: peer.missing(EVERY["tracking_1e-04"]) for peer in peers()}
-    assert said["MuJoCo"] == "the controller is ours; only motions without one are compared"
+    for name in set(said) - {"SUNDIALS IDA"}:
+        assert said[name] is not None
+        assert said[name].startswith("the law of a controlled motion needs D, C and h of the reduced model")
     assert said["SUNDIALS IDA"] is None
-    assert {peer.name: peer.missing(EVERY["andrews"]) for peer in peers()}["Pinocchio constraintDynamics"] is not None
+    andrews = {peer.name: peer.missing(EVERY["andrews"]) for peer in peers() if peer.name != LOOP}
+    assert andrews["Pinocchio constraintDynamics"] == "springs are no part of its models"
 
 
 # --- the table ----------------------------------------------------------------------------------------------------

@@ -45,5 +45,6 @@ def peers() -> list[Peer]:
     from ckc_pin.study.report.peers.ida import Ida
     from ckc_pin.study.report.peers.mujoco import Mujoco
     from ckc_pin.study.report.peers.pinocchio import Pinocchio
+    from ckc_pin.study.report.peers.pinocchio_loop import PinocchioLoop
 
-    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), Ida()]
+    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), PinocchioLoop(), Ida()]

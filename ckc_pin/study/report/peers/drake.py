@@ -14,7 +14,7 @@ from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
@@ -38,7 +38,7 @@ class Drake:
             return "not installed: pip install 'ckc_pin[peers]'"
         others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED)
         if work.controlled:
-            return "the controller is ours; only motions without one are compared"
+            return CONTROLLED
         if others:
             return f"it has no constraint for {', '.join(sorted(others))}"
         if work.mechanism.tree.free:

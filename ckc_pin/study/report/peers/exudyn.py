@@ -13,7 +13,7 @@ import pinocchio as pin
 from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
@@ -39,7 +39,7 @@ class Exudyn:
             return "not installed: pip install 'ckc_pin[peers]'"
         others = {loop.type for loop in mechanism.spec.loop} - set(CLOSED)
         if work.controlled:
-            return "the controller is ours; only motions without one are compared"
+            return CONTROLLED
         if others or mechanism.spec.coupling or mechanism.tree.free:
             return f"not set up in it: {', '.join(sorted(others)) or 'couplings and free roots'}"
         if mechanism.springs.joint_stiffness.any() or mechanism.springs.joint_damping.any():

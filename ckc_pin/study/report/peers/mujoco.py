@@ -17,7 +17,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.exporting import export
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
@@ -40,7 +40,7 @@ class Mujoco:
         if not _installed():
             return "not installed: pip install 'ckc_pin[peers]'"
         if work.controlled:
-            return "the controller is ours; only motions without one are compared"
+            return CONTROLLED
         try:
             _model(work.mechanism)
         except (InputError, ValueError) as error:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
-__all__ = ["Pinocchio"]
+__all__ = ["Pinocchio", "closed", "not_closed"]
 
 STEPS = (5e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # s
 QUICK_STEPS = (5e-3, 1e-3, 1e-4)
@@ -23,8 +24,11 @@ GAINS = (10.0, 100.0)  # K_p of the examples, 1/s^2, and a stiffer one; K_d = 2 
 CLOSED_BY = {
     "point": pin.ContactType.CONTACT_3D,
     "point_2d": pin.ContactType.CONTACT_3D,
+    "hinge": pin.ContactType.CONTACT_3D,
     "weld": pin.ContactType.CONTACT_6D,
 }
+
+Constraint: TypeAlias = tuple[pin.ContactType, int, pin.SE3, int, pin.SE3]  # kind, joint and place on it, twice
 
 
 class Pinocchio:
@@ -34,14 +38,9 @@ class Pinocchio:
     packaged = True
 
     def missing(self, work: Work) -> str | None:
-        others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED_BY)
-        if work.controlled:
-            return "the controller is ours; only motions without one are compared"
-        if others or work.mechanism.spec.coupling:
-            return f"it has no constraint model for {', '.join(sorted(others)) or 'couplings'}"
         if work.mechanism.springs.between_frames or work.mechanism.springs.joint_stiffness.any():
             return "springs are no part of its models"
-        return None
+        return not_closed(work)
 
     def version(self) -> str:
         return str(pin.__version__)
@@ -81,13 +80,38 @@ class Pinocchio:
         return stepped(work, dt, reset, step, read, budget)
 
 
-def _constraints(mechanism: Mechanism, gain: float) -> Any:
-    constraints = pin.StdVec_RigidConstraintModel()
+def not_closed(work: Work) -> str | None:
+    """Say why Pinocchio's constraints do not do for a work; None where they do."""
+    others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED_BY)
+    if work.controlled:
+        return CONTROLLED
+    if others or work.mechanism.spec.coupling:
+        return f"it has no constraint model for {', '.join(sorted(others)) or 'couplings'}"
+    return None
+
+
+def closed(mechanism: Mechanism) -> Iterator[Constraint]:
+    """Every loop as one constraint, a hinge as two, at points of its axis."""
     for loop in mechanism.spec.loop:
         a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
-        places = [pin.SE3(frame.rotation, frame.translation) for frame in (a, b)]
+        kind, axes = CLOSED_BY[loop.type], (loop.axis_a, loop.axis_b)
+        yield kind, a.joint, _moved(a), b.joint, _moved(b)
+        if loop.type == "hinge":
+            ends = [_moved(frame, axis, mechanism.size) for frame, axis in zip((a, b), axes, strict=True)]
+            yield kind, a.joint, ends[0], b.joint, ends[1]
+
+
+def _moved(frame: Frame, axis: Sequence[float] = (1.0, 0.0, 0.0), by: float = 0.0) -> pin.SE3:
+    """Return a frame's place on its joint, moved along an axis of it."""
+    along = np.array(axis) / np.linalg.norm(axis)
+    return pin.SE3(frame.rotation, frame.translation + frame.rotation @ along * by)
+
+
+def _constraints(mechanism: Mechanism, gain: float) -> Any:
+    constraints = pin.StdVec_RigidConstraintModel()
+    for kind, joint_a, on_a, joint_b, on_b in closed(mechanism):
         model = pin.RigidConstraintModel(
-            CLOSED_BY[loop.type], mechanism.tree.model, a.joint, places[0], b.joint, places[1], pin.ReferenceFrame.LOCAL
+            kind, mechanism.tree.model, joint_a, on_a, joint_b, on_b, pin.ReferenceFrame.LOCAL
         )
         model.setBaumgarteCorrectorParameters(pin.BaumgarteCorrectorParameters(gain, 2 * np.sqrt(gain)))
         constraints.append(model)

@@ -12,11 +12,17 @@ from ckc_pin.simulation.initial import find_start
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import INSTANTS, Work
 
-__all__ = ["divided", "start_of", "stepped"]
+__all__ = ["CONTROLLED", "divided", "start_of", "stepped"]
 
 TRIAL = 50  # steps, to foresee how long all take
 REPEATS = 3
 SHORT = 1.0  # s: what takes less is repeated
+
+# why a program is not run on a controlled motion
+CONTROLLED = (
+    "the law of a controlled motion needs D, C and h of the reduced model, which it does not give; to call ours from "
+    "it would time ours"
+)
 
 State = tuple[Array, Array]  # q_tree, v_tree by coordinate
 
@@ -56,28 +62,21 @@ def stepped(
     """
     none = np.empty((0, work.mechanism.n))
     many = round(work.t_end / INSTANTS / divided(work, dt))
-    reset()
-    began = perf_counter()
-    try:
-        step(min(TRIAL, many))
-    except Exception as error:  # whatever a program raises where its solver fails
-        return Motion("failed", _said(error), none, none, 0.0, 0.0)
-    foreseen = (perf_counter() - began) / min(TRIAL, many) * many * INSTANTS
-    if foreseen > budget:
-        return Motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s", none, none, 0.0, 0.0)
     walls: list[float] = []
-    while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
-        try:
+    try:
+        reset()
+        began = perf_counter()
+        step(min(TRIAL, many))
+        foreseen = (perf_counter() - began) / min(TRIAL, many) * many * INSTANTS
+        if foreseen > budget:
+            return Motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s", none, none, 0.0, 0.0)
+        while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
             wall, states = _timed(lambda: step(many), reset, state)
-        except Exception as error:
-            return Motion("failed", _said(error), none, none, 0.0, 0.0)
-        walls.append(wall)
+            walls.append(wall)
+    except Exception as error:  # whatever a program raises where its solver fails
+        return Motion("failed", " ".join(str(error).split()) or type(error).__name__, none, none, 0.0, 0.0)
     q_tree, v_tree = (np.array(rows) for rows in zip(*states, strict=True))
     return Motion("done", "", q_tree, v_tree, min(walls), 0.0, steps=many * INSTANTS)
-
-
-def _said(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _timed(

@@ -1,0 +1,253 @@
+// What a capable user of Pinocchio would write: constraintDynamics under Boost.Odeint's Runge-Kutta-Fehlberg 7(8) with
+// its own step control. Reads one problem from standard input, writes the motion at its instants and what it took.
+#include <pinocchio/algorithm/energy.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/proximal.hpp>
+#include <pinocchio/constraints.hpp>
+#include <pinocchio/multibody.hpp>
+
+#include <boost/numeric/odeint/integrate/integrate_times.hpp>
+#include <boost/numeric/odeint/stepper/generation.hpp>
+#include <boost/numeric/odeint/stepper/runge_kutta_fehlberg78.hpp>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include <iostream>
+#include <stdexcept>
+
+// As in Pinocchio's headers, whose definitions take a compiler half a minute: the library has them compiled.
+namespace pinocchio {
+template <typename Scalar, int Options, template <typename, int> class Collection, class Constraint, class Allocator,
+          class ConstraintData, class DataAllocator>
+void initConstraintDynamics(const ModelTpl<Scalar, Options, Collection>&, DataTpl<Scalar, Options, Collection>&,
+                            const std::vector<Constraint, Allocator>&,
+                            const std::vector<ConstraintData, DataAllocator>&);
+template <typename Scalar, int Options, template <typename, int> class Collection, typename Q, typename V, typename Tau,
+          class Allocator, class DataAllocator>
+const typename DataTpl<Scalar, Options, Collection>::TangentVectorType& constraintDynamics(
+    const ModelTpl<Scalar, Options, Collection>&, DataTpl<Scalar, Options, Collection>&, const Eigen::MatrixBase<Q>&,
+    const Eigen::MatrixBase<V>&, const Eigen::MatrixBase<Tau>&,
+    const std::vector<RigidConstraintModelTpl<Scalar, Options>, Allocator>&,
+    std::vector<RigidConstraintDataTpl<Scalar, Options>, DataAllocator>&, ProximalSettingsTpl<Scalar>&);
+}  // namespace pinocchio
+
+namespace pin = pinocchio;
+namespace odeint = boost::numeric::odeint;
+
+using State = std::vector<double>;  // q of the model, then v
+using Clock = std::chrono::steady_clock;
+using Vector = Eigen::VectorXd;
+
+constexpr double enough = 0.05;  // s of repeats, and three at least: short runs are repeated more often
+constexpr double brief = 0.5;    // s of repeats after which there is no other one
+
+template <class T>
+T read() {
+  T x;
+  if (!(std::cin >> x)) throw std::runtime_error("the problem ends early");
+  return x;
+}
+
+Vector read_vector(Eigen::Index n) {
+  Vector x(n);
+  for (double& number : x) number = read<double>();
+  return x;
+}
+
+pin::SE3 read_placement() {
+  const Vector x = read_vector(12);
+  return {Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(x.data()), x.tail<3>()};
+}
+
+pin::JointModel read_joint() {
+  const auto kind = read<std::string>();
+  if (kind == "free") return pin::JointModelFreeFlyer();
+  const Eigen::Vector3d axis = read_vector(3);
+  const bool turns = kind == "turns";
+  if (axis == Eigen::Vector3d::UnitX()) return turns ? pin::JointModel(pin::JointModelRX()) : pin::JointModelPX();
+  if (axis == Eigen::Vector3d::UnitY()) return turns ? pin::JointModel(pin::JointModelRY()) : pin::JointModelPY();
+  if (axis == Eigen::Vector3d::UnitZ()) return turns ? pin::JointModel(pin::JointModelRZ()) : pin::JointModelPZ();
+  if (turns) return pin::JointModelRevoluteUnaligned(axis);
+  return pin::JointModelPrismaticUnaligned(axis);
+}
+
+pin::Model read_model() {
+  pin::Model model;
+  model.gravity.linear() = read_vector(3);
+  for (auto left = read<int>(); left > 0; --left) {
+    const auto parent = read<pin::JointIndex>();
+    const pin::SE3 placement = read_placement();
+    const auto joint = model.addJoint(parent, read_joint(), placement, std::to_string(left));
+    const auto mass = read<double>();
+    const Eigen::Vector3d center = read_vector(3);
+    const Vector moments = read_vector(9);
+    const pin::Inertia inertia(mass, center, Eigen::Map<const Eigen::Matrix3d>(moments.data()));
+    model.appendBodyToJoint(joint, inertia, pin::SE3::Identity());
+  }
+  model.armature = read_vector(model.nv);
+  return model;
+}
+
+struct Spring {  // between two points of bodies
+  int joint[2];
+  Eigen::Vector3d local[2];
+  double stiffness, rest_length, damping;
+};
+
+struct Problem {
+  pin::Model model;
+  pin::Data data;
+  std::vector<pin::RigidConstraintModel> constraints;
+  std::vector<pin::RigidConstraintData> constraint_data;
+  pin::ProximalSettings proximal;
+  std::vector<Spring> springs;
+  Vector stiffness, rest, damping, constant;  // on joints
+  Vector q, v, tau;
+  double tolerance;
+  State start, instants;
+  std::size_t rhs = 0;
+
+  Problem() : model(read_model()), data(model) {
+    const double gain = read<double>();
+    for (auto left = read<int>(); left > 0; --left) {
+      const auto type = read<int>() == 6 ? pin::CONTACT_6D : pin::CONTACT_3D;
+      const auto a = read<pin::JointIndex>();
+      const pin::SE3 on_a = read_placement();
+      const auto b = read<pin::JointIndex>();
+      constraints.emplace_back(type, model, a, on_a, b, read_placement(), pin::LOCAL);
+      constraints.back().m_baumgarte_parameters.Kp = gain;
+      constraints.back().m_baumgarte_parameters.Kd = 2 * std::sqrt(gain);
+      constraint_data.push_back(constraints.back().createData());
+    }
+    pin::initConstraintDynamics(model, data, constraints, constraint_data);
+    const auto accuracy = read<double>(), mu = read<double>();
+    proximal = pin::ProximalSettings(accuracy, mu, read<int>());
+    for (auto left = read<int>(); left > 0; --left) {
+      Spring s;
+      for (int end : {0, 1}) s.joint[end] = read<int>(), s.local[end] = read_vector(3);
+      s.stiffness = read<double>(), s.rest_length = read<double>(), s.damping = read<double>();
+      springs.push_back(s);
+    }
+    for (Vector* on_joints : {&stiffness, &rest, &damping, &constant}) *on_joints = read_vector(model.nv);
+    tolerance = read<double>();
+    const Vector at = read_vector(model.nq + model.nv);
+    start.assign(at.begin(), at.end());
+    const Vector times = read_vector(read<int>());
+    instants.assign(times.begin(), times.end());
+    q.setZero(model.nq), v.setZero(model.nv), tau.setZero(model.nv);
+  }
+
+  void operator()(const State& x, State& rate, double) {
+    ++rhs;
+    std::copy_n(x.begin(), model.nq, q.begin());
+    std::copy_n(x.begin() + model.nq, model.nv, v.begin());
+    configuration_rate(rate);
+    const Vector& a = acceleration();
+    std::copy(a.begin(), a.end(), rate.begin() + model.nq);
+  }
+
+  const Vector& acceleration() {
+    tau = constant - damping.cwiseProduct(v);
+    if (model.nq == model.nv) tau -= stiffness.cwiseProduct(q - rest);
+    if (!springs.empty()) pull();
+    return pin::constraintDynamics(model, data, q, v, tau, constraints, constraint_data, proximal);
+  }
+
+ private:
+  // q_dot is v but for free roots, of whose quaternion the length, a matter of rounding, is taken off
+  void configuration_rate(State& rate) {
+    if (model.nq == model.nv) {
+      std::copy(v.begin(), v.end(), rate.begin());
+      return;
+    }
+    for (int joint = 1; joint < model.njoints; ++joint) {
+      const int at = model.idx_qs[joint], v_at = model.idx_vs[joint];
+      if (model.nqs[joint] != 7) {
+        rate[at] = v[v_at];
+        continue;
+      }
+      q.segment<4>(at + 3).normalize();
+      const Eigen::Quaterniond turned(q.segment<4>(at + 3));
+      const Eigen::Vector3d w = v.segment<3>(v_at + 3);
+      const Eigen::Vector3d p_dot = turned * v.segment<3>(v_at);
+      const Eigen::Quaterniond twice = turned * Eigen::Quaterniond(0, w.x(), w.y(), w.z());
+      for (int k : {0, 1, 2}) rate[at + k] = p_dot[k];
+      for (int k : {0, 1, 2, 3}) rate[at + 3 + k] = 0.5 * twice.coeffs()[k];
+    }
+  }
+
+  void pull() {
+    pin::computeJointJacobians(model, data, q);
+    for (const Spring& s : springs) {
+      const Eigen::Vector3d p[] = {data.oMi[s.joint[0]].act(s.local[0]), data.oMi[s.joint[1]].act(s.local[1])};
+      const Eigen::Vector3d r = p[0] - p[1];
+      const double length = r.norm();
+      if (length == 0) continue;
+      pin::Force unit[2];
+      for (int end : {0, 1}) unit[end] = pin::Force(r / length, p[end].cross(r / length));
+      double speed = 0;
+      for_each_column(s, [&](int k, double of_length) { speed += of_length * v[k]; }, unit);
+      const double force = s.stiffness * (length - s.rest_length) + s.damping * speed;
+      for_each_column(s, [&](int k, double of_length) { tau[k] -= force * of_length; }, unit);
+    }
+  }
+
+  template <class Use>
+  void for_each_column(const Spring& s, Use use, const pin::Force (&unit)[2]) {
+    for (int end : {0, 1})
+      for (int joint = s.joint[end]; joint > 0; joint = static_cast<int>(model.parents[joint]))
+        for (int k = model.idx_vs[joint]; k < model.idx_vs[joint] + model.nvs[joint]; ++k)
+          use(k, (end ? -1 : 1) * unit[end].toVector().dot(data.J.col(k)));
+  }
+};
+
+void write(const char* name, const double* first, Eigen::Index many) {
+  std::printf("%s", name);
+  for (Eigen::Index k = 0; k < many; ++k) std::printf(" %.17g", first[k]);
+  std::printf("\n");
+}
+
+// What the start is compared by before anything is timed: D', the bias, the energy without springs, the acceleration.
+void check(Problem& problem) {
+  State rate(problem.start.size());
+  problem(problem.start, rate, 0.0);
+  const pin::Model& model = problem.model;
+  const Eigen::MatrixXd D = problem.data.M.selfadjointView<Eigen::Upper>();
+  write("D", D.data(), D.size());
+  write("bias", problem.data.nle.data(), model.nv);
+  const double energy = pin::computeMechanicalEnergy(model, problem.data, problem.q, problem.v);
+  write("energy", &energy, 1);
+  write("acceleration", rate.data() + model.nq, model.nv);
+}
+
+void run(Problem& problem) {
+  using Stepper = odeint::runge_kutta_fehlberg78<State>;
+  std::vector<State> states;
+  std::vector<double> walls;
+  std::size_t steps = 0;
+  double spent = 0;
+  do {  // the first one warms up, and counts where it is long
+    State x = problem.start;
+    states.clear(), states.reserve(problem.instants.size()), problem.rhs = 0;
+    const auto began = Clock::now();
+    steps = odeint::integrate_times(
+        odeint::make_controlled<Stepper>(problem.tolerance, problem.tolerance), std::ref(problem), x,
+        problem.instants.begin(), problem.instants.end(), problem.instants[1] / 10,
+        [&](const State& at, double) { states.push_back(at); });
+    walls.push_back(std::chrono::duration<double>(Clock::now() - began).count());
+    spent += walls.back();
+  } while (spent < brief && (walls.size() < 4 || spent < enough));
+  const double told[] = {*std::min_element(walls.begin(), walls.end()), double(steps), double(problem.rhs)};
+  write("cost", told, 3);
+  for (const State& state : states) write("state", state.data(), static_cast<Eigen::Index>(state.size()));
+}
+
+int main() try {
+  Problem problem;
+  check(problem);
+  if (!problem.instants.empty()) run(problem);
+} catch (const std::exception& error) {
+  std::fprintf(stderr, "%s\n", error.what());
+  return 1;
+}
