@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ckc_pin.study.chart import COLOURS, chart, save, whole_decades
 from ckc_pin.study.markdown import escaped, table
-from ckc_pin.study.report.growth import FAMILIES, FORMULATIONS, Family, Growth, backends, exponent
+from ckc_pin.study.report.growth import FAMILIES, Family, Growth, backends, exponent
 from ckc_pin.study.report.ours import of_row
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.sentences import here
@@ -46,21 +46,26 @@ def growth_said(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]]) -
     lines += [f"- {said}" for family in FAMILIES for said in _grows(rows, family)]
     lines += [f"- {said}" for said in _tolerances(measured)]
     lines += ["", "![how cost grows](growth.png)", ""]
-    cells = [
-        [family.says, NAMES[formulation], WHERE[backend], str(x), f"{1e6 * seconds:.3g}", _text(counts.get(x))]
-        for family in FAMILIES
-        for formulation in FORMULATIONS
-        for counts in (_counts(rows, family, formulation),)
-        for backend in backends()
-        for x, seconds in sorted(_points(rows, family, formulation, backend).items())
-    ]
     failed = [
         f"- {row.family} = {row.x}, {NAMES[row.formulation]}, {WHERE[row.backend]}: {escaped(row.reason)}"
         for row in rows
         if row.reason
     ]
-    header = ["along", "formulation", "backend", "", "right-hand side, µs", "right-hand sides"]
-    return [*lines, *table(header, cells), "", *failed, ""]
+    return [*lines, *_table(rows), "", *failed, ""]
+
+
+def _table(rows: Sequence[Growth]) -> list[str]:
+    """Return a row a case: a right-hand side's time by formulation and backend, and a run's right-hand sides."""
+    ways = [(formulation, backend) for formulation in NAMES for backend in backends()]
+    cells = []
+    for family in FAMILIES:
+        times_of = [_points(rows, family, *way) for way in ways]
+        counts = [_counts(rows, family, formulation) for formulation in NAMES]
+        for x in sorted({row.x for row in rows if row.family == family.key}):
+            spent = [f"{1e6 * points[x]:.3g}" if x in points else "" for points in times_of]
+            cells.append([family.says, str(x), *spent, *(_text(found.get(x)) for found in counts)])
+    header = [f"{NAMES[formulation]}, {WHERE[backend]}, µs" for formulation, backend in ways]
+    return table(["along", "", *header, *(f"{name}, right-hand sides" for name in NAMES.values())], cells)
 
 
 def _text(x: float | None) -> str:

@@ -21,7 +21,8 @@ def left_out_said(rows: Sequence[LeftOut]) -> list[str]:
 
 _NOTE = (
     "Terms, beside the right-hand side of each scene, in Python, where what the right-hand side evaluates is there "
-    "already: how much longer it would take with them. J̇, ρ̇ and C are the whole matrices."
+    "already: how much longer it would take with them. J̇, ρ̇ and C are the whole matrices; "
+    "the native core has J̇ v' without J̇."
 )
 
 

@@ -32,7 +32,7 @@ METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "BDF": TOLERANCES, "RK45": 
 QUICK_METHODS = {"auto": QUICK_TOLERANCES}
 IN_PYTHON = dict.fromkeys(("auto", "DOP853", "Radau", "BDF"), FEW)
 QUICK_IN_PYTHON = {"auto": QUICK_FEW}
-ENOUGH = 0.2  # s of runs, set-up included; up to then they are repeated
+ENOUGH = 0.1  # s of runs, set-up included; up to then they are repeated
 REPEATS = 5
 LONG = 1.0  # s: one run of that is enough
 

@@ -6,7 +6,7 @@ import base64
 import html
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from ckc_pin.study.markdown import escaped, table
@@ -28,7 +28,7 @@ __all__ = ["Measured", "PeerNote", "markdown", "web"]
 STYLE = (
     "body{font:16px/1.5 sans-serif;color:#111;background:#fff;max-width:72rem;margin:2rem auto;padding:0 1rem}"
     "table{border-collapse:collapse;font-size:.85rem;display:block;overflow-x:auto}"
-    "td,th{border-bottom:1px solid #ddd;padding:.25rem .6rem;text-align:left}th{white-space:nowrap}img{max-width:100%}"
+    "td,th{border-bottom:1px solid #ddd;padding:.25rem .6rem;text-align:left}img{max-width:100%}"
     "h2{margin-top:2.5rem;border-top:1px solid #ddd;padding-top:1rem}"
 )
 
@@ -73,10 +73,11 @@ class Measured:
     left_out: Sequence[LeftOut]
     growth: Sequence[Growth]
     quick: bool
-    by_hand: frozenset[str] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "by_hand", frozenset(peer.name for peer in self.peers if not peer.packaged))
+    @property
+    def by_hand(self) -> frozenset[str]:
+        """Programs that are no packages."""
+        return frozenset(peer.name for peer in self.peers if not peer.packaged)
 
 
 def markdown(measured: Measured) -> str:
