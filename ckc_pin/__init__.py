@@ -19,10 +19,10 @@ from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.mechanism import Mechanism, load
 from ckc_pin.mechanism.point import Point
-from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, check, load_scene, simulate
 
 if TYPE_CHECKING:
     from ckc_pin.mechanism.mapped import SingularityMap
+    from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, check, load_scene, simulate
 
 __all__ = [
     "Check",
@@ -48,6 +48,24 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+OF_SIMULATION = ("Check", "Event", "Run", "Scene", "Simulator", "check", "load_scene", "simulate")
+
+
+def __getattr__(name: str) -> Any:
+    """Load simulation when something of it is used first: terms and mechanisms do without."""
+    from importlib import import_module
+
+    if name == "simulation":
+        return import_module("ckc_pin.simulation")
+    if name in OF_SIMULATION:
+        return getattr(import_module("ckc_pin.simulation"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Name what is loaded later, too."""
+    return sorted({*globals(), *__all__})
 
 
 def play(*runs: Run, **options: Any) -> Any:

@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 STAMP = VENV / "ckc_pin-setup"
 CONSTRAINTS = ROOT / "constraints.txt"
-NATIVE = ROOT / "ckc_pin" / "native" / "src"
+PACKAGE = ROOT / "ckc_pin"
+NATIVE = PACKAGE / "native" / "src"
 UNFINISHED = "unfinished\n"
 SIZE = "1.5 GB"  # on disk; a quarter of it comes over the network
 
@@ -102,6 +103,8 @@ def make(lock: int) -> None:
     with removed_on_failure():
         editable = ["--no-deps", "--no-build-isolation", "--no-index", "--editable", str(ROOT)]
         run_quietly(lock, "pip", [*pip(), *editable])
+        # The first start compiles nothing, and neither do later ones where Python is told to write no bytecode.
+        run_quietly(lock, "compileall", [str(VENV / "bin" / "python"), "-I", "-m", "compileall", "-q", str(PACKAGE)])
         STAMP.write_text(wanted_stamp())
     say("done")
 

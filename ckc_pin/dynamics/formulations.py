@@ -91,9 +91,9 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     Returns
     -------
     tangent : (n, d) array
-        Orthonormal basis of the velocities that the loops allow.
+        Basis of the velocities that the loops allow.
     particular : (n,) array, or (n, k)
-        The shortest x with J x = -residual.
+        An x with J x = -residual.
 
     Raises
     ------
@@ -101,17 +101,13 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
         J has lost rank.
     """
     mechanism = terms.mechanism
-    rank = mechanism.rank
-    normal, tangent, r, rows = null_space(terms.at.J, rank)
-    if rank == 0:
-        return tangent, np.zeros((mechanism.n, *residual.shape[1:]))
-    pivots = np.abs(np.diagonal(r))
-    if not pivots[-1] > SINGULAR * pivots[0]:
+    tangent, particular, pivots = null_space(terms.at.J, mechanism.rank, residual)
+    if mechanism.rank and not pivots[-1] > SINGULAR * pivots[0]:
         raise NumericalError(
             "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.q_tree)),
         )
-    return tangent, normal @ np.linalg.solve(r.T, -residual[rows])
+    return tangent, particular
 
 
 def closing_step(terms: Terms, residual: Array) -> Array:

@@ -117,33 +117,43 @@ def _by_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> Arr
     return x
 
 
-def null_space(jacobian: Array, rank: int) -> tuple[Array, Array, Array, Array]:
-    """Split the tangent space by a pivoted QR of J^T: J^T P = Q R.
+def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, Array]:
+    """Split the tangent space by a pivoted QR of J: J P = Q [R S].
+
+    The basis is that of the columns which the pivoting left over, with ones and zeros exact in their rows. An
+    orthonormal one would mix the rounding of all columns: where a light link moves far and a heavy one by 1e-4 of
+    that, the heavy one's part would be off by as much as the light one's.
 
     Parameters
     ----------
     jacobian : (m, n) array
     rank : int
         The rank of J, known from the assembled configuration.
+    residual : (m,) array, or (m, k)
+        With redundant rows consistent.
 
     Returns
     -------
-    normal : (n, rank) array
-        Orthonormal basis of the range of J^T.
     tangent : (n, n - rank) array
-        Orthonormal basis of the velocities that the loops allow.
-    r : (rank, rank) array
-        Upper triangular; `normal @ r` are the rows of J named by `rows`, as columns.
-    rows : (rank,) int array
-        The rows of J that the pivoting chose.
+        Basis of the velocities that the loops allow; no entry is much larger than 1.
+    particular : (n,) array, or (n, k)
+        x with J x = -residual that leaves the same columns alone.
+    pivots : (rank,) array
+        Sizes of R's diagonal, which falls.
     """
+    m, n = jacobian.shape
+    tangent, particular = np.zeros((n, n - rank)), np.zeros((n, *residual.shape[1:]))
+    if m == 0:
+        return np.eye(n), particular, np.zeros(0)
     lapack = _routines()
-    n = jacobian.shape[1]
-    if jacobian.shape[0] == 0:
-        return np.zeros((n, 0)), np.eye(n), np.zeros((0, 0)), np.zeros(0, np.intp)
-    factored, pivots, tau, _, _ = lapack.dgeqp3(jacobian.T)
-    q = np.zeros((n, n), order="F")
-    columns = min(n, factored.shape[1])
-    q[:, :columns] = factored[:, :columns]
-    q, _, _ = lapack.dorgqr(q, tau)
-    return q[:, :rank], q[:, rank:], np.triu(factored[:rank, :rank]), pivots[:rank] - 1
+    factored, order, tau, _, _ = lapack.dgeqp3(jacobian)
+    order -= 1
+    r = factored[:rank, :rank]
+    pivots = np.abs(np.diagonal(r))
+    tangent[order[rank:]] = np.eye(n - rank)
+    if rank and pivots[-1] > 0:
+        right = residual.reshape(m, -1)
+        turned, _, _ = lapack.dormqr("L", "T", factored[:, : len(tau)], tau, right, max(1, right.shape[1]))
+        tangent[order[:rank]] = -lapack.dtrtrs(r, factored[:rank, rank:])[0]
+        particular[order[:rank]] = -lapack.dtrtrs(r, turned[:rank])[0].reshape(rank, *residual.shape[1:])
+    return tangent, particular, pivots

@@ -15,11 +15,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.linalg import qr
 
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.linear import null_space
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.systems import Dae
 
@@ -106,7 +106,7 @@ class Ida:
         """Y = (q, v, mu, lambda) and its rate at a state on the closure; chooses the rows."""
         terms = self.system.terms(t, y)
         rank = self.system.mechanism.rank
-        self.rows = null_space(terms.at.J, rank)[3]
+        self.rows = qr(terms.at.J.T, mode="r", pivoting=True)[1][:rank]
         u_tree = self.system.force(t, terms)
         acceleration = dae_acceleration(terms, u_tree)
         force = terms.D_tree @ acceleration - self._applied(terms, u_tree)

@@ -40,7 +40,13 @@ def _modules(code: str, *words: str) -> tuple[set[str], str]:
 def test_importing_loads_no_solver_no_command_line_and_no_pictures() -> None:
     modules, _ = _modules(f"import ckc_pin; {LIST}")
     assert "pinocchio" in modules
-    assert not modules & (VIEW | {"typer", "scipy.integrate"})
+    assert not modules & (VIEW | {"typer", "scipy.integrate", "ckc_pin.simulation"})
+
+
+def test_what_is_loaded_later_is_there() -> None:
+    code = "import ckc_pin; assert set(ckc_pin.__all__) <= set(dir(ckc_pin)); from ckc_pin import *; simulate; "
+    modules, _ = _modules(f"{code} assert not hasattr(ckc_pin, 'simulated'); {LIST}")
+    assert "ckc_pin.simulation" in modules
 
 
 def test_terms_need_no_solver() -> None:

@@ -5,8 +5,10 @@
 
 namespace ckc {
 
-// Relative size of the last pivot of J^T at which its rank counts as lost; and at which Python closes with care.
+// Relative size of the last pivot of J at which its rank counts as lost; and at which Python closes with care.
 constexpr double singular = 1e-12, weak = 1e-2;
+// Of phi_z's pivots, and of rho: where the partition at hand is as good as any.
+constexpr double sound = 1e-2, steep = 4.0;
 
 Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_)
     : tree(model, std::move(place)),
@@ -15,14 +17,14 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       n(tree.n),
       d(0),
       rank(rank_),
-      qr_(n, std::max(rows.closure.rows, 1)) {
+      qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m);
-  transposed_.setZero(n, m), whole_.setZero(n, n), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
+  turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
   square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank, n - rank, full_pattern(n - rank));
-  qr_work_.setZero(n), small_.setZero(std::max(rank, n - rank)), small_b_.setZero(n - rank);
+  moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
 }
 
 void Core::split(Indices q_, Indices z_) {
@@ -123,8 +125,8 @@ void Core::C_times(In x, Out product) {
   y_.noalias() = C_tree * x_;
   x_.setZero();
   for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
-  D_times(x_, qr_work_);
-  y_ += qr_work_;
+  D_times(x_, moved_);
+  y_ += moved_;
   reduced(y_, product);
 }
 
@@ -153,25 +155,55 @@ void Core::spf_z_dot(In q_dot, double epsilon, In w, Out z_dot) {
   for (size_t i = 0; i < z.size(); ++i) z_dot(i) = rho.row(z[i]).dot(q_dot) - z_dot(i) / epsilon;
 }
 
-bool Core::tangent_basis(In residual, double least) {
-  x_.setZero();  // the shortest one
-  whole_.setIdentity();
-  if (rows.closure.rows) {
-    transposed_ = rows.J.transpose();
-    qr_.compute(transposed_);
-    const auto& r = qr_.matrixQR();
-    if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
-    qr_.householderQ().applyThisOnTheLeft(whole_, qr_work_);
-    for (int i = 0; i < rank; ++i) {  // R^T y = -residual, by rows
-      const int row = qr_.colsPermutation().indices()(i);
-      double value = -residual(row);
-      for (int k = 0; k < i; ++k) value -= r(k, i) * small_(k);
-      small_(i) = value / r(i, i);
-      x_ += small_(i) * whole_.col(i);
+// tangent_ and x_ of the partition at hand, where its z follow q closely and J is far from a loss of rank.
+bool Core::basis_of_partition() {
+  factor();
+  if (!(phi_z.pivot_ratio() > sound)) return false;
+  reduce();
+  if (!(rho.lpNorm<Eigen::Infinity>() < steep)) return false;
+  tangent_ = rho;
+  phi_z.solve(negative_, z_);
+  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
+  return true;
+}
+
+// As Python's `null_space`: J P = Q [R S], and the columns that the pivoting left over are the freedoms.
+bool Core::basis_by_pivoting(double least) {
+  qr_.compute(rows.J);
+  const auto& r = qr_.matrixQR();
+  const auto& order = qr_.colsPermutation().indices();
+  if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
+  turned_ = negative_;
+  for (int k = 0; k < rank; ++k) {  // Q^T
+    const auto v = r.col(k).tail(turned_.size() - k - 1);
+    const double along = qr_.hCoeffs()(k) * (turned_(k) + v.dot(turned_.tail(v.size())));
+    turned_(k) -= along;
+    turned_.tail(v.size()) -= along * v;
+  }
+  tangent_.setZero();
+  for (int i = rank - 1; i >= 0; --i) {  // -R^-1 of it and of S, by rows
+    double value = turned_(i);
+    for (int k = i + 1; k < rank; ++k) value -= r(i, k) * x_(order(k));
+    x_(order(i)) = value / r(i, i);
+    for (int j = 0; j < n - rank; ++j) {
+      double entry = -r(i, rank + j);
+      for (int k = i + 1; k < rank; ++k) entry -= r(i, k) * tangent_(order(k), j);
+      tangent_(order(i), j) = entry / r(i, i);
     }
   }
-  tangent_ = whole_.rightCols(n - rank);
-  for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
+  for (int j = 0; j < n - rank; ++j) tangent_(order(rank + j), j) = 1.0;
+  return true;
+}
+
+bool Core::tangent_basis(In residual, double least) {
+  const int freedoms = n - rank;
+  x_.setZero();
+  negative_ = -residual;  // which may be where `reduce` works
+  if (!rows.closure.rows)
+    tangent_.setIdentity();
+  else if (!basis_of_partition() && !basis_by_pivoting(least))
+    return false;
+  for (int k = 0; k < freedoms; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
   square_factor_.compute(square_);
   return true;
@@ -181,7 +213,7 @@ bool Core::closing_step(In residual, Out x) {
   if (!tangent_basis(residual, weak)) return false;
   D_times(x_, y_);
   small_b_.noalias() = tangent_.transpose() * y_;
-  square_factor_.solve(small_b_, small_.head(n - rank));
+  square_factor_.solve(small_b_, small_);
   x = x_;
   for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
   return true;
@@ -194,7 +226,7 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   y_ = u_tree - bias_tree - y_;
   if (springs.any_damping) springs.add_damping(v_tree, y_);
   small_b_.noalias() = tangent_.transpose() * y_;
-  square_factor_.solve(small_b_, small_.head(n - rank));
+  square_factor_.solve(small_b_, small_);
   acceleration = x_;
   for (int k = 0; k < n - rank; ++k) acceleration += small_(k) * tangent_.col(k);
   return true;

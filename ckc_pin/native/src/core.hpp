@@ -56,13 +56,15 @@ class Core {
 
  private:
   bool tangent_basis(In residual, double least);  // tangent_, the factorized inertia on it, and x_: J x = -residual
+  bool basis_of_partition();
+  bool basis_by_pivoting(double least);
   bool D_here_ = false;  // whether the tree's D' is that of q_tree
   Matrix D_rho_, tangent_, D_tangent_;
   Vector x_, y_, elastic_, residual_, z_, d_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
-  Matrix transposed_, whole_, square_;
+  Matrix square_;
   Factor square_factor_;
-  Vector qr_work_, small_, small_b_;
+  Vector turned_, negative_, moved_, small_, small_b_;
 };
 
 }  // namespace ckc

@@ -59,13 +59,16 @@ bool LevelSet::state(double t, In y, double tolerance) {
 bool LevelSet::newton(double tolerance) {
   double size = 0.0;
   for (int iteration = 0; iteration <= max_iterations; ++iteration) {
-    core.set(q_tree_, iteration == 0);  // mostly the prediction closes the loops, and D' will be wanted there
+    core.set(q_tree_, iteration == expected_);  // D' will be wanted at the end, which is mostly where it was last time
     core.factor();
     residual_ = core.rows.phi - w;
     const double previous = size;
     size = unclosed();
     if (iteration && !(size <= std::max(0.5 * previous, tolerance))) return false;
-    if (size <= tolerance) return true;
+    if (size <= tolerance) {
+      expected_ = iteration;
+      return true;
+    }
     if (!std::isfinite(size) || core.phi_z.singular() || iteration == max_iterations) return false;
     core.solve_z(residual_, z_);
     if (!(z_.lpNorm<Eigen::Infinity>() <= max_step)) return false;

@@ -32,6 +32,7 @@ class LevelSet : public System {
 
   double epsilon_, tolerance_, slack_;
   bool actual_, on_manifold_;
+  int expected_ = 0;  // corrections that closing will take
   Vector w0_, q_tree_, residual_, z_, moved_, y_dot_, tree_;
   Vector f_, column_;
   Matrix gradient_, damping_;

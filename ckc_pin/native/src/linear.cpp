@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <utility>
 
@@ -87,6 +88,15 @@ void Factor::eliminate() {
       below_[k].push_back(row);
     }
   }
+}
+
+double Factor::pivot_ratio() const {
+  double least = std::numeric_limits<double>::infinity(), most = 0.0;
+  for (int k = 0; k < columns_; ++k) {
+    const double pivot = std::abs(rows_ == columns_ ? lu_(row_at_[k], k) : qr_(k, k));
+    least = std::min(least, pivot), most = std::max(most, pivot);
+  }
+  return columns_ ? least / most : 1.0;
 }
 
 void Factor::householder() {

@@ -18,6 +18,7 @@ class Factor {
   void compute(const Matrix& a, const Indices& columns = {});
   void solve(In b, Out x);            // least squares when tall
   bool singular() const { return singular_; }
+  double pivot_ratio() const;         // the smallest pivot to the largest
 
  private:
   void eliminate();

@@ -156,7 +156,8 @@ class Dae:
 
     def _shortest(self, at: Kinematics, residual: Array) -> Array:
         self.counts.factorizations += 1
-        return tangent_basis(Terms(self.mechanism, at, residual), residual)[1]
+        tangent, some = tangent_basis(Terms(self.mechanism, at, residual), residual)
+        return some - tangent @ Factorization(tangent.T @ tangent).solve(tangent.T @ some)
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
         """Put a state on the closure by the shortest steps in the metric of the inertia.
