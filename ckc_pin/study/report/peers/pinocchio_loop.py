@@ -39,6 +39,7 @@ class PinocchioLoop:
     """What a capable user of Pinocchio would write next: the strongest peer measured."""
 
     name = "Pinocchio constraintDynamics, RKF78 in C++"
+    packaged = False  # the loop is written by hand
 
     def missing(self, work: Work) -> str | None:
         return not_closed(work) or program()[1]
