@@ -14,6 +14,7 @@ from ckc_pin.study.report.work import Work
 __all__ = ["advice"]
 
 ALIKE = 1.1  # ratio of times that are no difference
+UNREACHED = 10.0  # times the fastest one: what an accuracy that a setting does not get to counts as
 MOST = 0.9  # of the runs: what a tolerance is to be good for
 
 Rows = Mapping[str, Sequence[Row]]
@@ -61,14 +62,16 @@ def _mean(ratios: Collection[float]) -> float:
 
 
 def _best_family(told: Sequence[tuple[str, float]], rows: Rows) -> str | None:
-    """Return the formulation and method that gets furthest, and of those one that is as fast as any in the mean.
+    """Return the formulation and method that is the fastest in the mean, what it does not get to counted as slow.
 
     On the manifold eq. 17 is the reduced model, and chance decides between them: the reduced model is named.
     """
     families = dict.fromkeys(of_row(row).family for own in rows.values() for row in here(own))
     relative = {family: _relative(family, told, rows) for family in families}
-    most = max(map(len, relative.values()), default=0)
-    means = {family: _mean(own.values()) for family, own in relative.items() if own and len(own) == most}
+    reached = sum(fastest(here(rows[work]), target) is not None for work, target in told)
+    means = {
+        family: _mean([*own.values(), *[UNREACHED] * (reached - len(own))]) for family, own in relative.items() if own
+    }
     alike = [family for family, mean in means.items() if mean <= ALIKE * min(means.values())]
     return next((family for family in alike if family.startswith("reduced")), alike[0] if alike else None)
 
@@ -128,15 +131,14 @@ def _whether(told: Sequence[tuple[str, float]], rows: Rows, by_hand: Collection[
         if not names:
             continue
         found: dict[tuple[str, float], float | None] = {}
-        ahead_of_it: dict[str, list[str]] = {}
+        ahead_of_it: dict[str, list[tuple[str, float]]] = {}
         for work, target in told:
             other = fastest([row for row in rows[work] if row.program in names], target)
             if other is None:
                 continue
             found[work, target] = over = ratio(fastest(here(rows[work]), target), other)
             if over is None or over < 1:
-                by = "nothing here gets there" if over is None else f"{times(1 / over)} times faster"
-                ahead_of_it.setdefault(other.program, []).append(f"{work} to {target:.0e} ({by})")
+                ahead_of_it.setdefault(other.program, []).append((work, target))
         whom = "the loop written by hand around another library" if written else "the other packaged programs"
         if not found:
             yield f"Against {whom} ({', '.join(sorted(names))}): none of them gets to any of these accuracies."
@@ -145,12 +147,23 @@ def _whether(told: Sequence[tuple[str, float]], rows: Rows, by_hand: Collection[
         span = (
             f", {times(min(ahead))} to {times(max(ahead))} times ({times(_mean(ahead))} in the mean)" if ahead else ""
         )
-        where = "".join(f" {name} is ahead on {', '.join(on)}: take it there." for name, on in ahead_of_it.items())
+        where = "".join(
+            f" {name} is ahead on {', '.join(_where(on, found))}: take it there." for name, on in ahead_of_it.items()
+        )
         yield (
             f"Against {whom} ({', '.join(sorted(names))}) it is faster at {len(ahead)} of the {len(found)} works and "
             f"accuracies that one of them gets to{span}.{where}"
         )
     yield "It has no contacts, no dry friction and no deformable bodies: where those matter, take another program."
+
+
+def _where(on: Sequence[tuple[str, float]], found: Mapping[tuple[str, float], float | None]) -> Iterator[str]:
+    """Say on which works, to which accuracies and by how much another program is ahead."""
+    for work in dict.fromkeys(work for work, _ in on):
+        targets = [target for own, target in on if own == work]
+        overs = [1 / over for target in targets if (over := found[work, target]) is not None]
+        by = f"up to {times(max(overs))} times faster" if overs else "nothing here gets there"
+        yield f"{work} to {', '.join(f'{target:.0e}' for target in targets)} ({by})"
 
 
 def _eq_8(works: Sequence[Work], rows: Rows, references: Mapping[str, Reference]) -> str:

@@ -20,8 +20,9 @@ MARKERS = "osD^vPX<>"
 GRAY = "#666666"
 FLOOR = 1e-17  # a number of zero has no logarithm
 APART = 11.0  # points between the labels of two curves
-REACH = 130.0  # points: labels further apart do not meet
-NAMES = {"dae": "DAE", "reduced": "reduced model", "spf": "SPF, eq. 17", "spf, eq. 8": "SPF, eq. 8 as printed"}
+REACH = 100.0  # points: labels further apart do not meet
+LETTER = 5.0  # points wide
+NAMES = {"dae": "DAE", "reduced": "reduced model", "spf": "SPF eq. 17", "spf, eq. 8": "SPF eq. 8 as printed"}
 
 Number = Callable[[Row], float | None]
 
@@ -133,25 +134,29 @@ def _name(figure: Any, axes: Sequence[Any]) -> None:
     """Write each curve's name beside its end, where that does not lie on another name."""
     figure.draw_without_rendering()  # settles the layout, in which the labels are to be placed
     figure.set_layout_engine("none")
+    scale = 72.0 / figure.dpi
     for ax in axes:
-        scale = 72.0 / figure.dpi
-        ends = [ax.transData.transform((line.get_xdata()[-1], line.get_ydata()[-1])) * scale for line in ax.lines]
-        right = ax.bbox.x1 * scale
-        taken: list[tuple[float, float]] = []
-        for line, end in sorted(zip(ax.lines, ends, strict=True), key=lambda pair: pair[1][1]):
-            x, y = float(end[0]), float(end[1])
-            while any(abs(x - a) < REACH and abs(y - b) < APART for a, b in taken):
+        right, taken = ax.bbox.x1 * scale, list[tuple[float, float, int]]()
+        ends = [
+            (line, ax.transData.transform((line.get_xdata()[-1], line.get_ydata()[-1])) * scale) for line in ax.lines
+        ]
+        for line, (x, low) in sorted(ends, key=lambda end: float(end[1][1])):
+            words = line.get_label().removeprefix("Pinocchio ").replace(", ", ",\n")
+            lines = words.count("\n") + 1
+            y = max(float(low), ax.bbox.y0 * scale + APART * lines / 2)
+            while any(abs(x - a) < REACH and abs(y - b) < APART * (lines + n) / 2 for a, b, n in taken):
                 y += 1.0
-            taken.append((x, y))
-            inside = x + 6.0 * len(line.get_label()) < right
+            taken.append((float(x), y, lines))
+            inside = x + LETTER * max(map(len, words.splitlines())) < right
             ax.annotate(
-                line.get_label(),
+                words,
                 (line.get_xdata()[-1], line.get_ydata()[-1]),
-                xytext=(6 if inside else -6, y - float(end[1])),
+                xytext=(6 if inside else -6, y - float(low)),
                 textcoords="offset points",
                 ha="left" if inside else "right",
                 va="center",
                 fontsize=8,
+                linespacing=1.0,
                 color=_dark(line.get_color()),
                 bbox={"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
             )

@@ -86,20 +86,31 @@ def goals_table(
     every = [cell for own in found.values() for cell in own.values()]
     if not every:
         return []
-    missed = [f"{work} at {c.target:.0e}" for work, own in found.items() for c in own.values() if not c.reached]
+    missed = [cell for cell in every if not cell.reached]
+    where = [said for work, own in found.items() if (said := _missed(work, list(own.values())))]
     said = (
         f"At least {goal.factor:g} times faster than {goal.says}: reached at {len(every) - len(missed)} of "
         f"{len(every)} accuracies that one gets to{' (planar works)' if goal.planar else ''}"
-        + (f"; missed on {', '.join(missed)}." if missed else ".")
+        + (f"; missed on {', '.join(where)}." if where else ".")
     )
     header = ["work", *(f"{target:.0e}" for target in goal.targets)]
-    lines = [[asked[work], *(_said(own.get(target)) for target in goal.targets)] for work, own in found.items()]
+    several = len({cell.program for cell in every}) > 1
+    lines = [[asked[work], *(_said(own.get(x), several) for x in goal.targets)] for work, own in found.items()]
     return [said, "", *table(header, lines)]
 
 
-def _said(cell: Cell | None) -> str:
+def _missed(work: str, own: Sequence[Cell]) -> str:
+    """Name a work and the accuracies at which a goal is missed; nothing where there is none."""
+    missed = [f"{cell.target:.0e}" for cell in own if not cell.reached]
+    if len(missed) == len(own) > 1:
+        return f"{work} at all {len(own)}"
+    return f"{work} at {', '.join(missed)}" if missed else ""
+
+
+def _said(cell: Cell | None, with_program: bool) -> str:
     if cell is None:
         return ""
+    whose = f", {cell.program}" if with_program else ""
     if cell.ratio is None:
-        return f"missed, nothing here; {cell.program}"
-    return f"{times(cell.ratio)}, {cell.program}" if cell.reached else f"{times(cell.ratio)}, missed, {cell.program}"
+        return f"missed, nothing here{whose}"
+    return f"{times(cell.ratio)}{'' if cell.reached else ', missed'}{whose}"
