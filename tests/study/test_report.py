@@ -101,15 +101,15 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
     assert row.energy_drift is not None
     assert row.energy_drift < 1e-6
     settings = {
-        "MuJoCo": "RK4, stiff, dt 0.001",
-        "Drake": "dt 0.0001",
-        "Exudyn": "GeneralizedAlpha, dt 0.001",
-        "Pinocchio constraintDynamics": "K_p 10, dt 0.0001",
+        "MuJoCo": "RK4, solref 2 dt, dt 0.0005",
+        "Drake": "dt 6.25e-05",
+        "Exudyn": "GeneralizedAlpha, spectral radius 0.9, dt 0.0005",
+        "Pinocchio constraintDynamics": "K_p 10, dt 6.25e-05",
         "SUNDIALS IDA": "rtol 1e-05",
     }
     for peer in (peer for peer in peers() if peer.name != LOOP):  # which has tests of its own
         assert peer.missing(SHORT) is None
-        assert settings[peer.name] in set(peer.settings(quick=False))
+        assert settings[peer.name] in set(peer.settings(SHORT, quick=False))
         theirs = judged("k", SHORT, peer.name, "s", peer.compute(SHORT, settings[peer.name], 60.0), exact)
         assert theirs.error_max is not None
         assert theirs.error_max < 1e-3
@@ -162,7 +162,7 @@ def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
 
 def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:
     mujoco = peers()[0]
-    refused = judged("k", SHORT, "MuJoCo", "s", mujoco.compute(SHORT, "RK4, stiff, dt 1e-06", 1e-3), exact)
+    refused = judged("k", SHORT, "MuJoCo", "s", mujoco.compute(SHORT, "RK4, solref 2 dt, dt 1e-06", 1e-3), exact)
     assert refused.status == "refused"
     assert "the budget is" in refused.reason
     assert refused.error_max is None
@@ -250,7 +250,7 @@ class Nobody:
     def missing(self, work: Work) -> str:
         return "not installed: pip install nobody"
 
-    def settings(self, quick: bool) -> list[str]:
+    def settings(self, work: Work, quick: bool) -> list[str]:
         return ["never"]
 
 
@@ -266,7 +266,7 @@ class Breaks:
     def version(self) -> str:
         return "0.1"
 
-    def settings(self, quick: bool) -> list[str]:
+    def settings(self, work: Work, quick: bool) -> list[str]:
         return ["always"]
 
     def check(self, work: Work) -> str:
@@ -283,7 +283,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody(), Breaks()])
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", (1e-3,))
+    monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", 1)
+    monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.SOFT_STEPS", 1)
     monkeypatch.setattr(left_out, "MODULES", {"json": ("import json", "an example"), "no_such": ("import no_such", "")})
     row_of_squares = replace(growth.FAMILIES[0], quick=growth.FAMILIES[0].cases[:3])
     monkeypatch.setattr(growth, "FAMILIES", (row_of_squares,))
@@ -293,9 +294,9 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     measured: list[str] = []
     found = make.report(tmp_path / "r", quick=True, progress=measured.append)
-    assert len(found.rows["short"]) == 4 * 2 + 4 + 1
+    assert len(found.rows["short"]) == 4 * 2 + 5 + 1
     grown = 3 * len(growth.backends())
-    assert len(measured) == 1 + 13 + grown + 3
+    assert len(measured) == 1 + 14 + grown + 3
     tables = ["report.csv", "growth.csv", "left_out.csv"]
     figures = [f"{name}.{kind}" for name in ("report", "growth", "short") for kind in ("png", "svg")]
     assert [path.name for path in found.files] == ["report.html", "report.md", *tables, *figures]

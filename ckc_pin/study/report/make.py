@@ -137,7 +137,7 @@ class _Measured:
         if peer.missing(self.work) is not None:
             return
         budget = (QUICK_BUDGET if quick else BUDGET).peer
-        for setting in peer.settings(quick):
+        for setting in peer.settings(self.work, quick):
             yield self._row(peer.name, peer.version(), setting, partial(peer.compute, self.work, setting, budget))
 
     def _row(self, program: str, version: str, setting: str, compute: Callable[[], Motion]) -> Row:

@@ -25,8 +25,8 @@ class Peer(Protocol):
         """Its version."""
         ...
 
-    def settings(self, quick: bool) -> Iterator[str]:
-        """Names of the settings it is tried with, from coarse to fine steps."""
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        """Names of the settings it is tried with on a work, from coarse to fine steps."""
         ...
 
     def check(self, work: Work) -> str:

@@ -14,14 +14,13 @@ from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
 __all__ = ["Drake"]
 
-STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)  # s
-QUICK_STEPS = (3e-3, 1e-3, 3e-4)
+COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 6  # s, and how many halves
 CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
 
 
@@ -52,9 +51,9 @@ class Drake:
     def version(self) -> str:
         return metadata.version("drake")
 
-    def settings(self, quick: bool) -> Iterator[str]:
-        for dt in QUICK_STEPS if quick else STEPS:
-            yield f"dt {dt:g}"
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        for dt in halved(work, COARSEST, QUICK_STEPS if quick else STEPS):
+            yield f"dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
         """Compare D' and the bias at the start."""

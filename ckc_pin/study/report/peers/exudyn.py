@@ -13,20 +13,22 @@ import pinocchio as pin
 from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
+from ckc_pin.study.report.peers.exudyn_plane import Plane, in_plane
+from ckc_pin.study.report.peers.exudyn_steps import Steps
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
 __all__ = ["Exudyn"]
 
-STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5)  # s
-QUICK_STEPS = (3e-3, 1e-3, 1e-4)
-SOLVERS = ("GeneralizedAlpha", "TrapezoidalIndex2")
+COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 7  # s, and how many halves
+# 1 damps nothing, 0.9 is the default and steadier
+SOLVERS = (("GeneralizedAlpha", 1.0), ("GeneralizedAlpha", 0.9), ("TrapezoidalIndex2", 1.0))
 CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
 
 
 class Exudyn:
-    """Index-2 formulations with the spectral radius that damps nothing."""
+    """Generalized alpha on index 3, and the trapezoidal rule on index 2; its explicit solvers take no loops."""
 
     name = "Exudyn"
     packaged = True
@@ -49,28 +51,32 @@ class Exudyn:
     def version(self) -> str:
         return metadata.version("exudyn")
 
-    def settings(self, quick: bool) -> Iterator[str]:
-        solvers, steps = (SOLVERS[:1], QUICK_STEPS) if quick else (SOLVERS, STEPS)
-        for solver, dt in product(solvers, steps):
-            yield f"{solver}, dt {dt:g}"
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        solvers, steps = (SOLVERS[1:], QUICK_STEPS) if quick else (SOLVERS, STEPS)
+        for (solver, radius), dt in product(solvers, halved(work, COARSEST, steps)):
+            yield f"{solver}, spectral radius {radius:g}, dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
         """Compare the energy at the start."""
-        system, tree = _System(work), work.mechanism.tree
+        flat, tree = in_plane(work), work.mechanism.tree
+        system: Plane | _System = Plane(work) if flat else _System(work)
         q_tree, v_tree = start_of(work)
         kinetic = pin.computeKineticEnergy(tree.model, tree.data, q_tree, v_tree)
-        return f"its kinetic energy at the start is off by {abs(system.kinetic_energy() - kinetic):.0e} J"
+        return (
+            f"{'planar' if flat else 'spatial'} bodies; their kinetic energy at the start is off by "
+            f"{abs(system.kinetic_energy() - kinetic):.0e} J"
+        )
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
-        solver, step_size = setting.split(", dt ")
-        dt = divided(work, float(step_size))
+        solver, radius, step_size = setting.split(", ")
+        dt, flat = divided(work, float(step_size.split()[-1])), in_plane(work)
         running: dict[str, Any] = {}
 
         def reset() -> None:
-            running["system"] = _System(work)
+            running["system"] = Plane(work) if flat else _System(work)
 
         def step(many: int) -> None:
-            running["system"].advance(solver, dt, many)
+            running["system"].advance(solver, float(radius.split()[-1]), dt, many)
 
         def state() -> tuple[Array, Array]:
             q_tree, v_tree = running["system"].state()
@@ -79,30 +85,27 @@ class Exudyn:
         return stepped(work, dt, reset, step, state, budget)
 
 
-class _System:
-    """A work's mechanism in Exudyn, at its start."""
+class _System(Steps):
+    """A work's mechanism in Exudyn, at its start, in space."""
 
     def __init__(self, work: Work) -> None:
-        import exudyn
+        super().__init__(work)
         from exudyn.utilities import RigidBodyInertia
 
-        self.mechanism, tree = work.mechanism, work.mechanism.tree
-        exudyn.config.printToConsole = False
+        tree = work.mechanism.tree
         inertia_of: Any = RigidBodyInertia
-        self._exudyn, self._t = exudyn, 0.0
-        self._container = exudyn.SystemContainer()
-        self._mbs: Any = self._container.AddSystem()
+        self._dt = 0.0
         q_tree, v_tree = start_of(work)
         self._q = tree.to_coordinates(q_tree)
         self._v = v_tree.copy()
         pin.forwardKinematics(tree.model, tree.data, q_tree, v_tree)
         self._placements = [pin.SE3(placement) for placement in tree.data.oMi]
-        self._bodies: list[Any] = [self._mbs.CreateGround()]
+        self._bodies: list[Any] = [self.mbs.CreateGround()]
         for k in range(1, tree.model.njoints):
             place, velocity, inertia = self._placements[k], tree.data.v[k], tree.model.inertias[k]
             body = inertia_of(inertia.mass, inertia.inertia, inertia.lever, inertiaTensorAtCOM=True)
             self._bodies.append(
-                self._mbs.CreateRigidBody(
+                self.mbs.CreateRigidBody(
                     inertia=body,
                     referencePosition=place.translation,
                     referenceRotationMatrix=place.rotation,
@@ -114,35 +117,20 @@ class _System:
         self._axes = [self._joint(k) for k in range(1, tree.model.njoints)]
         self._close()
         self._push()
-        self._mbs.Assemble()
-        self._settings: Any = exudyn.SimulationSettings()
-        self._settings.timeIntegration.generalizedAlpha.spectralRadius = 1.0
-        self._settings.timeIntegration.newton.relativeTolerance = 1e-10
-        self._settings.timeIntegration.newton.absoluteTolerance = 1e-10
-        self._settings.solution.file.write = False
-        self._settings.timeIntegration.verboseMode = 0
-        self._settings.timeIntegration.adaptiveStep = False  # else a step that fails is tried shorter without end
-        if self.mechanism.redundant:  # the sparse solver, faster on many bodies, does not take a singular Jacobian
-            self._settings.linearSolver.solverType = exudyn.LinearSolverType.EigenDense
-            self._settings.linearSolver.ignoreSingularJacobian = True
-        else:
-            self._settings.linearSolver.solverType = exudyn.LinearSolverType.EigenSparse
+        self.assemble()
 
-    def advance(self, solver: str, dt: float, many: int) -> None:
+    def advance(self, solver: str, radius: float, dt: float, many: int) -> None:
         """Take steps; the state is where they end."""
-        time = self._settings.timeIntegration
-        time.numberOfSteps, time.startTime, time.endTime = many, self._t, self._t + many * dt
-        kind = getattr(self._exudyn.DynamicSolverType, solver)
-        self._mbs.SolveDynamic(self._settings, solverType=kind, updateInitialValues=True, showHints=False)
-        self._dt, self._t = many * dt, self._t + many * dt
+        super().advance(solver, radius, dt, many)
+        self._dt = many * dt
 
     def state(self) -> tuple[Array, Array]:
         """Return q_tree and v_tree; angles, of which bodies know the rotation alone, are followed through turns."""
-        tree, kind = self.mechanism.tree, self._exudyn.OutputVariableType
-        if self._t == 0.0:
+        tree, kind = self.mechanism.tree, self.exudyn.OutputVariableType
+        if self.t == 0.0:
             return self._q.copy(), self._v.copy()
         values: list[list[Any]] = [
-            [None, *(np.array(self._mbs.GetObjectOutputBody(body, x, [0, 0, 0])) for body in self._bodies[1:])]
+            [None, *(np.array(self.mbs.GetObjectOutputBody(body, x, [0, 0, 0])) for body in self._bodies[1:])]
             for x in (kind.RotationMatrix, kind.Position, kind.Velocity, kind.AngularVelocity)
         ]
         rotations, positions, velocities, spins = values
@@ -169,21 +157,21 @@ class _System:
 
     def kinetic_energy(self) -> float:
         """Return the sum over the bodies."""
-        kind = self._exudyn.OutputVariableType.KineticEnergy
-        return float(sum(self._mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
+        kind = self.exudyn.OutputVariableType.KineticEnergy
+        return float(sum(self.mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
 
     def _joint(self, k: int) -> tuple[Array, bool]:
         """Add a joint; return its axis in the body, and whether it turns."""
         model = self.mechanism.tree.model
         axis, turns = self.mechanism.tree.axis(k)
-        create = self._mbs.CreateRevoluteJoint if turns else self._mbs.CreatePrismaticJoint
+        create = self.mbs.CreateRevoluteJoint if turns else self.mbs.CreatePrismaticJoint
         place = self._placements[k]
         bodies = [self._bodies[int(model.parents[k])], self._bodies[k]]
         create(itemNumbers=bodies, position=place.translation, axis=place.rotation @ axis, show=False)
         return axis, turns
 
     def _close(self) -> None:
-        mechanism, mbs = self.mechanism, self._mbs
+        mechanism, mbs = self.mechanism, self.mbs
         for loop in mechanism.spec.loop:
             a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
             bodies = [self._bodies[a.joint], self._bodies[b.joint]]
@@ -206,7 +194,7 @@ class _System:
 
     def _push(self) -> None:
         """Add springs between frames, and constant forces on hinges."""
-        mechanism, mbs = self.mechanism, self._mbs
+        mechanism, mbs = self.mechanism, self.mbs
         for spring in mechanism.spec.spring:
             if spring.frame_a is None or spring.frame_b is None:
                 continue

@@ -28,7 +28,7 @@ class Ida:
     def version(self) -> str:
         return f"scikit-sundae {metadata.version('scikit-sundae')}"
 
-    def settings(self, quick: bool) -> Iterator[str]:
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
         for rtol in ours.QUICK_TOLERANCES if quick else ours.TOLERANCES:
             yield f"rtol {rtol:.0e}"
 

@@ -12,14 +12,13 @@ import pinocchio as pin
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, start_of, stepped
+from ckc_pin.study.report.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import Work
 
 __all__ = ["Pinocchio", "closed", "not_closed"]
 
-STEPS = (5e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # s
-QUICK_STEPS = (5e-3, 1e-3, 1e-4)
+COARSEST, STEPS, QUICK_STEPS = 5e-3, 10, 6  # s, and how many halves
 GAINS = (10.0, 100.0)  # K_p of the examples, 1/s^2, and a stiffer one; K_d = 2 sqrt(K_p)
 CLOSED_BY = {
     "point": pin.ContactType.CONTACT_3D,
@@ -45,9 +44,9 @@ class Pinocchio:
     def version(self) -> str:
         return str(pin.__version__)
 
-    def settings(self, quick: bool) -> Iterator[str]:
-        for gain, dt in product(GAINS, QUICK_STEPS if quick else STEPS):
-            yield f"K_p {gain:g}, dt {dt:g}"
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        for gain, dt in product(GAINS, halved(work, COARSEST, QUICK_STEPS if quick else STEPS)):
+            yield f"K_p {gain:g}, dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
         return "the tree is the same model"

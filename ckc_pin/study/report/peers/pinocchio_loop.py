@@ -47,7 +47,7 @@ class PinocchioLoop:
     def version(self) -> str:
         return version()
 
-    def settings(self, quick: bool) -> Iterator[str]:
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
         gains, proximal = (QUICK_GAINS, QUICK_PROXIMAL) if quick else (GAINS, PROXIMAL)
         for gain, (mu, iterations), tolerance in product(gains, proximal, QUICK_TOLERANCES if quick else TOLERANCES):
             yield f"K_p {gain:g}, mu {mu:g}, iterations {iterations}, tolerance {tolerance:g}"

@@ -12,7 +12,7 @@ from ckc_pin.simulation.initial import find_start
 from ckc_pin.study.report.row import Motion
 from ckc_pin.study.report.work import INSTANTS, Work
 
-__all__ = ["CONTROLLED", "divided", "start_of", "stepped"]
+__all__ = ["CONTROLLED", "divided", "halved", "start_of", "stepped"]
 
 TRIAL = 50  # steps, to foresee how long all take
 REPEATS = 3
@@ -31,6 +31,12 @@ def start_of(work: Work) -> State:
     """Return Pinocchio's q_tree and the v_tree that a work starts with."""
     start = find_start(work.mechanism, work.load())
     return start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+
+
+def halved(work: Work, coarsest: float, many: int) -> list[float]:
+    """Return steps that halve from the coarsest on, shorter by as much as a motion is shorter than two seconds."""
+    first = coarsest * min(1.0, work.t_end / 2)
+    return [first / 2**k for k in range(many)]
 
 
 def divided(work: Work, dt: float) -> float:
