@@ -9,14 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.study.report import growth, left_out
+from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.study.report import growth, left_out, make
 from ckc_pin.study.report.growth_said import growth_said
 from ckc_pin.study.report.left_out import LeftOut, module_costs, modules_of, terms_of
 from ckc_pin.study.report.left_out_said import left_out_said
 from ckc_pin.study.report.pace import motion, seconds
+from ckc_pin.study.report.table import Table
 
 # --- what a scene leaves out ------------------------------------------------------------------------------------------
 
@@ -81,14 +84,28 @@ def test_the_section_says_what_was_measured() -> None:
         *(LeftOut(key=name, scene="a/b", what=name, used=name == "scipy.integrate") for name in left_out.MODULES),
         LeftOut(key="1", scene="a/b", what="C'", used=False, seconds=1e-6, bytes=2048, rhs_s=1e-4),
         LeftOut(key="2", scene="a/b", what="σ", used=True, rhs_s=1e-4),
+        LeftOut(key="3", scene="c/d", what=left_out.MISSING, reason="no such *robot*"),
     ]
     text = "\n".join(left_out_said(rows))
     count = len(left_out.MODULES) - 1
     assert "None of the 1 scenes loads meshcat" in text
     assert f"to import them would take {0.5 * count:.2g} s and {count} MB in each process." in text
+    assert "- c/d: no such \\*robot\\*" in text
     assert "C' by 1 of 1 (+1 %)" in text
     assert "| a/b | 100 | +1.0 µs, 1 % |  |  |  |  | used |  | 2 |" in text
     assert "| scipy.integrate | the solvers; `ckc_pin.terms` needs none | 500 | 1.0 | all |" in text
+
+
+def test_a_scene_whose_robot_is_not_installed_is_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(scene: Scene) -> Mechanism:
+        raise InputError("no package")
+
+    monkeypatch.setattr(make, "scene_mechanism", none)
+    monkeypatch.setattr(left_out, "MODULES", {})
+    monkeypatch.setattr(left_out, "every_scene", lambda: ["talos/squat"])
+    (row,) = make._left_out(tmp_path, [], False, lambda said: None)
+    assert (row.scene, row.what, row.reason) == ("talos/squat", left_out.MISSING, "no package")
+    assert list(Table(tmp_path / "left_out.csv", LeftOut).rows.values()) == [row]
 
 
 # --- how cost grows -----------------------------------------------------------------------------------------------

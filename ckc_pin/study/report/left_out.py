@@ -26,8 +26,9 @@ from ckc_pin.simulation.scene import catalogue, load_scene
 from ckc_pin.study.report.pace import ROUNDS, motion, seconds
 from ckc_pin.study.report.table import Keyed
 
-__all__ = ["MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
+__all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 
+MISSING = "the scene itself"  # in the place of a module or term, where it cannot be loaded
 BRIEF = 0.02  # s of a scene's motion: enough to load what its run loads
 START = "five_bar/swing"  # the run after which a module is switched on
 REPEATS = 3  # fresh interpreters a module

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ckc_pin.study.markdown import table
-from ckc_pin.study.report.left_out import MODULES, TERMS, LeftOut
+from ckc_pin.study.markdown import escaped, table
+from ckc_pin.study.report.left_out import MISSING, MODULES, TERMS, LeftOut
 from ckc_pin.study.report.sentences import times
 
 __all__ = ["left_out_said"]
@@ -16,7 +16,8 @@ MEGA = 2**20
 def left_out_said(rows: Sequence[LeftOut]) -> list[str]:
     """Return a section of the page."""
     lines = ["## What a scene leaves out", "", _modules_sentence(rows), _terms_sentence(rows), ""]
-    return [*lines, *_modules(rows), "", _NOTE, "", *_terms(rows), ""]
+    missing = [f"- {row.scene}: {escaped(row.reason)}" for row in rows if row.what == MISSING]
+    return [*lines, *_modules(rows), "", _NOTE, "", *_terms(rows), "", *missing, ""]
 
 
 _NOTE = (
@@ -31,9 +32,8 @@ def _modules_sentence(rows: Sequence[LeftOut]) -> str:
     never = [name for name, own in runs.items() if own and not any(row.used for row in own)]
     costs = [row for row in rows if not row.scene and row.what in never and row.seconds is not None]
     spent, memory = sum(row.seconds or 0.0 for row in costs), sum(row.bytes or 0 for row in costs)
-    scenes = len({row.scene for row in rows if row.scene})
     return (
-        f"None of the {scenes} scenes loads {', '.join(never) or 'nothing'}: to import them would take "
+        f"None of the {_scenes(rows)} scenes loads {', '.join(never) or 'nothing'}: to import them would take "
         f"{times(spent)} s and {memory / MEGA:.0f} MB in each process."
     )
 
@@ -65,7 +65,7 @@ def _modules(rows: Sequence[LeftOut]) -> list[str]:
 
 
 def _scenes(rows: Sequence[LeftOut]) -> int:
-    return len({row.scene for row in rows if row.scene})
+    return len({row.scene for row in rows if row.scene and row.what in MODULES})
 
 
 def _terms(rows: Sequence[LeftOut]) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import CkcError, InputError
 from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import load_scene
 from ckc_pin.study.report import growth, left_out, ours
@@ -190,8 +190,13 @@ def _left_out(out: Path, works: list[Work], quick: bool, progress: Progress) -> 
     costs = digest("module costs", repeats)
     measured(left_out.MODULES, costs, "modules", partial(left_out.module_costs, repeats=repeats))
     for name in scenes:
-        scene = load_scene(name)
-        content = [scene.plain(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
+        try:
+            scene = load_scene(name)
+            content = [scene.plain(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
+        except CkcError as error:  # robots that are not installed
+            found.append(LeftOut(key=digest("scene", name), scene=name, what=left_out.MISSING, reason=str(error)))
+            table.add(found[-1])
+            continue
         measured(left_out.MODULES, digest("modules", *content), name, partial(left_out.modules_of, name))
         measured(left_out.TERMS, digest("terms", *content), name, partial(left_out.terms_of, name))
     table.write([row.key for row in found])
