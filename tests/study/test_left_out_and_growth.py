@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.library import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
@@ -54,6 +54,13 @@ def test_a_term_left_out_costs_time_and_memory() -> None:
     n = load("andrews").n
     assert by_name["C"].bytes >= by_name["C'"].bytes >= 8 * n * n  # type: ignore[operator]
     assert len({row.key for row in rows}) == len(rows) == len(left_out.TERMS)
+
+
+def test_a_scene_that_cannot_start_says_why() -> None:
+    rows = list(terms_of("five_bar/swing", "k", {"initial.q.theta_1": 3.0, "initial.q.theta_3": 0.1}))
+    assert [row.what for row in rows] == list(left_out.TERMS)
+    assert all("out of reach" in row.reason and row.seconds is None for row in rows)
+    assert "out of reach" in "\n".join(left_out_said(rows))
 
 
 def test_modules_are_seen_in_a_fresh_interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,11 +173,25 @@ def test_a_right_hand_side_is_timed_where_it_is_called() -> None:
             return np.ones(1)
 
     states = motion(Slow(), 2.0, states=5)
-    assert [t for t, _ in states] == pytest.approx([0.0, 1e-3, 2e-3, 3e-3, 4e-3])
-    assert [float(y[0]) for _, y in states] == pytest.approx([0.0, 1e-3, 2e-3, 3e-3, 4e-3])
+    assert [t for t, _ in states] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
+    assert [float(y[0]) for _, y in states] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
     calls.clear()
     assert seconds(Slow(), states) > 0
     assert set(calls) == {t for t, _ in states}
+
+
+def test_states_are_nearer_each_other_where_steps_overshoot() -> None:
+    class Stiff:
+        def start(self) -> np.ndarray:
+            return np.ones(1)
+
+        def rhs(self, t: float, y: np.ndarray) -> np.ndarray:
+            if abs(y[0]) > 10:
+                raise NumericalError("out of reach")
+            return -1e5 * y
+
+    states = motion(Stiff(), 2.0, states=4)
+    assert [t for t, _ in states] == pytest.approx([0.0, 1e-5, 2e-5, 3e-5])
 
 
 def test_exponents_are_in_the_sentences() -> None:

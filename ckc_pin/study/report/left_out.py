@@ -170,9 +170,13 @@ def _interpreter(code: str, *words: str) -> str:
 def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
     """Measure what each term would cost beside a scene's right-hand side, in Python, at states of its motion."""
     loaded = load_scene(scene, {**(changes or {}), "solver.backend": "python"})
-    system = prepare(loaded).system
-    states = motion(system, loaded.spec.t_end)
-    rhs_s, evaluated = seconds(system, states), _evaluated(system, states)
+    try:
+        system = prepare(loaded).system
+        states = motion(system, loaded.spec.t_end)
+        rhs_s, evaluated = seconds(system, states), _evaluated(system, states)
+    except CkcError as error:
+        yield from (LeftOut(key=f"{key}.{what}", scene=scene, what=what, reason=str(error)) for what in TERMS)
+        return
     for what, (name, probe) in TERMS.items():
         own = {"key": f"{key}.{what}", "scene": scene, "what": what, "used": name in evaluated, "rhs_s": rhs_s}
         if name in evaluated:

@@ -36,7 +36,7 @@ class Budget:
     peer: float
 
 
-BUDGET, QUICK_BUDGET = Budget(native=3.0, python=2.0, peer=5.0), Budget(native=2.0, python=1.0, peer=2.0)
+BUDGET, QUICK_BUDGET = Budget(native=2.5, python=1.5, peer=4.0), Budget(native=2.0, python=1.0, peer=2.0)
 
 Progress = Callable[[str], None]  # what is being measured
 

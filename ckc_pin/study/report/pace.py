@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["motion", "seconds"]
 
 STATES = 20
-SLOWEST = 1e-3  # s between states: what an integrator's stages are apart, so that sigma has something to correct
+SPACING = (1e-4, 1e-5)  # s between states, the shorter one where stiff controllers overshoot with the longer
 ROUNDS, MOST_ROUNDS = 3, 60
 LONG = 0.3  # s: that many rounds, of native ones
 
 
 def motion(system: Any, t_end: float, states: int = STATES) -> list[tuple[float, Array]]:
-    """Return the first states of a system's motion by the midpoint rule, as an integrator meets them."""
-    y, h = system.start(), min(SLOWEST, t_end / 2000)
+    """Return the first states of a system's motion by the midpoint rule, so that sigma has something to correct.
+
+    Raises
+    ------
+    NumericalError
+        There are none, however short the steps.
+    """
+    *longer, shortest = (min(h, t_end / 2000) for h in SPACING)
+    for h in longer:
+        with suppress(NumericalError):
+            return _midpoint(system, h, states)
+    return _midpoint(system, shortest, states)
+
+
+def _midpoint(system: Any, h: float, states: int) -> list[tuple[float, Array]]:
+    y = system.start()
     found = []
     for k in range(states):
         found.append((k * h, y))
