@@ -145,6 +145,15 @@ def test_a_row_tells_its_setting() -> None:
         assert ours.of_row(row(setting=setting.name)) == setting
 
 
+def test_a_reason_is_no_list_of_coordinates() -> None:
+    """The reduced model of squares in a row stops where they lie flat, and says near which coordinates."""
+    flat = replace(EVERY["n_four_bar_4"], t_end=2.0)
+    stopped = ours.compute(flat, ours.Setting("reduced", "DOP853", True, 1e-6).changes, 60.0)
+    assert stopped.status == "stopped"
+    assert re.match(r"stopped at t = 0\.\d+ s: J loses rank at t = 0\.7179\d+ s", stopped.reason)
+    assert "theta" not in stopped.reason
+
+
 def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

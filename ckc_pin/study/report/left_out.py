@@ -23,7 +23,7 @@ from ckc_pin.mechanism.lazy import Tally
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import catalogue, load_scene
-from ckc_pin.study.report.pace import ROUNDS, motion, seconds
+from ckc_pin.study.report.pace import motion, seconds
 from ckc_pin.study.report.table import Keyed
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
@@ -32,6 +32,7 @@ MISSING = "the scene itself"  # in the place of a module or term, where it canno
 BRIEF = 0.02  # s of a scene's motion: enough to load what its run loads
 START = "five_bar/swing"  # the run after which a module is switched on
 REPEATS = 3  # fresh interpreters a module
+ROUNDS = 8  # over the states, of a term
 
 # Module, what its import statement is, what it is for.
 MODULES: dict[str, tuple[str, str]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -27,8 +28,8 @@ TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 FEW = (1e-3, 1e-6, 1e-9, 1e-12)
 QUICK_FEW = (1e-3, 1e-7, 1e-11)
-# Few tolerances where SciPy's loop makes the steps, and in Python, whose steps are the native core's, but later.
-METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "BDF": TOLERANCES, "RK45": FEW, "Radau": FEW, "LSODA": FEW}
+# Few tolerances of what is not the fastest here, and in Python, whose steps are the native core's, but later.
+METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, **dict.fromkeys(("RK45", "Radau", "BDF", "LSODA"), FEW)}
 QUICK_METHODS = {"auto": QUICK_TOLERANCES}
 IN_PYTHON = dict.fromkeys(("auto", "DOP853", "Radau", "BDF"), FEW)
 QUICK_IN_PYTHON = {"auto": QUICK_FEW}
@@ -115,5 +116,6 @@ def compute(work: Work, changes: dict[str, Any], budget: float) -> Motion:
             break
     stats = run.stats
     method = f" ({stats['method']})" if changes["solver.method"] == "auto" else ""
-    reason = f"{run.message}{method}" if run.status != "done" else str(stats["method"])
+    without_place = re.sub(r" near [^:]*:", ":", run.message)  # a line of 81 coordinates
+    reason = f"{without_place}{method}" if run.status != "done" else str(stats["method"])
     return Motion(run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["steps"], stats["rhs"])

@@ -17,7 +17,7 @@ __all__ = ["motion", "seconds"]
 STATES = 20
 SPACING = (1e-4, 1e-5)  # s between states, the shorter one where stiff controllers overshoot with the longer
 ROUNDS, MOST_ROUNDS = 3, 60
-LONG = 0.3  # s: that many rounds, of native ones
+LONG = 0.3  # s, of all rounds, unless that is fewer than the least number of them
 
 
 def motion(system: Any, t_end: float, states: int = STATES) -> list[tuple[float, Array]]:
@@ -54,9 +54,14 @@ def seconds(system: Any, states: list[tuple[float, Array]]) -> float:
         if getattr(system, "crosses", False):
             table = np.array([[t, *y] for t, y in states])
             once = float(system.native.seconds(table, 1)[0])
-            rounds = int(np.clip(LONG / (once * len(states)), ROUNDS, MOST_ROUNDS))
-            return float(system.native.seconds(table, rounds)[0])
-        return min(_round(system, states) for _ in range(ROUNDS)) / len(states)
+            return float(system.native.seconds(table, _rounds(once * len(states)))[0])
+        first = _round(system, states)
+        return min(_round(system, states) for _ in range(_rounds(first))) / len(states)
+
+
+def _rounds(seconds: float) -> int:
+    """How many rounds to make when one takes so long."""
+    return int(np.clip(LONG / seconds, ROUNDS, MOST_ROUNDS))
 
 
 def _round(system: Any, states: list[tuple[float, Array]]) -> float:
