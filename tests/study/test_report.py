@@ -102,7 +102,7 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
     assert row.energy_drift < 1e-6
     settings = {
         "MuJoCo": "RK4, solref 2 dt, dt 0.0005",
-        "Drake": "dt 6.25e-05",
+        "Drake": "SAP, dt 6.25e-05",
         "Exudyn": "GeneralizedAlpha, spectral radius 0.9, dt 0.0005",
         "Pinocchio constraintDynamics": "K_p 10, dt 6.25e-05",
         "SUNDIALS IDA": "rtol 1e-05",

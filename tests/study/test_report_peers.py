@@ -1,4 +1,4 @@
-"""Other programs on motions that need what the five-bar does not: slides, many turns, springs, constant forces."""
+"""Other programs on motions that need more than the five-bar's swing: slides, many turns, springs, forces, bushings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from ckc_pin.study.report.work import WORKS, Work
 
 EVERY = {work.key: work for work in WORKS}
 EXUDYN = next(peer for peer in peers() if peer.name == "Exudyn")
+DRAKE = next(peer for peer in peers() if peer.name == "Drake")
 MUJOCO = next(peer for peer in peers() if peer.name == "MuJoCo")
+SWING = Work("swing", "five-bar, free swing, 0.3 s", "five_bar/swing", 0.3)
 TURNS = Work("turns", "slider-crank, 1 s, some three turns", "slider_crank", 1.0)
 SPRING = Work("spring", "Andrews' squeezer, 2 ms", "andrews", 0.002)
 
@@ -23,6 +25,8 @@ SPRING = Work("spring", "Andrews' squeezer, 2 ms", "andrews", 0.002)
         (EXUDYN, TURNS, "GeneralizedAlpha, spectral radius 0.9, dt 0.0003", 1e-2),
         (EXUDYN, TURNS, "TrapezoidalIndex2, spectral radius 1, dt 0.0003", 1e-2),
         (EXUDYN, SPRING, "GeneralizedAlpha, spectral radius 0.9, dt 1e-05", 1e-4),
+        (DRAKE, SWING, "RungeKutta3, bushings of 1e+06 N/m, accuracy 0.001", 1e-3),
+        (DRAKE, SPRING, "RungeKutta3, bushings of 1e+08 N/m, accuracy 0.001", 2e-3),
         (MUJOCO, TURNS, "RK4, solref 2 dt, dt 0.0003", 1e-3),
         (MUJOCO, SPRING, "RK4, solref 4 dt, dt 1e-05", 1e-3),
     ],

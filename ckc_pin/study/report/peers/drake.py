@@ -1,9 +1,11 @@
-"""Drake: a discrete plant with its own loop constraints, which it has in discrete time only."""
+"""Drake: a discrete plant with its own loop constraints; in continuous time, where it has none, with bushings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import metadata
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,10 @@ __all__ = ["Drake"]
 
 COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 6  # s, and how many halves
 CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
+POINTS = {"point", "point_2d"}  # what a bushing without torques closes
+STIFFNESSES, QUICK_STIFFNESSES = (3e4, 1e5, 3e5, 1e6, 1e7, 1e8), (1e5, 1e6)  # of bushings, N/m
+DAMPING = 1e-4  # s, by which the stiffness becomes the bushing's damping
+ACCURACIES, QUICK_ACCURACIES = (1e-2, 1e-3), (1e-2,)
 
 
 class Drake:
@@ -53,7 +59,11 @@ class Drake:
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
         for dt in halved(work, COARSEST, QUICK_STEPS if quick else STEPS):
-            yield f"dt {dt:.3g}"
+            yield f"SAP, dt {dt:.3g}"
+        if {loop.type for loop in work.mechanism.spec.loop} <= POINTS and not work.mechanism.spec.coupling:
+            stiffnesses, accuracies = (QUICK_STIFFNESSES, QUICK_ACCURACIES) if quick else (STIFFNESSES, ACCURACIES)
+            for stiffness, accuracy in product(stiffnesses, accuracies):
+                yield f"RungeKutta3, bushings of {stiffness:g} N/m, accuracy {accuracy:g}"
 
     def check(self, work: Work) -> str:
         """Compare D' and the bias at the start."""
@@ -73,10 +83,13 @@ class Drake:
         return f"D' agrees to {mass:.0e}, the bias to {off / max(float(np.abs(bias).max()), 1e-12):.0e}"
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
-        from pydrake.systems.analysis import Simulator
+        from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-        dt = float(setting.removeprefix("dt "))
-        plant = _Plant(work.mechanism, divided(work, dt))
+        solver, *said = setting.split(", ")
+        numbers = [float(number) for part in said for number in part.split() if number[0].isdigit()]
+        discrete = solver == "SAP"
+        dt = numbers[0] if discrete else work.t_end  # what takes steps of its own goes from instant to instant
+        plant = _Plant(work.mechanism, divided(work, dt)) if discrete else _Plant(work.mechanism, 0.0, numbers[0])
         q_tree, v_tree = start_of(work)
         running: dict[str, Any] = {}
 
@@ -85,33 +98,44 @@ class Drake:
             plant.plant.get_applied_generalized_force_input_port().FixValue(context, plant.constant)
             plant.put(context, q_tree, v_tree)
             running["simulator"], running["t"] = Simulator(plant.plant, context), 0.0
+            if not discrete:
+                integrator: Any = ResetIntegratorFromFlags(running["simulator"], "runge_kutta3", divided(work, dt))
+                integrator.set_target_accuracy(numbers[1])
             running["simulator"].Initialize()
 
         def step(many: int) -> None:
-            running["t"] += many * plant.dt
+            running["t"] += many * divided(work, dt)
             running["simulator"].AdvanceTo(running["t"])
 
         def state() -> tuple[Array, Array]:
             return plant.state(running["simulator"].get_context())
 
-        return stepped(work, dt, reset, step, state, budget)
+        motion = stepped(work, dt, reset, step, state, budget)
+        if discrete or motion.status != "done":
+            return motion
+        return replace(motion, steps=running["simulator"].get_integrator().get_num_steps_taken())
 
 
 class _Plant:
-    """A mechanism as Drake's plant."""
+    """A mechanism as Drake's plant: discrete with step dt, or continuous with bushings of a stiffness, N/m."""
 
-    def __init__(self, mechanism: Mechanism, dt: float) -> None:
+    def __init__(self, mechanism: Mechanism, dt: float, bushing: float = 0.0) -> None:
         from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 
-        self.mechanism, self.dt = mechanism, dt
+        self.mechanism = mechanism
         self.plant: Any = MultibodyPlant(dt)
-        self.plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)  # which has constraints
+        if dt > 0:
+            self.plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)  # which has constraints
+            self.plant.SetUseSampledOutputPorts(False)  # a third of the time
         self.plant.mutable_gravity_field().set_gravity_vector(mechanism.tree.model.gravity.linear)
         self._bodies: list[Any] = [self.plant.world_body()]
         self._joints: list[Any] = []
         for k in range(1, mechanism.tree.model.njoints):
             self._add(k)
-        self._close()
+        if bushing:
+            self._hold(bushing)
+        else:
+            self._close()
         self._spring()
         self.plant.Finalize()
         self.at = [int(joint.velocity_start()) for joint in self._joints]
@@ -176,6 +200,24 @@ class _Plant:
                 if other is None:
                     raise InputError("a coupling with ratio 0 has no counterpart in it")
                 plant.AddCouplerConstraint(self._joints[k], self._joints[other], -row[other], offset)
+
+    def _hold(self, stiffness: float) -> None:
+        """Close loops, all of them points, by bushings."""
+        from pydrake.multibody.tree import FixedOffsetFrame, LinearBushingRollPitchYaw
+
+        every, none = np.ones(3), np.zeros(3)
+        for loop in self.mechanism.spec.loop:
+            a, b = (self.mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
+            b = in_one_plane(self.mechanism, loop, a, b) if loop.type == "point_2d" else b
+            ends = [
+                self.plant.AddFrame(
+                    FixedOffsetFrame(f"{loop.name} {side}", self._bodies[frame.joint].body_frame(), _placed(frame))
+                )
+                for side, frame in (("a", a), ("b", b))
+            ]
+            bushing: Callable[..., Any] = LinearBushingRollPitchYaw
+            damping = DAMPING * stiffness
+            self.plant.AddForceElement(bushing(*ends, none, none, stiffness * every, damping * every))
 
     def _spring(self) -> None:
         """Add springs between frames; those on joints have an element for hinges only."""
