@@ -7,6 +7,7 @@ where its last plain step ended, and the next step is Python's.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -126,8 +127,11 @@ def runs(stepper: Stepper) -> bool:
 
 def _coefficients(stepper: Stepper) -> dict[str, Any]:
     """SciPy's own, so that both backends take the same steps."""
-    if stepper.method == "BDF":
-        return {"newton_tol": float(stepper.solver.newton_tol)}
+    return {"newton_tol": float(stepper.solver.newton_tol)} if stepper.method == "BDF" else _dop853()
+
+
+@cache
+def _dop853() -> dict[str, Any]:
     from scipy.integrate import DOP853
 
     names = ("A", "A_EXTRA", "D", "B", "C", "C_EXTRA", "E3", "E5")

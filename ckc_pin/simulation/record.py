@@ -9,7 +9,7 @@ import numpy as np
 from ckc_pin.control.actuation import Effort
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems import System
+from ckc_pin.simulation.systems import Native, System
 
 __all__ = ["Recorder", "Watch"]
 
@@ -49,8 +49,18 @@ class Recorder:
         """Record the state at an instant; instants not after the last one are passed over."""
         if self.rows["t"] and t <= self.rows["t"][-1]:
             return
+        row = self._native_row(t, y)
+        if row is not None:
+            self.extend(row[None, :])
+            return
         with np.errstate(all="ignore"):
             self._add(t, y)
+
+    def _native_row(self, t: float, y: Array) -> Array | None:
+        system = self.system
+        if isinstance(system, Native) and (self.lyapunov is None or system.controls):
+            return system.row(t, y)
+        return None
 
     def _add(self, t: float, y: Array) -> None:
         system = self.system

@@ -6,6 +6,7 @@
 #include "dae.hpp"
 #include "level_set.hpp"
 #include "printed_spf.hpp"
+#include "record.hpp"
 
 namespace ckc {
 
@@ -77,6 +78,14 @@ void spline(System& system, Matrix Lambda, Matrix K_D, Vector breaks, std::vecto
   system.drive.tracking = {Lambda, K_D, {{}, {}, {}, {}, breaks, coefficients}};
 }
 
+// What a run keeps of an instant, as `Record` has it; none where the state has no terms.
+nb::object row(System& system, double t, Given y) {
+  require(y, system.size, "y");
+  Record record(system.core);
+  Vector found(record.width);
+  return record.row(system, t, y, found) ? nb::cast(found) : nb::none();
+}
+
 // Seconds of a right-hand side, the least of several rounds over states of a motion, a row of (t, y) each; of
 // Pinocchio's own calls for its terms: J with its rate, D', C'v + h', and J for each of Newton's corrections; and how
 // many of those there were.
@@ -123,6 +132,7 @@ nb::tuple seconds(System& system, Table states, int rounds) {
 void bind_systems(nb::module_& m) {
   nb::class_<System>(m, "System")
       .def("rhs", &rhs, "t"_a, "y"_a)
+      .def("row", &row, "t"_a, "y"_a)
       .def("seconds", &seconds, "states"_a, "rounds"_a)
       .def("counts", [](System& system) {  // since the last time: Newton corrections, factorizations
              const Counts counts = system.counts;
