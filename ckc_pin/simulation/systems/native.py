@@ -83,12 +83,13 @@ class Native:
         counts.newton += newton
         counts.factorizations += factorizations
 
-    def row(self, t: float, y: Array) -> Array | None:
+    def row(self, t: float, y: Array, counts: Counts) -> Array | None:
         """What a run keeps of an instant, as the native step loop records it; None where Python has to tell."""
         if not self.crosses:
             return None
         self.refresh()
         found: Array | None = self.native.row(t, y)
+        self.book(counts)
         return found
 
     def evaluate(self, t: float, y: Array, counts: Counts) -> Array | None:
