@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -17,7 +18,7 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Leap", "leap"]
 
-Rate = Callable[[float, Array], Array]
+Rates = Callable[[Array, Array], Array]
 
 RUN_UP = 0.4  # of the leap: what is integrated first, to extrapolate the rest from
 STAGES = (10, 14)  # of the run-up and a first leap, and of the leap itself; even: none in the middle
@@ -46,7 +47,7 @@ class Leap:
     def __call__(self, t: float) -> Array:
         """Return y at t."""
         x = (2 * t - self.t_old - self.t) / (self.t - self.t_old)
-        return np.asarray(legendre.legval(x, self._series))
+        return _polynomials(x, len(self._series)) @ self._series
 
     @property
     def good(self) -> bool:
@@ -59,59 +60,84 @@ class Leap:
         return float(0.9 * (ACCURATE / max(self.error, 1e-300)) ** (1 / ORDER))
 
 
-def leap(rate: Rate, t: float, y: Array, span: float) -> Leap:
+def leap(rates: Rates, t: float, y: Array, span: float) -> Leap:
     """Step from (t, y) over a span with a position at its middle where J loses rank.
 
     Parameters
     ----------
-    rate : callable
-        y' at (t, y), y being put on the closure first; NaN where it does not exist.
+    rates : callable
+        y' at instants and rows of states, which are put on the closure first; NaN where it does not exist.
     t : float
     y : array
     span : float
     """
     few, many = STAGES
-    start = _series(np.array([rate(t, y)]), y, RUN_UP * span)
-    run_up = _collocated(rate, t, y, RUN_UP * span, few, _rates_of(start, RUN_UP * span, few, 1.0))
-    first = _collocated(rate, t, y, span, few, _rates_of(run_up, RUN_UP * span, few, 1 / RUN_UP))
-    last = _collocated(rate, t, y, span, many, _rates_of(first, span, many, 1.0))
+    start = _series(rates(np.array([t]), y[None]), y, RUN_UP * span)
+    run_up = _collocated(rates, t, y, RUN_UP * span, _rates_of(start, RUN_UP * span, few, 1.0))
+    first = _collocated(rates, t, y, span, _rates_of(run_up, RUN_UP * span, few, 1 / RUN_UP))
+    last = _collocated(rates, t, y, span, _rates_of(first, span, many, 1.0))
     gap = np.abs(legendre.legval(PLACES, last) - legendre.legval(PLACES, first)).max()
     error = float(gap / max(1.0, np.abs(y).max()))
     return Leap(t, t + span, error if np.isfinite(error) else np.inf, last)
 
 
-def _collocated(rate: Rate, t: float, y: Array, span: float, stages: int, rates: Array) -> Array:
+def _collocated(rates: Rates, t: float, y: Array, span: float, guess: Array) -> Array:
     """Solve the stages by fixed-point iteration, which the smoothness of the motion makes a contraction.
+
+    Parameters
+    ----------
+    guess : (stages, len(y)) array
+        Of y' at the stages.
 
     Returns
     -------
     (stages + 1, len(y)) array
         Legendre series of y over the step; NaN where a stage does not exist.
     """
-    nodes, _ = legendre.leggauss(stages)
-    before = np.inf
+    stages, before = len(guess), np.inf
+    nodes = _nodes(stages)
+    times, to_places = t + span * (1 + nodes) / 2, legendre.legvander(nodes, stages)
     for _ in range(SWEEPS):
-        places = legendre.legval(nodes, _series(rates, y, span)).T
-        new = np.array([rate(t + span * (1 + x) / 2, place) for x, place in zip(nodes, places, strict=True)])
-        change = float(np.abs(new - rates).max()) * span
-        rates = new
+        series = _series(guess, y, span)
+        if not np.isfinite(series).all():
+            return np.full_like(series, np.nan)
+        new = rates(times, to_places @ series)
+        change = float(np.abs(new - guess).max()) * span
+        guess = new
         if change <= 0.001 * ACCURATE or not change < 0.5 * before:  # else at rounding, or diverging
             break
         before = change
-    return _series(rates, y, span)
+    return _series(guess, y, span)
+
+
+@cache
+def _nodes(stages: int) -> Array:
+    nodes, _ = legendre.leggauss(stages)
+    return nodes
+
+
+@cache
+def _integration(stages: int) -> Array:
+    """From values at the nodes to the series of their integral from -1 on, shape (stages + 1, stages)."""
+    return legendre.legint(np.linalg.inv(legendre.legvander(_nodes(stages), stages - 1)), lbnd=-1)
 
 
 def _series(rates: Array, y: Array, span: float) -> Array:
     """Integrate the polynomial through the rates at Gauss nodes, from y on."""
-    nodes, _ = legendre.leggauss(len(rates))
-    coefficients = np.linalg.solve(legendre.legvander(nodes, len(nodes) - 1), rates)
-    integral = legendre.legint(coefficients, lbnd=-1) * (span / 2)
+    integral = (span / 2) * _integration(len(rates)) @ rates
     integral[0] += y
     return integral
 
 
 def _rates_of(series: Array, span: float, stages: int, further: float) -> Array:
     """Rates of a polynomial at the nodes of a step that is `further` times as long."""
-    nodes, _ = legendre.leggauss(stages)
-    x = (1 + nodes) * further - 1
+    x = (1 + _nodes(stages)) * further - 1
     return np.asarray(legendre.legval(x, legendre.legder(series) * (2 / span))).T
+
+
+def _polynomials(x: float, count: int) -> Array:
+    """Legendre's first polynomials at one place."""
+    values = [1.0, x]
+    for k in range(1, count - 1):
+        values.append(((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1))
+    return np.array(values)

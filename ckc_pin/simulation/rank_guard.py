@@ -190,7 +190,7 @@ class RankGuard:
         """Leap from (t, y) with a crossing in the middle; also when exactly it was met, None if it was not."""
         for _ in range(2):
             left = crossing - t
-            found = leap(self._rate_on_closure, t, y, 2 * left)
+            found = leap(self._rates, t, y, 2 * left)
             self._reach = left * float(np.clip(found.scale, 0.25, 2.0))
             if not found.good:
                 break
@@ -202,12 +202,13 @@ class RankGuard:
             crossing = met
         return found, None
 
-    def _rate_on_closure(self, t: float, y: Array) -> Array:
+    def _rates(self, times: Array, states: Array) -> Array:
+        """Return y' where the states are put on the closure, counted."""
         assert self.dae is not None
-        try:
-            return self.stepper.rate(t, self.dae.on_closure(y))
-        except NumericalError:
-            return np.full_like(y, np.nan)
+        for t in times.tolist():
+            self.stepper._count(t)
+        with np.errstate(all="ignore"):
+            return self.dae.rates_on_closure(times, states)
 
     def _closed(self, found: Leap) -> bool:
         """Whether the branches meet: off the closure the leap would have jumped a narrow gap between them."""

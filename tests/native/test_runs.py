@@ -141,3 +141,47 @@ def test_native_by_name_says_why_it_cannot_be_had(monkeypatch):
     with pytest.raises(InputError, match=r'backend = "native" cannot be had: the native core was not built'):
         simulate("five_bar/swing", {"solver.backend": "native"})
     assert simulate("five_bar/swing", {"t_end": 0.01}).stats["backend"] == "python"
+
+
+def _dae(scene, backend):
+    return prepare(load_scene(scene, {"formulation": "dae", "solver.backend": backend})).system
+
+
+@pytest.mark.parametrize("flat", [0.3, 1e-2, 1e-3])
+def test_rates_on_the_closure_are_pythons_near_a_flat_position(flat):
+    """All rods at one angle, about J's least singular value, by which what is off is divided twice."""
+    python, native = (_dae("n_four_bar", backend) for backend in ("python", "native"))
+    random, n, turned = np.random.default_rng(0), python.mechanism.n, python.start()
+    states = np.concatenate([np.tile(turned[:n] * (flat / turned[0]), (50, 1)), np.tile(turned[n:], (50, 1))], axis=1)
+    states += 0.03 * flat * random.standard_normal(states.shape)
+    _are_the_same(python, native, states, 1e-13 / flat**2)
+
+
+def test_rates_on_the_closure_are_pythons():
+    python, native = (_dae("five_bar/swing", backend) for backend in ("python", "native"))
+    states = python.start() + 0.1 * np.random.default_rng(0).standard_normal((50, 8))
+    _are_the_same(python, native, states, 1e-12)
+
+
+def _are_the_same(python, native, states, tolerance):
+    times = np.linspace(0.0, 1.0, len(states))
+    wanted, found = python.rates_on_closure(times, states), native.rates_on_closure(times, states)
+    assert np.isfinite(wanted).all()
+    assert np.abs(found - wanted).max() <= tolerance * np.abs(wanted).max()
+    assert native.counts.factorizations == python.counts.factorizations
+
+
+def test_states_that_cannot_be_put_on_the_closure_have_no_rate_and_those_that_are_none_are_refused():
+    python, native = (_dae("five_bar/swing", backend) for backend in ("python", "native"))
+    states = np.array([python.start(), python.start()])
+    states[1, :4] = 0.0  # stretched, all at one angle: J has lost rank
+    times = np.zeros(2)
+    for system in (python, native):
+        assert np.isfinite(system.rates_on_closure(times, states)).all(axis=1).tolist() == [True, False]
+    for bad in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="states: rows of as many finite numbers as y has"):
+            native.native.rates_on_closure(times, states + bad)
+    with pytest.raises(ValueError, match="states: rows of as many finite numbers as y has"):
+        native.native.rates_on_closure(times, states[:, 1:])
+    with pytest.raises(ValueError, match="times: 2 numbers are needed, got 1"):
+        native.native.rates_on_closure(times[1:], states)

@@ -1,6 +1,7 @@
 // The formulations as Python sees them.
 #include <algorithm>
 #include <chrono>
+#include <limits>
 
 #include "checks.hpp"
 #include "dae.hpp"
@@ -22,6 +23,20 @@ nb::object rhs(System& system, double t, Given y) {
   require_state(system, y);
   Vector y_dot(y.size());
   return system.rhs(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
+}
+
+// A row of y' for each instant and row of states, none of them on the closure yet; NaN where it does not exist.
+Matrix rates_on_closure(Dae& system, Given times, Table states) {
+  require(states.cols() == system.size && states.allFinite(), "states: rows of as many finite numbers as y has");
+  require(times, states.rows(), "times");
+  Matrix rates(system.size, states.rows());
+  Vector y(system.size);
+  for (Eigen::Index k = 0; k < states.rows(); ++k) {
+    y = states.row(k).transpose();
+    if (!system.rate_on_closure(times(k), y, rates.col(k)))
+      rates.col(k).setConstant(std::numeric_limits<double>::quiet_NaN());
+  }
+  return rates.transpose();
 }
 
 nb::object jacobian(LevelSet& system, double t, Given y) {
@@ -180,7 +195,8 @@ void bind_systems(nb::module_& m) {
              require(tolerance > 0 && alpha >= 0 && beta >= 0, "tolerance, alpha and beta must not be negative");
              new (self) Dae(core, tolerance, projects, alpha, beta);
            },
-           nb::keep_alive<1, 2>(), "core"_a, "tolerance"_a, "projects"_a, "alpha"_a, "beta"_a);
+           nb::keep_alive<1, 2>(), "core"_a, "tolerance"_a, "projects"_a, "alpha"_a, "beta"_a)
+      .def("rates_on_closure", &rates_on_closure, "times"_a, "states"_a);
   nb::class_<PrintedSpf, System>(m, "PrintedSpf")
       .def("__init__",
            [](PrintedSpf* self, Core& core, double epsilon, bool actual, Given w0) {

@@ -196,23 +196,37 @@ bool Core::basis_by_pivoting(double least) {
 }
 
 bool Core::tangent_basis(In residual, double least) {
-  const int freedoms = n - rank;
   x_.setZero();
   negative_ = -residual;  // which may be where `reduce` works
   if (!rows.closure.rows)
     tangent_.setIdentity();
   else if (!basis_of_partition() && !basis_by_pivoting(least))
     return false;
-  for (int k = 0; k < freedoms; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
+  return true;
+}
+
+void Core::tangent_inertia() {
+  for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
   square_factor_.compute(square_);
-  return true;
 }
 
 bool Core::closing_step(In residual, Out x) {
   if (!tangent_basis(residual, weak)) return false;
+  tangent_inertia();
   D_times(x_, y_);
   small_b_.noalias() = tangent_.transpose() * y_;
+  square_factor_.solve(small_b_, small_);
+  x = x_;
+  for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
+  return true;
+}
+
+bool Core::shortest_step(In residual, Out x) {
+  if (!tangent_basis(residual, singular)) return false;
+  square_.noalias() = tangent_.transpose() * tangent_;
+  square_factor_.compute(square_);
+  small_b_.noalias() = tangent_.transpose() * x_;
   square_factor_.solve(small_b_, small_);
   x = x_;
   for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
@@ -222,6 +236,7 @@ bool Core::closing_step(In residual, Out x) {
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   residual_ = J_dot_v + correction;
   if (!tangent_basis(residual_, singular)) return false;
+  tangent_inertia();
   D_times(x_, y_);
   y_ = u_tree - bias_tree - y_;
   if (springs.any_damping) springs.add_damping(v_tree, y_);

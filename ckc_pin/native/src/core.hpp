@@ -51,11 +51,14 @@ class Core {
   void spf_z_dot(In q_dot, double epsilon, In w, Out z_dot);
   // The x with J x = -residual that is smallest in the metric of D'; false where J has lost rank, or nearly so.
   bool closing_step(In residual, Out x);
+  // The same in the metric of the coordinates, along every direction that J determines at all.
+  bool shortest_step(In residual, Out x);
   // Eq. 1 by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
 
  private:
-  bool tangent_basis(In residual, double least);  // tangent_, the factorized inertia on it, and x_: J x = -residual
+  bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
+  void tangent_inertia();                         // factorized
   bool basis_of_partition();
   bool basis_by_pivoting(double least);
   bool D_here_ = false;  // whether the tree's D' is that of q_tree

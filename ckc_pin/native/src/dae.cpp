@@ -5,6 +5,7 @@
 namespace ckc {
 
 constexpr int most_steps = 10;
+constexpr double negligible = 1e-9;  // rad, m: Newton's last step onto the closure
 
 static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
 
@@ -24,11 +25,15 @@ void Dae::set(In q_tree) {
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {
-  const int n = core.n;
   if (!y.allFinite()) return false;
-  set(y.head(n));
-  core.bias(y.tail(n));
-  for (int k = 0; k < core.d; ++k) q(k) = y(core.q[k]), q_dot(k) = y(n + core.q[k]);
+  set(y.head(core.n));
+  return rate(t, y.tail(core.n), y_dot);
+}
+
+bool Dae::rate(double t, In v, Out y_dot) {
+  const int n = core.n;
+  core.bias(v);
+  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.q[k]), q_dot(k) = v(core.q[k]);
   drive.act(t, core, q, q_dot);
   residual_.setZero();
   if (alpha_ != 0.0 || beta_ != 0.0) {
@@ -36,7 +41,7 @@ bool Dae::rhs(double t, In y, Out y_dot) {
     residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
   }
   counts.factorizations += 2;
-  y_dot.head(n) = y.tail(n);
+  y_dot.head(n) = v;
   return core.dae_acceleration(drive.u_tree, residual_, y_dot.tail(n)) && y_dot.allFinite();
 }
 
@@ -56,6 +61,25 @@ bool Dae::project(In y) {
   if (!core.closing_step(residual_, step_)) return false;
   velocity = y.tail(n) + step_;
   return velocity.allFinite();
+}
+
+bool Dae::rate_on_closure(double t, In y, Out y_dot) {
+  const int n = core.n;
+  if (!y.allFinite()) return false;
+  q_tree_ = y.head(n);
+  set(q_tree_);
+  for (int k = 0;; ++k) {
+    if (k == most_steps || !core.shortest_step(core.rows.phi, step_)) return false;
+    ++counts.factorizations;
+    q_tree_ += step_;
+    set(q_tree_);
+    if (largest(step_) <= negligible) break;  // what is left is its square
+  }
+  residual_.noalias() = core.rows.J * y.tail(n);
+  if (!core.shortest_step(residual_, step_)) return false;
+  ++counts.factorizations;
+  velocity = y.tail(n) + step_;
+  return rate(t, velocity, y_dot);
 }
 
 bool Dae::exact(double, In y) {

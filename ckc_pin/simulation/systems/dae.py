@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -153,6 +154,14 @@ class Dae:
             if np.abs(step).max() <= NEGLIGIBLE:  # what is left is its square
                 return np.concatenate([at.q_tree, v_tree + self._shortest(at, at.J @ v_tree)])
         raise NumericalError("projection onto the closure did not converge: J is nearly singular here")
+
+    def rates_on_closure(self, times: Array, states: Array) -> Array:
+        """Return y' at each instant and row of states, put on the closure first; NaN where it does not exist."""
+        rates = np.full_like(states, np.nan)
+        for k, (t, y) in enumerate(zip(times.tolist(), states, strict=True)):
+            with suppress(NumericalError):
+                rates[k] = self.rhs(t, self.on_closure(y))
+        return rates
 
     def _shortest(self, at: Kinematics, residual: Array) -> Array:
         self.counts.factorizations += 1

@@ -178,6 +178,14 @@ class NativeDae(Dae, Native):
         derivative = self.evaluate(t, y, self.counts) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 
+    def rates_on_closure(self, times: Array, states: Array) -> Array:
+        if self.closes_within or not self.crosses:
+            return super().rates_on_closure(times, states)
+        self.refresh()
+        rates: Array = self.native.rates_on_closure(times, states)
+        self.book(self.counts)
+        return rates
+
     def _with_force(self, t: float, y: Array) -> Array | None:
         q_tree, v_tree = self._split(y)
         terms = Terms(self.mechanism, self.mechanism.kinematics(q_tree), v_tree)
