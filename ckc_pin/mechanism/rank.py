@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
-__all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled"]
+__all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled", "scales"]
 
 RANK_TOLERANCE = 1e-5  # relative; files are rounded to six digits
 SURE = 1e-9  # singular values between this and the tolerance are neither zero nor not
@@ -39,9 +39,13 @@ class RankReport:
 
 def scaled(jacobian: Array, tree: Tree, closure: Closure, size: float) -> Array:
     """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
-    rows = np.where(closure.in_metres(tree), 1.0 / size, 1.0)
-    columns = np.where(tree.in_metres, size, 1.0)
-    return rows[:, None] * jacobian * columns
+    rows, columns = scales(tree, closure, size)
+    return rows * jacobian * columns
+
+
+def scales(tree: Tree, closure: Closure, size: float) -> tuple[Array, Array]:
+    """Return what J's rows, shape (rows, 1), and its columns, shape (n,), are multiplied with for that."""
+    return np.where(closure.in_metres(tree), 1.0 / size, 1.0)[:, None], np.where(tree.in_metres, size, 1.0)
 
 
 def rank_of(scaled_jacobian: Array) -> RankReport:

@@ -25,6 +25,10 @@ STAGES = (10, 14)  # of the run-up and a first leap, and of the leap itself; eve
 ACCURATE = 1e-9  # of |y|: how well the two leaps have to agree
 ORDER = 12  # in the length of a leap: how its error is observed to grow
 SWEEPS = 30  # of the fixed-point iteration on the stages
+SETTLED = 0.005 * ACCURATE  # what is left to the fixed point when the iteration ends
+GUESSED = 1e-6  # the same where only a guess is extrapolated from it
+FAR = 0.03  # of |y|: a guess that is as far off foretells a leap that is not accurate
+FORETOLD = 1e-6  # of how far off the guess is: the error of such a leap, as observed
 PLACES = np.linspace(-1.0, 1.0, 41)  # where they are compared
 
 
@@ -60,7 +64,7 @@ class Leap:
         return float(0.9 * (ACCURATE / max(self.error, 1e-300)) ** (1 / ORDER))
 
 
-def leap(rates: Rates, t: float, y: Array, span: float) -> Leap:
+def leap(rates: Rates, t: float, y: Array, span: float, known: Leap | None = None) -> Leap:
     """Step from (t, y) over a span with a position at its middle where J loses rank.
 
     Parameters
@@ -70,44 +74,65 @@ def leap(rates: Rates, t: float, y: Array, span: float) -> Leap:
     t : float
     y : array
     span : float
+    known : Leap, optional
+        Another one from (t, y), over about the same span: no run-up is needed then.
     """
     few, many = STAGES
-    start = _series(rates(np.array([t]), y[None]), y, RUN_UP * span)
-    run_up = _collocated(rates, t, y, RUN_UP * span, _rates_of(start, RUN_UP * span, few, 1.0))
-    first = _collocated(rates, t, y, span, _rates_of(run_up, RUN_UP * span, few, 1 / RUN_UP))
-    last = _collocated(rates, t, y, span, _rates_of(first, span, many, 1.0))
+    if known is None:
+        length = RUN_UP * span
+        start = _series(rates(np.array([t]), y[None]), y, length)
+        series, _ = _collocated(rates, t, y, length, _rates_of(start, length, few, 1.0), GUESSED)
+    else:
+        length, series = known.t - known.t_old, known._series
+    size = max(1.0, float(np.abs(y).max()))
+    first, off = _collocated(rates, t, y, span, _rates_of(series, length, few, span / length), far=FAR * size)
+    if not off <= FAR * size:
+        return Leap(t, t + span, FORETOLD * off / size if np.isfinite(off) else np.inf, first)
+    last, _ = _collocated(rates, t, y, span, _rates_of(first, span, many, 1.0))
     gap = np.abs(legendre.legval(PLACES, last) - legendre.legval(PLACES, first)).max()
-    error = float(gap / max(1.0, np.abs(y).max()))
+    error = float(gap / size)
     return Leap(t, t + span, error if np.isfinite(error) else np.inf, last)
 
 
-def _collocated(rates: Rates, t: float, y: Array, span: float, guess: Array) -> Array:
+def _collocated(
+    rates: Rates, t: float, y: Array, span: float, guess: Array, settled: float = SETTLED, far: float = np.inf
+) -> tuple[Array, float]:
     """Solve the stages by fixed-point iteration, which the smoothness of the motion makes a contraction.
 
     Parameters
     ----------
     guess : (stages, len(y)) array
         Of y' at the stages.
+    settled : float
+        How near the fixed point is near enough, in y; what rounding leaves ends the iteration too.
+    far : float
+        A guess from which the first sweep goes farther is given up.
 
     Returns
     -------
-    (stages + 1, len(y)) array
+    series : (stages + 1, len(y)) array
         Legendre series of y over the step; NaN where a stage does not exist.
+    off : float
+        How far the first sweep went, in y.
     """
-    stages, before = len(guess), np.inf
+    stages, off, before = len(guess), np.nan, np.inf
     nodes = _nodes(stages)
     times, to_places = t + span * (1 + nodes) / 2, legendre.legvander(nodes, stages)
-    for _ in range(SWEEPS):
+    for sweep in range(SWEEPS):
         series = _series(guess, y, span)
         if not np.isfinite(series).all():
-            return np.full_like(series, np.nan)
+            break
         new = rates(times, to_places @ series)
         change = float(np.abs(new - guess).max()) * span
+        off = change if sweep == 0 else off
         guess = new
-        if change <= 0.001 * ACCURATE or not change < 0.5 * before:  # else at rounding, or diverging
+        if not change < 0.5 * before or off > far:  # diverging, or at rounding
+            break
+        left = change * (change / before if sweep else 1.0)  # contracting as it did last
+        if left <= settled:
             break
         before = change
-    return _series(guess, y, span)
+    return _series(guess, y, span), off
 
 
 @cache

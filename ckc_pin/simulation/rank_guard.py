@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.rank import scaled
+from ckc_pin.mechanism.rank import scales
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.integrate import Step, Stepper
 from ckc_pin.simulation.leap import Leap, leap
-from ckc_pin.simulation.systems import Dae
+from ckc_pin.simulation.systems import Dae, Native
 
 __all__ = ["RankGuard"]
 
@@ -57,8 +57,11 @@ class RankGuard:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.system = stepper.system
-        self.rank = self.system.mechanism.rank
+        mechanism = self.system.mechanism
+        self.rank = mechanism.rank
+        self.core = self.system.core if isinstance(self.system, Native) else None
         self.dae = self.system if isinstance(self.system, Dae) and self.system.closed else None
+        self._row_scale, self._column_scale = scales(mechanism.tree, mechanism.closure, mechanism.size)
         self.crossings: list[float] = []
         self.end: tuple[float, float] | None = None
         self.length = 0.0
@@ -188,9 +191,10 @@ class RankGuard:
 
     def _leap(self, t: float, y: Array, crossing: float) -> tuple[Leap, float | None]:
         """Leap from (t, y) with a crossing in the middle; also when exactly it was met, None if it was not."""
+        known = None
         for _ in range(2):
             left = crossing - t
-            found = leap(self._rates, t, y, 2 * left)
+            known = found = leap(self._rates, t, y, 2 * left, known)
             self._reach = left * float(np.clip(found.scale, 0.25, 2.0))
             if not found.good:
                 break
@@ -245,20 +249,22 @@ class RankGuard:
         )
 
     def _scaled(self, jacobian: Array) -> Array:
-        mechanism = self.system.mechanism
-        return scaled(jacobian, mechanism.tree, mechanism.closure, mechanism.size)
+        return self._row_scale * jacobian * self._column_scale
 
     def _value(self, q_tree: Array) -> float:
         """The rank-th singular value of the scaled J, relative to the largest."""
-        values = np.linalg.svd(self._scaled(self.system.mechanism.kinematics(q_tree).J), compute_uv=False)
+        J = self.core.jacobian(q_tree) if self.core else self.system.mechanism.kinematics(q_tree).J
+        values = np.linalg.svd(self._scaled(J), compute_uv=False)
         return float(values[self.rank - 1] / values[0])
 
     def _rate(self, step: Step, t: float) -> tuple[float, float]:
         """That value and its time derivative, u^T J_dot v over the largest singular value."""
         terms = self.system.terms(t, step.interpolant(t))
-        u, values, v = np.linalg.svd(self._scaled(terms.at.J), full_matrices=False)
+        velocity = self.system.velocity(t, terms)
+        J, J_dot = self.core.jacobians(terms.q_tree, velocity) if self.core else (terms.at.J, terms.at.J_dot(velocity))
+        u, values, v = np.linalg.svd(self._scaled(J), full_matrices=False)
         k = self.rank - 1
-        rate = u[:, k] @ self._scaled(terms.at.J_dot(self.system.velocity(t, terms))) @ v[k]
+        rate = u[:, k] @ self._scaled(J_dot) @ v[k]
         return float(values[k] / values[0]), float(rate / values[0])
 
 

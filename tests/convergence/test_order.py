@@ -103,7 +103,7 @@ def test_order_of_collocation(five_bar: Pair, exact: dict[bool, Exact], stages: 
 
     def error(span: float) -> float:
         guess = np.tile(motion.rhs(0.0, y), (stages, 1))
-        end = _collocated(rates, 0.0, y, span, guess).sum(axis=0)  # Legendre polynomials are 1 there
+        end = _collocated(rates, 0.0, y, span, guess)[0].sum(axis=0)  # Legendre polynomials are 1 there
         return float(np.abs(end - exact[False](span)).max())
 
     assert np.log2(error(0.02) / error(0.01)) == pytest.approx(2 * stages + 1, abs=0.3)

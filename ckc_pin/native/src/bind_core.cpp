@@ -104,6 +104,19 @@ nb::dict terms(Core& core, Given q_tree, Given v_tree) {
   return found;
 }
 
+Matrix jacobian(Core& core, Given q_tree) {
+  require(q_tree, core.tree.nq, "q_tree");
+  core.set(q_tree), core.rows.jacobian(core.tree);
+  return core.rows.J;
+}
+
+nb::tuple jacobians(Core& core, Given q_tree, Given v_tree) {
+  require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
+  core.set(q_tree), core.rows.jacobian(core.tree), core.bias(v_tree);
+  core.rows.jacobian_dot(core.tree, core.tree.jacobian_rate(q_tree, v_tree));
+  return nb::make_tuple(core.rows.J, core.rows.J_dot);
+}
+
 Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree, Given u_tree, bool actual) {
   require(q_tree, core.tree.nq, "q_tree"), require(q_dot, core.d, "q_dot");
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
@@ -147,6 +160,8 @@ void bind_core(nb::module_& m) {
              core.split(q, z);
            },
            "q"_a, "z"_a)
+      .def("jacobian", &jacobian, "q_tree"_a)
+      .def("jacobians", &jacobians, "q_tree"_a, "v_tree"_a)  // J and J_dot
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)
       .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a);

@@ -39,6 +39,12 @@ Matrix rates_on_closure(Dae& system, Given times, Table states) {
   return rates.transpose();
 }
 
+nb::object projected(Dae& system, Given y) {
+  require_state(system, y);
+  if (!system.project(y)) return nb::none();
+  return nb::make_tuple(Vector(system.core.q_tree), Vector(system.velocity));
+}
+
 nb::object jacobian(LevelSet& system, double t, Given y) {
   require_state(system, y);
   Matrix found(y.size(), y.size());
@@ -196,6 +202,7 @@ void bind_systems(nb::module_& m) {
              new (self) Dae(core, tolerance, projects, alpha, beta);
            },
            nb::keep_alive<1, 2>(), "core"_a, "tolerance"_a, "projects"_a, "alpha"_a, "beta"_a)
+      .def("projected", &projected, "y"_a)
       .def("rates_on_closure", &rates_on_closure, "times"_a, "states"_a);
   nb::class_<PrintedSpf, System>(m, "PrintedSpf")
       .def("__init__",

@@ -16,11 +16,13 @@ class Dae : public System {
   bool accept(double t, Out y, bool& changed) override;
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
   bool rate_on_closure(double t, In y, Out y_dot);
+  // Into core.q_tree and velocity, by the shortest steps in the metric of the inertia; false also where J is nearly
+  // singular, which Python closes with care.
+  bool project(In y);
 
  private:
   void set(In q_tree);  // the core at a configuration, with D' and what controllers need
   bool rate(double t, In v, Out y_dot);  // at the core's configuration
-  bool project(In y);   // into core.q_tree and velocity, by the shortest steps in the metric of the inertia
 
   double tolerance_, alpha_, beta_;
   bool projects_;

@@ -178,6 +178,14 @@ class NativeDae(Dae, Native):
         derivative = self.evaluate(t, y, self.counts) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 
+    def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
+        y = np.concatenate([at.q_tree, v_tree])
+        found = self.native.projected(y) if self.native is not None and np.isfinite(y).all() else None
+        if found is None:
+            return super()._projected(at, v_tree)
+        self.book(self.counts)
+        return Terms(self.mechanism, self.mechanism.kinematics(found[0]), found[1])
+
     def rates_on_closure(self, times: Array, states: Array) -> Array:
         if self.closes_within or not self.crosses:
             return super().rates_on_closure(times, states)
