@@ -28,6 +28,7 @@ NECK = 0.2  # of the larger end value: a minimum below that has to be resolved b
 SHORTEST = 1e-6  # s; a step below that resolves any neck that is wider than LOST
 JUMP = 0.7  # of the time to s = 0 along its tangent: the longest step that begins and ends with s falling
 NEAR = 4.0  # steps: a crossing that is as near as that is leapt over
+BEYOND = 0.3  # of the time to a crossing: one that is as much behind the end of the run is left alone
 AHEAD = 0.1  # of s: what is left of it at a crossing, the motion extrapolated
 ATTEMPTS = 6  # leaps, each from half as far away as the one before
 CENTRED = 0.04  # of half a leap: how well the crossing has to be in its middle
@@ -138,28 +139,33 @@ class RankGuard:
 
         left = -s / falling
         crossing, least = self._minimum(extrapolated, t + 0.3 * left, t + 1.3 * left, accuracy=1e-2)
-        return crossing - t if least < AHEAD * s else None
+        if least >= AHEAD * s or crossing - self.stepper.solver.t_bound > BEYOND * (crossing - t):
+            return None
+        return crossing - t
 
     def _across(self, left: float) -> Step | None:
         """Leap over a crossing; None where it has to be approached first, or is none."""
         stepper = self.stepper
         t, y = stepper.t, stepper.solver.y.copy()
-        if left > self._reach:
+        if left > max(self._reach, self.length):  # a step as long as the last one does not pass it either
             self._approach(left)
             return None
         starts = [(t, y)]
         if left < 0.5 * self.length:  # so near J is ill-conditioned: rather from where the last step began
             starts.insert(0, stepper.before)
         self._attempts += 1
+        again = stepper.options["rtol"] > FINE and t > 0 and stepper.solver.t_bound == self._first_leg
         for start in starts:
-            found, crossing = self._leap(*start, t + left)
+            found, crossing = self._leap(*start, t + left, centred=not again)
             if crossing is not None:
                 break
         else:
             self._approach(left)
             return None
-        if stepper.refine(FINE) and t > 0 and stepper.solver.t_bound == self._first_leg:
-            self.end, self.length = self._again(t), t - stepper.before[0]
+        stepper.refine(FINE)
+        if again:
+            self._again(t)
+            self._inside = crossing
             return None
         self.crossings.append(crossing)
         self._attempts = 0
@@ -177,20 +183,24 @@ class RankGuard:
         if solver.h_abs > length:
             self.stepper.go_on(self.stepper.t, solver.y.copy(), length)
 
-    def _again(self, t: float) -> tuple[float, float]:
-        """Come to t once more from the start, with the finer tolerance; return s and its rate there."""
+    def _again(self, t: float) -> None:
+        """Come to t once more from the start, with the finer tolerance, and see what the coarser one passed over."""
         stepper = self.stepper
         t_end = stepper.solver.t_bound
         stepper.go_on(0.0, stepper.y, t / 10)
         stepper.solver.t_bound = t
+        self.end, self.length, self._attempts = None, 0.0, 0
         while stepper.solver.status == "running":
-            step = stepper.step()
+            self.step()
             stepper.settle()
         stepper.solver.t_bound, stepper.solver.status = t_end, "running"
-        return self._rate(step, t)
+        stepper.go_on(t, stepper.solver.y.copy(), self.length)
 
-    def _leap(self, t: float, y: Array, crossing: float) -> tuple[Leap, float | None]:
-        """Leap from (t, y) with a crossing in the middle; also when exactly it was met, None if it was not."""
+    def _leap(self, t: float, y: Array, crossing: float, centred: bool) -> tuple[Leap, float | None]:
+        """Leap from (t, y) with a crossing in the middle; also when exactly it was met, None if it was not.
+
+        The first leap that meets it is as good as any where it need not be in the middle.
+        """
         known = None
         for _ in range(2):
             left = crossing - t
@@ -201,7 +211,7 @@ class RankGuard:
             met, value = self._minimum(found, t + 0.5 * left, t + 1.5 * left)
             if value > LOST or not self._closed(found):
                 break
-            if abs(met - crossing) < CENTRED * left:
+            if not centred or abs(met - crossing) < CENTRED * left:
                 return found, met
             crossing = met
         return found, None

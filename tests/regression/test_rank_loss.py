@@ -41,6 +41,20 @@ def test_a_run_may_end_before_at_or_behind_a_crossing(t_end: float) -> None:
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(1, t_end), abs=1e-9)
 
 
+@pytest.mark.parametrize(("rtol", "rhs"), [(1e-5, 48), (1e-7, 75)])
+def test_a_run_that_ends_well_before_a_crossing_costs_nothing_for_it(rtol: float, rhs: int) -> None:
+    """The first is at 0.7085 s; the numbers are the solver's own, with nobody watching."""
+    for N in (1, 4):
+        assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # of the interpolant
+
+
+def test_what_a_coarse_run_passes_over_is_crossed_when_it_is_run_again() -> None:
+    """At 1e-3 steps pass over three rank losses before the first is noticed."""
+    run = n_four_bar(4, 1e-3)
+    assert run.status == "done", run.message
+    assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(4, 10.0), abs=1e-4)
+
+
 def test_what_is_recorded_across_a_crossing_is_as_good_as_elsewhere() -> None:
     run = n_four_bar(2, 1e-10, t_end=0.8, solver__output_dt=0.01)
     exact = [first_top_pin(2, float(t)) for t in run.t[1:]]
