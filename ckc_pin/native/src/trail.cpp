@@ -69,9 +69,13 @@ int Trail::foretelling(double t, int nearest, int* chosen, double* a, double* b)
   for (int k = 0; k < count_; ++k) order[k] = k;
   const auto away = [&](int k) { return std::abs(points_[k].t - t); };
   const int most = std::min(count_, nodes);
-  std::partial_sort(order, order + most, order + count_, [&](int i, int k) {
-    return away(i) < away(k) || (away(i) == away(k) && i < k);
-  });
+  for (int i = 0; i < most; ++i) {  // the nearest first
+    int best = i;
+    for (int k = i + 1; k < count_; ++k)
+      if (away(order[k]) < away(order[best]) || (away(order[k]) == away(order[best]) && order[k] < order[best]))
+        best = k;
+    std::swap(order[i], order[best]);
+  }
   if (away(order[0]) > 0.0) {
     for (int count = most; count > 1; --count) {
       double times[nodes], sum = 0.0;
