@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.rank import scales
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.integrate import Step, Stepper
@@ -32,6 +33,7 @@ BEYOND = 0.3  # of the time to a crossing: one that is as much behind the end of
 AHEAD = 0.1  # of s: what is left of it at a crossing, the motion extrapolated
 ATTEMPTS = 6  # leaps, each from half as far away as the one before
 CENTRED = 0.04  # of half a leap: how well the crossing has to be in its middle
+NEWTON = 10  # steps of Newton's method on s, with its sign; it takes two or three
 CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a leap, or the branches do not meet
 
 
@@ -208,8 +210,8 @@ class RankGuard:
             self._reach = left * float(np.clip(found.scale, 0.25, 2.0))
             if not found.good:
                 break
-            met, value = self._minimum(found, t + 0.5 * left, t + 1.5 * left)
-            if value > LOST or not self._closed(found):
+            met = self._zero(found, crossing)
+            if met is None or not 0.5 < (met - t) / left < 1.5 or not self._closed(found):
                 break
             if not centred or abs(met - crossing) < CENTRED * left:
                 return found, met
@@ -234,6 +236,23 @@ class RankGuard:
         return True
 
     # --- the least singular value ----------------------------------------------------------------
+
+    def _zero(self, motion: Callable[[float], Array], t: float) -> float | None:
+        """When J has lost rank on a motion of the DAE, by Newton's method from t; None where it does not converge.
+
+        With its sign s is smooth there: on both sides s over its rate is what is left.
+        """
+        mechanism, value = self.system.mechanism, np.inf
+        for _ in range(NEWTON):
+            y = motion(t)
+            at = mechanism.kinematics(self.system.configuration(t, y))
+            before, (value, rate) = value, self._value_and_rate(at, y[mechanism.tree.nq :])
+            if value <= 1e-3 * LOST:
+                return t
+            if not value < 0.5 * before or rate == 0:
+                break
+            t -= value / rate
+        return t if value <= LOST else None
 
     def _minimum(
         self, motion: Callable[[float], Array], start: float, end: float, accuracy: float = 1e-7
@@ -270,8 +289,10 @@ class RankGuard:
     def _rate(self, step: Step, t: float) -> tuple[float, float]:
         """That value and its time derivative, u^T J_dot v over the largest singular value."""
         terms = self.system.terms(t, step.interpolant(t))
-        velocity = self.system.velocity(t, terms)
-        J, J_dot = self.core.jacobians(terms.q_tree, velocity) if self.core else (terms.at.J, terms.at.J_dot(velocity))
+        return self._value_and_rate(terms.at, self.system.velocity(t, terms))
+
+    def _value_and_rate(self, at: Kinematics, velocity: Array) -> tuple[float, float]:
+        J, J_dot = self.core.jacobians(at.q_tree, velocity) if self.core else (at.J, at.J_dot(velocity))
         u, values, v = np.linalg.svd(self._scaled(J), full_matrices=False)
         k = self.rank - 1
         rate = u[:, k] @ self._scaled(J_dot) @ v[k]

@@ -67,6 +67,10 @@ def test_terms_are_pythons(name):
         for quantity, value in wanted.items():
             assert np.abs(found[quantity] - value).max(initial=0.0) <= tolerance * sizes[quantity], quantity
         assert np.abs(found["J"] - terms.at.J).max(initial=0.0) <= tolerance * np.abs(terms.at.J).max(initial=1.0)
+        J, J_dot = core.jacobians(terms.q_tree, terms.v_tree)
+        assert np.abs(core.jacobian(terms.q_tree) - J).max(initial=0.0) == 0.0
+        assert np.abs(J - terms.at.J).max(initial=0.0) <= tolerance * np.abs(terms.at.J).max(initial=1.0)
+        assert np.abs(J_dot - terms.J_dot).max(initial=0.0) <= tolerance * sizes["J_dot"]
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -103,6 +107,11 @@ def test_numbers_that_are_none_are_refused(bad):
             core.dae_acceleration(**{**good, name: spoilt})
         with pytest.raises(ValueError, match=f"{name}: {len(value)} numbers are needed, got {len(value) + 1}"):
             core.dae_acceleration(**{**good, name: np.append(value, 0.0)})
+    for jacobians in (core.jacobian, lambda q_tree: core.jacobians(q_tree, good["v_tree"])):
+        with pytest.raises(ValueError, match="q_tree: a number is not finite"):
+            jacobians(np.append(mechanism.q_tree[1:], bad))
+        with pytest.raises(ValueError, match="q_tree: 4 numbers are needed, got 3"):
+            jacobians(mechanism.q_tree[1:])
 
 
 @pytest.mark.parametrize(

@@ -180,8 +180,11 @@ class NativeDae(Dae, Native):
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
         y = np.concatenate([at.q_tree, v_tree])
-        found = self.native.projected(y) if self.native is not None and np.isfinite(y).all() else None
-        if found is None:
+        if self.native is None or not np.isfinite(y).all():
+            return super()._projected(at, v_tree)
+        found = self.native.projected(y)
+        if found is None:  # near a rank loss, with what that has cost forgotten
+            self.native.counts()
             return super()._projected(at, v_tree)
         self.book(self.counts)
         return Terms(self.mechanism, self.mechanism.kinematics(found[0]), found[1])
