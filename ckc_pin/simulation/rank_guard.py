@@ -110,6 +110,9 @@ class RankGuard:
         if falling < 0 and rising <= 0 and h > JUMP * -old / falling and h > SHORTEST:
             self.stepper.take_back(h / 2)  # it may have passed zero, a peak, and be falling again
             return False
+        if falling >= 0 and rising > 0 and h > new / rising and h > SHORTEST:
+            self.stepper.take_back(h / 2)  # a peak, zero, and rising again: its tangent has zero within the step
+            return False
         if new < LOST:
             raise self._lost(step, step.t, new)
         if rising > 0:

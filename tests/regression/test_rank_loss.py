@@ -55,6 +55,14 @@ def test_what_a_coarse_run_passes_over_is_crossed_when_it_is_run_again() -> None
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(4, 10.0), abs=1e-4)
 
 
+@pytest.mark.parametrize("rtol", [1e-2, 1e-3])
+def test_steps_from_one_side_of_a_peak_to_behind_the_next_zero_are_noticed(rtol: float) -> None:
+    """Rising at both ends: with forty squares that went unseen all the way, and the pin ended 0.08 m off."""
+    run = n_four_bar(40, rtol)
+    assert run.status == "done", run.message
+    assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(40, 10.0), abs=1e-4)
+
+
 def test_what_is_recorded_across_a_crossing_is_as_good_as_elsewhere() -> None:
     run = n_four_bar(2, 1e-10, t_end=0.8, solver__output_dt=0.01)
     exact = [first_top_pin(2, float(t)) for t in run.t[1:]]

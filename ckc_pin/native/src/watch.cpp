@@ -73,7 +73,7 @@ bool Watch::ahead(const Rank& end, double length) const {
 
 bool Watch::plain(const Rank& before, const Rank& after, double h) const {
   if (!(after.value > near) || !std::isfinite(after.rate)) return false;
-  if (before.rate >= 0.0) return true;
+  if (before.rate >= 0.0) return !(after.rate > 0.0 && h * after.rate > after.value);
   if (after.rate <= 0.0) return h <= jump * before.value / -before.rate;
   // falling, then rising: where the tangents at both ends meet
   const double place = (after.value - before.value - after.rate * h) / (before.rate - after.rate);

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-__all__ = ["program", "version"]
+__all__ = ["compiler", "program", "version"]
 
 SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
 # The definitions that Pinocchio's headers need; otherwise as the native core is compiled.
@@ -27,7 +27,7 @@ def program() -> tuple[Path, str | None]:
     """Return the program, and why there is none: no compiler, no headers, or what the compiler said."""
     folder = _folder()
     path, prefix = Path(folder.name) / "loop", _prefix()
-    compiler = _compiler()
+    compiler = compiler()
     if compiler is None:
         return path, "no C++ compiler was found"
     if prefix is None or not (prefix / "include" / "eigen3").is_dir():
@@ -49,7 +49,7 @@ def program() -> tuple[Path, str | None]:
 @cache
 def version() -> str:
     """Return the versions of what it is made of and with."""
-    said = subprocess.run([_compiler() or "c++", "--version"], capture_output=True, text=True).stdout.splitlines()[0]
+    said = subprocess.run([compiler() or "c++", "--version"], capture_output=True, text=True).stdout.splitlines()[0]
     return f"{metadata.version('libpinocchio')}, Boost {metadata.version('cmeel-boost')}, {said}"
 
 
@@ -58,7 +58,8 @@ def _folder() -> TemporaryDirectory[str]:
     return TemporaryDirectory(prefix="ckc_report_")  # removed when the process ends
 
 
-def _compiler() -> str | None:
+def compiler() -> str | None:
+    """Return the first C++ compiler on PATH, $CXX before others."""
     return next(filter(None, map(shutil.which, (os.environ.get("CXX", "c++"), "c++", "g++", "clang++"))), None)
 
 
