@@ -27,14 +27,14 @@ def program() -> tuple[Path, str | None]:
     """Return the program, and why there is none: no compiler, no headers, or what the compiler said."""
     folder = _folder()
     path, prefix = Path(folder.name) / "loop", _prefix()
-    compiler = compiler()
-    if compiler is None:
+    found = compiler()
+    if found is None:
         return path, "no C++ compiler was found"
     if prefix is None or not (prefix / "include" / "eigen3").is_dir():
         return path, "Eigen's headers are missing: pip install cmeel-eigen"
     include = ["-isystem", str(prefix / "include"), "-isystem", str(prefix / "include" / "eigen3")]
     library = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default"]
-    command = [compiler, *FLAGS, *include, str(SOURCE), "-o", str(path), *library]
+    command = [found, *FLAGS, *include, str(SOURCE), "-o", str(path), *library]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=PATIENCE)
     except (OSError, subprocess.TimeoutExpired) as error:
