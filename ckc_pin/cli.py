@@ -394,7 +394,7 @@ def main() -> NoReturn:
     except CkcError as error:
         _fail(str(error), WRONG_INPUT, as_json)
     except KeyboardInterrupt as stop:
-        _fail(f"interrupted{_by(stop)}", _interrupted(str(stop)), as_json, status="interrupted")
+        _fail(f"by {str(stop) or 'Ctrl-C'}", _interrupted(str(stop)), as_json, status="interrupted")
     except BrokenPipeError:  # the reader went away; nothing is wrong
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:

@@ -36,7 +36,7 @@ class Budget:
     peer: float
 
 
-BUDGET, QUICK_BUDGET = Budget(native=2.5, python=1.5, peer=4.0), Budget(native=2.0, python=1.0, peer=2.0)
+BUDGET = Budget(native=1.5, python=0.8, peer=2.0)
 
 Progress = Callable[[str], None]  # what is being measured
 
@@ -120,10 +120,9 @@ class _Measured:
 
     def ours(self, quick: bool) -> Iterator[Row]:
         """Rows of this program; what used up its budget at one tolerance is not tried with a tighter one."""
-        budget = QUICK_BUDGET if quick else BUDGET
         spent: dict[str, str] = {}
         for setting in ours.settings(quick):
-            allowed = budget.python if setting.in_python else budget.native
+            allowed = BUDGET.python if setting.in_python else BUDGET.native
             compute = partial(ours.compute, self.work, setting.changes, allowed)
             if setting.family in spent:
                 compute = partial(ours.refused, self.work, spent[setting.family])
@@ -136,9 +135,8 @@ class _Measured:
         """Rows of another program."""
         if peer.missing(self.work) is not None:
             return
-        budget = (QUICK_BUDGET if quick else BUDGET).peer
         for setting in peer.settings(self.work, quick):
-            yield self._row(peer.name, peer.version(), setting, partial(peer.compute, self.work, setting, budget))
+            yield self._row(peer.name, peer.version(), setting, partial(peer.compute, self.work, setting, BUDGET.peer))
 
     def _row(self, program: str, version: str, setting: str, compute: Callable[[], Motion]) -> Row:
         own = key(self.work, program, version, setting)

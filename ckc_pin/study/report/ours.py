@@ -31,7 +31,7 @@ QUICK_FEW = (1e-3, 1e-7, 1e-11)
 # Few tolerances of what is not the fastest here, and in Python, whose steps are the native core's, but later.
 METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, **dict.fromkeys(("RK45", "Radau", "BDF", "LSODA"), FEW)}
 QUICK_METHODS = {"auto": QUICK_TOLERANCES}
-IN_PYTHON = dict.fromkeys(("auto", "DOP853", "Radau", "BDF"), FEW)
+IN_PYTHON = {"auto": FEW}
 QUICK_IN_PYTHON = {"auto": QUICK_FEW}
 ENOUGH = 0.1  # s of runs, set-up included; up to then they are repeated
 REPEATS = 5

@@ -24,8 +24,7 @@ __all__ = ["PinocchioLoop"]
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 14))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-GAINS = (0.0, 100.0, 1000.0)  # K_p, 1/s^2; K_d = 2 sqrt(K_p)
-QUICK_GAINS = (0.0, 100.0)
+GAINS = (0.0, 100.0)  # K_p, 1/s^2; K_d = 2 sqrt(K_p)
 # mu, and how often its effect is taken off: one iteration is cheapest, where the rows lose rank only a large mu gets by
 PROXIMAL = ((1e-12, 1), (1e-8, 3), (1e-4, 10), (1e-2, 12))
 QUICK_PROXIMAL = (PROXIMAL[0], PROXIMAL[2])
@@ -48,8 +47,8 @@ class PinocchioLoop:
         return version()
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
-        gains, proximal = (QUICK_GAINS, QUICK_PROXIMAL) if quick else (GAINS, PROXIMAL)
-        for gain, (mu, iterations), tolerance in product(gains, proximal, QUICK_TOLERANCES if quick else TOLERANCES):
+        proximal = QUICK_PROXIMAL if quick else PROXIMAL
+        for gain, (mu, iterations), tolerance in product(GAINS, proximal, QUICK_TOLERANCES if quick else TOLERANCES):
             yield f"K_p {gain:g}, mu {mu:g}, iterations {iterations}, tolerance {tolerance:g}"
 
     def check(self, work: Work) -> str:
