@@ -159,7 +159,7 @@ def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
 ) -> None:
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    monkeypatch.setattr(make, "QUICK_BUDGET", make.Budget(native=1e-6, python=1e-6, peer=1e-6))
+    monkeypatch.setattr(make, "BUDGET", make.Budget(native=1e-6, python=1e-6, peer=1e-6))
     rows = list(make._Measured(SHORT, Table(tmp_path / "t.csv", Row), lambda said: None).ours(quick=True))
     first, second = rows[:2]
     assert first.status == "stopped"
