@@ -242,8 +242,8 @@ def test_profile_does_not_disturb_json() -> None:
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
-        (KeyboardInterrupt(), 130, "interrupted"),
-        (KeyboardInterrupt("SIGTERM"), 143, "interrupted by SIGTERM"),
+        (KeyboardInterrupt(), 130, "by Ctrl-C"),
+        (KeyboardInterrupt("SIGTERM"), 143, "by SIGTERM"),
         (OSError(28, "No space left on device", "disk"), 2, "disk: No space left on device"),
     ],
 )

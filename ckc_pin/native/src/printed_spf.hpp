@@ -16,6 +16,8 @@ class PrintedSpf : public System {
   double decay() const override { return -1.0 / epsilon_; }
 
  private:
+  void place(double t, In y);  // the core at the state; z_dot_ with phi as it is
+
   double epsilon_;
   bool actual_;
   Vector w0_, q_tree_, z_dot_;
