@@ -21,6 +21,7 @@ Verdict = Literal["converged", "out of reach", "singular"]
 
 MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
 MAX_ITERATIONS = 12
+FAR = 500  # Newton steps, a hundred radians or more: no step of a motion is so long, but a trial of one may be
 SMALLEST_PIECE = 1e-9  # of the straight line in q
 STARTS = 20  # of z, when the line does not lead to q
 ROUNDING = 1e-9  # of |J|: below that, phi_z is singular to working precision
@@ -134,6 +135,8 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, a
         level = w - (1.0 - done - piece) * dw if between_levels else w
         trial = newton(predict(at, piece * dq, piece * dw if between_levels else None), level, tolerance)
         iterations += trial.iterations
+        if not anywhere and iterations > FAR:
+            return Sigma("out of reach", at, done, float("nan"), iterations, "that is too far away for one step")
         if trial.converged and _same_branch(at, trial.at):
             at, done, piece = trial.at, done + piece if piece < 1.0 - done else 1.0, 2.0 * piece
         else:

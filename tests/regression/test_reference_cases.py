@@ -205,3 +205,11 @@ length = 1.0
     start = -0.3
     run = period(tmp_path, CARRIAGE, loop, f"x = {np.cos(start)}\ny = {np.sin(start)}", "x", -1, "dae")
     assert run.t[-1] == pytest.approx(one_freedom.pendulum_period(start), abs=1e-9)
+
+
+def test_trial_stages_far_away_are_not_followed() -> None:
+    """At 1e-3 a step proposes stages 1e5 turns of the crank away: following sigma there took a minute."""
+    changes = {"formulation": "reduced", "t_end": 5.0, "solver.method": "DOP853", "solver.rtol": 1e-3}
+    run = simulate("slider_crank", changes)
+    assert run.status == "done"
+    assert run.stats["newton"] < 4 * run.stats["rhs"]
