@@ -49,8 +49,6 @@ __all__ = [
 
 __version__ = "0.1.0"
 
-OF_SIMULATION = ("Check", "Event", "Run", "Scene", "Simulator", "check", "load_scene", "simulate")
-
 
 def __getattr__(name: str) -> Any:
     """Load simulation when something of it is used first: terms and mechanisms do without."""
@@ -58,7 +56,7 @@ def __getattr__(name: str) -> Any:
 
     if name == "simulation":
         return import_module("ckc_pin.simulation")
-    if name in OF_SIMULATION:
+    if name in __all__:  # the others are here
         return getattr(import_module("ckc_pin.simulation"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -118,9 +118,7 @@ def closing_step(terms: Terms, residual: Array) -> Array:
     NumericalError
         J has lost rank.
     """
-    tangent, particular = tangent_basis(terms, residual)
-    inertia = tangent.T @ terms.D_tree @ tangent
-    return particular - tangent @ Factorization(inertia).solve(tangent.T @ (terms.D_tree @ particular))
+    return _with_force(terms, *tangent_basis(terms, residual), np.zeros(terms.mechanism.n))
 
 
 def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
@@ -136,11 +134,10 @@ def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.
         J has lost rank.
     """
     tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree + correction)
-    force = u_tree - terms.bias_tree - terms.D_tree @ particular
+    force = u_tree - terms.bias_tree
     if terms.mechanism.springs.any_damping:
         force += terms.damping_force
-    inertia = tangent.T @ terms.D_tree @ tangent
-    return particular + tangent @ Factorization(inertia).solve(tangent.T @ force)
+    return _with_force(terms, tangent, particular, force)
 
 
 def dae_rate_gradient(terms: Terms, u_gradient: Array) -> Array:
@@ -155,11 +152,17 @@ def dae_rate_gradient(terms: Terms, u_gradient: Array) -> Array:
         That of the actuators' forces on the tree.
     """
     tangent, particular = tangent_basis(terms, 2 * terms.J_dot)
-    force = u_gradient - 2 * terms.C_tree - terms.D_tree @ particular
+    force = u_gradient - 2 * terms.C_tree
     if terms.mechanism.springs.any_damping:
         force -= terms.mechanism.springs.damping_matrix(terms.q_tree)
+    return _with_force(terms, tangent, particular, force)
+
+
+def _with_force(terms: Terms, tangent: Array, particular: Array, force: Array) -> Array:
+    """Return the particular solution with as much of the tangent directions as a force on the tree makes of them."""
     inertia = tangent.T @ terms.D_tree @ tangent
-    return particular + tangent @ Factorization(inertia).solve(tangent.T @ force)
+    right = tangent.T @ (force - terms.D_tree @ particular)
+    return particular + tangent @ Factorization(inertia).solve(right)
 
 
 def multipliers(terms: Terms, u_tree: Array, acceleration: Array) -> Array:

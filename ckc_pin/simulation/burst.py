@@ -76,7 +76,7 @@ class Burst:
             self.times[due:],
             min(ROWS, len(self.times) - due),
         )
-        self.system.book(self.system.counts)
+        self.system.book()
         self.recorder.extend(rows)
         steps, rejected, rhs, jacobians, factorizations = loop.counts()
         stepper.rejected += rejected

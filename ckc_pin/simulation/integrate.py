@@ -185,15 +185,11 @@ class Stepper:
         if self.steps >= self.doubt and self.solver.status == "running":
             self._reconsider()
 
-    def rate(self, t: float, y: Array) -> Array:
-        """Evaluate y' at (t, y), counted; NaN where it does not exist."""
-        return self._rhs(t, y)
-
     def _ida(self, *start: Any, **options: Any) -> Any:
         from ckc_pin.simulation.ida import Ida
 
         assert isinstance(self.system, Dae)
-        return Ida(*start, system=self.system, count=self._count, **options)
+        return Ida(*start, system=self.system, count=self.count, **options)
 
     def refine(self, rtol: float) -> bool:
         """Take a finer tolerance from the next solver on; return whether it is finer than before."""
@@ -244,7 +240,7 @@ class Stepper:
         }
 
     def _rhs(self, t: float, y: Array, at_start: bool = False) -> Array:
-        self._count(t)
+        self.count(t)
         try:
             with np.errstate(all="ignore"):
                 derivative = self.system.rhs(t, y) if np.all(np.isfinite(y)) else np.full_like(y, np.nan)
@@ -261,7 +257,7 @@ class Stepper:
         self._recent.append((t, y.copy(), derivative))
         return derivative
 
-    def _count(self, t: float) -> None:
+    def count(self, t: float) -> None:
         """Take note of an evaluation, as long as there is a budget for it."""
         self.rhs_count += 1
         self._times.add(t)

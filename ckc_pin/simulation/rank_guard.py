@@ -225,7 +225,7 @@ class RankGuard:
         """Return y' where the states are put on the closure, counted."""
         assert self.dae is not None
         for t in times.tolist():
-            self.stepper._count(t)
+            self.stepper.count(t)
         with np.errstate(all="ignore"):
             return self.dae.rates_on_closure(times, states)
 

@@ -59,7 +59,7 @@ class Recorder:
     def _native_row(self, t: float, y: Array) -> Array | None:
         system = self.system
         if isinstance(system, Native) and (self.lyapunov is None or system.controls):
-            return system.row(t, y, system.counts)
+            return system.row(t, y)
         return None
 
     def _add(self, t: float, y: Array) -> None:

@@ -22,6 +22,7 @@ from ckc_pin.study.report.row import Motion, Row, judged
 from ckc_pin.study.report.table import Table, key
 from ckc_pin.study.report.work import WORKS, Work
 from tests.analytic.five_bar import FIVE_BAR, Q
+from tests.study.report_rows import row
 
 SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
 EVERY = {work.key: work for work in WORKS}
@@ -188,15 +189,6 @@ def test_others_say_why_they_are_missing() -> None:
 
 
 # --- the table ----------------------------------------------------------------------------------------------------
-
-
-def row(**changes: Any) -> Row:
-    plain: dict[str, Any] = {
-        "key": "k", "work": "short", "program": ours.PROGRAM, "setting": "dae, auto, rtol 1e-06", "status": "done",
-        "reason": "", "error_end": 1e-8, "error_max": 1e-7, "closure": 1e-14, "energy_drift": None, "wall_s": 0.01,
-        "setup_s": 0.02, "steps": 10, "rhs": 100,
-    }  # fmt: skip
-    return Row(**(plain | changes))
 
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ckc_pin.study.report import ours
 from ckc_pin.study.report.advice import advice
 from ckc_pin.study.report.figure import _front
 from ckc_pin.study.report.goals import BY_HAND, PACKAGED, cells, goals_table
@@ -18,25 +16,13 @@ from ckc_pin.study.report.reference import Reference
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.sentences import eq_8_ratio, fastest, sentences, times
 from ckc_pin.study.report.work import Work
+from tests.study.report_rows import peer, row
 
 SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1)
 SPATIAL = Work("spatial", "somewhere in space", "bricard", 0.1, planar=False)
 GOOD = Reference(np.zeros((11, 4)), 1e-13, "known")
 LOOP = "a loop in C++"
 SECONDS = st.floats(1e-4, 1e2)
-
-
-def row(**changes: Any) -> Row:
-    plain: dict[str, Any] = {
-        "key": "k", "work": "short", "program": ours.PROGRAM, "setting": "dae, auto, rtol 1e-06", "status": "done",
-        "reason": "", "error_end": 1e-8, "error_max": 1e-7, "closure": 1e-14, "energy_drift": None, "wall_s": 0.01,
-        "setup_s": 0.02, "steps": 10, "rhs": 100,
-    }  # fmt: skip
-    return Row(**(plain | changes))
-
-
-def peer(**changes: Any) -> Row:
-    return row(**{"program": "MuJoCo", "setting": "RK4", **changes})
 
 
 def advised(rows: Mapping[str, list[Row]], works: tuple[Work, ...] = (SHORT,)) -> str:

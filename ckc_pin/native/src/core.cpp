@@ -211,14 +211,19 @@ void Core::tangent_inertia() {
   square_factor_.compute(square_);
 }
 
+void Core::with_force(In force, Out x) {
+  small_b_.noalias() = tangent_.transpose() * force;
+  square_factor_.solve(small_b_, small_);
+  x = x_;
+  for (int k = 0; k < n - rank; ++k) x += small_(k) * tangent_.col(k);
+}
+
 bool Core::closing_step(In residual, Out x) {
   if (!tangent_basis(residual, weak)) return false;
   tangent_inertia();
   D_times(x_, y_);
-  small_b_.noalias() = tangent_.transpose() * y_;
-  square_factor_.solve(small_b_, small_);
-  x = x_;
-  for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
+  y_ = -y_;
+  with_force(y_, x);
   return true;
 }
 
@@ -226,10 +231,8 @@ bool Core::shortest_step(In residual, Out x) {
   if (!tangent_basis(residual, singular)) return false;
   square_.noalias() = tangent_.transpose() * tangent_;
   square_factor_.compute(square_);
-  small_b_.noalias() = tangent_.transpose() * x_;
-  square_factor_.solve(small_b_, small_);
-  x = x_;
-  for (int k = 0; k < n - rank; ++k) x -= small_(k) * tangent_.col(k);
+  y_ = -x_;
+  with_force(y_, x);
   return true;
 }
 
@@ -240,10 +243,7 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   D_times(x_, y_);
   y_ = u_tree - bias_tree - y_;
   if (springs.any_damping) springs.add_damping(v_tree, y_);
-  small_b_.noalias() = tangent_.transpose() * y_;
-  square_factor_.solve(small_b_, small_);
-  acceleration = x_;
-  for (int k = 0; k < n - rank; ++k) acceleration += small_(k) * tangent_.col(k);
+  with_force(y_, acceleration);
   return true;
 }
 

@@ -59,6 +59,7 @@ class Core {
  private:
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
   void tangent_inertia();                         // factorized
+  void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions
   bool basis_of_partition();
   bool basis_by_pivoting(double least);
   bool D_here_ = false;  // whether the tree's D' is that of q_tree

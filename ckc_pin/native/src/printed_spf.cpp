@@ -18,7 +18,8 @@ void PrintedSpf::place(double t, In y) {
   w = w0_ * std::exp(-t / epsilon_);
   core.spf_z_dot(q_dot, epsilon_, core.rows.phi, z_dot_);
   core.velocity(q_dot, v_tree);
-  for (size_t k = 0; k < core.z.size() && actual_; ++k) v_tree(core.z[k]) = z_dot_(k);
+  if (!actual_) return;
+  for (size_t k = 0; k < core.z.size(); ++k) v_tree(core.z[k]) = z_dot_(k);
 }
 
 // The velocity with the exact w: what a tolerance leaves phi off by would be divided by epsilon.

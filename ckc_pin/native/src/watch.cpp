@@ -18,10 +18,9 @@ Watch::Watch(const Core& core, In row_scale, In column_scale, double chart_margi
   scaled_.setZero(m, core.n), gram_.setZero(m, m), u_.setZero(m), v_.setZero(core.n);
   shifted_.shape(m, m, full_pattern(m));
   phi_z_.setZero(m, k), phi_z_gram_.setZero(k, k);
-  for (auto* solver : {&eigen_, &chart_eigen_}) {  // which cannot be copied before its first use
-    const int size = std::max(solver == &eigen_ ? m : k, 1);
-    solver->compute(Matrix::Identity(size, size), Eigen::EigenvaluesOnly);
-  }
+  // Solvers cannot be copied before their first use.
+  eigen_.compute(Matrix::Identity(std::max(m, 1), std::max(m, 1)), Eigen::EigenvaluesOnly);
+  chart_eigen_.compute(Matrix::Identity(std::max(k, 1), std::max(k, 1)), Eigen::EigenvaluesOnly);
 }
 
 Watch::Rank Watch::rank(System& system) {

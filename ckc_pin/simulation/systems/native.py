@@ -58,6 +58,7 @@ class Native:
 
     controller: Controller | None
     actuation: Actuation | None
+    counts: Counts
     native: Any = None
     crosses = False
     core: Any = None
@@ -77,26 +78,26 @@ class Native:
         if isinstance(self.controller, Held):
             self.native.hold(self.controller.held)
 
-    def book(self, counts: Counts) -> None:
+    def book(self) -> None:
         """Add the native side's counts."""
         newton, factorizations = self.native.counts()
-        counts.newton += newton
-        counts.factorizations += factorizations
+        self.counts.newton += newton
+        self.counts.factorizations += factorizations
 
-    def row(self, t: float, y: Array, counts: Counts) -> Array | None:
+    def row(self, t: float, y: Array) -> Array | None:
         """What a run keeps of an instant, as the native step loop records it; None where Python has to tell."""
         if not self.crosses:
             return None
         self.refresh()
         found: Array | None = self.native.row(t, y)
-        self.book(counts)
+        self.book()
         return found
 
-    def evaluate(self, t: float, y: Array, counts: Counts) -> Array | None:
+    def evaluate(self, t: float, y: Array) -> Array | None:
         """y' with what acts natively; None where it does not exist."""
         self.refresh()
         derivative: Array | None = self.native.rhs(t, y)
-        self.book(counts)
+        self.book()
         return derivative
 
 
@@ -124,7 +125,7 @@ class NativeLevelSet(LevelSet, Native):
         return NativeTrail(native, start)
 
     def rhs(self, t: float, y: Array) -> Array:
-        derivative = self.evaluate(t, y, self.counts) if self.crosses else self._with_force(t, y)
+        derivative = self.evaluate(t, y) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 
     def _with_force(self, t: float, y: Array) -> Array | None:
@@ -135,7 +136,7 @@ class NativeLevelSet(LevelSet, Native):
         at = Kinematics(at.tree, at.closure, at.partition, closed[0])
         u_tree = self.force(t, Terms(self.mechanism, at, closed[1]))
         derivative = self.native.finish(u_tree) if np.isfinite(u_tree).all() else None
-        self.book(self.counts)
+        self.book()
         return derivative
 
 
@@ -153,7 +154,7 @@ class NativePrintedSpf(PrintedSpf, Native):
         self.drive(core().PrintedSpf(self.core, self.epsilon, self.convention == "actual", self.w0))
 
     def rhs(self, t: float, y: Array) -> Array:
-        derivative = self.evaluate(t, y, self.counts) if self.crosses else None
+        derivative = self.evaluate(t, y) if self.crosses else None
         return super().rhs(t, y) if derivative is None else derivative
 
 
@@ -175,7 +176,7 @@ class NativeDae(Dae, Native):
     def rhs(self, t: float, y: Array) -> Array:
         if self.closes_within:
             return super().rhs(t, y)
-        derivative = self.evaluate(t, y, self.counts) if self.crosses else self._with_force(t, y)
+        derivative = self.evaluate(t, y) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
@@ -186,7 +187,7 @@ class NativeDae(Dae, Native):
         if found is None:  # near a rank loss, with what that has cost forgotten
             self.native.counts()
             return super()._projected(at, v_tree)
-        self.book(self.counts)
+        self.book()
         return Terms(self.mechanism, self.mechanism.kinematics(found[0]), found[1])
 
     def rates_on_closure(self, times: Array, states: Array) -> Array:
@@ -194,7 +195,7 @@ class NativeDae(Dae, Native):
             return super().rates_on_closure(times, states)
         self.refresh()
         rates: Array = self.native.rates_on_closure(times, states)
-        self.book(self.counts)
+        self.book()
         return rates
 
     def _with_force(self, t: float, y: Array) -> Array | None:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from time import perf_counter
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ckc_pin.dynamics.formulations import multipliers
@@ -179,16 +180,15 @@ def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> 
         yield from (LeftOut(key=f"{key}.{what}", scene=scene, what=what, reason=str(error)) for what in TERMS)
         return
     for what, (name, probe) in TERMS.items():
-        own = {"key": f"{key}.{what}", "scene": scene, "what": what, "used": name in evaluated, "rhs_s": rhs_s}
-        if name in evaluated:
-            yield LeftOut(**own)  # type: ignore[arg-type]
-            continue
-        try:
-            spent, memory = _beside(system, states, evaluated, probe)
-        except CkcError as error:
-            yield LeftOut(**own, reason=str(error))  # type: ignore[arg-type]
-        else:
-            yield LeftOut(**own, seconds=spent, bytes=memory)  # type: ignore[arg-type]
+        row = LeftOut(key=f"{key}.{what}", scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
+        if name not in evaluated:
+            try:
+                spent, memory = _beside(system, states, evaluated, probe)
+            except CkcError as error:
+                row = msgspec.structs.replace(row, reason=str(error))
+            else:
+                row = msgspec.structs.replace(row, seconds=spent, bytes=memory)
+        yield row
 
 
 def _evaluated(system: Any, states: list[tuple[float, Any]]) -> set[str]:

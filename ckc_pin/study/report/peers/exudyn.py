@@ -100,7 +100,7 @@ class _System(Steps):
         self._v = v_tree.copy()
         pin.forwardKinematics(tree.model, tree.data, q_tree, v_tree)
         self._placements = [pin.SE3(placement) for placement in tree.data.oMi]
-        self._bodies: list[Any] = [self.mbs.CreateGround()]
+        self._bodies = [self.mbs.CreateGround()]
         for k in range(1, tree.model.njoints):
             place, velocity, inertia = self._placements[k], tree.data.v[k], tree.model.inertias[k]
             body = inertia_of(inertia.mass, inertia.inertia, inertia.lever, inertiaTensorAtCOM=True)
@@ -154,11 +154,6 @@ class _System(Steps):
                 q_tree[at], v_tree[at] = relative.translation @ along, axis @ (velocities[k] - carried)
         self._q, self._v = q_tree, v_tree
         return q_tree.copy(), v_tree.copy()
-
-    def kinetic_energy(self) -> float:
-        """Return the sum over the bodies."""
-        kind = self.exudyn.OutputVariableType.KineticEnergy
-        return float(sum(self.mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
 
     def _joint(self, k: int) -> tuple[Array, bool]:
         """Add a joint; return its axis in the body, and whether it turns."""

@@ -75,11 +75,6 @@ class Plane(Steps):
             v_tree[j] = along @ (speed - carried)
         return q_tree, v_tree
 
-    def kinetic_energy(self) -> float:
-        """Return the sum over the bodies."""
-        kind = self.exudyn.OutputVariableType.KineticEnergy
-        return float(sum(self.mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
-
     def _body(self, place: pin.SE3, velocity: pin.Motion, inertia: pin.Inertia, gravity: Array) -> None:
         center = place.act(inertia.lever)
         moving = place.rotation @ (velocity.linear + np.cross(velocity.angular, inertia.lever))

@@ -22,6 +22,7 @@ class Steps:
         self.mechanism, self.exudyn, self.items, self.t = work.mechanism, exudyn, itemInterface, 0.0
         self._container = exudyn.SystemContainer()
         self.mbs: Any = self._container.AddSystem()
+        self._bodies: list[Any] = []  # the ground first
 
     def assemble(self) -> None:
         """End construction."""
@@ -36,6 +37,11 @@ class Steps:
         dense = redundant or self.mechanism.tree.model.njoints <= FEW
         self._settings.linearSolver.solverType = linear.EigenDense if dense else linear.EigenSparse
         self._settings.linearSolver.ignoreSingularJacobian = redundant
+
+    def kinetic_energy(self) -> float:
+        """Return the sum over the bodies."""
+        kind = self.exudyn.OutputVariableType.KineticEnergy
+        return float(sum(self.mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
 
     def advance(self, solver: str, radius: float, dt: float, many: int) -> None:
         """Take steps; the state is where they end."""
