@@ -16,8 +16,9 @@ def why_python(mechanism: Mechanism, spec: SceneSpec | None = None) -> str | Non
         return reason
     if spec is not None and spec.formulation == "dae":
         return None
-    if not mechanism.tree.flat:
-        return "with a free root the native core takes a DAE alone"
+    rooted = [name for name in mechanism.independent if name in mechanism.tree.free_coordinates]
+    if rooted:
+        return f"{rooted[0]} of a free root is independent, which the native core takes in a DAE alone"
     return None
 
 

@@ -18,7 +18,7 @@ from ckc_pin.simulation.integrate import Stepper
 from ckc_pin.simulation.rank_guard import RankGuard
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.systems.base import CHART_MARGIN
-from ckc_pin.simulation.systems.level_set import SWITCH_MARGIN, LevelSet
+from ckc_pin.simulation.systems.level_set import LevelSet
 
 __all__ = ["Burst", "runs"]
 
@@ -64,6 +64,7 @@ class Burst:
         loop.begin(stepper.t, solver.y, getattr(solver, "f", solver.y), solver.h_abs)
         if stepper.method == "BDF":
             loop.remember(solver.D, solver.order, solver.n_equal_steps, solver.J)
+        loop.chart_margin = getattr(self.system, "margin", CHART_MARGIN)
         if self.guard.end is not None:
             loop.end = self.guard.end
         end = float(solver.t_bound)
@@ -110,10 +111,9 @@ class Burst:
             mechanism = self.system.mechanism
             rows = np.where(mechanism.closure.in_metres(mechanism.tree), 1.0 / mechanism.size, 1.0)
             columns = np.where(mechanism.tree.in_metres, mechanism.size, 1.0)
-            margin = SWITCH_MARGIN if getattr(self.system, "may_switch", False) else CHART_MARGIN
             self._made = core().Loop(
                 self.system.native, self.stepper.method, _coefficients(self.stepper), options["rtol"], options["atol"],
-                options.get("max_step", np.inf), rows, columns, margin,
+                options.get("max_step", np.inf), rows, columns,
             )  # fmt: skip
         return self._made
 

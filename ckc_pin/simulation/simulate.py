@@ -207,7 +207,7 @@ def _burst(
     burst = Burst(stepper, legs.guard, recorder, outputs.times, clock.within)
 
     def run() -> None:
-        more = runs(stepper)  # no more once auto has taken a method that is Python's
+        more = system.crosses and runs(stepper)  # no more once method or coordinates are Python's
         while more:
             outputs.due, more = burst.run(outputs.due)
             legs.good = (stepper.t, stepper.solver.y)

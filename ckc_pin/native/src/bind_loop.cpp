@@ -90,15 +90,18 @@ void bind_loop(nb::module_& m) {
   nb::class_<Run>(m, "Loop")
       .def("__init__",
            [](Run* self, System& system, const std::string& method, const nb::dict& table, double rtol, double atol, double max_step,
-              Given row_scale, Given column_scale, double chart_margin) {
+              Given row_scale, Given column_scale) {
              const Core& core = system.core;
              require(row_scale, core.rows.closure.rows, "row_scale"), require(column_scale, core.n, "column_scale");
              require(rtol > 0 && atol > 0 && max_step > 0, "tolerances must be positive");
              new (self) Run(system, method_of(method, table, {rtol, atol, max_step}, system.size),
-                            Watch(core, row_scale, column_scale, chart_margin));
+                            Watch(core, row_scale, column_scale));
            },
            nb::keep_alive<1, 2>(), "system"_a, "method"_a, "table"_a, "rtol"_a, "atol"_a, "max_step"_a, "row_scale"_a,
-           "column_scale"_a, "chart_margin"_a)
+           "column_scale"_a)
+      .def_prop_rw(
+          "chart_margin", [](const Run& run) { return run.watch.chart_margin; },
+          [](Run& run, double margin) { run.watch.chart_margin = margin; })
       .def("begin", &begin, "t"_a, "y"_a, "f"_a, "h_abs"_a)
       .def("remember", &remember, "D"_a, "order"_a, "equal"_a, "J"_a)
       .def("memory", &memory)

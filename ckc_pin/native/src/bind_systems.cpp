@@ -17,6 +17,12 @@ namespace {
 
 constexpr const char* free_root = "a free root: its place is no number";
 
+bool single(const Core& core, const Indices& coordinates) {
+  const Indices& all = core.tree.single;
+  return std::all_of(coordinates.begin(), coordinates.end(),
+                     [&](int k) { return std::binary_search(all.begin(), all.end(), k); });
+}
+
 void require_state(const System& system, Given y) { require(y, system.size, "y"); }
 
 nb::object rhs(System& system, double t, Given y) {
@@ -181,7 +187,7 @@ void bind_systems(nb::module_& m) {
            [](LevelSet* self, Core& core, Given q_tree, double epsilon, bool actual, Given w0, double tolerance,
               double slack) {
              require(q_tree, core.tree.nq, "q_tree"), require(w0, core.rows.closure.rows, "w0");
-             require(core.tree.flat, free_root);
+             require(single(core, core.q), free_root);
              require(epsilon > 0 && tolerance > 0 && slack >= 0, "epsilon and tolerance must be positive");
              new (self) LevelSet(core, epsilon, actual, w0, tolerance, slack);
              core.set(q_tree), core.factor(), core.reduce();
@@ -197,7 +203,6 @@ void bind_systems(nb::module_& m) {
   nb::class_<Dae, System>(m, "Dae")
       .def("__init__",
            [](Dae* self, Core& core, double tolerance, bool projects, double alpha, double beta) {
-             require(core.tree.flat, free_root);
              require(tolerance > 0 && alpha >= 0 && beta >= 0, "tolerance, alpha and beta must not be negative");
              new (self) Dae(core, tolerance, projects, alpha, beta);
            },
@@ -207,7 +212,7 @@ void bind_systems(nb::module_& m) {
   nb::class_<PrintedSpf, System>(m, "PrintedSpf")
       .def("__init__",
            [](PrintedSpf* self, Core& core, double epsilon, bool actual, Given w0) {
-             require(core.tree.flat, free_root), require(w0, core.rows.closure.rows, "w0");
+             require(core.tree.roots.empty(), free_root), require(w0, core.rows.closure.rows, "w0");
              require(epsilon > 0, "epsilon must be positive");
              new (self) PrintedSpf(core, epsilon, actual, w0);
            },

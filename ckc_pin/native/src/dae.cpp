@@ -10,9 +10,9 @@ constexpr double negligible = 1e-9;  // rad, m: Newton's last step onto the clos
 static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
 
 Dae::Dae(Core& core_, double tolerance, bool projects, double alpha, double beta)
-    : System(core_, 2 * core_.n), tolerance_(tolerance), alpha_(alpha), beta_(beta), projects_(projects) {
+    : System(core_, core_.tree.nq + core_.n), tolerance_(tolerance), alpha_(alpha), beta_(beta), projects_(projects) {
   needs_chart = false, crosses = projects;
-  q_tree_.setZero(core.n), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
 void Dae::set(In q_tree) {
@@ -24,16 +24,22 @@ void Dae::set(In q_tree) {
   }
 }
 
+void Dae::place(In y) {
+  q_tree_ = y.head(core.tree.nq);
+  core.tree.normalize(q_tree_);
+  set(q_tree_);
+}
+
 bool Dae::rhs(double t, In y, Out y_dot) {
   if (!y.allFinite()) return false;
-  set(y.head(core.n));
+  place(y);
   return rate(t, y.tail(core.n), y_dot);
 }
 
 bool Dae::rate(double t, In v, Out y_dot) {
   const int n = core.n;
   core.bias(v);
-  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.q[k]), q_dot(k) = v(core.q[k]);
+  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
   drive.act(t, core, q, q_dot);
   residual_.setZero();
   if (alpha_ != 0.0 || beta_ != 0.0) {
@@ -41,19 +47,18 @@ bool Dae::rate(double t, In v, Out y_dot) {
     residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
   }
   counts.factorizations += 2;
-  y_dot.head(n) = v;
+  core.tree.rate(core.q_tree, v, y_dot.head(core.tree.nq));
   return core.dae_acceleration(drive.u_tree, residual_, y_dot.tail(n)) && y_dot.allFinite();
 }
 
 bool Dae::project(In y) {
   const int n = core.n;
-  q_tree_ = y.head(n);
-  set(q_tree_);
+  place(y);
   for (int k = 0; largest(core.rows.phi) > tolerance_; ++k) {
     if (k == most_steps || !core.rows.phi.allFinite() || !core.closing_step(core.rows.phi, step_)) return false;
     ++counts.newton, counts.factorizations += 2;
     residual_.noalias() = core.rows.J * step_;
-    q_tree_ += step_;
+    core.tree.move(q_tree_, step_);
     set(q_tree_);
     if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
   }
@@ -66,12 +71,11 @@ bool Dae::project(In y) {
 bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   const int n = core.n;
   if (!y.allFinite()) return false;
-  q_tree_ = y.head(n);
-  set(q_tree_);
+  place(y);
   for (int k = 0;; ++k) {
     if (k == most_steps || !core.shortest_step(core.rows.phi, step_)) return false;
     ++counts.factorizations;
-    q_tree_ += step_;
+    core.tree.move(q_tree_, step_);
     set(q_tree_);
     if (largest(step_) <= negligible) break;  // what is left is its square
   }
@@ -87,11 +91,11 @@ bool Dae::exact(double, In y) {
   if (projects_) {
     if (!project(y)) return false;
   } else {
-    set(y.head(n));
+    place(y);
     velocity = y.tail(n);
   }
   v_tree = velocity;
-  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.q[k]), q_dot(k) = velocity(core.q[k]);
+  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = velocity(core.q[k]);
   return true;
 }
 
@@ -99,12 +103,12 @@ bool Dae::accept(double, Out y, bool& changed) {
   const int n = core.n;
   changed = false;
   if (!projects_) return true;
-  set(y.head(n));
+  place(y);
   residual_.noalias() = core.rows.J * y.tail(n);
   const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
   if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return true;
   if (!project(y)) return false;
-  y.head(n) = core.q_tree, y.tail(n) = velocity;
+  y.head(core.tree.nq) = core.q_tree, y.tail(n) = velocity;
   changed = true;
   return true;
 }

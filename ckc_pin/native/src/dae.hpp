@@ -7,7 +7,7 @@ namespace ckc {
 
 class Dae : public System {
  public:
-  // `alpha`, `beta` of Baumgarte's stabilisation, zero for none; flat trees only.
+  // `alpha`, `beta` of Baumgarte's stabilisation, zero for none.
   Dae(Core& core, double tolerance, bool projects, double alpha, double beta);
 
   bool rhs(double t, In y, Out y_dot) override;
@@ -21,6 +21,7 @@ class Dae : public System {
   bool project(In y);
 
  private:
+  void place(In y);     // q_tree_, and the core at it
   void set(In q_tree);  // the core at a configuration, with D' and what controllers need
   bool rate(double t, In v, Out y_dot);  // at the core's configuration
 

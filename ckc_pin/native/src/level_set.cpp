@@ -19,7 +19,7 @@ LevelSet::LevelSet(Core& core_, double epsilon, bool actual, In w0, double toler
       on_manifold_(w0.isZero(0)),
       w0_(w0) {
   const int m = core.rows.closure.rows;
-  q_tree_.setZero(core.tree.nq), tree_.setZero(core.n);
+  q_tree_.setZero(core.tree.nq), tree_.setZero(core.n), step_.setZero(core.n);
   residual_.setZero(m), damping_.setZero(core.n, core.n);
 }
 
@@ -72,7 +72,9 @@ bool LevelSet::newton(double tolerance) {
     if (!std::isfinite(size) || core.phi_z.singular() || iteration == max_iterations) return false;
     core.solve_z(residual_, z_);
     if (!(z_.lpNorm<Eigen::Infinity>() <= max_step)) return false;
-    for (size_t k = 0; k < core.z.size(); ++k) q_tree_(core.tree.place[core.z[k]]) -= z_(k);
+    step_.setZero();
+    for (size_t k = 0; k < core.z.size(); ++k) step_(core.z[k]) = -z_(k);
+    core.tree.move(q_tree_, step_);
     ++counts.newton, ++counts.factorizations;
   }
   return false;

@@ -1,4 +1,4 @@
-// The reduced model, eq. 6, on a level set of phi; with w(t) of eq. 17 that is the SPF. Flat trees only.
+// The reduced model, eq. 6, on a level set of phi; with w(t) of eq. 17 that is the SPF. Every q a joint of one freedom.
 #pragma once
 
 #include "system.hpp"
@@ -33,7 +33,7 @@ class LevelSet : public System {
   double epsilon_, tolerance_, slack_;
   bool actual_, on_manifold_;
   int expected_ = 0;  // corrections that closing will take
-  Vector w0_, q_tree_, residual_, z_, moved_, y_dot_, tree_;
+  Vector w0_, q_tree_, residual_, z_, moved_, y_dot_, tree_, step_;
   Vector f_, column_;
   Matrix gradient_, damping_;
 };

@@ -1,4 +1,4 @@
-// Eq. 8 as printed, y = (q, q_dot, z). Flat trees only.
+// Eq. 8 as printed, y = (q, q_dot, z). Trees without free roots only.
 #pragma once
 
 #include "system.hpp"

@@ -9,7 +9,7 @@ Trail::Trail(const Core& core, double epsilon) : epsilon_(epsilon) {
   for (Point& point : points_) {
     point.q_tree.setZero(core.tree.nq), point.v_tree.setZero(core.n), point.w.setZero(core.rows.closure.rows);
   }
-  level_.setZero(core.rows.closure.rows);
+  level_.setZero(core.rows.closure.rows), step_.setZero(core.n), part_.setZero(core.n);
 }
 
 void Trail::start(const Core& core, In q_tree) {
@@ -51,17 +51,25 @@ void Trail::predict(double t, In q, const Core& core, In w, Out q_tree) {
   int chosen[nodes] = {nearest};
   double a[nodes] = {1.0}, b[nodes] = {0.0};
   const int count = count_ ? foretelling(t, nearest, chosen, a, b) : 1;
+  step_.setZero();
+  for (int i = 0; i < count; ++i) {
+    const Point& point = points_[chosen[i]];
+    core.tree.difference(base.q_tree, point.q_tree, part_);
+    step_ += a[i] * part_;
+    core.tree.difference_rate(base.q_tree, point.q_tree, point.v_tree, part_);
+    step_ += b[i] * part_;
+  }
+  for (int k = 0; k < core.d; ++k) dq_(k) = q(k) - base.q_tree(core.tree.place[core.q[k]]) - step_(core.q[k]);
+  for (int z : core.z) step_(z) += base.rho.row(z).dot(dq_);
+  if (off_ && count_) {
+    level_ = w;
+    for (int i = 0; i < count; ++i) level_ -= (a[i] - b[i] / epsilon_) * points_[chosen[i]].w;  // w_dot = -w / epsilon
+    base.phi_z.solve(level_, z_);
+    for (size_t k = 0; k < core.z.size(); ++k) step_(core.z[k]) += z_(k);
+  }
   q_tree = base.q_tree;
-  for (int i = 0; i < count; ++i)
-    q_tree += a[i] * (points_[chosen[i]].q_tree - base.q_tree) + b[i] * points_[chosen[i]].v_tree;
-  for (int k = 0; k < core.d; ++k) dq_(k) = q(k) - q_tree(core.tree.place[core.q[k]]);
-  for (int z : core.z) q_tree(core.tree.place[z]) += base.rho.row(z).dot(dq_);
+  core.tree.move(q_tree, step_);
   for (int k = 0; k < core.d; ++k) q_tree(core.tree.place[core.q[k]]) = q(k);
-  if (!off_ || !count_) return;
-  level_ = w;
-  for (int i = 0; i < count; ++i) level_ -= (a[i] - b[i] / epsilon_) * points_[chosen[i]].w;  // w_dot = -w / epsilon
-  base.phi_z.solve(level_, z_);
-  for (size_t k = 0; k < core.z.size(); ++k) q_tree(core.tree.place[core.z[k]]) += z_(k);
 }
 
 int Trail::foretelling(double t, int nearest, int* chosen, double* a, double* b) const {

@@ -1,4 +1,4 @@
-// Where a motion has been on its level sets, and where z will be next: `simulation.systems.trail` for flat trees.
+// Where a motion has been on its level sets, and where z will be next: `simulation.systems.trail`, q being joints of one freedom.
 #pragma once
 
 #include "core.hpp"
@@ -33,7 +33,7 @@ class Trail {
   Point points_[kept + 1];  // the last one is where it starts
   int count_ = 0, last_ = kept;
   bool off_ = false;
-  Vector dq_, level_, z_;
+  Vector dq_, level_, z_, step_, part_;
 };
 
 // Weights with p(t) = sum of a_i p(t_i) + b_i p'(t_i), exact for polynomials of degree 2 count - 1.

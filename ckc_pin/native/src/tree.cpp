@@ -6,6 +6,7 @@
 #include <pinocchio/algorithm/rnea.hpp>
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/serialization.hpp>
+#include <pinocchio/spatial.hpp>
 
 namespace ckc {
 
@@ -27,10 +28,13 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
   own = std::make_unique<Workspace>(read(serialized));
   const pin::Model& model = own->model;
   n = model.nv, nq = model.nq, joints = model.njoints;
-  flat = n == nq;
   support.resize(joints);
   ancestors.resize(n);
   for (int joint = 1; joint < joints; ++joint) {
+    if (model.nqs[joint] == 7)
+      roots.push_back({model.idx_qs[joint], model.idx_vs[joint]});
+    else
+      single.push_back(model.idx_vs[joint]);
     support[joint] = support[model.parents[joint]];
     for (int k = model.idx_vs[joint]; k < model.idx_vs[joint] + model.nvs[joint]; ++k) {
       support[joint].push_back(k);
@@ -73,6 +77,60 @@ const Matrix6x& Tree::jacobian_rate(In q, In v) {
 }
 
 double Tree::potential_energy(In q) { return pin::computePotentialEnergy(own->model, own->data, q); }
+
+static Eigen::Quaterniond turned(In q, Tree::Root root) {
+  return Eigen::Quaterniond(Eigen::Vector4d(q.segment<4>(root.q + 3))).normalized();
+}
+
+static pin::SE3 placement(In q, Tree::Root root) {
+  return {turned(q, root).toRotationMatrix(), q.segment<3>(root.q)};
+}
+
+void Tree::normalize(Out q) const {
+  for (const Root& root : roots) q.segment<4>(root.q + 3).normalize();
+}
+
+void Tree::move(Out q, In step) const {
+  for (int k : single) q(place[k]) += step(k);
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond before = turned(q, root);
+    const Vector3 by = step.segment<3>(root.v + 3);
+    q.segment<3>(root.q) = placement(q, root).act(pin::exp6(pin::Motion(step.segment<6>(root.v))).translation());
+    const Eigen::Quaterniond after = (before * Eigen::Quaterniond(pin::exp3(by))).normalized();
+    q.segment<4>(root.q + 3) = after.dot(before) < 0 ? Eigen::Vector4d(-after.coeffs()) : after.coeffs();
+  }
+}
+
+void Tree::difference(In from, In to, Out step) const {
+  for (int k : single) step(k) = to(place[k]) - from(place[k]);
+  for (const Root& root : roots)
+    step.segment<6>(root.v) = pin::log6(placement(from, root).actInv(placement(to, root))).toVector();
+}
+
+void Tree::difference_rate(In from, In to, In v, Out rate) const {
+  rate = v;
+  for (const Root& root : roots)
+    rate.segment<6>(root.v) = pin::Jlog6(placement(from, root).actInv(placement(to, root))) * v.segment<6>(root.v);
+}
+
+void Tree::rate(In q, In v, Out q_dot) const {
+  for (int k : single) q_dot(place[k]) = v(k);
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    Eigen::Quaterniond spin;  // half the angular velocity in the body's axes
+    spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
+    q_dot.segment<3>(root.q) = turn * Vector3(v.segment<3>(root.v));
+    q_dot.segment<4>(root.q + 3) = (turn * spin).coeffs();
+  }
+}
+
+void Tree::coordinates(In q, Out numbers) const {
+  for (int k : single) numbers(k) = q(place[k]);
+  for (const Root& root : roots) {
+    numbers.segment<3>(root.v) = q.segment<3>(root.q);
+    numbers.segment<3>(root.v + 3) = pin::log3(turned(q, root).toRotationMatrix());
+  }
+}
 
 Vector3 log3(const Matrix3& rotation) { return pin::log3(rotation); }
 

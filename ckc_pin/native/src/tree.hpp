@@ -16,8 +16,10 @@ class Tree {
   ~Tree();
 
   int n, nq, joints;
-  bool flat;                      // n = nq: every joint is one number
   Indices place;                  // (n)
+  struct Root { int q, v; };      // where a free root's seven numbers and its six velocities begin
+  std::vector<Root> roots;
+  Indices single;                 // tangent coordinates of joints of one freedom
   std::vector<Indices> support;   // by joint: the tangent coordinates that move it, ascending
   std::vector<Indices> ancestors; // by coordinate: those at or above it on its branch, where D' is not zero
 
@@ -41,6 +43,14 @@ class Tree {
   const Matrix6x& jacobian_dot() const;      // after `coriolis`: d/dt of `jacobian`
   const Matrix6x& jacobian_rate(In q, In v); // the same without C'
   double potential_energy(In q);
+
+  // A free root's place is no vector: position and unit quaternion in q', moved by a twist in its own axes.
+  void normalize(Out q) const;
+  void move(Out q, In step) const;                       // by a tangent step
+  void difference(In from, In to, Out step) const;       // the tangent step between
+  void difference_rate(In from, In to, In v, Out rate) const;  // of `difference`, where `to` moves with v
+  void rate(In q, In v, Out q_dot) const;
+  void coordinates(In q, Out numbers) const;             // (n): rotations as rotation vectors
 
  private:
   struct Workspace;

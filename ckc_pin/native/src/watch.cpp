@@ -8,10 +8,9 @@ namespace ckc {
 // As in `simulation.rank_guard`, except for `near`: from there on Python computes singular values, not their squares.
 constexpr double deep = 0.7, jump = 0.7, steps_ahead = 4.0, near = 1e-4;
 
-Watch::Watch(const Core& core, In row_scale, In column_scale, double chart_margin)
+Watch::Watch(const Core& core, In row_scale, In column_scale)
     : row_scale_(row_scale),
       column_scale_(column_scale),
-      chart_margin_(std::max(chart_margin, 1e-6)),
       eigen_(std::max(core.rows.closure.rows, 1)),
       chart_eigen_(std::max<int>(core.z.size(), 1)) {
   const int m = core.rows.closure.rows, k = static_cast<int>(core.z.size());
@@ -63,7 +62,7 @@ bool Watch::chart(const Core& core) {
   phi_z_gram_.noalias() = phi_z_.transpose() * phi_z_;
   chart_eigen_.compute(phi_z_gram_, Eigen::EigenvaluesOnly);
   const double least = chart_eigen_.eigenvalues()(0);
-  return least > chart_margin_ * chart_margin_ * core.rows.J.squaredNorm();
+  return least > chart_margin * chart_margin * core.rows.J.squaredNorm();
 }
 
 bool Watch::ahead(const Rank& end, double length) const {

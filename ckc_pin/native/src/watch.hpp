@@ -11,8 +11,10 @@ namespace ckc {
 
 class Watch {
  public:
-  // Scales that make J free of units; the margin of phi_z, relative to |J|, from which on Python looks after it.
-  Watch(const Core& core, In row_scale, In column_scale, double chart_margin);
+  // Scales that make J free of units.
+  Watch(const Core& core, In row_scale, In column_scale);
+
+  double chart_margin = 0.0;  // of phi_z, relative to |J|, from which on Python looks after it
 
   // J's least singular value that is not zero relative to the largest, and its rate, at the core's present state.
   struct Rank {
@@ -30,7 +32,6 @@ class Watch {
   void direction(double value);  // u_: the eigenvector of gram_
 
   Vector row_scale_, column_scale_, v_, u_;
-  double chart_margin_;
   Matrix scaled_, gram_, phi_z_, phi_z_gram_;
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_, chart_eigen_;  // values only: vectors would allocate
   Factor shifted_;

@@ -15,12 +15,23 @@ from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton, sigma
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems.base import DIFFERENCE, Counts, Force, Gradient, Rhs, require_chart, spf_velocity
+from ckc_pin.simulation.systems.base import (
+    CHART_MARGIN,
+    DIFFERENCE,
+    Counts,
+    Force,
+    Gradient,
+    Rhs,
+    require_chart,
+    spf_velocity,
+)
 from ckc_pin.simulation.systems.trail import Trail
 
 __all__ = ["LevelSet"]
 
 SWITCH_MARGIN = 0.03  # of |J|: where an uncontrolled run looks for a better q
+FALLEN = 0.7  # of the margin at which none was found: where it looks again
+POOR = 1e-3  # of |J|: from there on it looks at every step
 
 
 @dataclass
@@ -63,6 +74,11 @@ class LevelSet:
     @property
     def positions(self) -> int:
         return self._d if self._chart.plain else 0
+
+    @property
+    def margin(self) -> float:
+        """Of |J|: phi_z's least singular value down to which a step is plain."""
+        return self._alarm if self.may_switch else CHART_MARGIN
 
     def _new_trail(self, start: Kinematics) -> Trail:
         return Trail(start, self.epsilon)
@@ -165,8 +181,9 @@ class LevelSet:
 
     def _chart_from(self, at: Kinematics, q_dot: Array) -> Array:
         """Start the coordinates anew at a configuration."""
-        self._trail = self._new_trail(at)
         self._chart = Chart(at.tree, at.partition.q, at.q_tree)
+        self._trail = self._new_trail(at)
+        self._alarm = SWITCH_MARGIN
         return np.concatenate([self._chart.numbers(at.q_tree), q_dot])
 
     def _switched(self, t: float, y: Array) -> Array | None:
@@ -179,7 +196,10 @@ class LevelSet:
             return None
         size = max(float(np.linalg.norm(at.J)), 1e-300)
         margin = at.sigma_min() / size
-        better = self.mechanism.best_partition(at) if margin < SWITCH_MARGIN else None
+        if margin >= self._alarm:
+            return None
+        self._alarm = min(SWITCH_MARGIN, max(FALLEN * margin, POOR))
+        better = self.mechanism.best_partition(at)
         if better is None:
             return None
         terms = self.terms(t, y)

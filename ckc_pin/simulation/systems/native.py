@@ -103,7 +103,7 @@ class Native:
 
 @dataclass
 class NativeLevelSet(LevelSet, Native):
-    """A level set whose right-hand sides are native, for trees without free roots.
+    """A level set whose right-hand sides are native as long as no free root is among q.
 
     Where Newton's method does not close the loops from the prediction the inherited one looks further.
     """
@@ -113,6 +113,9 @@ class NativeLevelSet(LevelSet, Native):
     backend: ClassVar[str] = "native"
 
     def _new_trail(self, start: Kinematics) -> Trail:
+        if not self._chart.plain:
+            self.native, self.crosses = None, False
+            return super()._new_trail(start)
         if self.core is None:
             self.core = make_core(self.mechanism)
         self.core.split(start.partition.q.tolist(), start.partition.z.tolist())
@@ -125,6 +128,8 @@ class NativeLevelSet(LevelSet, Native):
         return NativeTrail(native, start)
 
     def rhs(self, t: float, y: Array) -> Array:
+        if self.native is None:
+            return super().rhs(t, y)
         derivative = self.evaluate(t, y) if self.crosses else self._with_force(t, y)
         return super().rhs(t, y) if derivative is None else derivative
 
@@ -169,9 +174,8 @@ class NativeDae(Dae, Native):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.core = make_core(self.mechanism)
-        if self.mechanism.tree.flat:
-            alpha, beta = self.baumgarte or (0.0, 0.0)
-            self.drive(core().Dae(self.core, self.mechanism.tolerance, self.projects, alpha, beta))
+        alpha, beta = self.baumgarte or (0.0, 0.0)
+        self.drive(core().Dae(self.core, self.mechanism.tolerance, self.projects, alpha, beta))
 
     def rhs(self, t: float, y: Array) -> Array:
         if self.closes_within:
@@ -181,7 +185,7 @@ class NativeDae(Dae, Native):
 
     def _projected(self, at: Kinematics, v_tree: Array) -> Terms:
         y = np.concatenate([at.q_tree, v_tree])
-        if self.native is None or not np.isfinite(y).all():
+        if not np.isfinite(y).all():
             return super()._projected(at, v_tree)
         found = self.native.projected(y)
         if found is None:  # near a rank loss, with what that has cost forgotten
