@@ -89,7 +89,7 @@ def leap(rates: Rates, t: float, y: Array, span: float, known: Leap | None = Non
     if not off <= FAR * size:
         return Leap(t, t + span, FORETOLD * off / size if np.isfinite(off) else np.inf, first)
     last, _ = _collocated(rates, t, y, span, _rates_of(first, span, many, 1.0))
-    gap = np.abs(legendre.legval(PLACES, last) - legendre.legval(PLACES, first)).max()
+    gap = np.abs(_at_places(many) @ last - _at_places(few) @ first).max()
     error = float(gap / size)
     return Leap(t, t + span, error if np.isfinite(error) else np.inf, last)
 
@@ -117,12 +117,12 @@ def _collocated(
     """
     stages, off, before = len(guess), np.nan, np.inf
     nodes = _nodes(stages)
-    times, to_places = t + span * (1 + nodes) / 2, legendre.legvander(nodes, stages)
+    times, to_nodes = t + span * (1 + nodes) / 2, _at_nodes(stages)
     for sweep in range(SWEEPS):
         series = _series(guess, y, span)
         if not np.isfinite(series).all():
             break
-        new = rates(times, to_places @ series)
+        new = rates(times, to_nodes @ series)
         change = float(np.abs(new - guess).max()) * span
         off = change if sweep == 0 else off
         guess = new
@@ -142,6 +142,24 @@ def _nodes(stages: int) -> Array:
 
 
 @cache
+def _at_nodes(stages: int) -> Array:
+    """From a series of a step to its values at the nodes."""
+    return np.asarray(legendre.legvander(_nodes(stages), stages))
+
+
+@cache
+def _at_places(stages: int) -> Array:
+    """The same at the places where leaps are compared."""
+    return np.asarray(legendre.legvander(PLACES, stages))
+
+
+@cache
+def _derivation(stages: int) -> Array:
+    """From a series of a step to that of its derivative, shape (stages, stages + 1)."""
+    return np.asarray(legendre.legder(np.eye(stages + 1)))
+
+
+@cache
 def _integration(stages: int) -> Array:
     """From values at the nodes to the series of their integral from -1 on, shape (stages + 1, stages)."""
     return legendre.legint(np.linalg.inv(legendre.legvander(_nodes(stages), stages - 1)), lbnd=-1)
@@ -157,7 +175,8 @@ def _series(rates: Array, y: Array, span: float) -> Array:
 def _rates_of(series: Array, span: float, stages: int, further: float) -> Array:
     """Rates of a polynomial at the nodes of a step that is `further` times as long."""
     x = (1 + _nodes(stages)) * further - 1
-    return np.asarray(legendre.legval(x, legendre.legder(series) * (2 / span))).T
+    known = len(series) - 1
+    return np.asarray(legendre.legvander(x, known - 1) @ (_derivation(known) @ series) * (2 / span))
 
 
 def _polynomials(x: float, count: int) -> Array:
