@@ -279,8 +279,9 @@ class Breaks:
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A report of few settings."""
-    monkeypatch.setattr(make, "WORKS", (SHORT,))
+    """A report of few settings, and of a motion that cannot be made here."""
+    away = Work("away", "robots that are away", "no_such", 1.0, quick=True)
+    monkeypatch.setattr(make, "WORKS", (SHORT, away))
     monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody(), Breaks()])
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
@@ -306,6 +307,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     text = (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
     assert "Nobody : not compared, not installed: pip install nobody." in text
     assert "Breaks 0.1: it agrees." in text
+    assert "- Not measured: robots that are away, no mechanism 'no_such'; shipped: " in text
     html = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
     assert html.count('src="data:image/png;base64,') == 3
     assert "http" not in html.replace("http-equiv", "")

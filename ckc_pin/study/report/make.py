@@ -79,7 +79,7 @@ def report(out: Path, *, quick: bool = False, progress: Progress | None = None) 
     except OSError as error:
         raise InputError(f"--out {out}: cannot be made: {error.strerror}") from None
     tell = progress or (lambda said: None)
-    works = [work for work in WORKS if work.quick or not quick]
+    works, unmade = _at_hand(quick)
     table, found, references = Table(out / "report.csv", Row), Report(), {}
     others = peers()
     for work in works:
@@ -90,12 +90,27 @@ def report(out: Path, *, quick: bool = False, progress: Progress | None = None) 
     notes = [_checked(peer, works) for peer in others]
     grown, left = _grown(out, quick, tell), _left_out(out, works, quick, tell)
     figures = _figures(works, found.rows, [peer.name for peer in others], grown, out)
-    text = markdown(Measured(works, found.rows, references, notes, left, grown, quick))
+    text = markdown(Measured(works, unmade, found.rows, references, notes, left, grown, quick))
     for name, content in (("report.md", text), ("report.html", web(text, out))):
         (out / name).write_text(content, encoding="utf-8")
     tables = ("report.csv", "growth.csv", "left_out.csv")
     found.files = [out / name for name in ("report.html", "report.md", *tables, *figures)]
     return found
+
+
+def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
+    """Works that can be measured here, and by what they are called why the others cannot: robots not installed."""
+    works, unmade = [], {}
+    for work in WORKS:
+        if quick and not work.quick:
+            continue
+        try:
+            work.mechanism  # noqa: B018
+        except CkcError as error:
+            unmade[work.says] = str(error)
+        else:
+            works.append(work)
+    return works, unmade
 
 
 def _figures(

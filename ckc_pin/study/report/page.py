@@ -58,6 +58,8 @@ class Measured:
     Attributes
     ----------
     works : sequence of Work
+    unmade : dict of str to str
+        Why works are not there, by what they are called.
     rows, references : mappings by the work's key
     peers : sequence of PeerNote
     left_out : sequence of LeftOut
@@ -67,6 +69,7 @@ class Measured:
     """
 
     works: Sequence[Work]
+    unmade: Mapping[str, str]
     rows: Mapping[str, Sequence[Row]]
     references: Mapping[str, Reference]
     peers: Sequence[PeerNote]
@@ -114,6 +117,8 @@ def _method(measured: Measured) -> list[str]:
         "reasons, is in `report.csv`; what a scene leaves out in `left_out.csv`, how cost grows in `growth.csv`. "
         "Curves show each program's best settings, those that no other one beats in both time and error."
     ]
+    if measured.unmade:
+        said += ["", *(f"- Not measured: {name}, {escaped(why)}" for name, why in measured.unmade.items())]
     if measured.by_hand:
         said += ["", f"Written by hand around a library, and told apart: {', '.join(sorted(measured.by_hand))}."]
     if measured.quick:
