@@ -113,6 +113,7 @@ def main() -> int:
         ("the same, native / Pinocchio's own calls", against_pinocchio, "<=", 1.7),
         ("five_bar/swing, Python / native", lambda: run_ratio("five_bar/swing"), ">=", 12),
         ("five_bar/tracking, Python / native", lambda: run_ratio("five_bar/tracking"), ">=", 8),
+        ("delta/default, with a free root, Python / native", lambda: run_ratio("delta/default"), ">=", 5),
         ("Andrews, right-hand side", lambda: rhs_ratio("andrews", REDUCED), ">=", 5),
         ("Bricard, right-hand side", lambda: rhs_ratio("bricard", REDUCED), ">=", 5),
         ("N-four-bar, N = 40", lambda: rhs_ratio("n_four_bar", {**REDUCED, "mechanism.N": 40}), ">=", 3),

@@ -20,6 +20,8 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("five_bar/tracking", {}),
     ("five_bar/tracking", TRACKING),
     ("three_rrr/default", {"formulation": "reduced"}),
+    ("delta/default", {}),
+    ("delta/circle", TRACKING),
 ]
 
 

@@ -194,6 +194,20 @@ def test_rates_on_the_closure_are_pythons():
     _are_the_same(python, native, states, 1e-12)
 
 
+@pytest.mark.parametrize("name", ["delta/default", "stewart/default", "two_ur5/default"])
+def test_a_free_roots_rates_are_pythons_whatever_its_quaternion_has_become(name):
+    python, native = (_dae(name, backend) for backend in ("python", "native"))
+    tree, random = python.mechanism.tree, np.random.default_rng(1)
+    for _ in range(50):
+        q_tree = tree.integrate(python.initial.q_tree, 0.3 * random.standard_normal(tree.n))
+        for q_at, _v_at in tree.free:
+            q_tree[q_at + 3 : q_at + 7] *= -1.0 if random.random() < 0.5 else 1.001  # both are read as unit ones
+        y = np.concatenate([q_tree, random.standard_normal(tree.n)])
+        wanted, found = python.rhs(0.0, y), native.rhs(0.0, y)
+        assert np.abs(found - wanted)[: tree.nq].max() <= 1e-14 * np.abs(wanted[: tree.nq]).max()
+        assert np.abs(found - wanted).max() <= 1e-11 * np.abs(wanted).max()
+
+
 @pytest.mark.parametrize("name", ["five_bar/swing", "andrews", "three_rrr", "delta/default"])
 def test_states_put_on_the_closure_are_pythons(name):
     """Where no row is redundant: off the closure redundant ones contradict each other, and each takes its own part."""
