@@ -47,7 +47,7 @@ bool Dae::rate(double t, In v, Out y_dot) {
     residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
   }
   counts.factorizations += 2;
-  core.tree.rate(core.q_tree, v, y_dot.head(core.tree.nq));
+  core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
   return core.dae_acceleration(drive.u_tree, residual_, y_dot.tail(n)) && y_dot.allFinite();
 }
 
@@ -58,7 +58,7 @@ bool Dae::project(In y) {
     if (k == most_steps || !core.rows.phi.allFinite() || !core.closing_step(core.rows.phi, step_)) return false;
     ++counts.newton, counts.factorizations += 2;
     residual_.noalias() = core.rows.J * step_;
-    core.tree.move(q_tree_, step_);
+    core.tree.integrate(q_tree_, step_);
     set(q_tree_);
     if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
   }
@@ -75,7 +75,7 @@ bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   for (int k = 0;; ++k) {
     if (k == most_steps || !core.shortest_step(core.rows.phi, step_)) return false;
     ++counts.factorizations;
-    core.tree.move(q_tree_, step_);
+    core.tree.integrate(q_tree_, step_);
     set(q_tree_);
     if (largest(step_) <= negligible) break;  // what is left is its square
   }

@@ -74,7 +74,7 @@ bool LevelSet::newton(double tolerance) {
     if (!(z_.lpNorm<Eigen::Infinity>() <= max_step)) return false;
     step_.setZero();
     for (size_t k = 0; k < core.z.size(); ++k) step_(core.z[k]) = -z_(k);
-    core.tree.move(q_tree_, step_);
+    core.tree.integrate(q_tree_, step_);
     ++counts.newton, ++counts.factorizations;
   }
   return false;

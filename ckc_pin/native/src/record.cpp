@@ -17,7 +17,7 @@ bool Record::row(System& system, double t, In y, Out row) {
   system.drive.act(t, core, system.q, system.q_dot);
   const double potential = core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree);
   row(0) = t;
-  core.tree.coordinates(core.q_tree, row.segment(1, n));
+  core.tree.to_coordinates(core.q_tree, row.segment(1, n));
   row.segment(1 + n, n) = system.velocity;
   row.segment(1 + 2 * n, d) = system.drive.tau;
   row.segment(1 + 2 * n + d, m) = core.rows.phi;

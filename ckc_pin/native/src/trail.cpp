@@ -68,7 +68,7 @@ void Trail::predict(double t, In q, const Core& core, In w, Out q_tree) {
     for (size_t k = 0; k < core.z.size(); ++k) step_(core.z[k]) += z_(k);
   }
   q_tree = base.q_tree;
-  core.tree.move(q_tree, step_);
+  core.tree.integrate(q_tree, step_);
   for (int k = 0; k < core.d; ++k) q_tree(core.tree.place[core.q[k]]) = q(k);
 }
 

@@ -90,14 +90,15 @@ void Tree::normalize(Out q) const {
   for (const Root& root : roots) q.segment<4>(root.q + 3).normalize();
 }
 
-void Tree::move(Out q, In step) const {
+void Tree::integrate(Out q, In step) const {
   for (int k : single) q(place[k]) += step(k);
   for (const Root& root : roots) {
-    const Eigen::Quaterniond before = turned(q, root);
-    const Vector3 by = step.segment<3>(root.v + 3);
-    q.segment<3>(root.q) = placement(q, root).act(pin::exp6(pin::Motion(step.segment<6>(root.v))).translation());
-    const Eigen::Quaterniond after = (before * Eigen::Quaterniond(pin::exp3(by))).normalized();
-    q.segment<4>(root.q + 3) = after.dot(before) < 0 ? Eigen::Vector4d(-after.coeffs()) : after.coeffs();
+    const pin::SE3 there = placement(q, root) * pin::exp6(pin::Motion(step.segment<6>(root.v)));
+    Eigen::Quaterniond turn(there.rotation());
+    turn.normalize();
+    if (turn.dot(turned(q, root)) < 0) turn.coeffs() *= -1;  // of the two that mean the same the nearer one
+    q.segment<3>(root.q) = there.translation();
+    q.segment<4>(root.q + 3) = turn.coeffs();
   }
 }
 
@@ -113,7 +114,7 @@ void Tree::difference_rate(In from, In to, In v, Out rate) const {
     rate.segment<6>(root.v) = pin::Jlog6(placement(from, root).actInv(placement(to, root))) * v.segment<6>(root.v);
 }
 
-void Tree::rate(In q, In v, Out q_dot) const {
+void Tree::configuration_rate(In q, In v, Out q_dot) const {
   for (int k : single) q_dot(place[k]) = v(k);
   for (const Root& root : roots) {
     const Eigen::Quaterniond turn = turned(q, root);
@@ -124,7 +125,7 @@ void Tree::rate(In q, In v, Out q_dot) const {
   }
 }
 
-void Tree::coordinates(In q, Out numbers) const {
+void Tree::to_coordinates(In q, Out numbers) const {
   for (int k : single) numbers(k) = q(place[k]);
   for (const Root& root : roots) {
     numbers.segment<3>(root.v) = q.segment<3>(root.q);

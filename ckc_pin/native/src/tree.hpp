@@ -44,13 +44,13 @@ class Tree {
   const Matrix6x& jacobian_rate(In q, In v); // the same without C'
   double potential_energy(In q);
 
-  // A free root's place is no vector: position and unit quaternion in q', moved by a twist in its own axes.
+  // As Python's, on q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
   void normalize(Out q) const;
-  void move(Out q, In step) const;                       // by a tangent step
-  void difference(In from, In to, Out step) const;       // the tangent step between
-  void difference_rate(In from, In to, In v, Out rate) const;  // of `difference`, where `to` moves with v
-  void rate(In q, In v, Out q_dot) const;
-  void coordinates(In q, Out numbers) const;             // (n): rotations as rotation vectors
+  void integrate(Out q, In step) const;  // by a tangent step, in place
+  void difference(In from, In to, Out step) const;
+  void difference_rate(In from, In to, In v, Out rate) const;  // where `to` moves with v
+  void configuration_rate(In q, In v, Out q_dot) const;
+  void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
 
  private:
   struct Workspace;
