@@ -41,11 +41,10 @@ RUNS = [
     ("three_rrr/default", {}),
     ("three_rrr/circle", {**TRACKING, "t_end": 0.2}),
     ("two_ur5/default", {"t_end": 0.2}),
-    ("two_ur5/lift", {"t_end": 0.1}),
+    ("two_ur5/lift", {**TRACKING, "t_end": 0.1}),
     ("stewart/default", {"t_end": 0.05}),
     ("stewart/wave", {"t_end": 0.05}),
     ("talos/default", {"t_end": 0.02}),
-    ("talos/squat", {"t_end": 0.02}),
 ]
 
 
