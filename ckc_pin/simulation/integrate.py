@@ -257,10 +257,10 @@ class Stepper:
         self._recent.append((t, y.copy(), derivative))
         return derivative
 
-    def count(self, t: float) -> None:
-        """Take note of an evaluation, as long as there is a budget for it."""
-        self.rhs_count += 1
-        self._times.add(t)
+    def count(self, *times: float) -> None:
+        """Take note of evaluations, as long as there is a budget for them."""
+        self.rhs_count += len(times)
+        self._times.update(times)
         if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
             raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
         self.require_time()

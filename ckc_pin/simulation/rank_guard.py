@@ -224,8 +224,7 @@ class RankGuard:
     def _rates(self, times: Array, states: Array) -> Array:
         """Return y' where the states are put on the closure, counted."""
         assert self.dae is not None
-        for t in times.tolist():
-            self.stepper.count(t)
+        self.stepper.count(*times.tolist())
         with np.errstate(all="ignore"):
             return self.dae.rates_on_closure(times, states)
 
@@ -233,7 +232,8 @@ class RankGuard:
         """Whether the branches meet: off the closure the leap would have jumped a narrow gap between them."""
         mechanism = self.system.mechanism
         for t in np.linspace(found.t_old, found.t, 9):
-            phi = mechanism.kinematics(self.system.configuration(t, found(t))).phi
+            q_tree = self.system.configuration(t, found(t))
+            phi = self.core.phi(q_tree) if self.core else mechanism.kinematics(q_tree).phi
             if np.abs(phi).max() > max(CLOSED * mechanism.size, 10 * mechanism.tolerance):
                 return False
         return True

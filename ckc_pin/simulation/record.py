@@ -94,7 +94,9 @@ class Recorder:
         mechanism = self.system.mechanism
         n, d, m = mechanism.n, mechanism.d, mechanism.closure.rows
         widths = {"t": 1, "q_tree": n, "v_tree": n, "u": d, "phi": m, "w": m, "energy": 1, "lyapunov": 1}
-        parts = dict(zip(widths, np.split(rows, np.cumsum(list(widths.values())), axis=1), strict=False))
+        parts, at = {}, 0
+        for name, width in widths.items():
+            parts[name], at = rows[:, at : at + width], at + width
         direct = mechanism.actuated == mechanism.independent
         parts["tau"] = parts["u"] if direct else np.zeros((len(rows), len(mechanism.actuated)))
         for name, kept in self.rows.items():

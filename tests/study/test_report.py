@@ -20,7 +20,7 @@ from ckc_pin.study.report.peers import peers
 from ckc_pin.study.report.reference import Reference, reference
 from ckc_pin.study.report.row import Motion, Row, judged
 from ckc_pin.study.report.table import Table, key
-from ckc_pin.study.report.work import WORKS, Work
+from ckc_pin.study.report.work import WORKS, Budget, Work
 from tests.analytic.five_bar import FIVE_BAR, Q
 from tests.study.report_rows import row
 
@@ -160,7 +160,7 @@ def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
 ) -> None:
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
     monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    monkeypatch.setattr(make, "BUDGET", make.Budget(native=1e-6, python=1e-6, peer=1e-6))
+    monkeypatch.setattr(make, "BUDGET", Budget(native=1e-6, python=1e-6, peer=1e-6))
     rows = list(make._Measured(SHORT, Table(tmp_path / "t.csv", Row), lambda said: None).ours(quick=True))
     first, second = rows[:2]
     assert first.status == "stopped"
@@ -307,6 +307,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     text = (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
     assert "Nobody : not compared, not installed: pip install nobody." in text
     assert "Breaks 0.1: it agrees." in text
+    assert "A run may take 1.5 s here, 0.8 s in Python and 2 s in another program" in text
     assert "- Not measured: robots that are away, no mechanism 'no_such'; shipped: " in text
     html = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
     assert html.count('src="data:image/png;base64,') == 3

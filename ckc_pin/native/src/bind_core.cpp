@@ -104,6 +104,12 @@ nb::dict terms(Core& core, Given q_tree, Given v_tree) {
   return found;
 }
 
+Vector phi(Core& core, Given q_tree) {
+  require(q_tree, core.tree.nq, "q_tree");
+  core.set(q_tree);
+  return core.rows.phi;
+}
+
 Matrix jacobian(Core& core, Given q_tree) {
   require(q_tree, core.tree.nq, "q_tree");
   core.set(q_tree), core.rows.jacobian(core.tree);
@@ -160,6 +166,7 @@ void bind_core(nb::module_& m) {
              core.split(q, z);
            },
            "q"_a, "z"_a)
+      .def("phi", &phi, "q_tree"_a)
       .def("jacobian", &jacobian, "q_tree"_a)
       .def("jacobians", &jacobians, "q_tree"_a, "v_tree"_a)  // J and J_dot
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)

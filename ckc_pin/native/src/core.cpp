@@ -43,12 +43,13 @@ void Core::split(Indices q_, Indices z_) {
 }
 
 void Core::set(In q_tree_, bool with_inertia) {
+  ++sets;
   q_tree = q_tree_;
   if (with_inertia)
     tree.inertia(q_tree);
   else
     tree.set(q_tree);
-  D_here_ = with_inertia;
+  D_here_ = with_inertia, rates_here_ = false;
   rows.set(tree, q_tree);
 }
 
@@ -99,10 +100,19 @@ void Core::inertia() {
   D_factor.compute(D);
 }
 
+void Core::rates(In v) {
+  if (rates_here_ && v_tree == v) return;
+  v_tree = v;
+  tree.bias(q_tree, v_tree);
+  rows.rates(tree);
+  rates_here_ = true;
+}
+
 void Core::bias(In v) {
   v_tree = v;
   bias_tree = tree.bias(q_tree, v_tree);
   rows.rates(tree);
+  rates_here_ = true;
   rows.bias(J_dot_v);
   if (springs.any || springs.any_damping) springs.set(tree);
   if (!springs.any) return;

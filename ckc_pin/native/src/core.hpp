@@ -25,6 +25,7 @@ class Core {
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
+  long sets = 0;              // how often that was: who remembers it knows whether the core is where it was left
   void factor();              // J and phi_z's factorization
   void reduce();              // rho, eq. 5
   Vector q_tree;
@@ -35,6 +36,7 @@ class Core {
   // --- at a velocity ---
   void inertia();             // D' and D
   void bias(In v_tree);       // C'v + h' less springs, J_dot v
+  void rates(In v_tree);      // of the rows alone, as `bias` leaves them
   void coriolis();            // after `bias`: C', J_dot and h' less springs
   void D_times(In x, Out product) const;
   void velocity(In q_dot, Out v) const;   // rho q_dot
@@ -63,6 +65,7 @@ class Core {
   bool basis_of_partition();
   bool basis_by_pivoting(double least);
   bool D_here_ = false;  // whether the tree's D' is that of q_tree
+  bool rates_here_ = false;  // whether the rows' rates are those of v_tree
   Matrix D_rho_, tangent_, D_tangent_;
   Vector x_, y_, elastic_, residual_, z_, d_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;

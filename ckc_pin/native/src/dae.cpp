@@ -22,12 +22,13 @@ void Dae::set(In q_tree) {
   } else {
     core.rows.jacobian(core.tree);
   }
+  placed_ = core.sets;
 }
 
 void Dae::place(In y) {
   q_tree_ = y.head(core.tree.nq);
   core.tree.normalize(q_tree_);
-  set(q_tree_);
+  if (placed_ != core.sets || q_tree_ != core.q_tree) set(q_tree_);
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {
@@ -96,6 +97,12 @@ bool Dae::exact(double, In y) {
   }
   v_tree = velocity;
   for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = velocity(core.q[k]);
+  return true;
+}
+
+bool Dae::at_last(double, In y) {
+  place(y);
+  velocity = v_tree = y.tail(core.n);
   return true;
 }
 

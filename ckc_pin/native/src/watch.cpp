@@ -35,8 +35,7 @@ Watch::Rank Watch::rank(System& system) {
   const double least = std::sqrt(std::max(eigen_.eigenvalues()(m - core.rank), 0.0));
   direction(eigen_.eigenvalues()(m - core.rank));
   v_.noalias() = scaled_.transpose() * u_;  // times `least`
-  core.tree.bias(core.q_tree, system.velocity);
-  core.rows.rates(core.tree);
+  core.rates(system.velocity);
   core.rows.jacobian_dot(core.tree, core.tree.jacobian_rate(core.q_tree, system.velocity));
   v_.array() *= column_scale_.array();
   u_.array() *= row_scale_.array();

@@ -22,18 +22,9 @@ from ckc_pin.study.report.peers import Peer, peers
 from ckc_pin.study.report.reference import Reference, reference
 from ckc_pin.study.report.row import Motion, Row, judged
 from ckc_pin.study.report.table import Table, digest, key
-from ckc_pin.study.report.work import WORKS, Work
+from ckc_pin.study.report.work import WORKS, Budget, Work
 
 __all__ = ["Report", "report"]
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Seconds that one run may take, here, in Python, and in the other programs."""
-
-    native: float
-    python: float
-    peer: float
 
 
 BUDGET = Budget(native=1.5, python=0.8, peer=2.0)
@@ -90,7 +81,7 @@ def report(out: Path, *, quick: bool = False, progress: Progress | None = None) 
     notes = [_checked(peer, works) for peer in others]
     grown, left = _grown(out, quick, tell), _left_out(out, works, quick, tell)
     figures = _figures(works, found.rows, [peer.name for peer in others], grown, out)
-    text = markdown(Measured(works, unmade, found.rows, references, notes, left, grown, quick))
+    text = markdown(Measured(works, unmade, BUDGET, found.rows, references, notes, left, grown, quick))
     for name, content in (("report.md", text), ("report.html", web(text, out))):
         (out / name).write_text(content, encoding="utf-8")
     tables = ("report.csv", "growth.csv", "left_out.csv")

@@ -21,7 +21,7 @@ from ckc_pin.study.report.reference import Reference
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.sentences import TARGETS, eq_8_ratio, fastest, here, milliseconds, sentences, times
 from ckc_pin.study.report.table import machine, versions
-from ckc_pin.study.report.work import Work
+from ckc_pin.study.report.work import Budget, Work
 
 __all__ = ["Measured", "PeerNote", "markdown", "web"]
 
@@ -60,6 +60,7 @@ class Measured:
     works : sequence of Work
     unmade : dict of str to str
         Why works are not there, by what they are called.
+    budget : Budget
     rows, references : mappings by the work's key
     peers : sequence of PeerNote
     left_out : sequence of LeftOut
@@ -70,6 +71,7 @@ class Measured:
 
     works: Sequence[Work]
     unmade: Mapping[str, str]
+    budget: Budget
     rows: Mapping[str, Sequence[Row]]
     references: Mapping[str, Reference]
     peers: Sequence[PeerNote]
@@ -109,13 +111,16 @@ def _of_work(work: Work, measured: Measured) -> list[str]:
 
 def _method(measured: Measured) -> list[str]:
     used = ", ".join(f"{name} {version}" for name, version in versions().items())
+    own, python, others = measured.budget.native, measured.budget.python, measured.budget.peer
     said = [
         f"Measured on {machine()}, one process at a time, with {used}. Each motion is compared at the same ten "
         "instants; the error is the largest along the run, the table has that at the end as well. A time is the least "
         "of its repeats, without setting up. Closure is the largest |φ|, energy drift is in units of the largest "
         "kinetic energy: soft constraints trade one for another. Every run, those that failed too with their "
         "reasons, is in `report.csv`; what a scene leaves out in `left_out.csv`, how cost grows in `growth.csv`. "
-        "Curves show each program's best settings, those that no other one beats in both time and error."
+        "Curves show each program's best settings, those that no other one beats in both time and error. A run may "
+        f"take {own:g} s here, {python:g} s in Python and {others:g} s in another program; one that would take longer "
+        "counts as not getting there."
     ]
     if measured.unmade:
         said += ["", *(f"- Not measured: {name}, {escaped(why)}" for name, why in measured.unmade.items())]

@@ -14,9 +14,18 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import Scene, load_scene
 
-__all__ = ["WORKS", "Work"]
+__all__ = ["WORKS", "Budget", "Work"]
 
 INSTANTS = 10  # at which motions are compared, the end among them
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Seconds that one run may take, here, in Python, and in the other programs."""
+
+    native: float
+    python: float
+    peer: float
 
 
 @dataclass(frozen=True)
