@@ -64,6 +64,7 @@ class Burst:
         loop.begin(stepper.t, solver.y, getattr(solver, "f", solver.y), solver.h_abs)
         if stepper.method == "BDF":
             loop.remember(solver.D, solver.order, solver.n_equal_steps, solver.J)
+        loop.growing = stepper.growing
         loop.chart_margin = getattr(self.system, "margin", CHART_MARGIN)
         if self.guard.end is not None:
             loop.end = self.guard.end
@@ -87,6 +88,7 @@ class Burst:
         if steps:
             stepper.steps += steps
             self.guard.end, self.guard.length = loop.end, loop.length
+            stepper.growing = loop.growing
             stepper.adopt(loop.t, loop.y, loop.f, loop.h_abs, loop.before)
             if stepper.method == "BDF":
                 solver.D, solver.order, solver.n_equal_steps, solver.J = loop.memory()

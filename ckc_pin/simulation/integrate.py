@@ -23,7 +23,9 @@ from ckc_pin.simulation.systems import Dae, System, nearly_singular
 
 __all__ = ["BudgetError", "Step", "Stepper"]
 
-ONE_STEP = ("RK23", "RK45", "DOP853", "Radau")
+EXPLICIT = ("RK23", "RK45", "DOP853")
+ONE_STEP = (*EXPLICIT, "Radau")
+GROWTH = 2.0  # of an explicit method's step; more when two steps in a row ask for it, for one may do so by chance
 DOUBT = 50  # steps
 RECENT = 12  # evaluations remembered: those of one Newton iteration and of one Jacobian
 NEWTON_TOL = 0.03  # of the local error; SciPy's own, rtol^0.5, takes a third more right-hand sides for nothing
@@ -70,6 +72,7 @@ class Stepper:
         self.spec = spec
         self.rhs_count = self.steps = self.rejected = 0
         self.failure: NumericalError | None = None
+        self.growing = False  # whether the last step asked for one of more than `GROWTH` times its length
         self._deadline = perf_counter() + spec.max_wall_s if spec.max_wall_s else np.inf
         self._budgeted = False  # from the first step on: what a solver evaluates to be made is let pass
         self._times: set[float] = set()
@@ -160,6 +163,12 @@ class Stepper:
         if solver.status == "failed":
             raise self._explain(message)
         self._before = (t_old, y_old)
+        if self.method in EXPLICIT and solver.status == "running":
+            most = GROWTH * (solver.t - t_old)
+            asked = bool(solver.h_abs > most)
+            if asked and not self.growing:
+                solver.h_abs = most
+            self.growing = asked
         self.steps += 1
         self.rejected += self._attempts(self.rhs_count - before) - 1
         if solver.t - t_old < self.spec.min_step and solver.status == "running":
@@ -222,6 +231,7 @@ class Stepper:
 
     def _restart(self, t: float, y: Array, first_step: float) -> None:
         """Go on with a new solver that remembers nothing."""
+        self.growing = False
         self._retired = {name: count + int(getattr(self.solver, name)) for name, count in self._retired.items()}
         t_end = self.solver.t_bound
         self.solver = self._solver(t, y, t_end, first_step=min(first_step, t_end - t))

@@ -28,7 +28,7 @@ RUNS = [
     ("five_bar/set_point", {"formulation": "reduced", "solver.method": "DOP853", "t_end": 0.5}),
     ("five_bar/set_point", {"formulation": "dae", "solver.method": "DOP853", "t_end": 0.2}),
     ("five_bar/set_point", {"controller.sample_time": 0.01, "controller.delay": 0.004, "t_end": 0.2}),
-    ("andrews/default", {"formulation": "reduced", "t_end": 0.02}),
+    ("andrews/default", {"formulation": "reduced", "t_end": 0.01}),
     ("bricard/default", {}),
     ("delta/default", {"t_end": 0.2}),
     ("delta/default", {"formulation": "reduced", "t_end": 0.1}),

@@ -37,7 +37,7 @@ def test_memory_does_not_grow_with_steps(scene: str, changes: dict[str, object])
             sizes.append(tracemalloc.get_traced_memory()[0])
 
     # the native core takes many steps between two looks, and its own test counts its allocations
-    every = {"t_end": 1.5, "solver.output_dt": 100.0, "solver.backend": "python", **changes}
+    every = {"t_end": 3.0, "solver.output_dt": 100.0, "solver.backend": "python", **changes}
     simulate(scene, every)  # what is loaded and kept at first use is there before memory is looked at
     tracemalloc.start()
     try:

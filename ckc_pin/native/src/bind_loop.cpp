@@ -107,6 +107,9 @@ void bind_loop(nb::module_& m) {
       .def("memory", &memory)
       .def("go", &go, "t_bound"_a, "min_step"_a, "most_rhs"_a, "seconds"_a, "last_output"_a, "times"_a,
            "most_rows"_a)
+      .def_prop_rw(
+          "growing", [](const Run& run) { return run.method->growing; },
+          [](Run& run, bool growing) { run.method->growing = growing; })
       .def_prop_ro("t", [](const Run& run) { return run.method->t; })
       .def_prop_ro("y", [](const Run& run) { return Vector(run.method->y); })
       .def_prop_ro("f", [](const Run& run) { return Vector(run.method->f); })

@@ -34,6 +34,7 @@ class Method {
   }
 
   double t = 0, h_abs = 0;  // h_abs: length of the next step to try
+  bool growing = false;     // whether the last step asked for one of more than twice its length
   Vector y, f;
   double t_new = 0, h_next = 0;
   Vector y_new, f_new;
@@ -48,7 +49,7 @@ class Method {
   }
 };
 
-// SciPy's DOP853 with SciPy's coefficients and step control, so that its steps are SciPy's.
+// SciPy's DOP853 with SciPy's coefficients and step control, so that its steps are Python's.
 class Dop853 : public Method {
  public:
   struct Table {
@@ -59,6 +60,10 @@ class Dop853 : public Method {
   Dop853(Table table, Tolerance tolerance, int size);
   bool step(System& system, double t_bound) override;
   bool between(System& system, double t, Out y) override;
+  void commit() override {
+    Method::commit();
+    growing = growing_next_;
+  }
 
  private:
   bool stages(System& system, double h);
@@ -68,7 +73,7 @@ class Dop853 : public Method {
   Tolerance tolerance_;
   Matrix K_, F_;  // (size, stages), (size, powers)
   Vector y_stage_, scale_, error_;
-  bool dense_ = false;
+  bool dense_ = false, growing_next_ = false;
 };
 
 }  // namespace ckc
