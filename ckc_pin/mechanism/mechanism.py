@@ -109,6 +109,11 @@ class Mechanism:
         """The closure's terms at the assembled configuration."""
         return self.kinematics(self.q_tree)
 
+    @property
+    def rooted(self) -> tuple[str, ...]:
+        """Independent coordinates that belong to free roots."""
+        return tuple(name for name in self.independent if name in self.tree.free_coordinates)
+
     def sigma(self, q: Array, start: Kinematics | None = None, w: Array | float = 0.0) -> Sigma:
         """Return q' = sigma(q), eq. 4, on the assembly branch of `start` (default: as assembled).
 

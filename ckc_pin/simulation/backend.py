@@ -16,9 +16,8 @@ def why_python(mechanism: Mechanism, spec: SceneSpec | None = None) -> str | Non
         return reason
     if spec is not None and spec.formulation == "dae":
         return None
-    rooted = [name for name in mechanism.independent if name in mechanism.tree.free_coordinates]
-    if rooted:
-        return f"{rooted[0]} of a free root is independent, which the native core takes in a DAE alone"
+    if mechanism.rooted:
+        return f"{mechanism.rooted[0]} of a free root is independent, which the native core takes in a DAE alone"
     return None
 
 

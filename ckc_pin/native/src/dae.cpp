@@ -37,10 +37,14 @@ bool Dae::rhs(double t, In y, Out y_dot) {
   return rate(t, y.tail(core.n), y_dot);
 }
 
+void Dae::independent(In v) {
+  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
+}
+
 bool Dae::rate(double t, In v, Out y_dot) {
   const int n = core.n;
   core.bias(v);
-  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
+  independent(v);
   drive.act(t, core, q, q_dot);
   residual_.setZero();
   if (alpha_ != 0.0 || beta_ != 0.0) {
@@ -96,7 +100,7 @@ bool Dae::exact(double, In y) {
     velocity = y.tail(n);
   }
   v_tree = velocity;
-  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = velocity(core.q[k]);
+  independent(velocity);
   return true;
 }
 

@@ -23,6 +23,7 @@ class Dae : public System {
  private:
   void place(In y);     // q_tree_, and the core at it, unless it was left there
   void set(In q_tree);  // the core at a configuration, with D' and what controllers need
+  void independent(In v);  // q of the core's configuration, and q_dot
   bool rate(double t, In v, Out y_dot);  // at the core's configuration
 
   double tolerance_, alpha_, beta_;

@@ -60,7 +60,7 @@ bool Dop853::step(System& system, double t_bound) {
       const double factor = size == 0.0 ? max_factor : std::min(max_factor, safety * std::pow(size, exponent));
       const bool asked = t_new < t_bound && !refused && factor > growth;
       h_next = length * (refused ? std::min(1.0, factor) : asked && !growing ? growth : factor);
-      growing_next_ = asked;
+      growing_next = asked;
       return true;
     }
     length *= std::max(min_factor, safety * std::pow(size, exponent));

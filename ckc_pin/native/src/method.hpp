@@ -30,13 +30,14 @@ class Method {
   // Take over the step just made.
   virtual void commit() {
     t_old = t, y_old = y;
-    t = t_new, y = y_new, f = f_new, h_abs = h_next;
+    t = t_new, y = y_new, f = f_new, h_abs = h_next, growing = growing_next;
   }
 
   double t = 0, h_abs = 0;  // h_abs: length of the next step to try
   bool growing = false;     // whether the last step asked for one of more than twice its length
   Vector y, f;
   double t_new = 0, h_next = 0;
+  bool growing_next = false;
   Vector y_new, f_new;
   double t_old = 0;  // where the last step began
   Vector y_old;
@@ -60,10 +61,6 @@ class Dop853 : public Method {
   Dop853(Table table, Tolerance tolerance, int size);
   bool step(System& system, double t_bound) override;
   bool between(System& system, double t, Out y) override;
-  void commit() override {
-    Method::commit();
-    growing = growing_next_;
-  }
 
  private:
   bool stages(System& system, double h);
@@ -73,7 +70,7 @@ class Dop853 : public Method {
   Tolerance tolerance_;
   Matrix K_, F_;  // (size, stages), (size, powers)
   Vector y_stage_, scale_, error_;
-  bool dense_ = false, growing_next_ = false;
+  bool dense_ = false;
 };
 
 }  // namespace ckc

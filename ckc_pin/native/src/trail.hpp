@@ -1,4 +1,5 @@
-// Where a motion has been on its level sets, and where z will be next: `simulation.systems.trail`, q being joints of one freedom.
+// Where a motion has been on its level sets, and where z will be next: `simulation.systems.trail`, where every q is
+// a joint of one freedom.
 #pragma once
 
 #include "core.hpp"

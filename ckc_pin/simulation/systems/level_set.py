@@ -198,7 +198,7 @@ class LevelSet:
         margin = at.sigma_min() / size
         if margin >= self._alarm:
             return None
-        self._alarm = min(SWITCH_MARGIN, max(FALLEN * margin, POOR))
+        self._alarm = max(FALLEN * margin, POOR)
         better = self.mechanism.best_partition(at)
         if better is None:
             return None

@@ -142,11 +142,10 @@ def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tup
 def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
     """Choose the told rows and which of them are the axes."""
     mechanism = extended.mechanism
-    rooted = [name for name in mechanism.independent if name in mechanism.tree.free_coordinates]
-    if rooted and not cartesian:
+    if mechanism.rooted and not cartesian:
         raise InputError(
-            f"{mechanism.name}: {rooted[0]} belongs to a free root, which has no chart to draw a map over; choose "
-            "joints as independent coordinates"
+            f"{mechanism.name}: {mechanism.rooted[0]} belongs to a free root, which has no chart to draw a map over; "
+            "choose joints as independent coordinates"
         )
     if cartesian:
         task = Task(extended, extended.fixing)

@@ -96,7 +96,7 @@ def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
         if quick and not work.quick:
             continue
         try:
-            work.mechanism  # noqa: B018
+            _ = work.mechanism  # loaded here, and kept by the work
         except CkcError as error:
             unmade[work.says] = str(error)
         else:
