@@ -92,7 +92,7 @@ def test_explicit_right_hand_sides_grow_like_one_over_epsilon(problem: Problem) 
 
 @pytest.mark.parametrize("first", [1e-3, 1e-6, 1e-10])
 def test_loosest_tolerance_is_found_from_wherever_it_begins(problem: Problem, first: float) -> None:
-    search = Search(target=1e-7)
+    search = Search(target=1e-8)
     reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT)
     errors = [
         max(difference(reference, march(problem.reduced(), "DOP853", rtol, SHORT).terms)) for rtol in search.rtols

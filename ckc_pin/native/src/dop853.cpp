@@ -8,7 +8,7 @@ namespace ckc {
 
 constexpr int stages_ = 12;
 constexpr double safety = 0.9, min_factor = 0.2, max_factor = 10.0, exponent = -1.0 / 8.0;
-constexpr double growth = 2.0;  // as in `simulation.integrate`
+constexpr double caution = 5.0 / 6.0, growth = 2.0;  // as in `simulation.integrate`
 
 Dop853::Dop853(Table table, Tolerance tolerance, int size) : table_(std::move(table)), tolerance_(tolerance) {
   K_.setZero(size, stages_ + 1 + table_.C_extra.size());
@@ -57,10 +57,10 @@ bool Dop853::step(System& system, double t_bound) {
     if (!stages(system, h)) return false;
     const double size = error(h);
     if (size < 1.0) {
-      const double factor = size == 0.0 ? max_factor : std::min(max_factor, safety * std::pow(size, exponent));
-      const bool asked = t_new < t_bound && !refused && factor > growth;
-      h_next = length * (refused ? std::min(1.0, factor) : asked && !growing ? growth : factor);
-      growing_next = asked;
+      const double most = refused ? 1.0 : max_factor;
+      const double factor = caution * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
+      growing_next = t_new < t_bound && factor > growth;
+      h_next = length * (growing_next && !growing ? growth : factor);
       return true;
     }
     length *= std::max(min_factor, safety * std::pow(size, exponent));
