@@ -7,8 +7,8 @@ namespace ckc {
 
 // Relative size of the last pivot of J at which its rank counts as lost; and at which Python closes with care.
 constexpr double singular = 1e-12, weak = 1e-2;
-// Of phi_z's pivots, and of rho: where the partition at hand is as good as any.
-constexpr double sound = 1e-2, steep = 4.0;
+// Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
+constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
 
 Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_)
     : tree(model, std::move(place)),
@@ -27,17 +27,23 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
   moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
 }
 
+// phi_z's pattern by rows.
+static std::vector<Indices> pattern_of(const Rows& rows, const Indices& z, int n) {
+  Indices at(n, -1);
+  for (size_t j = 0; j < z.size(); ++j) at[z[j]] = static_cast<int>(j);
+  std::vector<Indices> pattern(rows.closure.rows);
+  for (int i = 0; i < rows.closure.rows; ++i)
+    for (int j : rows.pattern[i])
+      if (at[j] >= 0) pattern[i].push_back(at[j]);
+  return pattern;
+}
+
 void Core::split(Indices q_, Indices z_) {
   q = std::move(q_), z = std::move(z_);
   d = static_cast<int>(q.size());
   const int m = rows.closure.rows, k = static_cast<int>(z.size());
-  Indices at(n, -1);
-  for (int j = 0; j < k; ++j) at[z[j]] = j;
-  std::vector<Indices> pattern(m);
-  for (int i = 0; i < m; ++i)
-    for (int j : rows.pattern[i])
-      if (at[j] >= 0) pattern[i].push_back(at[j]);
-  phi_z.shape(m, k, pattern);
+  phi_z.shape(m, k, pattern_of(rows, z, n));
+  basis_q_ = q, basis_z_ = z, basis_ = phi_z;
   D_factor.shape(d, d, full_pattern(d));
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
@@ -165,16 +171,33 @@ void Core::spf_z_dot(In q_dot, double epsilon, In w, Out z_dot) {
   for (size_t i = 0; i < z.size(); ++i) z_dot(i) = rho.row(z[i]).dot(q_dot) - z_dot(i) / epsilon;
 }
 
-// tangent_ and x_ of the partition at hand, where its z follow q closely and J is far from a loss of rank.
-bool Core::basis_of_partition() {
-  factor();
-  if (!(phi_z.pivot_ratio() > sound)) return false;
-  reduce();
-  if (!(rho.lpNorm<Eigen::Infinity>() < steep)) return false;
-  tangent_ = rho;
-  phi_z.solve(negative_, z_);
-  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
+// tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
+bool Core::basis_by_partition() {
+  basis_.compute(rows.J, basis_z_);
+  if (!(basis_.pivot_ratio() > sound)) return false;
+  for (int k = 0; k < n - rank; ++k) {
+    residual_ = -rows.J.col(basis_q_[k]);
+    basis_.solve(residual_, z_);
+    tangent_.col(k).setZero();
+    tangent_(basis_q_[k], k) = 1.0;
+    for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
+  }
+  if (!(tangent_.lpNorm<Eigen::Infinity>() < steep)) return false;
+  basis_.solve(negative_, z_);
+  for (size_t i = 0; i < basis_z_.size(); ++i) x_(basis_z_[i]) = z_(i);
   return true;
+}
+
+// Take the pivoting's columns for the tangent basis from now on, if they are other ones and good for a while.
+void Core::repartition() {
+  if (!(tangent_.lpNorm<Eigen::Infinity>() < better)) return;
+  const auto& order = qr_.colsPermutation().indices();
+  pivots_.assign(order.data(), order.data() + rank);
+  std::sort(pivots_.begin(), pivots_.end());
+  if (pivots_ == basis_z_) return;
+  basis_z_ = pivots_;
+  basis_q_.assign(order.data() + rank, order.data() + n);
+  basis_.shape(rows.closure.rows, rank, pattern_of(rows, basis_z_, n));
 }
 
 // As Python's `null_space`: J P = Q [R S], and the columns that the pivoting left over are the freedoms.
@@ -207,11 +230,13 @@ bool Core::basis_by_pivoting(double least) {
 
 bool Core::tangent_basis(In residual, double least) {
   x_.setZero();
-  negative_ = -residual;  // which may be where `reduce` works
+  negative_ = -residual;  // which may be residual_
   if (!rows.closure.rows)
     tangent_.setIdentity();
-  else if (!basis_of_partition() && !basis_by_pivoting(least))
-    return false;
+  else if (!basis_by_partition()) {
+    if (!basis_by_pivoting(least)) return false;
+    repartition();
+  }
   return true;
 }
 

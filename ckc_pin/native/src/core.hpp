@@ -62,11 +62,14 @@ class Core {
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
   void tangent_inertia();                         // factorized
   void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions
-  bool basis_of_partition();
+  bool basis_by_partition();
   bool basis_by_pivoting(double least);
+  void repartition();
   bool D_here_ = false;  // whether the tree's D' is that of q_tree
   bool rates_here_ = false;  // whether the rows' rates are those of v_tree
   Matrix D_rho_, tangent_, D_tangent_;
+  Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
+  Factor basis_;
   Vector x_, y_, elastic_, residual_, z_, d_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Matrix square_;
