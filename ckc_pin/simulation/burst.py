@@ -15,6 +15,7 @@ import numpy as np
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import core
 from ckc_pin.simulation.integrate import Stepper
+from ckc_pin.simulation.leap import tables
 from ckc_pin.simulation.rank_guard import RankGuard
 from ckc_pin.simulation.record import Recorder
 from ckc_pin.simulation.systems.base import CHART_MARGIN
@@ -61,7 +62,7 @@ class Burst:
         loop, stepper = self._loop(), self.stepper
         solver = stepper.solver
         self.system.refresh()
-        loop.begin(stepper.t, solver.y, getattr(solver, "f", solver.y), solver.h_abs)
+        loop.begin(stepper.t, solver.y, getattr(solver, "f", solver.y), solver.h_abs, *stepper.before)
         if stepper.method == "BDF":
             loop.remember(solver.D, solver.order, solver.n_equal_steps, solver.J)
         loop.growing = stepper.growing
@@ -75,6 +76,7 @@ class Burst:
             self._allowed(),
             PAUSE,
             self.within(end, end),
+            self.guard.fine,
             self.times[due:],
             min(ROWS, len(self.times) - due),
         )
@@ -87,14 +89,23 @@ class Burst:
         solver.nlu += factorizations
         if steps:
             stepper.steps += steps
-            self.guard.end, self.guard.length = loop.end, loop.length
+            self.guard.take_over(loop.end, loop.length)
             stepper.growing = loop.growing
             stepper.adopt(loop.t, loop.y, loop.f, loop.h_abs, loop.before)
             if stepper.method == "BDF":
                 solver.D, solver.order, solver.n_equal_steps, solver.J = loop.memory()
                 solver.LU = None
+        self.guard.crossings += loop.crossings()
+        if np.isfinite(loop.ahead):
+            self.guard.expect(loop.ahead)
         stepper.require_time()
         return due + len(rows), why == "pause" and steps > 0
+
+    def unrecorded(self) -> None:
+        """Step on as far as that goes, without output."""
+        more = True
+        while more:
+            _, more = self.run(len(self.times))
 
     def _allowed(self) -> int:
         """Right-hand sides up to the budget, or to about where the method is doubted."""
@@ -107,7 +118,8 @@ class Burst:
 
     def _loop(self) -> Any:
         options = self.stepper.options
-        made_for = (self.system.native, self.stepper.method, options["rtol"], options["atol"])
+        leaps = self.guard.leaps
+        made_for = (self.system.native, self.stepper.method, options["rtol"], options["atol"], leaps)
         if made_for != self._made_for:
             self._made_for = made_for
             mechanism = self.system.mechanism
@@ -115,7 +127,7 @@ class Burst:
             columns = np.where(mechanism.tree.in_metres, mechanism.size, 1.0)
             self._made = core().Loop(
                 self.system.native, self.stepper.method, _coefficients(self.stepper), options["rtol"], options["atol"],
-                options.get("max_step", np.inf), rows, columns,
+                options.get("max_step", np.inf), rows, columns, tables() if leaps else [], self.guard.gap,
             )  # fmt: skip
         return self._made
 

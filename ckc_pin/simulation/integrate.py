@@ -78,6 +78,7 @@ class Stepper:
         self._budgeted = False  # from the first step on: what a solver evaluates to be made is let pass
         self._times: set[float] = set()
         self.y = system.start()
+        self._before = (0.0, self.y)
         self._recent: deque[tuple[float, Array, Array]] = deque(maxlen=RECENT)
         self._rhs(0.0, self.y, at_start=True)
         self._known_jacobian: Array | None = None

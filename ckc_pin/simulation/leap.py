@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Leap", "leap"]
+__all__ = ["Leap", "leap", "tables"]
 
 Rates = Callable[[Array, Array], Array]
 
@@ -133,6 +133,21 @@ def _collocated(
             break
         before = change
     return _series(guess, y, span), off
+
+
+@cache
+def tables() -> list[dict[str, Array]]:
+    """What the native leap takes, by number of stages; it keeps states in columns."""
+    return [
+        {
+            "nodes": _nodes(stages),
+            "at_nodes": np.asfortranarray(_at_nodes(stages).T),
+            "at_places": np.asfortranarray(_at_places(stages).T),
+            "integration": np.asfortranarray(_integration(stages).T),
+            "derivation": np.asfortranarray(_derivation(stages).T),
+        }
+        for stages in STAGES
+    ]
 
 
 @cache

@@ -55,6 +55,8 @@ class RankGuard:
         The least singular value at the end of the last step.
     length : float
         Of that step, s.
+    burst : callable or None
+        Steps as far as it can by itself, without output.
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -68,6 +70,7 @@ class RankGuard:
         self.crossings: list[float] = []
         self.end: tuple[float, float] | None = None
         self.length = 0.0
+        self.burst: Callable[[], None] | None = None
         self._inside: float | None = None  # when rank is lost within a step that was taken back
         self._reach = np.inf  # s; from farther away no leap is expected to be accurate
         self._attempts = 0
@@ -115,10 +118,37 @@ class RankGuard:
             return False
         if new < LOST:
             raise self._lost(step, step.t, new)
-        if rising > 0:
-            self._attempts = 0
-        self.end, self.length = (new, rising), h
+        self.take_over((new, rising), h)
         return True
+
+    # --- what the native loop sees to ------------------------------------------------------------
+
+    @property
+    def leaps(self) -> bool:
+        """Whether the native loop knows how to leap: no row of J is idle."""
+        return self.dae is not None and self.rank == self.system.mechanism.closure.rows
+
+    @property
+    def fine(self) -> bool:
+        """Whether crossings come out well as the run is; else it is made again up to the first one."""
+        return bool(self.stepper.options["rtol"] <= FINE)
+
+    @property
+    def gap(self) -> float:
+        """How far loops may be open along a leap, rad or m."""
+        mechanism = self.system.mechanism
+        return max(CLOSED * mechanism.size, 10 * mechanism.tolerance)
+
+    def take_over(self, end: tuple[float, float], length: float) -> None:
+        """Learn of a step that was kept: the value and rate at its end, and its length."""
+        if end[1] > 0:
+            self._attempts = 0
+        self.end, self.length, self._inside = end, length, None
+
+    def expect(self, crossing: float) -> None:
+        """Learn when J is about to lose rank."""
+        if self._passes:
+            self._inside = crossing
 
     # --- crossing --------------------------------------------------------------------------------
 
@@ -159,7 +189,7 @@ class RankGuard:
         if left < 0.5 * self.length:  # so near J is ill-conditioned: rather from where the last step began
             starts.insert(0, stepper.before)
         self._attempts += 1
-        again = stepper.options["rtol"] > FINE and t > 0 and stepper.solver.t_bound == self._first_leg
+        again = not self.fine and t > 0 and stepper.solver.t_bound == self._first_leg
         for start in starts:
             found, crossing = self._leap(*start, t + left, centred=not again)
             if crossing is not None:
@@ -196,6 +226,10 @@ class RankGuard:
         stepper.solver.t_bound = t
         self.end, self.length, self._attempts = None, 0.0, 0
         while stepper.solver.status == "running":
+            if self.burst is not None:
+                self.burst()
+                if stepper.solver.status != "running":
+                    break
             self.step()
             stepper.settle()
         stepper.solver.t_bound, stepper.solver.status = t_end, "running"
@@ -234,7 +268,7 @@ class RankGuard:
         for t in np.linspace(found.t_old, found.t, 9):
             q_tree = self.system.configuration(t, found(t))
             phi = self.core.phi(q_tree) if self.core else mechanism.kinematics(q_tree).phi
-            if np.abs(phi).max() > max(CLOSED * mechanism.size, 10 * mechanism.tolerance):
+            if np.abs(phi).max() > self.gap:
                 return False
         return True
 

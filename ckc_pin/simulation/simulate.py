@@ -205,6 +205,7 @@ def _burst(
     if events.watches or not (recorder.lyapunov is None or system.controls):
         return None
     burst = Burst(stepper, legs.guard, recorder, outputs.times, clock.within)
+    legs.guard.burst = burst.unrecorded
 
     def run() -> None:
         more = system.crosses and runs(stepper)  # no more once method or coordinates are Python's

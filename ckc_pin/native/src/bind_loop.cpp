@@ -3,6 +3,7 @@
 #include <memory>
 
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/vector.h>
 
 #include "bdf.hpp"
 #include "checks.hpp"
@@ -16,13 +17,15 @@ namespace {
 
 // A loop with all it works on.
 struct Run {
-  Run(System& system_, std::unique_ptr<Method> method_, Watch watch_)
-      : system(system_), method(std::move(method_)), watch(std::move(watch_)), record(system_.core),
-        loop(system_, *method, watch, record) {}
+  Run(System& system_, std::unique_ptr<Method> method_, Watch watch_, std::unique_ptr<Leap> leap, double closed)
+      : system(system_), method(std::move(method_)), watch(std::move(watch_)),
+        crossing(system_, *method, watch, std::move(leap), closed), record(system_.core),
+        loop(system_, *method, watch, crossing, record) {}
 
   System& system;
   std::unique_ptr<Method> method;
   Watch watch;
+  Crossing crossing;
   Record record;
   Loop loop;
 };
@@ -34,11 +37,14 @@ Dop853::Table table_of(const nb::dict& given) {
           vector("E5")};
 }
 
-void begin(Run& run, double t, Given y, Given f, double h_abs) {
-  require(y, run.system.size, "y"), require(f, run.system.size, "f");
+// `t_old`, `y_old`: where the last step began.
+void begin(Run& run, double t, Given y, Given f, double h_abs, double t_old, Given y_old) {
+  require(y, run.system.size, "y"), require(f, run.system.size, "f"), require(y_old, run.system.size, "y_old");
   require(std::isfinite(t) && h_abs > 0, "a time and a positive step are needed");
   Method& method = *run.method;
   method.t = t, method.y = y, method.f = f, method.h_abs = h_abs;
+  method.t_old = t_old, method.y_old = y_old;
+  run.crossing.begin();
 }
 
 Bdf& bdf_of(Run& run) {
@@ -69,16 +75,39 @@ std::unique_ptr<Method> method_of(const std::string& name, const nb::dict& table
   return std::make_unique<Bdf>(tolerance, nb::cast<double>(table["newton_tol"]), size);
 }
 
+Leap::Table leap_table(const nb::dict& given) {
+  const auto matrix = [&](const char* key) { return nb::cast<Matrix>(given[key]); };
+  Leap::Table table{nb::cast<Vector>(given["nodes"]), matrix("at_nodes"), matrix("at_places"), matrix("integration"),
+                    matrix("derivation")};
+  const auto stages = table.nodes.size();
+  const auto fits = [&](const Matrix& a, Eigen::Index rows, Eigen::Index columns) {
+    return a.rows() == rows && a.cols() == columns;
+  };
+  require(stages > 0 && fits(table.at_nodes, stages + 1, stages) && table.at_places.rows() == stages + 1 &&
+              fits(table.integration, stages, stages + 1) && fits(table.derivation, stages + 1, stages),
+          "leap: matrices of one number of stages are needed");
+  return table;
+}
+
+std::unique_ptr<Leap> leap_of(System& system, const nb::list& tables) {
+  if (nb::len(tables) == 0) return nullptr;
+  Dae* dae = dynamic_cast<Dae*>(&system);
+  require(dae && dae->crosses && nb::len(tables) == 2, "leap: two tables and a DAE that is projected are needed");
+  const auto table = [&](int k) { return leap_table(nb::cast<nb::dict>(tables[k])); };
+  auto leap = std::make_unique<Leap>(*dae, table(0), table(1));
+  return leap;
+}
+
 // (why, rows): the instants recorded, a row each.
 nb::tuple go(Run& run, double t_bound, double min_step, long most_rhs, double seconds,
-             double last_output, Given times, long most_rows) {
+             double last_output, bool fine, Given times, long most_rows) {
   Matrix rows(run.record.width, most_rows);
   Vector instants = times;
   Eigen::Index due = 0, filled = 0;
   Why why;
   {
     nb::gil_scoped_release released;
-    why = run.loop.run({t_bound, min_step, most_rhs, seconds, last_output}, instants, due, rows, filled);
+    why = run.loop.run({t_bound, min_step, most_rhs, seconds, last_output, fine}, instants, due, rows, filled);
   }
   const char* names[] = {"finished", "pause", "python"};
   return nb::make_tuple(names[static_cast<int>(why)], Matrix(rows.leftCols(filled).transpose()));
@@ -90,23 +119,23 @@ void bind_loop(nb::module_& m) {
   nb::class_<Run>(m, "Loop")
       .def("__init__",
            [](Run* self, System& system, const std::string& method, const nb::dict& table, double rtol, double atol, double max_step,
-              Given row_scale, Given column_scale) {
+              Given row_scale, Given column_scale, const nb::list& leap, double closed) {
              const Core& core = system.core;
              require(row_scale, core.rows.closure.rows, "row_scale"), require(column_scale, core.n, "column_scale");
              require(rtol > 0 && atol > 0 && max_step > 0, "tolerances must be positive");
              new (self) Run(system, method_of(method, table, {rtol, atol, max_step}, system.size),
-                            Watch(core, row_scale, column_scale));
+                            Watch(core, row_scale, column_scale), leap_of(system, leap), closed);
            },
            nb::keep_alive<1, 2>(), "system"_a, "method"_a, "table"_a, "rtol"_a, "atol"_a, "max_step"_a, "row_scale"_a,
-           "column_scale"_a)
+           "column_scale"_a, "leap"_a, "closed"_a)
       .def_prop_rw(
           "chart_margin", [](const Run& run) { return run.watch.chart_margin; },
           [](Run& run, double margin) { run.watch.chart_margin = margin; })
-      .def("begin", &begin, "t"_a, "y"_a, "f"_a, "h_abs"_a)
+      .def("begin", &begin, "t"_a, "y"_a, "f"_a, "h_abs"_a, "t_old"_a, "y_old"_a)
       .def("remember", &remember, "D"_a, "order"_a, "equal"_a, "J"_a)
       .def("memory", &memory)
-      .def("go", &go, "t_bound"_a, "min_step"_a, "most_rhs"_a, "seconds"_a, "last_output"_a, "times"_a,
-           "most_rows"_a)
+      .def("go", &go, "t_bound"_a, "min_step"_a, "most_rhs"_a, "seconds"_a, "last_output"_a, "fine"_a,
+           "times"_a, "most_rows"_a)
       .def_prop_rw(
           "growing", [](const Run& run) { return run.method->growing; },
           [](Run& run, bool growing) { run.method->growing = growing; })
@@ -116,6 +145,8 @@ void bind_loop(nb::module_& m) {
       .def_prop_ro("h_abs", [](const Run& run) { return run.method->h_abs; })
       .def_prop_ro("before", [](const Run& run) { return nb::make_tuple(run.method->t_old, Vector(run.method->y_old)); })
       .def_prop_ro("length", [](const Run& run) { return run.loop.length; })
+      .def_prop_ro("ahead", [](const Run& run) { return run.loop.ahead; })
+      .def("crossings", [](Run& run) { return nb::cast(std::exchange(run.loop.crossings, {})); })  // since the last time
       .def_prop_rw(
           "end",
           [](const Run& run) { return nb::make_tuple(run.loop.end.value, run.loop.end.rate); },

@@ -25,10 +25,13 @@ void Dae::set(In q_tree) {
   placed_ = core.sets;
 }
 
-void Dae::place(In y) {
+// Unless the core was left there.
+bool Dae::place(In y) {
   q_tree_ = y.head(core.tree.nq);
+  if (!q_tree_.allFinite()) return false;
   core.tree.normalize(q_tree_);
   if (placed_ != core.sets || q_tree_ != core.q_tree) set(q_tree_);
+  return true;
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {

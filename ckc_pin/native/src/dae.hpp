@@ -13,6 +13,7 @@ class Dae : public System {
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override;
   bool at_last(double t, In y) override;
+  bool place(In y) override;
   bool accept(double t, Out y, bool& changed) override;
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
   bool rate_on_closure(double t, In y, Out y_dot);
@@ -21,7 +22,6 @@ class Dae : public System {
   bool project(In y);
 
  private:
-  void place(In y);     // q_tree_, and the core at it, unless it was left there
   void set(In q_tree);  // the core at a configuration, with D' and what controllers need
   void independent(In v);  // q of the core's configuration, and q_dot
   bool rate(double t, In v, Out y_dot);  // at the core's configuration

@@ -69,6 +69,17 @@ bool Dop853::step(System& system, double t_bound) {
   }
 }
 
+bool Dop853::again(double length) {
+  h_abs = length, growing = false;
+  ++rejected;
+  return true;
+}
+
+bool Dop853::adopt(System& system, double to, In y_to, double length) {
+  t_new = to, y_new = y_to, h_next = length, growing_next = false;
+  return evaluate(system, t_new, y_new, f_new);
+}
+
 bool Dop853::between(System& system, double at, Out y_at) {
   const double h = t_new - t;
   if (!dense_) {

@@ -16,6 +16,10 @@ class Method {
   // Try steps from (t, y, f) until one is accepted; false where a right-hand side does not exist or steps vanish:
   // nothing is lost then but the work, and Python goes on from (t, y).
   virtual bool step(System& system, double t_bound) = 0;
+  // Forget the step just made and try a shorter one next; false where the method cannot.
+  virtual bool again(double) { return false; }
+  // Make a step that something else integrated, and let the next one try a length; false where the method cannot.
+  virtual bool adopt(System&, double, In, double) { return false; }
   // y within the step just made; false where a right-hand side does not exist.
   virtual bool between(System& system, double t, Out y) = 0;
   // Make the step's end the present state, as the system accepts it; false where it does not.
@@ -60,6 +64,8 @@ class Dop853 : public Method {
 
   Dop853(Table table, Tolerance tolerance, int size);
   bool step(System& system, double t_bound) override;
+  bool again(double length) override;
+  bool adopt(System& system, double to, In y_to, double length) override;
   bool between(System& system, double t, Out y) override;
 
  private:

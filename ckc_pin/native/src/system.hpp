@@ -20,6 +20,8 @@ class System {
   virtual bool exact(double t, In y) = 0;
   // The same for a state that `rhs` was evaluated at last, as closed as it is.
   virtual bool at_last(double t, In y) = 0;
+  // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
+  virtual bool place(In) { return false; }
   // What becomes of an accepted state: `changed` says whether y is another one now.
   virtual bool accept(double t, Out y, bool& changed) = 0;
   // d rhs / d y; false where it is not known, or not finite.

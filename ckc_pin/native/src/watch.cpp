@@ -5,8 +5,8 @@
 
 namespace ckc {
 
-// As in `simulation.rank_guard`, except for `near`: from there on Python computes singular values, not their squares.
-constexpr double deep = 0.7, jump = 0.7, steps_ahead = 4.0, near = 1e-4;
+// As in `simulation.rank_guard`, except for `near`: below that a step's end is Python's, by singular values, not their squares.
+constexpr double deep = 0.7, neck = 0.2, jump = 0.7, steps_ahead = 4.0, shortest = 1e-6, near = 1e-4;
 
 Watch::Watch(const Core& core, In row_scale, In column_scale)
     : row_scale_(row_scale),
@@ -22,19 +22,29 @@ Watch::Watch(const Core& core, In row_scale, In column_scale)
   chart_eigen_.compute(Matrix::Identity(std::max(k, 1), std::max(k, 1)), Eigen::EigenvaluesOnly);
 }
 
-Watch::Rank Watch::rank(System& system) {
-  Core& core = system.core;
-  if (core.rank == 0) return {1.0, 0.0};
+void Watch::decompose(const Core& core) {
   scaled_ = core.rows.J;
   scaled_.array().colwise() *= row_scale_.array();
   scaled_.array().rowwise() *= column_scale_.transpose().array();
   gram_.noalias() = scaled_ * scaled_.transpose();
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
+}
+
+double Watch::at(const Core& core) {
+  decompose(core);
+  const auto m = gram_.rows();
+  return std::sqrt(std::max(eigen_.eigenvalues()(m - core.rank), 0.0) / eigen_.eigenvalues()(m - 1));
+}
+
+Watch::Rank Watch::rank(System& system) {
+  Core& core = system.core;
+  if (core.rank == 0) return {1.0, 0.0};
+  decompose(core);
   const auto m = gram_.rows();
   const double largest = std::sqrt(eigen_.eigenvalues()(m - 1));
-  const double least = std::sqrt(std::max(eigen_.eigenvalues()(m - core.rank), 0.0));
   direction(eigen_.eigenvalues()(m - core.rank));
-  v_.noalias() = scaled_.transpose() * u_;  // times `least`
+  v_.noalias() = scaled_.transpose() * u_;
+  const double least = v_.norm();  // to rounding, of which its square's eigenvalue has half the digits
   core.rates(system.velocity);
   core.rows.jacobian_dot(core.tree, core.tree.jacobian_rate(core.q_tree, system.velocity));
   v_.array() *= column_scale_.array();
@@ -68,13 +78,25 @@ bool Watch::ahead(const Rank& end, double length) const {
   return end.rate < 0.0 && end.value <= -steps_ahead * length * end.rate;
 }
 
-bool Watch::plain(const Rank& before, const Rank& after, double h) const {
-  if (!(after.value > near) || !std::isfinite(after.rate)) return false;
-  if (before.rate >= 0.0) return !(after.rate > 0.0 && h * after.rate > after.value);
-  if (after.rate <= 0.0) return h <= jump * before.value / -before.rate;
-  // falling, then rising: where the tangents at both ends meet
-  const double place = (after.value - before.value - after.rate * h) / (before.rate - after.rate);
-  return !(before.value + before.rate * place < deep * std::max(before.value, after.value));
+bool Watch::plain(const Rank& at) const { return at.value > near && std::isfinite(at.rate); }
+
+double Watch::part(const Rank& before, const Rank& after, double h) const {
+  if (!plain(after)) return 0.0;
+  if (before.rate < 0.0 && after.rate > 0.0) {  // a V: where the tangents at both ends meet
+    const double place = (after.value - before.value - after.rate * h) / (before.rate - after.rate);
+    return before.value + before.rate * place < deep * std::max(before.value, after.value) ? 0.0 : 1.0;
+  }
+  // falling, zero, a peak, and falling again; or a peak, zero, and rising again
+  const bool over = before.rate < 0.0 ? h > jump * before.value / -before.rate
+                                      : after.rate > 0.0 && h * after.rate > after.value;
+  if (!over) return 1.0;
+  return h > shortest ? 0.5 : 0.0;
+}
+
+double Watch::part(const Rank& before, const Rank& after, double h, double least) const {
+  if (!plain(after)) return 0.0;
+  if (least >= neck * std::max(before.value, after.value)) return 1.0;
+  return h > shortest ? 0.25 : 0.0;
 }
 
 }  // namespace ckc

@@ -3,7 +3,10 @@
 // What is to be done where it is not is Python's (`simulation.rank_guard`, `LevelSet.accept`).
 #pragma once
 
+#include <limits>
+
 #include <Eigen/Eigenvalues>
+#include <boost/math/tools/minima.hpp>
 
 #include "system.hpp"
 
@@ -23,12 +26,34 @@ class Watch {
 
   Rank rank(System& system);
   bool chart(const Core& core);  // whether phi_z is far enough from singular
-  // Whether a position where J loses rank is so near that Python looks ahead.
+  // Whether J is far enough from losing rank for that to be exact.
+  bool plain(const Rank& at) const;
+  // Whether a position where J loses rank may be so near that it has to be looked for.
   bool ahead(const Rank& end, double length) const;
-  // Whether a step of length h between two such values passes no loss of rank.
-  bool plain(const Rank& before, const Rank& after, double h) const;
+  // How much of a step of length h between two such values to make: all where it passes no loss of rank, a part where
+  // it is too long to tell, none where only what is between its ends tells.
+  double part(const Rank& before, const Rank& after, double h) const;
+  // The same of a step of which the least value in between is known.
+  double part(const Rank& before, const Rank& after, double h, double least) const;
+
+  // When that value is least on a motion, to 2^(1 - bits) of the interval, and how large it is then.
+  struct Least {
+    double t, value;
+  };
+  // `motion`: sets the core to where it is at an instant, with J; false where it does not exist.
+  template <class Motion>
+  Least least(const Core& core, const Motion& motion, double from, double to, int bits) {
+    const double h = to - from;
+    const auto value = [&](double x) {
+      return motion(from + (x - 1) * h) ? at(core) : std::numeric_limits<double>::infinity();
+    };
+    const auto [x, least] = boost::math::tools::brent_find_minima(value, 1.0, 2.0, bits);
+    return {from + (x - 1) * h, least};
+  }
 
  private:
+  double at(const Core& core);   // the value alone
+  void decompose(const Core& core);
   void direction(double value);  // u_: the eigenvector of gram_
 
   Vector row_scale_, column_scale_, v_, u_;

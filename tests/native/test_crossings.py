@@ -1,0 +1,75 @@
+"""Where J nearly or really loses rank, in the native core: the same leaps as Python's, and no step of Python's for them."""
+
+import numpy as np
+import pytest
+
+from ckc_pin import simulate
+from ckc_pin.simulation.rank_guard import RankGuard
+from tests.regression.test_reference_cases import first_top_pin
+
+T_END = 3.0  # with three positions where the rods lie flat
+
+
+def _row_of_squares(N, rtol, **changes):
+    scene = {"mechanism.N": N, "t_end": T_END, "solver.output_dt": 0.1, "solver.rtol": rtol}
+    return simulate("n_four_bar", {**scene, **{key.replace("__", "."): value for key, value in changes.items()}})
+
+
+@pytest.fixture
+def steps_of_python(monkeypatch):
+    """Times at which Python was asked for a step."""
+    found, step = [], RankGuard.step
+
+    def told(guard):
+        found.append(guard.stepper.t)
+        return step(guard)
+
+    monkeypatch.setattr(RankGuard, "step", told)
+    return found
+
+
+@pytest.mark.parametrize(("N", "rtol"), [(1, 1e-7), (2, 1e-9), (5, 1e-11), (20, 1e-8)])
+def test_crossings_are_leapt_over_without_python(N, rtol, steps_of_python):
+    run = _row_of_squares(N, rtol)
+    assert run.status == "done", run.message
+    assert steps_of_python == []
+    wanted = [first_top_pin(N, t) for t in run.t]
+    assert np.abs(run.points["B0"][:, :2] - wanted).max() < 200 * rtol
+
+
+def test_a_coarse_run_asks_python_once_and_is_made_again_to_the_first_crossing(steps_of_python):
+    run = _row_of_squares(3, 1e-4)
+    assert run.status == "done", run.message
+    assert len(steps_of_python) == 1
+    wanted = [first_top_pin(3, t) for t in run.t]
+    after = run.t > 0.75  # the first is at 0.6 s; before it the output is as coarse as it was asked for
+    assert np.abs(run.points["B0"][:, :2] - wanted)[after].max() < 1e-5
+
+
+@pytest.mark.parametrize(("N", "rtol"), [(1, 1e-8), (4, 1e-10)])
+def test_both_backends_come_out_the_same(N, rtol):
+    python, native = (_row_of_squares(N, rtol, solver__backend=backend) for backend in ("python", "native"))
+    assert python.status == native.status == "done"
+    assert np.abs(native.q_tree - python.q_tree).max() < 500 * rtol
+    assert native.stats["rhs"] < 1.1 * python.stats["rhs"]
+    assert native.max_phi < 1e-11
+
+
+def test_a_budget_ends_a_run_with_crossings_where_it_is_used_up():
+    whole = _row_of_squares(2, 1e-8)
+    cut = _row_of_squares(2, 1e-8, solver__max_rhs=whole.stats["rhs"] - 50)
+    assert cut.status == "stopped"
+    assert "max_rhs" in cut.message
+    assert cut.stats["rhs"] <= whole.stats["rhs"] - 49
+    assert 0.5 * T_END < cut.t[-1] < T_END
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-10])
+def test_positions_that_only_come_near_cost_no_step_of_python(rtol, steps_of_python):
+    """Two arms on a bar come near a loss of rank several times in two seconds; the reference is Python's own run."""
+    changes = {"t_end": 0.8, "solver.rtol": rtol, "solver.output_dt": 0.1}
+    native = simulate("two_ur5", changes)
+    assert native.status == "done", native.message
+    assert steps_of_python == []
+    python = simulate("two_ur5", {**changes, "solver.backend": "python", "solver.rtol": min(rtol, 1e-9)})
+    assert np.abs(native.q_tree - python.q_tree).max() < 1e3 * rtol
