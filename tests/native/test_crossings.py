@@ -1,4 +1,4 @@
-"""Where J nearly or really loses rank, in the native core: the same leaps as Python's, and no step of Python's for them."""
+"""Where J nearly or really loses rank, in the native core: as Python leaps, and with no step of Python's for it."""
 
 import numpy as np
 import pytest
