@@ -40,12 +40,12 @@ class RankReport:
 def scaled(jacobian: Array, tree: Tree, closure: Closure, size: float) -> Array:
     """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
     rows, columns = scales(tree, closure, size)
-    return rows * jacobian * columns
+    return rows[:, None] * jacobian * columns
 
 
 def scales(tree: Tree, closure: Closure, size: float) -> tuple[Array, Array]:
-    """Return what J's rows, shape (rows, 1), and its columns, shape (n,), are multiplied with for that."""
-    return np.where(closure.in_metres(tree), 1.0 / size, 1.0)[:, None], np.where(tree.in_metres, size, 1.0)
+    """Return what J's rows, shape (rows,), and its columns, shape (n,), are multiplied with for that."""
+    return np.where(closure.in_metres(tree), 1.0 / size, 1.0), np.where(tree.in_metres, size, 1.0)
 
 
 def rank_of(scaled_jacobian: Array) -> RankReport:

@@ -122,12 +122,9 @@ class Burst:
         made_for = (self.system.native, self.stepper.method, options["rtol"], options["atol"], leaps)
         if made_for != self._made_for:
             self._made_for = made_for
-            mechanism = self.system.mechanism
-            rows = np.where(mechanism.closure.in_metres(mechanism.tree), 1.0 / mechanism.size, 1.0)
-            columns = np.where(mechanism.tree.in_metres, mechanism.size, 1.0)
             self._made = core().Loop(
                 self.system.native, self.stepper.method, _coefficients(self.stepper), options["rtol"], options["atol"],
-                options.get("max_step", np.inf), rows, columns, tables() if leaps else [], self.guard.gap,
+                options.get("max_step", np.inf), *self.guard.scales, _leap() if leaps else [], self.guard.gap,
             )  # fmt: skip
         return self._made
 
@@ -139,14 +136,19 @@ def runs(stepper: Stepper) -> bool:
     )
 
 
-def _coefficients(stepper: Stepper) -> dict[str, Any]:
+def _coefficients(stepper: Stepper) -> Any:
     """SciPy's own, so that both backends take the same steps."""
-    return {"newton_tol": float(stepper.solver.newton_tol)} if stepper.method == "BDF" else _dop853()
+    return float(stepper.solver.newton_tol) if stepper.method == "BDF" else _dop853()
 
 
 @cache
-def _dop853() -> dict[str, Any]:
+def _dop853() -> Any:
     from scipy.integrate import DOP853
 
     names = ("A", "A_EXTRA", "D", "B", "C", "C_EXTRA", "E3", "E5")
-    return {name: np.asfortranarray(getattr(DOP853, name), dtype=float) for name in names}
+    return core().Dop853Table(*(np.asfortranarray(getattr(DOP853, name), dtype=float) for name in names))
+
+
+@cache
+def _leap() -> list[Any]:
+    return [core().LeapTable(**table) for table in tables()]

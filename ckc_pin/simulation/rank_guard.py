@@ -55,6 +55,8 @@ class RankGuard:
         The least singular value at the end of the last step.
     length : float
         Of that step, s.
+    scales : (array, array)
+        What makes J free of units: of its rows and its columns.
     burst : callable or None
         Steps as far as it can by itself, without output.
     """
@@ -66,7 +68,7 @@ class RankGuard:
         self.rank = mechanism.rank
         self.core = self.system.core if isinstance(self.system, Native) else None
         self.dae = self.system if isinstance(self.system, Dae) and self.system.closed else None
-        self._row_scale, self._column_scale = scales(mechanism.tree, mechanism.closure, mechanism.size)
+        self.scales = scales(mechanism.tree, mechanism.closure, mechanism.size)
         self.crossings: list[float] = []
         self.end: tuple[float, float] | None = None
         self.length = 0.0
@@ -315,7 +317,8 @@ class RankGuard:
         )
 
     def _scaled(self, jacobian: Array) -> Array:
-        return self._row_scale * jacobian * self._column_scale
+        rows, columns = self.scales
+        return rows[:, None] * jacobian * columns
 
     def _value(self, q_tree: Array) -> float:
         """The rank-th singular value of the scaled J, relative to the largest."""

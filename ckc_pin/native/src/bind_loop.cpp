@@ -30,13 +30,6 @@ struct Run {
   Loop loop;
 };
 
-Dop853::Table table_of(const nb::dict& given) {
-  const auto matrix = [&](const char* key) { return nb::cast<Matrix>(given[key]); };
-  const auto vector = [&](const char* key) { return nb::cast<Vector>(given[key]); };
-  return {matrix("A"), matrix("A_EXTRA"), matrix("D"), vector("B"), vector("C"), vector("C_EXTRA"), vector("E3"),
-          vector("E5")};
-}
-
 // `t_old`, `y_old`: where the last step began.
 void begin(Run& run, double t, Given y, Given f, double h_abs, double t_old, Given y_old) {
   require(y, run.system.size, "y"), require(f, run.system.size, "f"), require(y_old, run.system.size, "y_old");
@@ -69,33 +62,31 @@ nb::tuple memory(Run& run) {
   return nb::make_tuple(Matrix(bdf.now.D.transpose()), bdf.now.order, bdf.now.equal, bdf.J);
 }
 
-std::unique_ptr<Method> method_of(const std::string& name, const nb::dict& table, Tolerance tolerance, int size) {
-  if (name == "DOP853") return std::make_unique<Dop853>(table_of(table), tolerance, size);
+// `table`: DOP853's coefficients, BDF's tolerance of Newton's method.
+std::unique_ptr<Method> method_of(const std::string& name, nb::handle table, Tolerance tolerance, int size) {
+  if (name == "DOP853") return std::make_unique<Dop853>(nb::cast<Dop853::Table>(table), tolerance, size);
   require(name == "BDF", "method: DOP853 or BDF");
-  return std::make_unique<Bdf>(tolerance, nb::cast<double>(table["newton_tol"]), size);
-}
-
-Leap::Table leap_table(const nb::dict& given) {
-  const auto matrix = [&](const char* key) { return nb::cast<Matrix>(given[key]); };
-  Leap::Table table{nb::cast<Vector>(given["nodes"]), matrix("at_nodes"), matrix("at_places"), matrix("integration"),
-                    matrix("derivation")};
-  const auto stages = table.nodes.size();
-  const auto fits = [&](const Matrix& a, Eigen::Index rows, Eigen::Index columns) {
-    return a.rows() == rows && a.cols() == columns;
-  };
-  require(stages > 0 && fits(table.at_nodes, stages + 1, stages) && table.at_places.rows() == stages + 1 &&
-              fits(table.integration, stages, stages + 1) && fits(table.derivation, stages + 1, stages),
-          "leap: matrices of one number of stages are needed");
-  return table;
+  return std::make_unique<Bdf>(tolerance, nb::cast<double>(table), size);
 }
 
 std::unique_ptr<Leap> leap_of(System& system, const nb::list& tables) {
   if (nb::len(tables) == 0) return nullptr;
   Dae* dae = dynamic_cast<Dae*>(&system);
   require(dae && dae->crosses && nb::len(tables) == 2, "leap: two tables and a DAE that is projected are needed");
-  const auto table = [&](int k) { return leap_table(nb::cast<nb::dict>(tables[k])); };
-  auto leap = std::make_unique<Leap>(*dae, table(0), table(1));
-  return leap;
+  return std::make_unique<Leap>(*dae, nb::cast<Leap::Table>(tables[0]), nb::cast<Leap::Table>(tables[1]));
+}
+
+void make_table(Leap::Table* table, Vector nodes, Matrix at_nodes, Matrix at_places, Matrix integration,
+                Matrix derivation) {
+  const auto stages = nodes.size();
+  const auto fits = [&](const Matrix& a, Eigen::Index rows, Eigen::Index columns) {
+    return a.rows() == rows && a.cols() == columns;
+  };
+  require(stages > 0 && fits(at_nodes, stages + 1, stages) && at_places.rows() == stages + 1 &&
+              fits(integration, stages, stages + 1) && fits(derivation, stages + 1, stages),
+          "leap: matrices of one number of stages are needed");
+  new (table) Leap::Table{std::move(nodes), std::move(at_nodes), std::move(at_places), std::move(integration),
+                          std::move(derivation)};
 }
 
 // (why, rows): the instants recorded, a row each.
@@ -116,9 +107,19 @@ nb::tuple go(Run& run, double t_bound, double min_step, long most_rhs, double se
 }  // namespace
 
 void bind_loop(nb::module_& m) {
+  nb::class_<Dop853::Table>(m, "Dop853Table")
+      .def("__init__",
+           [](Dop853::Table* table, Matrix A, Matrix A_extra, Matrix D, Vector B, Vector C, Vector C_extra, Vector E3,
+              Vector E5) {
+             new (table) Dop853::Table{std::move(A), std::move(A_extra), std::move(D),  std::move(B),
+                                       std::move(C), std::move(C_extra), std::move(E3), std::move(E5)};
+           },
+           "A"_a, "A_extra"_a, "D"_a, "B"_a, "C"_a, "C_extra"_a, "E3"_a, "E5"_a);
+  nb::class_<Leap::Table>(m, "LeapTable")
+      .def("__init__", &make_table, "nodes"_a, "at_nodes"_a, "at_places"_a, "integration"_a, "derivation"_a);
   nb::class_<Run>(m, "Loop")
       .def("__init__",
-           [](Run* self, System& system, const std::string& method, const nb::dict& table, double rtol, double atol, double max_step,
+           [](Run* self, System& system, const std::string& method, nb::handle table, double rtol, double atol, double max_step,
               Given row_scale, Given column_scale, const nb::list& leap, double closed) {
              const Core& core = system.core;
              require(row_scale, core.rows.closure.rows, "row_scale"), require(column_scale, core.n, "column_scale");
