@@ -55,6 +55,16 @@ def test_sentences_name_who_is_ahead_and_by_how_much() -> None:
     assert next(sentences(SHORT, [row(error_max=1.0)], rough)) == "To 1e-03: no setting tried gets there."
 
 
+@pytest.mark.parametrize(
+    ("other", "verdict"),
+    [(0.05, "4 times faster than here"), (0.16, "25 % faster than here"), (0.2, "0 % longer"), (0.21, "5 % longer"),
+     (0.4, "2 times as long")],
+)  # fmt: skip
+def test_small_differences_are_told_in_percent(other: float, verdict: str) -> None:
+    said = next(sentences(SHORT, [row(wall_s=0.2), peer(wall_s=other)], GOOD))
+    assert said.endswith(f", {verdict}.")
+
+
 @given(own=SECONDS, other=SECONDS, by_hand=st.booleans())
 def test_whoever_takes_less_time_is_said_to_be_ahead(own: float, other: float, by_hand: bool) -> None:
     program = LOOP if by_hand else "MuJoCo"

@@ -8,7 +8,7 @@ from math import exp, log
 from ckc_pin.study.report.ours import PROGRAM, of_row
 from ckc_pin.study.report.reference import Reference
 from ckc_pin.study.report.row import Row
-from ckc_pin.study.report.sentences import TARGETS, eq_8_ratio, fastest, here, ratio, times
+from ckc_pin.study.report.sentences import TARGETS, eq_8_ratio, faster, fastest, here, ratio, times
 from ckc_pin.study.report.work import Work
 
 __all__ = ["advice"]
@@ -162,7 +162,7 @@ def _where(on: Sequence[tuple[str, float]], found: Mapping[tuple[str, float], fl
     for work in dict.fromkeys(work for work, _ in on):
         targets = [target for own, target in on if own == work]
         overs = [1 / over for target in targets if (over := found[work, target]) is not None]
-        by = f"up to {times(max(overs))} times faster" if overs else "nothing here gets there"
+        by = f"up to {faster(max(overs))}" if overs else "nothing here gets there"
         yield f"{work} to {', '.join(f'{target:.0e}' for target in targets)} ({by})"
 
 

@@ -9,7 +9,7 @@ from ckc_pin.study.report.reference import Reference
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.work import Work
 
-__all__ = ["TARGETS", "eq_8_ratio", "fastest", "here", "milliseconds", "ratio", "sentences", "times"]
+__all__ = ["TARGETS", "eq_8_ratio", "faster", "fastest", "here", "milliseconds", "ratio", "sentences", "times"]
 
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 
@@ -79,7 +79,9 @@ def _against(own: Row | None, other: Row | None) -> str:
 
 def _verdict(own: Row, other: Row) -> str:
     found = other.wall_s / own.wall_s
-    return f"{times(found)} times as long" if found >= 1 else f"{times(1 / found)} times faster than here"
+    if found < 1:
+        return f"{faster(1 / found)} than here"
+    return f"{times(found)} times as long" if found >= 2 else f"{times(100 * (found - 1))} % longer"
 
 
 def eq_8_ratio(ours: Sequence[Row], target: float) -> float | None:
@@ -112,6 +114,11 @@ def _named(row: Row) -> str:
 def milliseconds(row: Row) -> str:
     """A row's time for people."""
     return f"{times(row.wall_s * 1e3)} ms"
+
+
+def faster(x: float) -> str:
+    """How much faster x times as fast is, for people."""
+    return f"{times(x)} times faster" if x >= 2 else f"{times(100 * (x - 1))} % faster"
 
 
 def times(x: float) -> str:
