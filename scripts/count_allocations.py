@@ -33,7 +33,7 @@ def loop_of(scene: str, changes: dict[str, Any]) -> tuple[Any, Stepper]:
     recorder = Recorder(ready.system, ready.plant.effort, None)
     burst = Burst(stepper, RankGuard(stepper), recorder, np.zeros(0), lambda until, end: until)
     loop, solver = burst._loop(), stepper.solver
-    loop.begin(0.0, solver.y, getattr(solver, "f", solver.y), solver.h_abs)
+    loop.begin(0.0, solver.y, getattr(solver, "f", solver.y), solver.h_abs, *stepper.before)
     if stepper.method == "BDF":
         loop.remember(solver.D, solver.order, solver.n_equal_steps, solver.J)
     return loop, stepper
@@ -50,7 +50,7 @@ def main() -> int:
         def stretch(end: float, loop: Any = loop, instants: Any = instants) -> tuple[int, int]:
             due = instants[(instants > loop.t) & (instants <= end)]
             before = counter()
-            loop.go(end, 0.0, 2**62, 60.0, end, due, 64)
+            loop.go(end, 0.0, 2**62, 60.0, end, True, due, 64)
             made = counter() - before
             return made, loop.counts()[0]
 

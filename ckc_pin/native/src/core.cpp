@@ -42,8 +42,9 @@ void Core::split(Indices q_, Indices z_) {
   q = std::move(q_), z = std::move(z_);
   d = static_cast<int>(q.size());
   const int m = rows.closure.rows, k = static_cast<int>(z.size());
-  phi_z.shape(m, k, pattern_of(rows, z, n));
-  basis_q_ = q, basis_z_ = z, basis_ = phi_z;
+  const auto pattern = pattern_of(rows, z, n);
+  phi_z.shape(m, k, pattern), basis_.shape(m, k, pattern);
+  basis_q_ = q, basis_z_ = z;
   D_factor.shape(d, d, full_pattern(d));
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }

@@ -1,6 +1,7 @@
 // A mechanism's terms at one state, and the formulations as functions of them.
 //
-// Everything is kept in the object and overwritten by the next state: nothing is allocated after construction.
+// Everything is kept in the object and overwritten by the next state: nothing is allocated after construction, but
+// for a tangent basis that changes its partition.
 #pragma once
 
 #include <Eigen/QR>
