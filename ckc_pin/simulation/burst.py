@@ -1,7 +1,7 @@
 """Plain steps one after the other in the native core, until something calls for Python.
 
-Events, changes of the partition, positions where J loses rank, budgets, whatever does not converge: the loop returns
-where its last plain step ended, and the next step is Python's.
+Events, changes of the partition, a loss of rank that a coarse run meets or that cannot be leapt over, budgets, whatever
+does not converge: the loop returns where its last step ended, and the next one is Python's.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ At a change point (a flat four-bar) the loops stop to determine the motion: a st
 come out on the other branch, within tolerance and wrong. The smallest singular value s(t) of J shows it
 as a V that reaches zero: falling at the start of a step, rising at its end. In such a step the minimum is
 searched for. Where the motion itself is smooth there, it is crossed by a leap (`simulation.leap`).
+The native loop does the same by itself (`native/src/crossing.hpp`); what it does not pass comes here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-// The step loop: plain steps one after the other. Whatever else there is to a run is Python's, between two calls.
+// The step loop: plain steps one after the other, and leaps over positions where J loses rank. Whatever else there is
+// to a run is Python's, between two calls.
 #pragma once
 
 #include <chrono>
@@ -41,7 +42,7 @@ class Loop {
  private:
   enum class Made {
     all,      // a step, to be recorded
-    shorter,  // none, the next one is to be shorter
+    shorter,  // none yet: the next one tried is shorter
     none,     // none: it is Python's
   };
   Made step(const Stretch& stretch, Watch::Rank& after);

@@ -5,7 +5,8 @@
 
 namespace ckc {
 
-// As in `simulation.rank_guard`, except for `near`: below that a step's end is Python's, by singular values, not their squares.
+// As in `simulation.rank_guard`, except for `near`: below that a step's end is Python's, by singular values, not their
+// squares.
 constexpr double deep = 0.7, neck = 0.2, jump = 0.7, steps_ahead = 4.0, shortest = 1e-6, near = 1e-4;
 
 Watch::Watch(const Core& core, In row_scale, In column_scale)

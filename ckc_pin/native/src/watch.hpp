@@ -1,6 +1,6 @@
 // Watches for J losing rank and phi_z becoming singular, after every step: whether all is plainly well.
 //
-// What is to be done where it is not is Python's (`simulation.rank_guard`, `LevelSet.accept`).
+// What is to be done where it is not is for `Crossing` or for Python (`simulation.rank_guard`, `LevelSet.accept`).
 #pragma once
 
 #include <limits>
