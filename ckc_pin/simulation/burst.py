@@ -6,6 +6,7 @@ does not converge: the loop returns where its last step ended, and the next one 
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -152,3 +153,7 @@ def _dop853() -> Any:
 @cache
 def _leap() -> list[Any]:
     return [core().LeapTable(**table) for table in tables()]
+
+
+for kept in (_dop853, _leap):  # nanobind tells of objects that outlive it
+    atexit.register(kept.cache_clear)

@@ -1,5 +1,8 @@
 """Where J nearly or really loses rank, in the native core: as Python leaps, and with no step of Python's for it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -73,3 +76,15 @@ def test_positions_that_only_come_near_cost_no_step_of_python(rtol, steps_of_pyt
     assert steps_of_python == []
     python = simulate("two_ur5", {**changes, "solver.backend": "python", "solver.rtol": min(rtol, 1e-9)})
     assert np.abs(native.q_tree - python.q_tree).max() < 1e3 * rtol
+
+
+def test_nothing_of_the_native_core_is_left_when_python_ends():
+    """Kept alive by a module of the caller's, which is what the report's libraries do."""
+    program = (
+        "import ctypes, ckc_pin, ckc_pin.simulation.burst as burst\n"
+        "ckc_pin.simulate('n_four_bar', {'t_end': 0.8})\n"
+        "ctypes.pythonapi.Py_IncRef(ctypes.py_object(burst._dop853))\n"
+        "ctypes.pythonapi.Py_IncRef(ctypes.py_object(burst._leap))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ended.stderr == ""
