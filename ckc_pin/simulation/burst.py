@@ -58,6 +58,11 @@ class Burst:
         self.system: Any = stepper.system
         self._made_for: tuple[Any, ...] = ()
 
+    @property
+    def able(self) -> bool:
+        """Whether the native loop can go on: no more once method or coordinates are Python's."""
+        return bool(self.system.crosses) and runs(self.stepper)
+
     def run(self, due: int) -> tuple[int, bool]:
         """Step on; return which output instant is the next, and whether there is more to be done natively."""
         loop, stepper = self._loop(), self.stepper
@@ -104,7 +109,7 @@ class Burst:
 
     def unrecorded(self) -> None:
         """Step on as far as that goes, without output."""
-        more = True
+        more = self.able
         while more:
             _, more = self.run(len(self.times))
 

@@ -208,7 +208,7 @@ def _burst(
     legs.guard.burst = burst.unrecorded
 
     def run() -> None:
-        more = system.crosses and runs(stepper)  # no more once method or coordinates are Python's
+        more = burst.able
         while more:
             outputs.due, more = burst.run(outputs.due)
             legs.good = (stepper.t, stepper.solver.y)

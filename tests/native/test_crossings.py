@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from ckc_pin import simulate
+from ckc_pin.simulation.burst import Burst
+from ckc_pin.simulation.integrate import Stepper
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.rank_guard import RankGuard
+from ckc_pin.simulation.record import Recorder
+from ckc_pin.simulation.scene import load_scene
 from tests.regression.test_reference_cases import first_top_pin
 
 T_END = 3.0  # with three positions where the rods lie flat
@@ -76,6 +81,16 @@ def test_positions_that_only_come_near_cost_no_step_of_python(rtol, steps_of_pyt
     assert steps_of_python == []
     python = simulate("two_ur5", {**changes, "solver.backend": "python", "solver.rtol": min(rtol, 1e-9)})
     assert np.abs(native.q_tree - python.q_tree).max() < 1e3 * rtol
+
+
+def test_a_method_of_python_s_is_left_to_python_on_the_way_back_to_a_crossing():
+    """ "auto" may have changed to it since the run began."""
+    scene = load_scene("n_four_bar", {"solver.method": "Radau"})
+    ready = prepare(scene)
+    stepper = Stepper(ready.system, ready.method, scene.spec.solver, 1.0)
+    recorder = Recorder(ready.system, ready.plant.effort, None)
+    Burst(stepper, RankGuard(stepper), recorder, np.zeros(0), lambda until, end: until).unrecorded()
+    assert (stepper.t, stepper.steps, stepper.solver.status) == (0.0, 0, "running")
 
 
 def test_nothing_of_the_native_core_is_left_when_python_ends():
