@@ -270,10 +270,11 @@ class Stepper:
 
     def count(self, *times: float) -> None:
         """Take note of evaluations, as long as there is a budget for them."""
+        most = self.spec.max_rhs
+        if self._budgeted and most is not None and self.rhs_count + len(times) > most:
+            raise BudgetError(f"the budget of max_rhs = {most} right-hand sides is used up")
         self.rhs_count += len(times)
         self._times.update(times)
-        if self._budgeted and self.spec.max_rhs is not None and self.rhs_count > self.spec.max_rhs:
-            raise BudgetError(f"the budget of max_rhs = {self.spec.max_rhs} right-hand sides is used up")
         self.require_time()
 
     def require_time(self) -> None:

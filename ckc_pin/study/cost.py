@@ -108,7 +108,7 @@ def cost_at_equal_error(
     k = int(np.argmin(np.abs(np.log(np.array(search.rtols) / first))))
     best = attempt(k)
     if best.reason:
-        while best.reason and k + 1 < len(search.rtols) and not _out_of_budget(best, search):
+        while best.reason and k + 1 < len(search.rtols) and not _out_of_budget(best):
             k += 1
             best = attempt(k)
     else:
@@ -117,8 +117,8 @@ def cost_at_equal_error(
     return best if best.reason else _timed(best, make, t_end)
 
 
-def _out_of_budget(cost: Cost, search: Search) -> bool:
-    return cost.outcome is not None and cost.outcome.stats["rhs"] > search.max_rhs
+def _out_of_budget(cost: Cost) -> bool:
+    return "max_rhs" in cost.reason
 
 
 def _timed(cost: Cost, make: Callable[[], System], t_end: float) -> Cost:
@@ -178,7 +178,7 @@ def _costs_of_method(
             continue
         cost = cost_at_equal_error(name, make, reference, t_end, search, rtol)
         rtol = rtol if cost.reason else cost.rtol  # the next one will need much the same
-        if name.epsilon is not None and _out_of_budget(cost, search):
+        if name.epsilon is not None and _out_of_budget(cost):
             spent = f"not tried: too much at epsilon = {name.epsilon:.0e} already"
         costs.append(cost)
     return costs

@@ -129,6 +129,14 @@ void bind_loop(nb::module_& m) {
            },
            nb::keep_alive<1, 2>(), "system"_a, "method"_a, "table"_a, "rtol"_a, "atol"_a, "max_step"_a, "row_scale"_a,
            "column_scale"_a, "leap"_a, "closed"_a)
+      .def("rank",
+           [](Run& run, Given y) {  // (value, rate) at a state, as closed as it is
+             require(y, run.system.size, "y");
+             require(run.system.at_last(0.0, y), "y: the core cannot be set from it");
+             const Watch::Rank found = run.watch.rank(run.system);
+             return nb::make_tuple(found.value, found.rate);
+           },
+           "y"_a)
       .def_prop_rw(
           "chart_margin", [](const Run& run) { return run.watch.chart_margin; },
           [](Run& run, double margin) { run.watch.chart_margin = margin; })

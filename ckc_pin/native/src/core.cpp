@@ -44,7 +44,7 @@ void Core::split(Indices q_, Indices z_) {
   const int m = rows.closure.rows, k = static_cast<int>(z.size());
   const auto pattern = pattern_of(rows, z, n);
   phi_z.shape(m, k, pattern), basis_.shape(m, k, pattern);
-  basis_q_ = q, basis_z_ = z;
+  basis_q_ = q, basis_z_ = z, basis_at_ = -1;
   D_factor.shape(d, d, full_pattern(d));
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
@@ -174,16 +174,20 @@ void Core::spf_z_dot(In q_dot, double epsilon, In w, Out z_dot) {
 
 // tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
 bool Core::basis_by_partition() {
-  basis_.compute(rows.J, basis_z_);
-  if (!(basis_.pivot_ratio() > sound)) return false;
-  for (int k = 0; k < n - rank; ++k) {
-    residual_ = -rows.J.col(basis_q_[k]);
-    basis_.solve(residual_, z_);
-    tangent_.col(k).setZero();
-    tangent_(basis_q_[k], k) = 1.0;
-    for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
+  if (basis_at_ != sets) {
+    basis_at_ = -1;
+    basis_.compute(rows.J, basis_z_);
+    if (!(basis_.pivot_ratio() > sound)) return false;
+    for (int k = 0; k < n - rank; ++k) {
+      residual_ = -rows.J.col(basis_q_[k]);
+      basis_.solve(residual_, z_);
+      tangent_.col(k).setZero();
+      tangent_(basis_q_[k], k) = 1.0;
+      for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
+    }
+    if (!(tangent_.lpNorm<Eigen::Infinity>() < steep)) return false;
+    basis_at_ = sets;
   }
-  if (!(tangent_.lpNorm<Eigen::Infinity>() < steep)) return false;
   basis_.solve(negative_, z_);
   for (size_t i = 0; i < basis_z_.size(); ++i) x_(basis_z_[i]) = z_(i);
   return true;

@@ -71,6 +71,7 @@ class Core {
   Matrix D_rho_, tangent_, D_tangent_;
   Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
   Factor basis_;
+  long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1
   Vector x_, y_, elastic_, residual_, z_, d_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Matrix square_;

@@ -7,8 +7,9 @@
 
 namespace ckc {
 
-// As in `simulation.rank_guard`; `bits`: how closely the least value is looked for, ahead and within a step.
-constexpr double lost = 1e-5, beyond = 0.3, ahead = 0.1, centred = 0.04;
+// As in `simulation.rank_guard`; `bits`: how closely the least value is looked for, ahead and within a step; `foreseen`:
+// of the time to a crossing, the last step of Newton's method on it, whose next one would be its square.
+constexpr double lost = 1e-5, beyond = 0.3, ahead = 0.1, centred = 0.04, foreseen = 0.01;
 constexpr int most_attempts = 6, newton = 10, bits_ahead = 8, bits_within = 24, places = 9;
 constexpr double none = std::numeric_limits<double>::quiet_NaN();
 
@@ -34,13 +35,13 @@ double Crossing::left(const Watch::Rank& end, double length, double t_bound) {
   const int nq = core.tree.nq;
   const auto extrapolated = [&](double at) {  // as it accelerates now
     const double h = at - t;
-    auto q = y_.head(nq);
-    q = method_.y.head(nq) + h * method_.f.head(nq);
-    if (nq == core.n) q += (0.5 * h * h) * method_.f.tail(core.n);
-    return system_.place(y_);
+    y_ = method_.y + h * method_.f;
+    if (nq == core.n) y_.head(nq) += (0.5 * h * h) * method_.f.tail(core.n);
   };
-  const double tangent = end.value / -end.rate;
-  const Watch::Least least = watch_.least(core, extrapolated, t + 0.3 * tangent, t + 1.3 * tangent, bits_ahead);
+  const auto place = [&](double at) { return extrapolated(at), system_.place(y_); };
+  const double tangent = end.value / -end.rate, from = t + 0.3 * tangent, to = t + 1.3 * tangent;
+  Watch::Least least{zero(extrapolated, t + tangent, foreseen * tangent), 0.0};
+  if (!(least.t > from && least.t < to)) least = watch_.least(core, place, from, to, bits_ahead);
   return least.value >= ahead * end.value || least.t - t_bound > beyond * (least.t - t) ? none : least.t - t;
 }
 
@@ -79,7 +80,7 @@ double Crossing::from(double t, In y, double crossing) {
     leap->make(t, y, 2 * left, k > 0);
     reach_ = left * std::clamp(leap->scale(), 0.25, 2.0);
     if (!leap->good()) break;
-    const double when = zero(crossing), middle = (when - t) / left;
+    const double when = zero([&](double at) { leap->at(at, y_); }, crossing, 0.0), middle = (when - t) / left;
     if (!(middle > 0.5 && middle < 1.5) || !closed()) break;
     if (std::abs(when - crossing) < centred * left) return when;
     crossing = when;
@@ -88,17 +89,20 @@ double Crossing::from(double t, In y, double crossing) {
 }
 
 // By Newton's method: with its sign the value is smooth there, on both sides it over its rate is what is left.
-double Crossing::zero(double t) {
+template <class Motion>
+double Crossing::zero(const Motion& motion, double t, double accuracy) {
   double value = std::numeric_limits<double>::infinity();
   for (int k = 0; k < newton; ++k) {
-    leap->at(t, y_);
+    motion(t);
     if (!y_.allFinite() || !system_.at_last(t, y_)) return none;
     const double before = value;
     const Watch::Rank found = watch_.rank(system_);
     value = found.value;
     if (value <= 1e-3 * lost) return t;
     if (!(value < 0.5 * before) || found.rate == 0.0) break;
-    t -= value / found.rate;
+    const double step = value / found.rate;
+    t -= step;
+    if (std::abs(step) <= accuracy) return t;
   }
   return value <= lost ? t : none;
 }

@@ -32,7 +32,9 @@ class Crossing {
 
  private:
   double from(double t, In y, double crossing);
-  double zero(double t);
+  // When J loses rank on a motion that sets y_, from t on; NaN where that is not found.
+  template <class Motion>
+  double zero(const Motion& motion, double t, double accuracy);
   bool closed();
   void approach(double left);
 

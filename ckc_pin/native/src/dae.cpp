@@ -15,14 +15,14 @@ Dae::Dae(Core& core_, double tolerance, bool projects, double alpha, double beta
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
-void Dae::set(In q_tree) {
-  core.set(q_tree, true);
+void Dae::set(In q_tree, bool with_inertia) {
+  core.set(q_tree, with_inertia);
   if (drive.controls()) {
     core.factor(), core.reduce(), core.inertia();
   } else {
     core.rows.jacobian(core.tree);
   }
-  placed_ = core.sets;
+  placed_ = with_inertia ? core.sets : -1;
 }
 
 // Unless the core was left there.
@@ -79,7 +79,9 @@ bool Dae::project(In y) {
 bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   const int n = core.n;
   if (!y.allFinite()) return false;
-  place(y);
+  q_tree_ = y.head(core.tree.nq);
+  core.tree.normalize(q_tree_);
+  set(q_tree_, false);
   for (int k = 0;; ++k) {
     if (k == most_steps || !core.shortest_step(core.rows.phi, step_)) return false;
     ++counts.factorizations;

@@ -22,7 +22,7 @@ class Dae : public System {
   bool project(In y);
 
  private:
-  void set(In q_tree);  // the core at a configuration, with D' and what controllers need
+  void set(In q_tree, bool with_inertia = true);  // the core at a configuration, with D' and what controllers need
   void independent(In v);  // q of the core's configuration, and q_dot
   bool rate(double t, In v, Out y_dot);  // at the core's configuration
 

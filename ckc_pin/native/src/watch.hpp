@@ -5,9 +5,9 @@
 
 #include <limits>
 
-#include <Eigen/Eigenvalues>
 #include <boost/math/tools/minima.hpp>
 
+#include "spectrum.hpp"
 #include "system.hpp"
 
 namespace ckc {
@@ -53,13 +53,11 @@ class Watch {
 
  private:
   double at(const Core& core);   // the value alone
-  void decompose(const Core& core);
-  void direction(double value);  // u_: the eigenvector of gram_
 
   Vector row_scale_, column_scale_, v_, u_;
-  Matrix scaled_, gram_, phi_z_, phi_z_gram_;
-  Eigen::SelfAdjointEigenSolver<Matrix> eigen_, chart_eigen_;  // values only: vectors would allocate
-  Factor shifted_;
+  Matrix phi_z_, phi_z_gram_;
+  Spectrum spectrum_;                                  // of J, scaled
+  Eigen::SelfAdjointEigenSolver<Matrix> chart_eigen_;  // values only: vectors would allocate
 };
 
 }  // namespace ckc

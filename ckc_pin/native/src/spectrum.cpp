@@ -1,0 +1,108 @@
+#include "spectrum.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <iterator>
+#include <utility>
+
+namespace ckc {
+
+constexpr int small = 24;           // rows, up to which decomposing it whole is as cheap
+constexpr double exhausted = 1e-14;  // of the matrix' size: what the next direction is short of being one
+
+// A vector that no symmetry of a mechanism is orthogonal to.
+static void along_nothing(Out u) {
+  for (Eigen::Index k = 0; k < u.size(); ++k) u(k) = 1.0 + 0.1 * static_cast<double>(k % 7);
+}
+
+Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank)
+    : pattern_(std::move(pattern)), rank_(rank), eigen_(std::max<int>(static_cast<int>(pattern_.size()), 1)) {
+  const int m = static_cast<int>(pattern_.size());
+  whole_ = m <= small || rank < m;
+  scaled_.setZero(m, columns), gram_.setZero(m, m), u_.setZero(m);
+  std::vector<Indices> meets(m);
+  for (int a = 0; a < m; ++a)
+    for (int b = 0; b < m; ++b) {
+      Indices columns_of_both;
+      std::set_intersection(pattern_[a].begin(), pattern_[a].end(), pattern_[b].begin(), pattern_[b].end(),
+                            std::back_inserter(columns_of_both));
+      if (columns_of_both.empty()) continue;
+      meets[a].push_back(b);
+      if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
+    }
+  factor_.shape(m, m, whole_ ? full_pattern(m) : meets);
+  if (whole_)  // it cannot be copied before its first use
+    eigen_.compute(Matrix::Identity(std::max(m, 1), std::max(m, 1)), Eigen::EigenvaluesOnly);
+  else
+    basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
+}
+
+void Spectrum::compute(const Matrix& a, In row_scale, In column_scale) {
+  for (size_t i = 0; i < pattern_.size(); ++i)
+    for (int j : pattern_[i]) scaled_(i, j) = row_scale(i) * a(i, j) * column_scale(j);
+  for (const Pair& pair : pairs_) {
+    double sum = 0.0;
+    for (int j : pair.columns) sum += scaled_(pair.a, j) * scaled_(pair.b, j);
+    gram_(pair.a, pair.b) = gram_(pair.b, pair.a) = sum;
+  }
+  whole_ ? dense() : sparse();
+}
+
+void Spectrum::dense() {
+  eigen_.compute(gram_, Eigen::EigenvaluesOnly);
+  const auto m = gram_.rows();
+  largest_ = eigen_.eigenvalues()(m - 1), least_ = eigen_.eigenvalues()(m - rank_);
+}
+
+void Spectrum::sparse() {
+  largest_ = top([this](In x, Vector& product) {
+    product.setZero();
+    for (const Pair& pair : pairs_) {
+      const double entry = gram_(pair.a, pair.b);
+      product(pair.a) += entry * x(pair.b);
+      if (pair.a != pair.b) product(pair.b) += entry * x(pair.a);
+    }
+  });
+  factor_.compute(gram_);
+  least_ = factor_.singular() ? 0.0 : 1.0 / top([this](In x, Vector& product) { factor_.solve(x, product); });
+}
+
+// With full orthogonalization, twice, which a few steps can afford.
+template <class Apply>
+double Spectrum::top(const Apply& apply) {
+  Small diagonal = Small::Zero(), beside = Small::Zero();
+  along_nothing(u_);
+  basis_.col(0) = u_.normalized();
+  for (int k = 0; k < steps_; ++k) {
+    apply(basis_.col(k), next_);
+    diagonal(k) = basis_.col(k).dot(next_);
+    const auto known = basis_.leftCols(k + 1);
+    for (int twice = 0; twice < 2; ++twice) {
+      along_.head(k + 1).noalias() = known.transpose() * next_;
+      next_.noalias() -= known * along_.head(k + 1);
+    }
+    const double rest = next_.norm();
+    if (k + 1 == steps_ || !(rest > exhausted * std::abs(diagonal(0)))) break;
+    beside(k) = rest;
+    basis_.col(k + 1) = next_ / rest;
+  }
+  ritz_.computeFromTridiagonal(diagonal, beside.head<steps_ - 1>());
+  u_.noalias() = basis_ * ritz_.eigenvectors().col(steps_ - 1);
+  return ritz_.eigenvalues()(steps_ - 1);
+}
+
+void Spectrum::vectors(Vector& u, Vector& v) {
+  if (whole_) {  // inverse iteration: the shift is as good as the value
+    gram_.diagonal().array() -= least_ + 1e-12 * largest_;
+    factor_.compute(gram_);
+    along_nothing(u_);
+    for (int k = 0; k < 2; ++k) {
+      factor_.solve(u_, u_);
+      u_.normalize();
+    }
+  }
+  u = u_;
+  v.noalias() = scaled_.transpose() * u;
+}
+
+}  // namespace ckc

@@ -1,0 +1,51 @@
+// The least and the largest singular value of a wide matrix, few of whose entries are not zero.
+#pragma once
+
+#include <Eigen/Eigenvalues>
+
+#include "linear.hpp"
+
+namespace ckc {
+
+// From A A^T, so the least one is exact to eps times the square of their ratio.
+//
+// A small matrix, or one that lacks rank, is decomposed whole. For a large one that costs its rows cubed; it has the
+// least and the largest eigenvalue looked for by Lanczos' method, on A A^T and on its inverse, whose factors are as
+// sparse as the loops are.
+class Spectrum {
+ public:
+  // The pattern by rows; `rank`: how many singular values are not zero whatever the state.
+  Spectrum(std::vector<Indices> pattern, int columns, int rank);
+
+  void compute(const Matrix& a, In row_scale, In column_scale);  // of the scaled matrix; not read outside the pattern
+  double largest() const { return std::sqrt(largest_); }
+  double least() const { return std::sqrt(std::max(least_, 0.0)); }
+  // Singular vectors of the least: u of unit length, and v = A^T u, whose length is that value to rounding.
+  void vectors(Vector& u, Vector& v);
+
+ private:
+  static constexpr int steps_ = 16;  // of Lanczos' method
+  using Small = Eigen::Matrix<double, steps_, 1>;
+
+  void dense();
+  void sparse();
+  template <class Apply>
+  double top(const Apply& apply);  // the largest eigenvalue, its vector into u_
+
+  struct Pair {  // of rows that meet common columns
+    int a, b;
+    Indices columns;
+  };
+  std::vector<Indices> pattern_;
+  std::vector<Pair> pairs_;
+  int rank_;
+  bool whole_;
+  double largest_ = 0.0, least_ = 0.0;
+  Matrix scaled_, gram_, basis_;
+  Vector u_, next_, along_;
+  Eigen::SelfAdjointEigenSolver<Matrix> eigen_;  // values only: vectors would allocate
+  Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, steps_, steps_>> ritz_;
+  Factor factor_;
+};
+
+}  // namespace ckc
