@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -161,6 +161,11 @@ def prepare(scene: Scene, controller: Controller | None = None, *, measured: boo
     plant = Plant(controller, actuation)
     system = make_system(mechanism, scene, start, plant, measured)
     return Prepared(mechanism, plant, system, _method(scene, system, plant), start, texts)
+
+
+def again(scene: Scene, ready: Prepared) -> Prepared:
+    """Return the same with a system that stands at its start, for another run of the scene."""
+    return replace(ready, system=make_system(ready.mechanism, scene, ready.start, ready.plant))
 
 
 def _refuse_massless(terms: Terms) -> None:

@@ -21,14 +21,14 @@ from ckc_pin.simulation.burst import Burst, runs
 from ckc_pin.simulation.clock import Clock, Legs
 from ckc_pin.simulation.events import Event, Events
 from ckc_pin.simulation.integrate import BudgetError, Stepper
-from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.record import Recorder, Watch
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.systems import Native
 
-__all__ = ["Progress", "simulate"]
+__all__ = ["Progress", "run_prepared", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 
@@ -81,8 +81,28 @@ def simulate(
         scene = load_scene(scene, changes)
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
-    times = _output_instants(scene)
+    _output_instants(scene)  # refused before anything is loaded
     ready = prepare(scene, controller, measured=profile)
+    run = run_prepared(scene, ready, events=events, progress=progress, watch=watch, profile=profile)
+    if controller is not None:
+        run.scene.pop("controller", None)  # the caller's took its place
+    return run
+
+
+def run_prepared(
+    scene: Scene,
+    ready: Prepared,
+    *,
+    events: Sequence[Event] = (),
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+    profile: bool = False,
+) -> Run:
+    """Run what was prepared for a scene, once: its system ends where the run does.
+
+    Parameters and errors are those of `simulate`.
+    """
+    times = _output_instants(scene)
     mechanism, plant = ready.mechanism, ready.plant
     _refuse_too_much(mechanism, len(times))
     watched = Events(scene.spec.event, events, mechanism)
@@ -112,21 +132,13 @@ def simulate(
         events=watched.met,
         stats=stats,
         scene_name=scene.name,
-        scene=_as_run(scene, controller is not None),
+        scene=scene.plain(),
         texts=texts,
         profile=tally.plain() if tally else {},
         **{"lyapunov": None, **recorder.arrays()},  # type: ignore[arg-type]
     )
     run.__dict__["mechanism"] = mechanism
     return run
-
-
-def _as_run(scene: Scene, own_controller: bool) -> dict[str, Any]:
-    """Return the scene as it was run: without its controller where the caller's took its place."""
-    plain = scene.plain()
-    if own_controller:
-        plain.pop("controller", None)
-    return plain
 
 
 def _output_instants(scene: Scene) -> Array:

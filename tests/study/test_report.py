@@ -94,6 +94,19 @@ def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> N
     assert row.status != "done" or broken == "short"
 
 
+def test_a_repeated_run_is_the_same_run() -> None:
+    """What is measured, warm and from a system made once more, is what a user's run computes."""
+    setting = ours.Setting("reduced", "DOP853", False, 1e-6)
+    motion, run = (
+        ours.compute(SHORT, setting.changes, 60.0),
+        simulate(SHORT.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6)),
+    )
+    assert np.array_equal(motion.q_tree, run.q_tree)
+    assert np.array_equal(motion.v_tree, run.v_tree)
+    assert (motion.steps, motion.rhs) == (run.stats["steps"], run.stats["rhs"])
+    assert 0 < motion.wall_s <= 3 * run.stats["wall_s"]
+
+
 def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
     setting = ours.Setting("dae", "auto", False, 1e-8)
     row = judged("k", SHORT, ours.PROGRAM, setting.name, ours.compute(SHORT, setting.changes, 60.0), exact)
@@ -236,7 +249,7 @@ def test_an_interrupt_ends_the_report_and_what_was_measured_is_there(
 
     whole = simulate(SHORT.load())
     monkeypatch.setattr(make, "WORKS", (SHORT,))
-    monkeypatch.setattr(ours, "simulate", interrupted)
+    monkeypatch.setattr(ours, "run_prepared", interrupted)
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
         make.report(tmp_path, quick=True)
     assert len(Table(tmp_path / "report.csv", Row).rows) == 1

@@ -8,8 +8,10 @@
 
 namespace ckc {
 
+constexpr int few = 6;  // rows, which to take as they are costs less than to look where their entries are
+
 void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
-  rows_ = rows, columns_ = columns, pattern_ = pattern;
+  rows_ = rows, columns_ = columns, pattern_ = pattern, small_ = rows == columns && rows <= few;
   Indices first(columns, rows);
   for (int i = rows - 1; i >= 0; --i)
     for (int j : pattern[i]) first[j] = i;
@@ -40,6 +42,11 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
   if (rows_ != columns_) {
     for (int j = 0; j < columns_; ++j) qr_.col(j) = a.col(at(j));
     return householder();
+  }
+  if (small_) {
+    for (int i = 0; i < rows_; ++i)
+      for (int k = 0; k < rows_; ++k) lu_(i, k) = a(i, at(column_at_[k]));
+    return eliminate_small();
   }
   for (int i = 0; i < rows_; ++i) {
     lu_.row(i).head(high_[i]).setZero();  // what the last time left
@@ -90,6 +97,27 @@ void Factor::eliminate() {
   }
 }
 
+void Factor::eliminate_small() {
+  const int n = rows_;
+  std::iota(row_at_.begin(), row_at_.end(), 0);
+  for (int k = 0; k < n; ++k) {
+    int best = k;
+    double largest = -1.0;
+    for (int i = k; i < n; ++i) {
+      const double size = std::abs(lu_(row_at_[i], k));
+      if (size > largest || std::isnan(size)) largest = size, best = i;
+    }
+    if (!(largest > 0.0)) singular_ = true;
+    std::swap(row_at_[k], row_at_[best]);
+    const double* pivot = &lu_(row_at_[k], 0);
+    for (int i = k + 1; i < n; ++i) {
+      double* row = &lu_(row_at_[i], 0);
+      row[k] /= pivot[k];
+      for (int j = k + 1; j < n; ++j) row[j] -= row[k] * pivot[j];
+    }
+  }
+}
+
 double Factor::pivot_ratio() const {
   double least = std::numeric_limits<double>::infinity(), most = 0.0;
   for (int k = 0; k < columns_; ++k) {
@@ -135,6 +163,21 @@ void Factor::solve(In b, Out x) {
       work_(k) = (work_(k) - qr_.row(k).tail(rest).dot(work_.segment(k + 1, rest))) / qr_(k, k);
     }
     x = work_.head(columns_);
+    return;
+  }
+  if (small_) {
+    for (int k = 0; k < rows_; ++k) {
+      const double* row = &lu_(row_at_[k], 0);
+      double value = b(row_at_[k]);
+      for (int j = 0; j < k; ++j) value -= row[j] * work_(j);
+      work_(k) = value;
+    }
+    for (int k = rows_ - 1; k >= 0; --k) {
+      const double* row = &lu_(row_at_[k], 0);
+      double value = work_(k);
+      for (int j = k + 1; j < rows_; ++j) value -= row[j] * x(column_at_[j]);
+      x(column_at_[k]) = value / row[k];
+    }
     return;
   }
   work_.head(rows_) = b;

@@ -14,7 +14,7 @@ class Factor {
  public:
   // Columns in the order of the first row that meets them, by the pattern of a (rows, columns) matrix.
   void shape(int rows, int columns, const std::vector<Indices>& pattern);
-  // Of columns of a matrix (all when none are named); entries outside the pattern are not read.
+  // Of columns of a matrix (all when none are named); entries outside the pattern are zero.
   void compute(const Matrix& a, const Indices& columns = {});
   void solve(In b, Out x);            // least squares when tall
   bool singular() const { return singular_; }
@@ -22,6 +22,7 @@ class Factor {
 
  private:
   void eliminate();
+  void eliminate_small();
   void householder();
 
   int rows_ = 0, columns_ = 0;
@@ -35,7 +36,7 @@ class Factor {
   std::vector<Indices> beginning_;    // by column: rows whose interval begins there
   std::vector<Indices> below_;        // by column: rows that its elimination touched
   Indices active_;                    // rows met and not yet pivots
-  bool singular_ = false;
+  bool small_ = false, singular_ = false;
 };
 
 // The pattern of a full square matrix.

@@ -15,7 +15,7 @@ from ckc_pin.study.report.work import INSTANTS, Work
 __all__ = ["CONTROLLED", "divided", "halved", "start_of", "stepped"]
 
 TRIAL = 50  # steps, to foresee how long all take
-REPEATS = 3
+REPEATS, ENOUGH = 3, 0.05  # s of repeats, and three at least
 SHORT = 1.0  # s: what takes less is repeated
 
 # why a program is not run on a controlled motion
@@ -76,7 +76,7 @@ def stepped(
         foreseen = (perf_counter() - began) / min(TRIAL, many) * many * INSTANTS
         if foreseen > budget:
             return Motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s", none, none, 0.0, 0.0)
-        while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
+        while not walls or (walls[-1] < SHORT and (len(walls) < REPEATS or sum(walls) < ENOUGH)):
             wall, states = _timed(lambda: step(many), reset, state)
             walls.append(wall)
     except Exception as error:  # whatever a program raises where its solver fails
