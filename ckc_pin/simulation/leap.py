@@ -26,7 +26,8 @@ ACCURATE = 1e-9  # of |y|: how well the two leaps have to agree
 ORDER = 12  # in the length of a leap: how its error is observed to grow
 SWEEPS = 30  # of the fixed-point iteration on the stages
 SETTLED = 0.005 * ACCURATE  # what is left to the fixed point when the iteration ends
-GUESSED = 1e-6  # the same where only a guess is extrapolated from it
+FIRST = 0.1 * ACCURATE  # the same for the first leap, which the last one is compared with
+GUESSED = 1e-4  # the same where only a guess is extrapolated from it
 FAR = 0.03  # of |y|: a guess that is as far off foretells a leap that is not accurate
 FORETOLD = 1e-6  # of how far off the guess is: the error of such a leap, as observed
 PLACES = np.linspace(-1.0, 1.0, 41)  # where they are compared
@@ -85,7 +86,7 @@ def leap(rates: Rates, t: float, y: Array, span: float, known: Leap | None = Non
     else:
         length, series = known.t - known.t_old, known._series
     size = max(1.0, float(np.abs(y).max()))
-    first, off = _collocated(rates, t, y, span, _rates_of(series, length, few, span / length), far=FAR * size)
+    first, off = _collocated(rates, t, y, span, _rates_of(series, length, few, span / length), FIRST, FAR * size)
     if not off <= FAR * size:
         return Leap(t, t + span, FORETOLD * off / size if np.isfinite(off) else np.inf, first)
     last, _ = _collocated(rates, t, y, span, _rates_of(first, span, many, 1.0))

@@ -7,7 +7,8 @@
 namespace ckc {
 
 // As in `simulation.leap`.
-constexpr double run_up = 0.4, accurate = 1e-9, settled_ = 0.005 * accurate, guessed = 1e-6, far_ = 0.03, foretold = 1e-6;
+constexpr double run_up = 0.4, accurate = 1e-9, compared = 0.1 * accurate, settled_ = 0.005 * accurate;
+constexpr double guessed = 1e-4, far_ = 0.03, foretold = 1e-6;
 constexpr int order = 12, sweeps = 30;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
@@ -49,7 +50,7 @@ void Leap::make(double t_, In y, double span, bool known) {
     collocate(few_, length, guessed, infinity);
   }
   guess(few_, length, span / length);
-  const double off = collocate(few_, span, settled_, far_ * size);
+  const double off = collocate(few_, span, compared, far_ * size);
   if (!(off <= far_ * size)) {
     error = std::isfinite(off) ? foretold * off / size : infinity;
     return;
