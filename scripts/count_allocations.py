@@ -20,6 +20,7 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("five_bar/tracking", {}),
     ("five_bar/tracking", TRACKING),
     ("three_rrr/default", {"formulation": "reduced"}),
+    ("n_four_bar", {"mechanism.N": 20, "formulation": "dae", "solver.rtol": 1e-11}),
     ("delta/default", {}),
     ("delta/circle", TRACKING),
 ]

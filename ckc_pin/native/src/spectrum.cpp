@@ -15,8 +15,7 @@ static void along_nothing(Out u) {
   for (Eigen::Index k = 0; k < u.size(); ++k) u(k) = 1.0 + 0.1 * static_cast<double>(k % 7);
 }
 
-Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank)
-    : pattern_(std::move(pattern)), rank_(rank), eigen_(std::max<int>(static_cast<int>(pattern_.size()), 1)) {
+Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank) : pattern_(std::move(pattern)), rank_(rank) {
   const int m = static_cast<int>(pattern_.size());
   whole_ = m <= small || rank < m;
   scaled_.setZero(m, columns), gram_.setZero(m, m), u_.setZero(m);
@@ -31,10 +30,11 @@ Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank)
       if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
     }
   factor_.shape(m, m, whole_ ? full_pattern(m) : meets);
-  if (whole_)  // it cannot be copied before its first use
-    eigen_.compute(Matrix::Identity(std::max(m, 1), std::max(m, 1)), Eigen::EigenvaluesOnly);
-  else
-    basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
+  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
+  // Solvers cannot be copied before their first use.
+  const int size = whole_ ? std::max(m, 1) : 1;
+  eigen_.compute(Matrix::Identity(size, size), Eigen::EigenvaluesOnly);
+  ritz_.compute(Eigen::Matrix<double, steps_, steps_>::Identity(), Eigen::EigenvaluesOnly);
 }
 
 void Spectrum::compute(const Matrix& a, In row_scale, In column_scale) {
@@ -72,7 +72,8 @@ template <class Apply>
 double Spectrum::top(const Apply& apply) {
   Small diagonal = Small::Zero(), beside = Small::Zero();
   along_nothing(u_);
-  basis_.col(0) = u_.normalized();
+  u_.normalize();
+  basis_.col(0) = u_;
   for (int k = 0; k < steps_; ++k) {
     apply(basis_.col(k), next_);
     diagonal(k) = basis_.col(k).dot(next_);
