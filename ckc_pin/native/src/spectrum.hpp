@@ -1,6 +1,9 @@
 // The least and the largest singular value of a wide matrix, few of whose entries are not zero.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
+
 #include <Eigen/Eigenvalues>
 
 #include "linear.hpp"

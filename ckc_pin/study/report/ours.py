@@ -34,7 +34,7 @@ METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, **dict.fromkeys(("RK45", "R
 QUICK_METHODS = {"auto": QUICK_TOLERANCES}
 IN_PYTHON = {"auto": FEW}
 QUICK_IN_PYTHON = {"auto": QUICK_FEW}
-ENOUGH = 0.15  # s of runs, set-up included; up to then they are repeated
+ENOUGH = 0.1  # s of runs, set-up included; up to then they are repeated
 REPEATS = 50
 LONG = 1.0  # s: one run of that is enough
 
