@@ -81,28 +81,31 @@ def simulate(
         scene = load_scene(scene, changes)
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
-    _output_instants(scene)  # refused before anything is loaded
+    times = _output_instants(scene)  # refused before anything is loaded
     ready = prepare(scene, controller, measured=profile)
-    run = run_prepared(scene, ready, events=events, progress=progress, watch=watch, profile=profile)
+    run = _run(scene, ready, times, events, progress, watch, profile)
     if controller is not None:
         run.scene.pop("controller", None)  # the caller's took its place
     return run
 
 
-def run_prepared(
+def run_prepared(scene: Scene, ready: Prepared) -> Run:
+    """Run what was prepared for a scene, once: its system ends where the run does.
+
+    Errors are those of `simulate`.
+    """
+    return _run(scene, ready, _output_instants(scene))
+
+
+def _run(
     scene: Scene,
     ready: Prepared,
-    *,
+    times: Array,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
     watch: Watch | None = None,
     profile: bool = False,
 ) -> Run:
-    """Run what was prepared for a scene, once: its system ends where the run does.
-
-    Parameters and errors are those of `simulate`.
-    """
-    times = _output_instants(scene)
     mechanism, plant = ready.mechanism, ready.plant
     _refuse_too_much(mechanism, len(times))
     watched = Events(scene.spec.event, events, mechanism)
