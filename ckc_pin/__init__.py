@@ -22,7 +22,7 @@ from ckc_pin.mechanism.point import Point
 
 if TYPE_CHECKING:
     from ckc_pin.mechanism.mapped import SingularityMap
-    from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, check, load_scene, simulate
+    from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, as_ivp, check, load_scene, simulate
 
 __all__ = [
     "Check",
@@ -38,6 +38,7 @@ __all__ = [
     "Scene",
     "Simulator",
     "Terms",
+    "as_ivp",
     "check",
     "load",
     "load_scene",

@@ -20,7 +20,7 @@ from ckc_pin.view.figures import plot
 ROOT = Path(__file__).resolve().parent.parent
 CASES = ("set_point", "tracking")
 # The SPF as the paper prints it, eq. 8: from w(0) = 0 eq. 17's coordinates would compute the reduced model again.
-FORMULATIONS = {"spf": {"formulation": "spf", "solver.spf_equation": 8}, "reduced": {"formulation": "reduced"}}
+FORMULATIONS = {"spf": {"formulation": "spf", "spf_coordinates": "z"}, "reduced": {"formulation": "reduced"}}
 STEADY = 4.0  # s: from here on tracking is in its steady state
 BOUND, BOUND_STEADY = 30.0, 5.0  # |u| in the paper's tracking, N m: at first, in steady state
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-import ckc_pin.native
 from ckc_pin import Mechanism, Run, load, simulate
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
@@ -22,15 +21,6 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("ckc_pin")
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--backend", choices=("auto", "python"), default="auto", help="python: as if nothing was built")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("--backend") == "python":
-        ckc_pin.native._load = lambda: (None, "the native core is switched off for these tests")  # type: ignore[assignment]
 
 
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}

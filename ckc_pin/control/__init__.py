@@ -3,7 +3,7 @@
 from ckc_pin.control.actuation import Actuation, Effort
 from ckc_pin.control.controllers import Controller, Model, SetPoint, Tracking
 from ckc_pin.control.desired import Desired, Harmonics, Table
-from ckc_pin.control.sampled import Held, Sampled
+from ckc_pin.control.sampled import Sampled
 
 __all__ = [
     "Actuation",
@@ -11,7 +11,6 @@ __all__ = [
     "Desired",
     "Effort",
     "Harmonics",
-    "Held",
     "Model",
     "Sampled",
     "SetPoint",

@@ -95,10 +95,6 @@ class Actuation:
                 f"the motion along {loose} is held by none of them"
             )
 
-    def unlimited(self, tau: Array) -> Array:
-        """1 where an actuator is below its limit, 0 where it is held at it, shape (actuators,)."""
-        return np.ones(len(tau)) if self.limit is None else (np.abs(tau) < self.limit).astype(float)
-
     def apply(self, terms: Terms, u: Array) -> Effort:
         """Map u to tau (minimum norm when there are more actuators than freedoms) and limit it.
 

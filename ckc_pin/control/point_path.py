@@ -143,6 +143,14 @@ class PointPath:
                 self.times.append(float(t))
                 self.knots.append(at)
 
+    @property
+    def past_end(self) -> str:
+        """What is to be said when it is asked for later than `leaves_at`."""
+        return (
+            f"the desired path of the point {self.point.name!r} leaves the workspace of its branch at "
+            f"t = {self.leaves_at or 0.0:.5f} s"
+        )
+
     def _end(self, inside: float, outside: float) -> None:
         """Bisect for the last instant that can be reached; it becomes the last knot."""
         at = self.knots[-1]
@@ -177,13 +185,10 @@ class PointPath:
             The path has left the workspace, or passes a serial singularity.
         """
         if self.leaves_at is not None and t > self.leaves_at:
-            raise NumericalError(
-                f"the desired path of the point {self.point.name!r} leaves the workspace of its branch at "
-                f"t = {self.leaves_at:.5f} s",
-                t=t,
-            )
+            raise NumericalError(self.past_end, t=t)
         x, x_dot, x_ddot = self.place(t)
-        psi = self.point.follow(self._near(t), x)
+        ways = (self.point.follow(knot, x) for knot in self._near(t))
+        psi = next((found for found in ways if found is not None), None)
         if psi is None:
             raise NumericalError(f"the desired path of the point {self.point.name!r} cannot be followed here", t=t)
         v, v_dot = self.point.rates(psi, x_dot, x_ddot)
@@ -191,10 +196,11 @@ class PointPath:
         q = mechanism.partition.q
         return mechanism.independent_part(psi.q_tree), v[q], v_dot[q]
 
-    def _near(self, t: float) -> Kinematics:
-        after = int(np.clip(np.searchsorted(self.times, t), 0, len(self.times) - 1))
-        before = max(after - 1, 0)
-        return self.knots[after if abs(self.times[after] - t) < abs(t - self.times[before]) else before]
+    def _near(self, t: float) -> tuple[Kinematics, Kinematics]:
+        """Return the knots around t, the nearer one first; the last one may be singular, at the workspace's edge."""
+        after = int(np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1))
+        around = (self.knots[after - 1], self.knots[after])
+        return around if t - self.times[after - 1] < self.times[after] - t else around[::-1]
 
 
 def make_desired(

@@ -2,7 +2,6 @@
 
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.formulations import (
-    closing_step,
     dae_acceleration,
     multipliers,
     reduced_acceleration,
@@ -14,7 +13,6 @@ from ckc_pin.dynamics.terms import Terms, terms
 
 __all__ = [
     "Terms",
-    "closing_step",
     "dae_acceleration",
     "h_gradient",
     "multipliers",

@@ -18,9 +18,7 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = [
     "CoriolisVelocity",
-    "closing_step",
     "dae_acceleration",
-    "dae_rate_gradient",
     "multipliers",
     "reduced_acceleration",
     "spf_terms",
@@ -110,17 +108,6 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     return tangent, particular
 
 
-def closing_step(terms: Terms, residual: Array) -> Array:
-    """Return x with J x = -residual that is smallest in the metric of D', shape (n,).
-
-    Raises
-    ------
-    NumericalError
-        J has lost rank.
-    """
-    return _with_force(terms, *tangent_basis(terms, residual), np.zeros(terms.mechanism.n))
-
-
 def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
     """Solve eq. 1 with its closure differentiated twice, J a + J_dot v' + correction = 0, for a = dv'/dt, shape (n,).
 
@@ -137,29 +124,6 @@ def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.
     force = u_tree - terms.bias_tree
     if terms.mechanism.springs.any_damping:
         force += terms.damping_force
-    return _with_force(terms, tangent, particular, force)
-
-
-def dae_rate_gradient(terms: Terms, u_gradient: Array) -> Array:
-    """Derivative of `dae_acceleration` along v', shape (n, n), on a tree of joints with one freedom each.
-
-    C' v' and J_dot v' are quadratic there: their derivatives are 2 C' and 2 J_dot.
-
-    Parameters
-    ----------
-    terms : Terms
-    u_gradient : (n, n) array
-        That of the actuators' forces on the tree.
-    """
-    tangent, particular = tangent_basis(terms, 2 * terms.J_dot)
-    force = u_gradient - 2 * terms.C_tree
-    if terms.mechanism.springs.any_damping:
-        force -= terms.mechanism.springs.damping_matrix(terms.q_tree)
-    return _with_force(terms, tangent, particular, force)
-
-
-def _with_force(terms: Terms, tangent: Array, particular: Array, force: Array) -> Array:
-    """Return the particular solution with as much of the tangent directions as a force on the tree makes of them."""
     inertia = tangent.T @ terms.D_tree @ tangent
     right = tangent.T @ (force - terms.D_tree @ particular)
     return particular + tangent @ Factorization(inertia).solve(right)

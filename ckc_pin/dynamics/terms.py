@@ -8,6 +8,7 @@ controller that needs C' asks for it, and it is computed then.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -40,34 +41,37 @@ class Terms:
 
     def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array) -> None:
         self.mechanism = mechanism
-        self.tally = mechanism.tree.tally
         self.at = at
         self.q_tree = at.q_tree
         self.v_tree = v_tree
-        self._model, self._data = mechanism.tree.model, mechanism.tree.data
+
+    @lazy
+    def _tree(self) -> tuple[Any, Any]:
+        """Pinocchio's model and workspace."""
+        return self.mechanism.tree.model, self.mechanism.tree.data
 
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 
     @lazy
     def D_tree(self) -> Array:
         """D', inertia of the open chains, shape (n, n)."""
-        return np.array(pin.crba(self._model, self._data, self.q_tree))
+        return np.array(pin.crba(*self._tree, self.q_tree))
 
     @lazy
     def C_tree(self) -> Array:
         """C', the Christoffel matrix, shape (n, n)."""
-        return np.array(pin.computeCoriolisMatrix(self._model, self._data, self.q_tree, self.v_tree))
+        return np.array(pin.computeCoriolisMatrix(*self._tree, self.q_tree, self.v_tree))
 
     @lazy
     def h_tree(self) -> Array:
         """h', gravity of the tree and its springs, whatever has a potential: shape (n,)."""
-        h = np.array(pin.computeGeneralizedGravity(self._model, self._data, self.q_tree))
+        h = np.array(pin.computeGeneralizedGravity(*self._tree, self.q_tree))
         return h - self.spring_force if self.mechanism.springs.any else h
 
     @lazy
     def bias_tree(self) -> Array:
         """C' v' + h' without the matrix C', shape (n,)."""
-        bias = np.array(pin.nonLinearEffects(self._model, self._data, self.q_tree, self.v_tree))
+        bias = np.array(pin.nonLinearEffects(*self._tree, self.q_tree, self.v_tree))
         return bias - self.spring_force if self.mechanism.springs.any else bias
 
     @lazy
@@ -89,15 +93,15 @@ class Terms:
     @lazy
     def potential_energy(self) -> float:
         """V(q'), joules, zero at the world's origin."""
-        gravity = float(pin.computePotentialEnergy(self._model, self._data, self.q_tree))
+        gravity = float(pin.computePotentialEnergy(*self._tree, self.q_tree))
         return gravity + self.mechanism.springs.energy(self.q_tree)
 
-    @property
+    @lazy
     def q(self) -> Array:
         """Independent coordinates q, shape (d,)."""
         return self.q_tree[self.mechanism.tree.place[self.at.partition.q]]
 
-    @property
+    @lazy
     def q_dot(self) -> Array:
         """Their rates, shape (d,)."""
         return self.v_tree[self.at.partition.q]

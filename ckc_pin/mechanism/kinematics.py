@@ -36,7 +36,6 @@ class Kinematics:
 
     def __init__(self, tree: Tree, closure: Closure, partition: Partition, q_tree: Array) -> None:
         self.tree = tree
-        self.tally = tree.tally
         self.closure = closure
         self.partition = partition
         self.q_tree = q_tree

@@ -135,7 +135,6 @@ class ManyPoses(Pose):
     def __init__(self, tree: Tree, anchors: Anchors, configurations: Array) -> None:
         self.tree = tree
         self.anchors = anchors
-        self.tally = None
         self.configurations = configurations
         self.count = len(configurations)
         placement, jacobian = tree.many_kinematics(configurations)

@@ -58,7 +58,6 @@ class Pose:
     def __init__(self, tree: Tree, anchors: Anchors, q_tree: Array) -> None:
         self.tree = tree
         self.anchors = anchors
-        self.tally = tree.tally
         self.q_tree = q_tree
         placement, jacobian = tree.kinematics(q_tree)
         self.rotation = placement[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
@@ -123,7 +122,6 @@ class Rate:
 
     def __init__(self, pose: Pose, v: Array) -> None:
         self.pose = pose
-        self.tally = pose.tally
         self.v = v
         jacobian_dot = pose.tree.jacobian_dot(pose.q_tree, v)
         self.linear_part = jacobian_dot[:3]

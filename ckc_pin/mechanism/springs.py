@@ -107,14 +107,6 @@ class Springs:
             force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
         return force
 
-    def damping_matrix(self, q_tree: Array) -> Array:
-        """Minus the derivative of `damping_force` along v', shape (n, n)."""
-        matrix = np.diag(self.joint_damping)
-        if self.damping.any():
-            _, length_jacobian = self._lengths(q_tree)
-            matrix += length_jacobian.T @ (self.damping[:, None] * length_jacobian)
-        return matrix
-
     def energy(self, q_tree: Array) -> float:
         """Energy stored, joules; what a constant force has left to give counts, zero at coordinate zero."""
         coordinates = q_tree[self.tree.place]

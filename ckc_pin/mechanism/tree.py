@@ -15,7 +15,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.lazy import Tally
 
 __all__ = ["Array", "BoolArray", "IntArray", "Tree"]
 
@@ -74,7 +73,6 @@ class Tree:
         self._placement = _strided_placements(self.data)
         # a matrix of one column would come as a vector
         self._jacobian, self._jacobian_dot = self.data.J.reshape(6, self.n), self.data.dJ.reshape(6, self.n)
-        self.tally: Tally | None = None
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""

@@ -8,58 +8,66 @@ import numpy as np
 
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rank import RANK_TOLERANCE, scales
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.native import core
 
-__all__ = ["make_core"]
-
-
-def make_core(mechanism: Mechanism) -> Any:
-    """Return a native core of a mechanism, with a workspace of its own."""
-    return core().Core(
-        mechanism.tree.model.saveToString(),
-        mechanism.tree.place.tolist(),
-        _closure(mechanism.closure, mechanism.n),
-        _springs(mechanism.springs),
-        mechanism.rank,
-        mechanism.partition.q.tolist(),
-        mechanism.partition.z.tolist(),
-    )
+__all__ = ["closure_table", "core_table"]
 
 
-def _closure(closure: Closure, n: int) -> dict[str, Any]:
+def core_table(mechanism: Mechanism) -> dict[str, Any]:
+    """Return what a native core of a mechanism is made of; each has a workspace of its own."""
+    rows, columns = scales(mechanism.tree, mechanism.closure, mechanism.size)
+    return {
+        "model": mechanism.tree.model.saveToString(),
+        "place": mechanism.tree.place.tolist(),
+        "closure": closure_table(mechanism.closure, mechanism.n),
+        "springs": _springs(mechanism.springs),
+        "rank": mechanism.rank,
+        "q": mechanism.partition.q.tolist(),
+        "z": mechanism.partition.z.tolist(),
+        "row_scale": rows,
+        "column_scale": columns,
+        "rank_tolerance": RANK_TOLERANCE,
+    }
+
+
+def closure_table(closure: Closure, n: int) -> dict[str, Any]:
+    """Return the rows of a closure, by primitive."""
     anchors = closure.anchors
-    table: dict[str, Any] = {
+    table: dict[str, Any] = {name: [] for name in ("component", "dot", "distance", "affine", "log")}
+    numbers: dict[str, list[Array]] = {"length": [np.zeros(0)], "affine_matrix": [np.zeros((0, n))],
+        "affine_offset": [np.zeros(0)], "rotation_a": [np.zeros((0, 9))], "rotation_b": [np.zeros((0, 9))]}  # fmt: skip
+    for group in closure.groups:
+        out = group.out.tolist()
+        match group:
+            case Component():
+                table["component"] += _rows(out, group.pair, group.direction)
+            case Dot():
+                table["dot"] += _rows(out, group.a, group.b)
+            case Distance():
+                table["distance"] += _rows(out, group.pair)
+                numbers["length"].append(group.length)
+            case Affine():
+                table["affine"] += out
+                numbers["affine_matrix"].append(_matrix(group.matrix, n))
+                numbers["affine_offset"].append(group.offset)
+            case RelativeLog():
+                table["log"] += _rows(out[::3], out[1::3], out[2::3], group.joint_a, group.joint_b)
+                numbers["rotation_a"].append(_matrix(group.rotation_a.reshape(-1, 9), 9))
+                numbers["rotation_b"].append(_matrix(group.rotation_b.reshape(-1, 9), 9))
+            case _:
+                raise TypeError(f"{type(group).__name__}: no such primitive crosses to the native core")
+    return {
+        **table,
+        **{name: np.concatenate(parts) for name, parts in numbers.items()},
         "rows": closure.rows,
         "point_joint": anchors.point_joint.tolist(),
         "point_local": _matrix(anchors.point_local, 3),
         "direction_joint": anchors.direction_joint.tolist(),
         "direction_local": _matrix(anchors.direction_local, 3),
-        "component": [], "dot": [], "distance": [], "affine": [], "log": [],
-        "length": np.zeros(0), "affine_matrix": np.zeros((0, n)), "affine_offset": np.zeros(0),
-        "rotation_a": np.zeros((0, 9)), "rotation_b": np.zeros((0, 9)),
-    }  # fmt: skip
-    for group in closure.groups:
-        out = group.out.tolist()
-        match group:
-            case Component():
-                table["component"] = _rows(out, group.pair, group.direction)
-            case Dot():
-                table["dot"] = _rows(out, group.a, group.b)
-            case Distance():
-                table["distance"], table["length"] = _rows(out, group.pair), group.length
-            case Affine():
-                table["affine"] = out
-                table["affine_matrix"], table["affine_offset"] = _matrix(group.matrix, n), group.offset
-            case RelativeLog():
-                table["log"] = _rows(out[::3], out[1::3], out[2::3], group.joint_a, group.joint_b)
-                table["rotation_a"] = _matrix(group.rotation_a.reshape(-1, 9), 9)
-                table["rotation_b"] = _matrix(group.rotation_b.reshape(-1, 9), 9)
-            case _:
-                raise TypeError(f"{type(group).__name__}: no such primitive crosses to the native core")
-    return table
+    }
 
 
 def _springs(springs: Springs) -> dict[str, Any]:

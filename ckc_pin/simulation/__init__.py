@@ -2,9 +2,10 @@
 
 from ckc_pin.simulation.check import Check, check
 from ckc_pin.simulation.events import Event
+from ckc_pin.simulation.ivp import as_ivp
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
 from ckc_pin.simulation.simulator import Simulator
 
-__all__ = ["Check", "Event", "Run", "Scene", "Simulator", "check", "load_scene", "simulate"]
+__all__ = ["Check", "Event", "Run", "Scene", "Simulator", "as_ivp", "check", "load_scene", "simulate"]

@@ -12,7 +12,6 @@ from ckc_pin.mechanism.branches import assembly_branches
 from ckc_pin.mechanism.library import is_path, load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.backend import takes_native, why_python
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
@@ -40,10 +39,6 @@ class Check:
     sigma_min_phi_z, cond_phi_z : float
     gap : (above, below)
         Relative singular values of the scaled J around the cut that the rank is.
-    backend : "native" or "python"
-        What evaluates right-hand sides.
-    backend_reason : str or None
-        Why not the native core.
     warnings : tuple of str
     desired : DesiredCheck or None
         For a scene with a controller.
@@ -64,8 +59,6 @@ class Check:
     sigma_min_phi_z: float
     cond_phi_z: float
     gap: tuple[float, float]
-    backend: str
-    backend_reason: str | None
     warnings: tuple[str, ...]
     desired: DesiredCheck | None = None
     branches: Array | None = None
@@ -89,13 +82,11 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, why_python(what), None, [])
+        found = _mechanism_check(what, None, [])
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     desired = _desired(what, mechanism)
-    native = takes_native(mechanism, what.spec)
-    reason = None if native else why_python(mechanism, what.spec) or 'solver.backend = "python"'
-    found = _mechanism_check(mechanism, reason, desired, _desired_warnings(mechanism, desired))
+    found = _mechanism_check(mechanism, desired, _desired_warnings(mechanism, desired))
     return replace(found, branches=_branches(mechanism)) if branches else found
 
 
@@ -110,9 +101,7 @@ def _names_a_scene(name: str) -> bool:
     return "/" in name
 
 
-def _mechanism_check(
-    mechanism: Mechanism, why_python: str | None, desired: DesiredCheck | None, warnings: list[str]
-) -> Check:
+def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str]) -> Check:
     at = mechanism.assembled
     values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
@@ -130,8 +119,6 @@ def _mechanism_check(
         sigma_min_phi_z=float(values[-1]),
         cond_phi_z=float(values[0] / values[-1]) if values[-1] > 0 else float("inf"),
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
-        backend="python" if why_python else "native",
-        backend_reason=why_python,
         warnings=(*mechanism.warnings, *warnings),
         desired=desired,
     )

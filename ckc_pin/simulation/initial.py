@@ -12,8 +12,8 @@ from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.systems import CHART_MARGIN, nearly_singular
 
 __all__ = ["Start", "find_start"]
 
@@ -101,7 +101,7 @@ def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinem
 def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
     """Say what is singular; other independent coordinates help where J keeps its rank."""
     best = mechanism.best_partition(at)
-    if best is not None and nearly_singular(Kinematics(at.tree, at.closure, best, at.q_tree), CHART_MARGIN) is None:
+    if best is not None and _is_chart(Kinematics(at.tree, at.closure, best, at.q_tree)):
         names = ", ".join(mechanism.coordinates[k] for k in best.q)
         return (
             f"{', '.join(mechanism.independent)} do not determine {', '.join(mechanism.dependent)} there; "
@@ -110,6 +110,10 @@ def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
     return (
         "J loses rank there, branches of the motion meet, and the loops do not say which one it takes; start elsewhere"
     )
+
+
+def _is_chart(at: Kinematics) -> bool:
+    return at.sigma_min() > _core.chart_margin * float(np.linalg.norm(at.J))
 
 
 def _refuse_contradiction(mechanism: Mechanism, at: Kinematics, w: Array) -> None:

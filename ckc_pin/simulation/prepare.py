@@ -1,32 +1,39 @@
-"""From a scene to a system that can be stepped: mechanism, controller, start, formulation, solver."""
+"""From a scene to a loop that can be started: mechanism, controller, start, formulation, solver."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
-from ckc_pin.control.actuation import Actuation, Effort
+from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
 from ckc_pin.control.controllers import Controller, SetPoint, Tracking
-from ckc_pin.control.sampled import Held, Sampled
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load, mechanism_file
 from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.backend import takes_native
+from ckc_pin.native import _core
+from ckc_pin.native.control import control_table
+from ckc_pin.native.tables import core_table
+from ckc_pin.simulation.events import Event, Watched, watched
 from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.scene import Scene, SolverSpec
-from ckc_pin.simulation.systems import Dae, LevelSet, NativeDae, NativeLevelSet, NativePrintedSpf, PrintedSpf, System
+from ckc_pin.simulation.loop_terms import controller_call
+from ckc_pin.simulation.scene import Scene, SceneSpec
 
-__all__ = ["Plant", "Prepared", "make_system", "prepare", "scene_controller", "scene_mechanism"]
+__all__ = ["Prepared", "prepare", "scene_controller", "scene_mechanism"]
 
-DIFFERENCE = 1e-7  # rad/s or m/s
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
+CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a collocation step, or the branches do not meet
+UNLIMITED = 2**62
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
@@ -60,79 +67,59 @@ def scene_controller(
 
 
 @dataclass(frozen=True)
-class Plant:
-    """What acts on the mechanism: a controller through its actuators, or nothing."""
-
-    controller: Controller | None
-    actuation: Actuation
-
-    def effort(self, t: float, terms: Terms) -> Effort:
-        """What the actuators do at (t, terms)."""
-        if self.controller is None:
-            return self.actuation.none
-        return self.actuation.apply(terms, self.controller.u(t, terms))
-
-    def force(self, t: float, terms: Terms) -> Array:
-        """u' on the tree, shape (n,)."""
-        return self.effort(t, terms).u_tree
-
-    def u_rate_gradient(self, t: float, terms: Terms) -> Array | None:
-        """d u / d q_dot: what the controller knows, or differences of u alone; None behind another actuation."""
-        if self.controller is None:
-            return np.zeros((len(terms.q), len(terms.q)))
-        if not self.actuation.direct:
-            return None
-        gradient = getattr(self.controller, "u_rate_gradient", None) or self._u_rate_differences
-        free = self.actuation.unlimited(self.effort(t, terms).tau)
-        return free[:, None] * np.asarray(gradient(t, terms))
-
-    def _u_rate_differences(self, t: float, terms: Terms) -> Array:
-        """d u / d q_dot of any controller: its own evaluations at other velocities, none of the mechanism's."""
-        u = self.effort(t, terms).u
-        gradient = np.empty((len(u), len(u)))
-        for k, q_dot in enumerate(terms.q_dot):
-            step = np.zeros(len(u))
-            step[k] = DIFFERENCE * max(1.0, abs(float(q_dot)))
-            moved = Terms(terms.mechanism, terms.at, terms.v_tree + terms.rho @ step)
-            gradient[:, k] = (self.effort(t, moved).u - u) / step[k]
-        return gradient
-
-
-@dataclass(frozen=True)
 class Prepared:
-    """A scene ready to be stepped.
+    """A scene ready to be run, again and again.
 
     Attributes
     ----------
+    scene : Scene
     mechanism : Mechanism
-    plant : Plant
-        What acts on it.
-    system : System
-        The formulation as a first-order system, at its start.
-    method : str
-        The solver named, or the one that "auto" stands for here; "auto" where that depends on the motion.
+    controller : Controller or None
+        What acts, beside a u that is held.
+    actuation : Actuation
+    events : list of Watched
     start : Start
     texts : dict of str to str
-        Files that the scene's controller brought along.
+        The files of mechanism, scene and controller.
+    loop : native Loop
     """
 
+    scene: Scene
     mechanism: Mechanism
-    plant: Plant
-    system: System
-    method: str
+    controller: Controller | None
+    actuation: Actuation
+    events: list[Watched]
     start: Start
     texts: dict[str, str]
+    loop: Any
+
+    def begin(self, start: Start | None = None, t: float = 0.0) -> None:
+        """Put the loop to a start, as if nothing had been before."""
+        start = start or self.start
+        v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+        self.loop.start(t, start.at.q_tree, v_tree, start.w)
 
 
-def prepare(scene: Scene, controller: Controller | None = None, *, measured: bool = False) -> Prepared:
+def prepare(
+    scene: Scene,
+    controller: Controller | None = None,
+    events: Sequence[Event] = (),
+    *,
+    free: bool = False,
+    profile: bool = False,
+) -> Prepared:
     """Build everything that a scene needs before its first step.
 
     Parameters
     ----------
     controller : Controller, optional
         Takes the place of the scene's.
-    measured : bool
-        What Python evaluates is to be counted: "auto" does not take the native backend.
+    events : sequence of Event
+        Beside those of the scene.
+    free : bool
+        No controller at all: the caller says what acts.
+    profile : bool
+        Book which terms are evaluated.
 
     Raises
     ------
@@ -144,28 +131,69 @@ def prepare(scene: Scene, controller: Controller | None = None, *, measured: boo
     mechanism = scene_mechanism(scene)
     texts: dict[str, str] = {}
     spec = scene.spec.controller
-    if controller is None:
+    if controller is None and not free:
         controller = scene_controller(scene, mechanism, texts)
         if controller is not None and spec is not None and spec.sample_time is not None:
             controller = Sampled(controller, spec.sample_time, spec.delay)
-    limit = spec.torque_limit if spec else None
-    actuation = Actuation(mechanism, limit)
+    if isinstance(controller, Sampled):
+        controller.require_countable(scene.spec.t_end)
+    actuation = Actuation(mechanism, spec.torque_limit if spec else None)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
-    if mechanism.splits_root and (controller is not None or scene.spec.formulation != "dae"):
+    if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
         raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
+    watching = watched(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
+    D_tree = np.array(pin.crba(mechanism.tree.model, mechanism.tree.data, start.at.q_tree))
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
-    if controller is not None:
+    if controller is not None or free:
         actuation.require_transmission(start.at)
-    plant = Plant(controller, actuation)
-    system = make_system(mechanism, scene, start, plant, measured)
-    return Prepared(mechanism, plant, system, _method(scene, system, plant), start, texts)
+    loop = _core.Loop(
+        core_table(mechanism),
+        _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
+        control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
+        _solver(mechanism, scene.spec, profile),
+        [event.row for event in watching],
+    )
+    texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
+    return Prepared(scene, mechanism, controller, actuation, watching, start, texts, loop)
 
 
-def again(scene: Scene, ready: Prepared) -> Prepared:
-    """Return the same with a system that stands at its start, for another run of the scene."""
-    return replace(ready, system=make_system(ready.mechanism, scene, ready.start, ready.plant))
+def _formulation(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarray[Any, Any]) -> dict[str, Any]:
+    if spec.formulation == "dae":
+        alpha, beta = spec.solver.baumgarte or (0.0, 0.0)
+        return {"kind": "dae", "tolerance": mechanism.tolerance, "projects": spec.solver.projection,
+                "alpha": alpha, "beta": beta}  # fmt: skip
+    table = {
+        "tolerance": mechanism.tolerance,
+        "epsilon": spec.epsilon if spec.formulation == "spf" else 1.0,
+        "actual": spec.formulation == "spf" and spec.coriolis_velocity == "actual",
+    }
+    if spec.formulation == "spf" and spec.spf_coordinates == "z":
+        if mechanism.tree.free:
+            raise InputError(
+                'spf_coordinates = "z": eq. 8 as printed integrates q and z as numbers, and the rotation of a free '
+                'root is none; take "w"'
+            )
+        return {"kind": "printed", **table}
+    # heavy links turn what a light one's closure is off by into accelerations
+    evenness = min(1.0, UNEVEN * float(inertias.min()) / float(inertias.max()))
+    return {"kind": "level_set", **table, "slack": SLACK * spec.solver.rtol * mechanism.size * evenness}
+
+
+def _solver(mechanism: Mechanism, spec: SceneSpec, profile: bool) -> dict[str, Any]:
+    solver = spec.solver
+    printed = spec.formulation == "spf" and spec.spf_coordinates == "z"
+    return {
+        "method": "Radau" if solver.method == "auto" and printed else solver.method,
+        "rtol": solver.rtol,
+        "atol": solver.rtol / 100 if solver.atol is None else solver.atol,
+        "max_step": solver.max_step or math.inf,
+        "min_step": solver.min_step,
+        "max_rhs": solver.max_rhs or UNLIMITED,
+        "closed": max(CLOSED * mechanism.size, 10 * mechanism.tolerance),
+        "profile": profile,
+    }
 
 
 def _refuse_massless(terms: Terms) -> None:
@@ -185,71 +213,3 @@ def _refuse_massless(terms: Terms) -> None:
         f"{terms.mechanism.name}: the motion along {name} moves no mass, so no force can tell its acceleration; "
         "give the links it moves a mass and an inertia, or make the joint fixed"
     )
-
-
-def make_system(mechanism: Mechanism, scene: Scene, start: Start, plant: Plant, measured: bool = False) -> System:
-    """Make the first-order system of a scene's formulation, at a start."""
-    spec, force = scene.spec, plant.force
-    native = takes_native(mechanism, spec, measured)
-    controller, actuation = plant.controller, plant.actuation
-    free = controller is None  # of a controller that lives in the mechanism's own q
-    slack = SLACK * spec.solver.rtol * mechanism.size * _evenness(mechanism, start)
-    if spec.formulation == "dae":
-        v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
-        projects, baumgarte = _closing(spec.solver)
-        dae = partial(NativeDae, controller=controller, actuation=actuation) if native else Dae
-        return dae(mechanism, start.at, v_tree, force, projects, baumgarte, plant.u_rate_gradient)
-    level_set = partial(NativeLevelSet, controller=controller, actuation=actuation) if native else LevelSet
-    if spec.formulation == "reduced":
-        return level_set(
-            mechanism,
-            start.at,
-            start.q_dot,
-            force,
-            u_rate_gradient=plant.u_rate_gradient,
-            may_switch=free,
-            slack=slack,
-        )
-    equation = spec.solver.spf_equation or (17 if spec.solver.method == "auto" else 8)
-    if equation == 8:
-        if mechanism.tree.free:
-            raise InputError(
-                "solver: eq. 8 as printed integrates q and z as numbers, and the rotation of a free root is none; "
-                'give spf_equation = 17, or method = "auto"'
-            )
-        printed = partial(NativePrintedSpf, controller=controller, actuation=actuation) if native else PrintedSpf
-        return printed(mechanism, start.at, start.q_dot, force, spec.epsilon, start.w, spec.coriolis_velocity)
-    return level_set(
-        mechanism,
-        start.at,
-        start.q_dot,
-        force,
-        spec.epsilon,
-        spec.coriolis_velocity,
-        start.w,
-        plant.u_rate_gradient,
-        free,
-        slack,
-    )
-
-
-def _evenness(mechanism: Mechanism, start: Start) -> float:
-    """1, or how much better the closure has to be kept where inertias differ by more than `UNEVEN`."""
-    inertias = np.diagonal(Terms(mechanism, start.at, np.zeros(mechanism.n)).D_tree)
-    return min(1.0, UNEVEN * float(inertias.min()) / float(inertias.max()))
-
-
-def _closing(solver: SolverSpec) -> tuple[bool, tuple[float, float] | None]:
-    """What keeps a DAE on its closure: projection, Baumgarte's terms, or the method itself."""
-    return solver.projection and solver.method != "IDA", solver.baumgarte
-
-
-def _method(scene: Scene, system: System, plant: Plant) -> str:
-    """What "auto" means: closed loops are stiff through gains and dampers, unless u is held; eq. 8 through epsilon."""
-    spec = scene.spec
-    if spec.solver.method != "auto":
-        return spec.solver.method
-    if isinstance(system, PrintedSpf):
-        return "Radau"
-    feedback = plant.controller is not None and not isinstance(plant.controller, Held)
-    return "auto" if feedback or system.mechanism.springs.any_damping else "DOP853"

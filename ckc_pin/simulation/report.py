@@ -57,7 +57,6 @@ def check_table(found: Check) -> Group:
     if found.det_phi_z is not None:
         table.add_row("det phi_z", f"{found.det_phi_z:.6g}")
     table.add_row("sigma_min(phi_z), cond", f"{found.sigma_min_phi_z:.6g}, {found.cond_phi_z:.4g}")
-    table.add_row("backend", found.backend + (f": {found.backend_reason}" if found.backend_reason else ""))
     for k, numbers in enumerate(found.branches if found.branches is not None else ()):
         shown = "  ".join(f"{c} = {x:.6f}" for c, x in zip(found.coordinates, numbers, strict=True))
         table.add_row(f"branch {k + 1}", shown)
@@ -104,9 +103,7 @@ def run_table(run: Run) -> Table:
     """Return the outcome of a run for people."""
     table = _plain_table("", "")
     table.add_row("status", run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}")
-    formulation = run.scene["formulation"]
-    with_epsilon = f", epsilon = {run.scene['epsilon']:g}" if formulation == "spf" else ""
-    table.add_row("formulation", f"{formulation}{with_epsilon}")
+    table.add_row("formulation", _formulation(run))
     last = "  ".join(f"{k} = {x:.8f}" for k, x in zip(run.coordinates, run.q_tree[-1], strict=True))
     table.add_row(f"q_tree at {run.t[-1]:g} s", last)
     if "controller" in run.scene:
@@ -118,10 +115,22 @@ def run_table(run: Run) -> Table:
     if len(run.events) > MOST_EVENTS:
         table.add_row("", f"and {len(run.events) - MOST_EVENTS} more")
     stats = run.stats
-    table.add_row("method", f"{stats['method']}, {stats['steps']} steps, {stats['rejected']} rejected")
+    steps = ", ".join(f"{name} {count} steps" for name, count in stats["steps_by_method"].items())
+    table.add_row("method", f"{steps or stats['method']}, {stats['rejected']} rejected")
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
-    table.add_row("work", f"{work}, {stats['factorizations']} factorizations, {stats['wall_s']:.2f} s")
+    called = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
+    table.add_row("work", f"{work}, {stats['factorizations']} factorizations{called}, {stats['wall_s']:.2g} s")
     return table
+
+
+def _formulation(run: Run) -> str:
+    formulation = run.scene["formulation"]
+    if formulation != "spf":
+        return str(formulation)
+    coordinates = run.scene["spf_coordinates"]
+    exact = coordinates == "w" and not run.w[0].any()  # epsilon stands only in w = w(0) exp(-t / epsilon)
+    same = ": from w(0) = 0 bit for bit the reduced model, whatever epsilon" if exact else ""
+    return f"spf in (q, q_dot, {coordinates}), epsilon = {run.scene['epsilon']:g}{same}"
 
 
 def profile_table(run: Run) -> Table:

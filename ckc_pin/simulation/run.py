@@ -50,7 +50,8 @@ class Run:
         Events that were met, in order of time: t, name, of, coordinate, value, direction (1 rising, -1 falling; of
         "limit" 1 is leaving, -1 coming back), stop.
     stats : dict
-        rhs, steps, rejected, newton, factorizations, jacobians, switches, wall_s, method, backend.
+        rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (of a
+        caller's controller and events), terms, wall_s.
     scene : dict
         The scene as resolved.
     texts : dict of str to str

@@ -27,7 +27,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers replace anything finer
 
-Method = Literal["auto", "RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", "IDA"]
+Method = Literal["auto", "DOP853", "RK45", "Radau"]
 
 
 class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -46,13 +46,10 @@ class InitialSpec(_Spec, frozen=True):
 class SolverSpec(_Spec, frozen=True):
     """How a run is integrated.
 
-    `spf_equation`: the SPF in the coordinates of eq. 17 (what "auto" takes) or eq. 8 as printed (what a
-    named method is for, unless this says otherwise).
     `baumgarte`: alpha and beta, 1/s, of a DAE that is not projected.
     """
 
     method: Method = "auto"
-    spf_equation: Literal[8, 17] | None = None
     rtol: Tolerance = 1e-8
     atol: Positive | None = None
     max_step: Positive | None = None
@@ -62,7 +59,6 @@ class SolverSpec(_Spec, frozen=True):
     output_dt: Positive | None = None
     projection: bool = True
     baumgarte: tuple[NonNegative, NonNegative] | None = None
-    backend: Literal["auto", "python", "native"] = "auto"
 
 
 class EventSpec(_Spec, frozen=True):
@@ -79,12 +75,16 @@ class EventSpec(_Spec, frozen=True):
 
 
 class SceneSpec(_Spec, frozen=True):
-    """The whole file."""
+    """The whole file.
+
+    `spf_coordinates`: the SPF in the coordinates of eq. 17, exact in w, or with z as eq. 8 is printed.
+    """
 
     mechanism: str | GeneratorSpec
     formulation: Literal["reduced", "spf", "dae"]
     t_end: Positive
     epsilon: Positive = 1e-3
+    spf_coordinates: Literal["w", "z"] = "w"
     coriolis_velocity: Literal["rho", "actual"] = "rho"
     initial: InitialSpec = InitialSpec()
     solver: SolverSpec = SolverSpec()
@@ -190,14 +190,10 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
         raise InputError(f"{sources.name}: controller.delay: give sample_time too; what is sampled is delayed")
     for k, event in enumerate(spec.event):
         _check_event(event, f"{sources.name}: event[{k}]")
-    if spec.formulation != "dae" and (spec.solver.method == "IDA" or spec.solver.baumgarte):
-        what = "method IDA" if spec.solver.method == "IDA" else "baumgarte"
-        raise InputError(f'{sources.name}: solver: {what} is for formulation = "dae", not {spec.formulation!r}')
-    if spec.solver.baumgarte and (spec.solver.projection or spec.solver.method == "IDA"):
-        raise InputError(
-            f"{sources.name}: solver.baumgarte takes the place of projection: give projection = false, "
-            "and a method other than IDA, which closes the loops itself"
-        )
+    if spec.solver.baumgarte and spec.formulation != "dae":
+        raise InputError(f'{sources.name}: solver: baumgarte is for formulation = "dae", not {spec.formulation!r}')
+    if spec.solver.baumgarte and spec.solver.projection:
+        raise InputError(f"{sources.name}: solver.baumgarte takes the place of projection: give projection = false too")
     shortest, longest = spec.solver.min_step, spec.solver.max_step
     if longest is not None and shortest > longest:
         raise InputError(f"{sources.name}: solver: min_step = {shortest:g} is above max_step = {longest:g}")

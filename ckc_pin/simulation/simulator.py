@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ckc_pin.control.actuation import require_u
 from ckc_pin.control.controllers import Controller
-from ckc_pin.control.sampled import Held
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.clock import Legs
-from ckc_pin.simulation.events import Event, Events
+from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.integrate import BudgetError, Stepper
-from ckc_pin.simulation.prepare import make_system, prepare, scene_controller
+from ckc_pin.simulation.prepare import prepare, scene_controller
 from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
-from ckc_pin.simulation.systems import LevelSet, System
+from ckc_pin.simulation.stops import Stop, explain
 
 __all__ = ["Simulator", "State"]
 
+PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
 
-@dataclass(frozen=True, eq=False)
+
 class State:
     """Where a simulator is. It stays as it is when the simulator goes on.
 
@@ -38,33 +35,40 @@ class State:
     ----------
     t : float
         Time, s.
-    terms : Terms
-        Every term of the mechanism at this state, each computed when first asked for.
     v_tree : (n,) array
         Rates by coordinate; off its manifold the SPF's z_dot differs from what q_dot implies.
     w : (rows,) array
         What phi is: zero but for the SPF started off its manifold.
     """
 
-    t: float
-    terms: Terms
-    v_tree: Array
-    w: Array
+    def __init__(self, mechanism: Mechanism, t: float, numbers: Array, q: list[int], z: list[int]) -> None:
+        n, nq = mechanism.n, mechanism.tree.nq
+        self._mechanism, self._q, self._z = mechanism, q, z
+        self.t = t
+        self._q_tree, self.v_tree = numbers[:nq], numbers[nq : nq + n]
+        self._v_terms, self.w = numbers[nq + n : nq + 2 * n], numbers[nq + 2 * n :]
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Every term of the mechanism at this state, each computed when first asked for."""
+        mechanism = self._mechanism
+        partition = Partition(np.array(self._q, np.intp), np.array(self._z, np.intp))
+        return Terms(mechanism, Kinematics(mechanism.tree, mechanism.closure, partition, self._q_tree), self._v_terms)
 
     @property
     def q_tree(self) -> Array:
         """Values by coordinate, in the order of `coordinates`, shape (n,)."""
-        return self.terms.mechanism.tree.to_coordinates(self.terms.q_tree)
+        return self._mechanism.tree.to_coordinates(self._q_tree)
 
     @property
     def q(self) -> Array:
         """The independent ones, in the user's order, shape (d,)."""
-        return self.terms.mechanism.independent_part(self.terms.q_tree)
+        return self._mechanism.independent_part(self._q_tree)
 
     @property
     def q_dot(self) -> Array:
         """Their rates, shape (d,)."""
-        return self.v_tree[self.terms.mechanism.partition.q]
+        return self.v_tree[self._mechanism.partition.q]
 
 
 class Simulator:
@@ -89,6 +93,8 @@ class Simulator:
         Where it is.
     events : list of dict
         Events met since the last reset, as in `Run.events`. One that stops ends the step it happens in early.
+    stats : dict
+        What was evaluated since the last reset: `Run.stats` but for the time.
 
     Raises
     ------
@@ -117,14 +123,11 @@ class Simulator:
             scene = load_scene(scene, changes)
         elif changes:
             raise InputError("Simulator: changes go with the name of a scene; a Scene is complete")
-        self._scene, self._hold = scene, Held(0)
-        with one_blas_thread():
-            self._ready = prepare(scene, self._hold)
-            self.mechanism = self._ready.mechanism
-            self.controller: Controller | None = scene_controller(scene, self.mechanism)
-        self._solver = msgspec.structs.replace(scene.spec.solver, max_wall_s=None)
-        self._events = Events(scene.spec.event, events, self.mechanism)
-        self._legs: Legs | None = None  # until the first step
+        self._ready = prepare(scene, events=events, free=True)
+        self._loop = self._ready.loop
+        self.mechanism = self._ready.mechanism
+        self.controller: Controller | None = scene_controller(scene, self.mechanism)
+        self._none = np.zeros(self.mechanism.d)
         self.reset()
 
     @property
@@ -135,7 +138,12 @@ class Simulator:
     @property
     def events(self) -> list[dict[str, Any]]:
         """Events met since the last reset."""
-        return list(self._events.met)
+        return [self._ready.events[k].met(t, direction) for t, k, direction in self._loop.met()]
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """What was evaluated since the last reset, by the names of `Run.stats`."""
+        return {**self._loop.stats(), "terms": "pinocchio"}
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state; what was before has no influence on what follows.
@@ -155,18 +163,13 @@ class Simulator:
         InputError, NumericalError
             A state of another mechanism, out of reach or singular.
         """
-        with one_blas_thread():
-            if isinstance(state, State):
-                start, t = self._start(state), state.t
-            else:
-                start, t = self._ready.start if state is None else self._initial(state), 0.0
-            self._begin(start, t)
-            self._events.met.clear()
-            self._events.begin(t)
-            if isinstance(state, State):
-                self._state = State(t, Terms(self.mechanism, start.at, state.terms.v_tree), state.v_tree, state.w)
-            else:
-                self._state = self._at(0.0, self._system.start())
+        if isinstance(state, State):
+            self._ready.begin(self._start(state), state.t)
+            numbers = np.concatenate([state._q_tree, state.v_tree, state._v_terms, state.w])
+            self._state = State(self.mechanism, state.t, numbers, state._q, state._z)
+        else:
+            self._ready.begin(None if state is None else self._initial(state))
+            self._state = self._present()
         return self._state
 
     def step(self, u: Any, dt: float) -> State:
@@ -191,86 +194,39 @@ class Simulator:
         NumericalError
             The numerics stopped within the step; `state` is the last one that was reached.
         """
-        held = np.zeros(self.mechanism.d) if u is None else require_u(u, self.mechanism, "u").copy()
-        if not np.isfinite(held).all():
+        held = self._none if u is None else require_u(u, self.mechanism, "u")
+        until = self._state.t + self._require_dt(dt)
+        loop = self._loop
+        if not loop.hold(held):
             raise InputError(f"u is not finite: {held.tolist()}")
-        dt = self._require_dt(dt)
-        with one_blas_thread():
-            self._let_act(held)
-            try:
-                return self._step(dt)
-            except BudgetError as error:
-                self._fall_back()
-                raise NumericalError(str(error), t=self._state.t) from None
-            except NumericalError as error:
-                self._fall_back()
-                raise NumericalError(str(error), t=self._state.t, q_tree=error.q_tree) from None
-            except BaseException:
-                self._fall_back()
-                raise
-
-    def _let_act(self, u: Array) -> None:
-        """Change what acts. As in `simulate`, only where nothing acts may q change; a u refers to the user's own q."""
-        switched = not np.array_equal(self._state.terms.at.partition.q, self.mechanism.partition.q)
-        if switched and u.any():
-            self._go_on()
-        self._hold.held = u
-        if isinstance(self._system, LevelSet):
-            self._system.may_switch = not u.any()
-
-    def _step(self, dt: float) -> State:
-        end = self._state.t - self._origin + dt
-        if self._legs is None:
-            self._legs = Legs(Stepper(self._system, self._ready.method, self._solver, end))
-        else:
-            self._legs.aim(end)
-        for step in self._legs.steps():
-            halt = self._events.check(step, self._system)
-            if halt is not None:
-                self._state = self._at(halt, step.interpolant(halt))
-                self._go_on()
-                return self._state
-        self._state = self._at(*self._legs.good)
+        try:
+            while (stop := loop.advance(until, False, PAUSE, math.inf))[0] == "pause":
+                pass
+        finally:  # a caller's function may raise, and Ctrl-C
+            self._state = self._present()
+        if stop[0] not in ("end", "event"):
+            raise explain(Stop(*stop), loop, self.mechanism, self._ready.scene.spec.solver, self._ready.events)
         return self._state
 
-    def _fall_back(self) -> None:
-        """Make the last good state the present one, and let nothing of what failed live on."""
-        if self._legs is not None:
-            with suppress(NumericalError):
-                self._state = self._at(*self._legs.good)
-        self._go_on()
-
-    def _go_on(self) -> None:
-        """Start again from the present state; events remember on which side of their values they are."""
-        self._begin(self._start(self._state), self._state.t)
-        self._events.go_on(self._state.t)
-
-    def _begin(self, start: Start, t: float) -> None:
-        """Start from a state, with a new clock that is 0 there."""
-        self._origin = t
-        self._legs = None
-        self._system: System = make_system(self.mechanism, self._scene, start, self._ready.plant)
-
-    def _at(self, t: float, y: Array) -> State:
-        system = self._system
-        terms = system.terms(t, y)
-        return State(self._origin + t, terms, system.velocity(t, terms).copy(), system.w(t).copy())
+    def _present(self) -> State:
+        told = self._loop.state()
+        return self._state if told is None else State(self.mechanism, *told)
 
     def _start(self, state: State) -> Start:
-        theirs = state.terms.mechanism
+        theirs = state._mechanism
         if theirs.coordinates != self.mechanism.coordinates or len(state.w) != self.mechanism.closure.rows:
             raise InputError(f"reset: a state of {theirs.name}, this is {self.mechanism.name}")
-        if np.any(state.w) and self._scene.spec.formulation != "spf":
+        if np.any(state.w) and self._ready.scene.spec.formulation != "spf":
             raise InputError("reset: a state off phi = 0, which only the SPF can be in")
-        at = self.mechanism.kinematics(state.terms.q_tree)
-        return Start(at, state.q_dot, state.w, state.v_tree)
+        return Start(self.mechanism.kinematics(state._q_tree), state.q_dot, state.w, state.v_tree)
 
     def _initial(self, table: Mapping[str, Any]) -> Start:
         """Return the start that a table as a scene's [initial] gives."""
         if not isinstance(table, Mapping):
             raise InputError(f"reset: {table!r:.80} is no State and no table as a scene's [initial]")
-        data = with_changes(self._scene.plain(), {"initial": table})
-        return find_start(self.mechanism, make_scene(data, self._scene.name, self._scene.sources))
+        scene = self._ready.scene
+        data = with_changes(scene.plain(), {"initial": table})
+        return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 
     def _require_dt(self, dt: Any) -> float:
         number = isinstance(dt, int | float | np.integer | np.floating) and not isinstance(dt, bool)

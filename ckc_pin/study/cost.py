@@ -1,8 +1,8 @@
 """What the formulations cost at equal error (section III-B): eq. 8 as printed, the reduced model, the DAE.
 
-For each method the loosest of a list of tolerances is taken whose run ends within `TARGET` of the DAE
-integrated at 1e-12; its counts and its processor time are the cost. All start on phi = 0, so that epsilon
-changes what eq. 8 costs and nothing else.
+All are marched in NumPy by SciPy's methods, so that nothing but the equations differs. For each method the loosest
+of a list of tolerances is taken whose run ends within `TARGET` of the DAE integrated at 1e-12; its counts and its
+processor time are the cost. All start on phi = 0, so that epsilon changes what eq. 8 costs and nothing else.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.simulation.systems import System
+from ckc_pin.simulation.ivp import Ivp
 from ckc_pin.study.experiment import Outcome, Problem, difference, end_of, march
 
 __all__ = ["EPSILONS", "METHODS", "Cost", "Search", "cheapest", "cost_at_equal_error", "study"]
@@ -78,7 +78,7 @@ class Cost:
 
 
 def cost_at_equal_error(
-    name: Cost, make: Callable[[], System], reference: Terms, t_end: float, search: Search, first: float
+    name: Cost, make: Callable[[], Ivp], reference: Terms, t_end: float, search: Search, first: float
 ) -> Cost:
     """Find the loosest tolerance that reaches the target and what its run costs.
 
@@ -87,7 +87,7 @@ def cost_at_equal_error(
     name : Cost
         Says which formulation, epsilon and method.
     make : callable
-        Gives the system, fresh for each run.
+        Gives the initial value problem, fresh for each run.
     reference : Terms
         The exact state at t_end.
     t_end : float
@@ -121,7 +121,7 @@ def _out_of_budget(cost: Cost) -> bool:
     return "max_rhs" in cost.reason
 
 
-def _timed(cost: Cost, make: Callable[[], System], t_end: float) -> Cost:
+def _timed(cost: Cost, make: Callable[[], Ivp], t_end: float) -> Cost:
     if cost.outcome is None or cost.outcome.seconds > LONG:
         return cost
     runs = [cost.outcome, *(march(make(), cost.method, cost.rtol, t_end) for _ in range(REPEATS - 1))]
@@ -155,8 +155,8 @@ def study(
     """
     search = search or Search()
     reference = end_of(problem.dae(), "DOP853", 1e-12, t_end)
-    for system in (problem.printed_spf(1e-2), problem.reduced()):  # imports and caches are nobody's cost
-        march(system, "DOP853", 1e-3, min(t_end, 0.1))
+    for ivp in (problem.printed_spf(1e-2), problem.reduced()):  # imports and caches are nobody's cost
+        march(ivp, "DOP853", 1e-3, min(t_end, 0.1))
     return [
         cost for method in methods for cost in _costs_of_method(problem, method, epsilons, reference, t_end, search)
     ]
@@ -165,9 +165,9 @@ def study(
 def _costs_of_method(
     problem: Problem, method: str, epsilons: Sequence[float], reference: Terms, t_end: float, search: Search
 ) -> list[Cost]:
-    cases: list[tuple[Cost, Callable[[], System]]] = [
+    cases: list[tuple[Cost, Callable[[], Ivp]]] = [
         (Cost("reduced", None, method), problem.reduced),
-        (Cost("DAE", None, method), partial(problem.dae, method)),
+        (Cost("DAE", None, method), problem.dae),
         *((Cost("eq. 8", epsilon, method), partial(problem.printed_spf, epsilon)) for epsilon in epsilons),
     ]
     costs: list[Cost] = []

@@ -66,8 +66,8 @@ def _sigma(found: Found) -> str:
         f"corrections a right-hand side ({METHODS[0]}), eq. 8 none; a right-hand side takes {with_sigma:.0f} against "
         f"{without:.0f} µs. But ε makes eq. 8 stiff: {METHODS[0]}'s steps are {step:.1f} ε on average at ε = "
         f"{stiffest.epsilon:.0e}, and an implicit method is itself a nonlinear solver at each step, on more unknowns. "
-        "At equal error "
-        f"(≤ {Search().target:g} at the end; processor time; Jacobians by differences for all):"
+        f"At equal error (≤ {Search().target:g} at the end; processor time in NumPy; SciPy's methods, Jacobians by "
+        "differences for all):"
     )
 
 
@@ -79,8 +79,7 @@ def _cheapest(name: str, costs: Sequence[Cost]) -> str:
 
 
 def _words(what: str, cost: Cost) -> str:
-    newton = "corrections of the projection" if cost.formulation == "DAE" else "corrections of σ"
-    numbers = {"rhs": "right-hand sides", "newton": newton, "jacobians": "Jacobians"}
+    numbers = {"rhs": "right-hand sides", "newton": "corrections of σ", "jacobians": "Jacobians"}
     counts = ", ".join(f"{cost.count(key)} {words}" for key, words in numbers.items())
     return (
         f"{what} {1e3 * cost.seconds:.0f} ms ({cost.method}: {counts}, {cost.count('factorizations')} factorizations)"

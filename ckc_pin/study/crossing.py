@@ -6,6 +6,7 @@ If freedoms were lost where phi_z is singular, a motion through such a configura
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,8 @@ from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.integrate import Step
-from ckc_pin.simulation.systems import Dae
-from ckc_pin.study.experiment import march
+from ckc_pin.simulation.ivp import Dae
+from ckc_pin.study.experiment import between, march
 from ckc_pin.study.singularities import SingularPoint
 
 __all__ = ["Crossing", "cross"]
@@ -95,15 +95,14 @@ def cross(mechanism: Mechanism, point: SingularPoint, speed: float = 3.0, half: 
 def _fall(mechanism: Mechanism, at: Kinematics, v: Array, duration: float) -> list[tuple[float, Terms]]:
     """Integrate the free DAE; states at and between its steps, the middle of the time among them."""
     none = np.zeros(mechanism.n)
-    system = Dae(mechanism, at, v, lambda t, terms: none)
-    way = [(0.0, system.terms(0.0, system.start()))]
+    dae = Dae(mechanism, at, v, lambda t, terms: none, (0.0, duration))
+    way = [(0.0, dae.terms(0.0, dae.y0))]
 
-    def note(step: Step) -> None:
-        inside = np.linspace(step.t_old, step.t, SAMPLES + 1)[1:]
-        wanted = np.union1d(inside, [duration / 2]) if step.t_old < duration / 2 < step.t else inside
-        way.extend((float(t), system.terms(float(t), step.interpolant(float(t)))) for t in wanted)
+    def note(solver: Any) -> None:
+        wanted = np.union1d(np.linspace(solver.t_old, solver.t, SAMPLES + 1), [duration / 2])
+        way.extend((t, dae.terms(t, y)) for t, y in between(solver, wanted))
 
-    outcome = march(system, "DOP853", 1e-11, duration, on_step=note)
+    outcome = march(dae, "DOP853", 1e-11, duration, on_step=note)
     if outcome.stopped:
         raise NumericalError(f"the motion through the singular configuration {outcome.stopped}", t=outcome.t)
     return way

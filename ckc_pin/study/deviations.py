@@ -8,25 +8,22 @@ solution, while the plant has its own z.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.integrate import Stepper
-from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.ivp import Force, Ivp, LevelSet
 from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.systems.level_set import LevelSet
+from ckc_pin.study.experiment import Problem, between, march
 
-__all__ = ["PERIOD", "Deviation", "FromLast", "OwnSigma", "Track", "deviation", "instants", "track"]
+__all__ = ["PERIOD", "Deviation", "FromLast", "OwnSigma", "Setting", "Track", "deviation", "instants", "track"]
 
 PERIOD = 2 * np.pi  # s, of eq. 21
 SAMPLES = 128  # in a period
@@ -60,25 +57,48 @@ class FromLast:
 
 
 class OwnSigma:
-    """A controller whose z is its own, not the plant's: the inner controller gets the terms there."""
+    """The force of a controller whose z is its own, not the plant's."""
 
-    def __init__(self, inner: Controller, sigma: FromLast) -> None:
-        self.inner, self.sigma = inner, sigma
+    def __init__(self, force: Force, sigma: FromLast) -> None:
+        self.force, self.sigma = force, sigma
 
-    def u(self, t: float, terms: Terms) -> Array:
-        """Return the inner controller's force with this controller's z."""
+    def __call__(self, t: float, terms: Terms) -> Array:
+        """Return u' with the controller's z."""
         at = self.sigma.at(terms.q)
-        return self.inner.u(t, Terms(terms.mechanism, at, at.rho @ terms.q_dot))
+        return self.force(t, Terms(terms.mechanism, at, at.rho @ terms.q_dot))
 
 
 @dataclass
 class Loose(LevelSet):
     """The reduced model whose z, the controller's as well, is solved `FromLast`."""
 
-    sigma: FromLast | None = None
+    sigma: FromLast = field(kw_only=True)
 
-    def _close(self, t: float, numbers: Array, w: Array, tolerance: float) -> Kinematics:
-        return super()._close(t, numbers, w, tolerance) if self.sigma is None else self.sigma.at(numbers)
+    def close(self, t: float, numbers: Array) -> Kinematics:
+        return self.sigma.at(numbers)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a tracking run is integrated, and how sigma is solved.
+
+    Attributes
+    ----------
+    model : "reduced" or "eq. 8"
+    method : str
+        A class of `scipy.integrate`.
+    rtol : float
+    tolerance : float or None
+        Largest |phi| that the reduced model's sigma takes for closed, solved `FromLast`, m.
+    own : float or None
+        The same of a sigma that the controller solves by itself.
+    """
+
+    model: Literal["reduced", "eq. 8"]
+    method: str
+    rtol: float
+    tolerance: float | None = None
+    own: float | None = None
 
 
 @dataclass(frozen=True)
@@ -97,53 +117,40 @@ class Track:
     open: float
 
 
-def track(
-    scene: str, changes: Mapping[str, Any], times: Array, *, tolerance: float | None = None, own: float | None = None
-) -> Track:
-    """Run a scene with a controller and return its q at increasing times.
-
-    Parameters
-    ----------
-    scene : str
-    changes : mapping
-        Values of the scene by dotted key.
-    times : (m,) array
-        From 0 on; the run ends with the last.
-    tolerance : float, optional
-        Largest |phi| that the reduced model's sigma takes for closed, solved `FromLast`, m.
-    own : float, optional
-        The same of a sigma that the controller solves by itself.
+def track(scene: str, setting: Setting, times: Array) -> Track:
+    """Run a scene with a controller and return its q at increasing times, from 0 on.
 
     Raises
     ------
     NumericalError
-        The run does not get there.
+        The run does not get to the last one.
     """
-    loaded = load_scene(scene, {**changes, "solver.backend": "python", "t_end": float(times[-1])})
-    prepared, sigma = prepare(loaded), None
-    if own is not None:
-        if prepared.plant.controller is None:
-            raise InputError(f"{loaded.name}: a scene with a controller is needed")
-        sigma = FromLast(prepared.mechanism, prepared.start.at, own)
-        prepared = prepare(loaded, OwnSigma(prepared.plant.controller, sigma))
-    system = prepared.system
-    if tolerance is not None:
-        assert isinstance(system, LevelSet)
-        sigma = FromLast(prepared.mechanism, prepared.start.at, tolerance)
-        system = Loose(**{x.name: getattr(system, x.name) for x in fields(system)}, sigma=sigma)
-    stepper = Stepper(system, prepared.method, loaded.spec.solver, float(times[-1]))
-    first = system.terms(0.0, stepper.y)
-    q, opened = [first.q], np.abs(first.phi)
-    while stepper.solver.status == "running":
-        step = stepper.step()
-        while len(q) < len(times) and times[len(q)] <= step.t:
-            at = system.terms(float(times[len(q)]), step.interpolant(float(times[len(q)])))
+    loaded = load_scene(scene)
+    if loaded.spec.controller is None:
+        raise InputError(f"{loaded.name}: a scene with a controller is needed")
+    problem, sigma = Problem.of_scene(loaded), None
+    if setting.own is not None:
+        sigma = FromLast(problem.mechanism, problem.at, setting.own)
+        problem = replace(problem, force=OwnSigma(problem.force, sigma))
+    ivp: Ivp = problem.reduced() if setting.model == "reduced" else problem.printed_spf(loaded.spec.epsilon)
+    if setting.tolerance is not None:
+        sigma = FromLast(problem.mechanism, problem.at, setting.tolerance)
+        ivp = Loose(problem.mechanism, problem.at, problem.q_dot, problem.force, ivp.t_span, sigma=sigma)
+    first = ivp.terms(0.0, ivp.y0)
+    q, opened = [first.q], [first.phi]
+
+    def note(solver: Any) -> None:
+        for t, y in between(solver, times):
+            at = ivp.terms(t, y)
             q.append(at.q)
-            opened = np.maximum(np.abs(at.phi), opened)
+            opened.append(at.phi)
         if sigma is not None:
-            kept = sigma.keep(system.terms(step.t, stepper.solver.y).q)
-            opened = np.maximum(np.abs(kept.phi), opened)
-    return Track(np.array(q), float(opened.max()))
+            opened.append(sigma.keep(ivp.terms(solver.t, solver.y).q).phi)
+
+    outcome = march(ivp, setting.method, setting.rtol, float(times[-1]), on_step=note)
+    if outcome.stopped:
+        raise NumericalError(outcome.stopped)
+    return Track(np.array(q), float(np.abs(opened).max()))
 
 
 @dataclass(frozen=True)

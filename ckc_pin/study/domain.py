@@ -11,7 +11,7 @@ from ckc_pin.mechanism.kinematics import Kinematics, Psi
 from ckc_pin.mechanism.library import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.systems import PrintedSpf
+from ckc_pin.simulation.ivp import PrintedSpf
 from ckc_pin.study.claim import Claim
 from ckc_pin.study.experiment import march
 from ckc_pin.study.five_bar import FIVE_BAR, PRINTED
@@ -112,8 +112,9 @@ def off_manifold(mechanism: Mechanism, *, reachable: bool, count: int = STARTS, 
         verdict = mechanism.sigma(mechanism.independent_part(at.q_tree)).verdict
         if verdict != ("converged" if reachable else "out of reach"):
             continue
-        system = PrintedSpf(mechanism, at, np.zeros(mechanism.d), lambda t, terms: none, EPSILON, at.phi)
-        outcome = march(system, "Radau", 1e-5, LAYERS * EPSILON)
+        span = (0.0, LAYERS * EPSILON)
+        spf = PrintedSpf(mechanism, at, np.zeros(mechanism.d), lambda t, terms: none, span, EPSILON, at.phi)
+        outcome = march(spf, "Radau", 1e-5, span[1])
         gone = np.abs(outcome.terms.phi).max() <= 2 * np.exp(-LAYERS) * np.abs(at.phi).max() + 1e-7
         rows.append((at.sigma_min(), outcome.t / EPSILON, bool(gone and not outcome.stopped)))
         if len(rows) == count:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,9 +12,9 @@ from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.library import load
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.ivp import LevelSet
 from ckc_pin.simulation.prepare import scene_controller
 from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.systems import LevelSet
 from ckc_pin.study.erratum import Erratum
 from ckc_pin.study.experiment import Problem, march
 from ckc_pin.study.five_bar import FIVE_BAR
@@ -29,13 +30,13 @@ ON_MANIFOLD = np.zeros(2)  # w, m
 
 def set_point_error() -> Erratum:
     """Section II-B: which sign the error has."""
-    system, controller = _set_point()
-    state = np.concatenate([system.start()[: system.mechanism.d] + 0.3, Q_DOT])
+    reduced, controller = _set_point()
+    state = np.concatenate([reduced.y0[: reduced.mechanism.d] + 0.3, Q_DOT])
     q_d, h_d = controller.q_d, controller.target.h
 
     def candidate(sign: float) -> Callable[[float, Array], float]:
         def value(t: float, y: Array) -> float:
-            terms = system.terms(t, y)
+            terms = reduced.terms(t, y)
             error = q_d - terms.q
             kinetic = 0.5 * terms.q_dot @ terms.D @ terms.q_dot
             return float(kinetic + terms.potential_energy + sign * error @ h_d + 0.5 * error @ controller.K_P @ error)
@@ -43,7 +44,7 @@ def set_point_error() -> Erratum:
         return value
 
     expected = -Q_DOT @ controller.K_V @ Q_DOT
-    right, wrong = (_rate(system, 0.0, state, candidate(sign)) - expected for sign in (1.0, -1.0))
+    right, wrong = (_rate(reduced, 0.0, state, candidate(sign)) - expected for sign in (1.0, -1.0))
     return Erratum(
         key="set-point-error",
         where="eqs. 14 and 16 and the function of section II-B",
@@ -124,12 +125,12 @@ def gain_condition() -> Erratum:
 def lyapunov_rate() -> Erratum:
     """Eq. 19: a sign, two tildes, an order."""
     problem, controller = _tracking()
-    system = problem.reduced()
-    reached = march(system, "Radau", 1e-10, T).terms
+    reduced = problem.reduced()
+    reached = march(reduced, "Radau", 1e-10, T).terms
     q, q_dot, Lambda, K_D = reached.q, reached.q_dot, controller.Lambda, controller.K_D
     q_d, q_d_dot, _ = controller.desired(T)
     error, error_dot = q - q_d, q_dot - q_d_dot
-    truth = _rate(system, T, np.concatenate([q, q_dot]), _reported(system, controller))
+    truth = _rate(reduced, T, np.concatenate([q, q_dot]), _reported(reduced, controller))
     r = error_dot + Lambda @ error
     first = -r @ K_D @ r - 2 * q_dot @ Lambda @ K_D @ error
     last = -q_dot @ K_D @ q_dot - error @ Lambda.T @ K_D @ Lambda @ error
@@ -154,8 +155,8 @@ def rate_on_trajectory() -> Erratum:
     problem, controller = _tracking()
     q_d, q_d_dot, _ = controller.desired(T)
     found = problem.mechanism.sigma(q_d)
-    system = LevelSet(problem.mechanism, found.at, q_d_dot, problem.force)
-    measured = _rate(system, T, np.concatenate([q_d, q_d_dot]), _reported(system, controller))
+    reduced = replace(problem, at=found.at, q_dot=q_d_dot).reduced()
+    measured = _rate(reduced, T, np.concatenate([q_d, q_d_dot]), _reported(reduced, controller))
     return Erratum(
         key="rate-on-trajectory",
         where='section II-C, "-V_dot is locally positive definite"',
@@ -195,12 +196,12 @@ def _scene(name: str) -> tuple[Problem, SetPoint | Tracking | None]:
     return problem, scene_controller(scene, problem.mechanism)
 
 
-def _reported(system: LevelSet, controller: Tracking) -> Callable[[float, Array], float]:
+def _reported(reduced: LevelSet, controller: Tracking) -> Callable[[float, Array], float]:
     """Return the function that the program reports, of (t, y)."""
-    return lambda t, y: controller.lyapunov(t, system.terms(t, y), ON_MANIFOLD)
+    return lambda t, y: controller.lyapunov(t, reduced.terms(t, y), ON_MANIFOLD)
 
 
-def _rate(system: LevelSet, t: float, y: Array, V: Callable[[float, Array], float]) -> float:
+def _rate(reduced: LevelSet, t: float, y: Array, V: Callable[[float, Array], float]) -> float:
     """Return dV/dt along the closed loop through y at t, by a central difference along its tangent."""
-    y_dot = system.rhs(t, y)
+    y_dot = reduced.f(t, y)
     return (V(t + STEP, y + STEP * y_dot) - V(t - STEP, y - STEP * y_dot)) / (2 * STEP)

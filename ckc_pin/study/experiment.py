@@ -1,4 +1,4 @@
-"""One motion in every formulation, marched to its end: what the studies of epsilon and of cost have in common.
+"""One motion in every formulation, marched to its end by SciPy: what the studies of epsilon and of cost share.
 
 Nothing is recorded on the way, so that a march's time and counts are those of the integration alone.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import process_time
+from typing import Any
 
 import numpy as np
 
@@ -18,18 +19,19 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.library import load
+from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.integrate import ONE_STEP, BudgetError, Step, Stepper
+from ckc_pin.simulation.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import Scene, SolverSpec
-from ckc_pin.simulation.systems import Dae, Force, LevelSet, PrintedSpf, System
+from ckc_pin.simulation.scene import Scene
 
 __all__ = [
     "W0",
     "Outcome",
     "Problem",
+    "between",
     "difference",
     "end_of",
     "five_bar_problem",
@@ -42,6 +44,7 @@ __all__ = [
 W0 = np.array([0.01, -0.006])  # w(0) of the studies on the five-bar, m
 MOVING = np.array([1.0, -2.0])  # q_dot(0) of their moving start, rad/s
 OFFSET = 0.5  # of theta_1 and theta_3 from the equilibrium, rad
+OPEN = (0.0, np.inf)  # s: a march says where it ends
 
 
 @dataclass(frozen=True)
@@ -74,35 +77,27 @@ class Problem:
         """Take a scene's start and controller; its formulation, solver and w are left aside."""
         mechanism = scene_mechanism(scene)
         start = find_start(mechanism, scene)
-        controller = scene_controller(scene, mechanism)
-        if controller is None:
-            return cls.free(mechanism, start.at, start.q_dot)
         limit = scene.spec.controller.torque_limit if scene.spec.controller else None
-        actuation = Actuation(mechanism, limit)
-        return cls(
-            mechanism,
-            start.at,
-            start.q_dot,
-            lambda t, terms: actuation.apply(terms, controller.u(t, terms)).u_tree,
-        )
+        force = force_of(scene_controller(scene, mechanism), Actuation(mechanism, limit))
+        return cls(mechanism, start.at, start.q_dot, force)
 
-    def dae(self, method: str = "DOP853") -> Dae:
-        """Eq. 1, projected where the method allows it."""
-        return Dae(self.mechanism, self.at, self.at.rho @ self.q_dot, self.force, method in ONE_STEP)
+    def dae(self) -> Dae:
+        """Eq. 1, its closure differentiated twice and never projected."""
+        return Dae(self.mechanism, self.at, self.at.rho @ self.q_dot, self.force, OPEN)
 
     def reduced(self) -> LevelSet:
         """Eq. 6."""
-        return LevelSet(self.mechanism, self.at, self.q_dot, self.force)
+        return LevelSet(self.mechanism, self.at, self.q_dot, self.force, OPEN)
 
     def spf(self, epsilon: float, w: Array, convention: CoriolisVelocity = "rho") -> LevelSet:
         """Eq. 17, from the same q and q_dot with z on phi = w."""
         start = on_level(self.mechanism, self.at, w)
-        return LevelSet(self.mechanism, start, self.q_dot, self.force, epsilon, convention, w)
+        return LevelSet(self.mechanism, start, self.q_dot, self.force, OPEN, epsilon, w, convention)
 
     def printed_spf(self, epsilon: float) -> PrintedSpf:
         """Eq. 8 as printed, from phi = 0."""
         w0 = np.zeros(self.mechanism.closure.rows)
-        return PrintedSpf(self.mechanism, self.at, self.q_dot, self.force, epsilon, w0)
+        return PrintedSpf(self.mechanism, self.at, self.q_dot, self.force, OPEN, epsilon, w0)
 
 
 def five_bar_problem(moving: bool) -> Problem:
@@ -124,7 +119,7 @@ class Outcome:
     terms : Terms
         The state there.
     stats : dict of str to int
-        rhs, steps, rejected, newton (corrections of sigma), factorizations, jacobians.
+        rhs, steps, newton (corrections of sigma); jacobians and factorizations of an implicit integrator.
     iterations : int or None
         Newton iterations of an implicit integrator, 0 for an explicit one; None where the solver does not
         tell (LSODA). Radau's are right to a third of its rejected steps.
@@ -157,81 +152,114 @@ def on_level(mechanism: Mechanism, at: Kinematics, w: Array) -> Kinematics:
 
 
 def march(
-    system: System,
+    ivp: Ivp,
     method: str,
     rtol: float,
     t_end: float,
     *,
     max_rhs: int | None = None,
-    on_step: Callable[[Step], None] | None = None,
+    on_step: Callable[[Any], None] | None = None,
 ) -> Outcome:
-    """Integrate a system to t_end, or to where the budget of right-hand sides or the numerics end it.
+    """Integrate to t_end, or to where the budget of right-hand sides or the numerics end it.
 
-    atol is rtol / 100.
+    Parameters
+    ----------
+    ivp : Ivp
+    method : str
+        A class of `scipy.integrate`; Jacobians are by differences.
+    rtol : float
+        And atol = rtol / 100.
+    t_end : float
+    max_rhs : int, optional
+    on_step : callable, optional
+        Called with SciPy's solver after each accepted step: its t_old, t, y and dense_output().
     """
-    started = process_time()
-    stepper = Stepper(system, method, SolverSpec(method=method, rtol=rtol, max_rhs=max_rhs), t_end)  # type: ignore[arg-type]
-    stopped = ""
-    try:
-        while stepper.solver.status == "running":
-            step = stepper.step()
-            if on_step is not None:
-                on_step(step)
-            stepper.settle()
-    except (BudgetError, NumericalError) as error:
-        stopped = f"stopped at t = {stepper.t:.4g} s: {error}"
-    seconds = process_time() - started
-    stats, iterations = stepper.stats(), _iterations(stepper)
-    return Outcome(stepper.t, system.terms(stepper.t, stepper.solver.y), stats, iterations, seconds, stopped)
+    import scipy.integrate
+
+    rhs = steps = 0
+
+    def f(t: float, y: Array) -> Array:
+        nonlocal rhs
+        if rhs == max_rhs:
+            raise NumericalError(f"the budget of max_rhs = {max_rhs} right-hand sides is used up")
+        rhs += 1
+        return ivp.f(t, y)
+
+    stopped, newton, started = "", ivp.counts["newton"], process_time()
+    with one_blas_thread(), np.errstate(all="ignore"):  # no right-hand side is NaN, and a shorter step
+        solver: Any = getattr(scipy.integrate, method)(f, 0.0, ivp.y0, t_end, rtol=rtol, atol=rtol / 100)
+        try:
+            while solver.status == "running":
+                stopped = solver.step() or ""
+                if solver.status == "failed":
+                    break
+                steps += 1
+                if on_step is not None:
+                    on_step(solver)
+        except (NumericalError, ValueError, np.linalg.LinAlgError) as error:  # or an implicit method's algebra with NaN
+            stopped = str(error)
+    seconds, t = process_time() - started, float(solver.t)
+    stats = {
+        "rhs": rhs, "steps": steps, "newton": ivp.counts["newton"] - newton,
+        "jacobians": int(solver.njev), "factorizations": int(solver.nlu),
+    }  # fmt: skip
+    reason = f"stopped at t = {t:.4g} s: {stopped}" if stopped else ""
+    return Outcome(t, ivp.terms(t, solver.y), stats, _iterations(method, solver.nfev, steps), seconds, reason)
 
 
-def _iterations(stepper: Stepper) -> int | None:
+def _iterations(method: str, nfev: int, steps: int) -> int | None:
     """Newton iterations of the integrator, from SciPy's nfev, which leaves finite-difference Jacobians out.
 
     Two evaluations choose the first step. An iteration of BDF is one evaluation; one of Radau is three,
     with one more at the end of each accepted step and where a rejected step's error is looked at again.
     """
-    nfev = int(stepper.solver.nfev)
-    if stepper.method == "BDF":
+    if method == "BDF":
         return nfev - 2
-    if stepper.method == "Radau":
-        return (nfev - 2 - stepper.steps) // 3
-    return None if stepper.method == "LSODA" else 0
+    if method == "Radau":
+        return (nfev - 2 - steps) // 3
+    return None if method == "LSODA" else 0
 
 
-def end_of(system: System, method: str, rtol: float, t_end: float) -> Terms:
-    """Return the state that a system reaches at t_end.
+def end_of(ivp: Ivp, method: str, rtol: float, t_end: float) -> Terms:
+    """Return the state that a motion reaches at t_end.
 
     Raises
     ------
     NumericalError
         It does not get there.
     """
-    outcome = march(system, method, rtol, t_end)
+    outcome = march(ivp, method, rtol, t_end)
     if outcome.stopped:
         raise NumericalError(outcome.stopped)
     return outcome.terms
 
 
-def sample(system: System, method: str, rtol: float, times: Array) -> list[Terms]:
+def sample(ivp: Ivp, method: str, rtol: float, times: Array) -> list[Terms]:
     """Return the states at increasing times, the first of them 0.
 
     Raises
     ------
     NumericalError
-        The system does not get to the last one.
+        The motion does not get to the last one.
     """
-    found = [system.terms(0.0, system.start())]
+    found = [ivp.terms(0.0, ivp.y0)]
 
-    def take(step: Step) -> None:
-        while len(found) < len(times) and times[len(found)] <= step.t:
-            t = float(times[len(found)])
-            found.append(system.terms(t, step.interpolant(t)))
+    def take(solver: Any) -> None:
+        found.extend(ivp.terms(t, y) for t, y in between(solver, times))
 
-    outcome = march(system, method, rtol, float(times[-1]), on_step=take)
+    outcome = march(ivp, method, rtol, float(times[-1]), on_step=take)
     if outcome.stopped:
         raise NumericalError(outcome.stopped)
     return found
+
+
+def between(solver: Any, times: Array) -> list[tuple[float, Array]]:
+    """Return t and y at those of the times that lie in a SciPy solver's last step, its end included."""
+    inside = times[(times > solver.t_old) & (times <= solver.t)]
+    if not len(inside):  # an interpolant costs DOP853 three right-hand sides
+        return []
+    at = solver.dense_output()
+    return [(float(t), at(t)) for t in inside]
 
 
 def difference(a: Terms, b: Terms) -> tuple[float, float]:

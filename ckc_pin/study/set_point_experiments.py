@@ -45,9 +45,9 @@ DENSE = {"solver.rtol": 1e-12, "solver.method": "DOP853", "solver.output_dt": 5e
 NEAR = {"initial.at": None, "initial.q": {"theta_1": 0.3, "theta_3": 0.5}}  # a start half a radian from the target
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "reduced, eq. 6": {"formulation": "reduced"},
-    "SPF, eq. 17": {"formulation": "spf", "solver.spf_equation": 17},
+    "SPF, eq. 17": {"formulation": "spf"},
     # explicit methods are bound to steps of epsilon in eq. 8 as printed
-    "SPF, eq. 8": {"formulation": "spf", "solver.spf_equation": 8, "solver.method": "Radau", "solver.rtol": 1e-10},
+    "SPF, eq. 8": {"formulation": "spf", "spf_coordinates": "z", "solver.method": "Radau", "solver.rtol": 1e-10},
     "DAE, eq. 1": {"formulation": "dae"},
 }
 

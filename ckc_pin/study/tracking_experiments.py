@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
-from ckc_pin.study.deviations import Deviation, deviation, instants, track
+from ckc_pin.study.deviations import Deviation, Setting, deviation, instants, track
 from ckc_pin.study.lyapunov import Record, record
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "START",
     "W0",
     "WHOLE",
-    "Setting",
     "deviations",
     "lyapunov_along",
     "off_manifold",
@@ -37,9 +36,9 @@ W0 = (0.01, -0.006)  # m
 EXPLICIT = {"solver.method": "DOP853", "solver.rtol": 1e-12}
 ON_MANIFOLD: dict[str, dict[str, Any]] = {
     "reduced, eq. 6": {"formulation": "reduced", **EXPLICIT},
-    "SPF, eq. 17": {"formulation": "spf", "solver.spf_equation": 17, **EXPLICIT},
+    "SPF, eq. 17": {"formulation": "spf", **EXPLICIT},
     # explicit methods are bound to steps of epsilon in eq. 8 as printed
-    "SPF, eq. 8": {"formulation": "spf", "solver.method": "Radau", "solver.rtol": 1e-10},
+    "SPF, eq. 8": {"formulation": "spf", "spf_coordinates": "z", "solver.method": "Radau", "solver.rtol": 1e-10},
     "DAE, eq. 1": {"formulation": "dae", **EXPLICIT},
 }
 SINCE = 0.1  # s; r dies out with 1/600 s, which output instants up to here resolve
@@ -106,58 +105,31 @@ def off_manifold(epsilon: float, convention: str, moving: bool) -> Record:
     start = {"initial.q_dot": {"theta_1": 1.0, "theta_3": -2.0}} if moving else {}
     layer = {"t_end": 20 * epsilon, "solver.output_dt": epsilon / 50}
     return lyapunov_along(
-        {"formulation": "spf", "solver.spf_equation": 17, "epsilon": epsilon, "coriolis_velocity": convention,
-         "initial.w": list(W0), **EXPLICIT, **layer, **start}
+        {"formulation": "spf", "epsilon": epsilon, "coriolis_velocity": convention, "initial.w": list(W0),
+         **EXPLICIT, **layer, **start}
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How a tracking run is made less than exact.
-
-    Attributes
-    ----------
-    changes : dict
-        Of the scene.
-    tolerance : float or None
-        Of the sigma that plant and controller share, m.
-    own : float or None
-        Of a sigma that the controller solves by itself, m.
-    """
-
-    changes: dict[str, Any]
-    tolerance: float | None = None
-    own: float | None = None
-
-
-def _reduced(method: str, rtol: float) -> dict[str, Any]:
-    return {"formulation": "reduced", "solver.method": method, "solver.rtol": rtol}
-
-
-def _eq_8(method: str, rtol: float) -> dict[str, Any]:
-    return {"formulation": "spf", "solver.spf_equation": 8, "solver.method": method, "solver.rtol": rtol}
-
-
-EXACT = _reduced("Radau", 1e-9)
+EXACT = Setting("reduced", "Radau", 1e-9)
 # by what is not exact about them
 SETTINGS: dict[str, dict[str, Setting]] = {
-    "nothing": {"SPF, eq. 8: Radau, rtol 1e-9": Setting(_eq_8("Radau", 1e-9))},
+    "nothing": {"SPF, eq. 8: Radau, rtol 1e-9": Setting("eq. 8", "Radau", 1e-9)},
     "integrator": {
-        "reduced: RK45, rtol 1e-3": Setting(_reduced("RK45", 1e-3)),
-        "reduced: Radau, rtol 1e-3": Setting(_reduced("Radau", 1e-3)),
-        "SPF, eq. 8: Radau, rtol 1e-3": Setting(_eq_8("Radau", 1e-3)),
-        "reduced: BDF, rtol 1e-3": Setting(_reduced("BDF", 1e-3)),
-        "SPF, eq. 8: BDF, rtol 1e-3": Setting(_eq_8("BDF", 1e-3)),
-        "reduced: BDF, rtol 1e-2": Setting(_reduced("BDF", 1e-2)),
-        "SPF, eq. 8: BDF, rtol 1e-2": Setting(_eq_8("BDF", 1e-2)),
+        "reduced: RK45, rtol 1e-3": Setting("reduced", "RK45", 1e-3),
+        "reduced: Radau, rtol 1e-3": Setting("reduced", "Radau", 1e-3),
+        "SPF, eq. 8: Radau, rtol 1e-3": Setting("eq. 8", "Radau", 1e-3),
+        "reduced: BDF, rtol 1e-3": Setting("reduced", "BDF", 1e-3),
+        "SPF, eq. 8: BDF, rtol 1e-3": Setting("eq. 8", "BDF", 1e-3),
+        "reduced: BDF, rtol 1e-2": Setting("reduced", "BDF", 1e-2),
+        "SPF, eq. 8: BDF, rtol 1e-2": Setting("eq. 8", "BDF", 1e-2),
     },
     "sigma of both": {
-        "sigma of both to 1e-2 m": Setting(_reduced("Radau", 1e-8), tolerance=1e-2),
-        "sigma of both to 1e-3 m": Setting(_reduced("Radau", 1e-8), tolerance=1e-3),
+        "sigma of both to 1e-2 m": Setting("reduced", "Radau", 1e-8, tolerance=1e-2),
+        "sigma of both to 1e-3 m": Setting("reduced", "Radau", 1e-8, tolerance=1e-3),
     },
     "controller's sigma": {
-        "controller's own sigma to 1e-2 m": Setting(_reduced("RK45", 1e-3), own=1e-2),
-        "controller's own sigma to 1e-3 m": Setting(_reduced("RK45", 1e-3), own=1e-3),
+        "controller's own sigma to 1e-2 m": Setting("reduced", "RK45", 1e-3, own=1e-2),
+        "controller's own sigma to 1e-3 m": Setting("reduced", "RK45", 1e-3, own=1e-3),
     },
 }
 
@@ -177,8 +149,5 @@ def deviations(settings: Mapping[str, Setting], periods: int = PERIODS) -> tuple
     exact = track(SCENE, EXACT, times)
     controller = _tracking(load_scene(SCENE))
     desired = np.array([controller.desired(float(t))[0] for t in times])
-    found = {
-        name: deviation(track(SCENE, x.changes, times, tolerance=x.tolerance, own=x.own), exact)
-        for name, x in settings.items()
-    }
+    found = {name: deviation(track(SCENE, setting, times), exact) for name, setting in settings.items()}
     return times, np.abs(exact.q - desired).max(axis=1), found

@@ -60,10 +60,11 @@ SOLVER = [
     _value("solver.rtol=1e-300", "solver.rtol = 1e-300: a number of at least 2.3e-14"),
     _value("solver.rtol=high", "solver.rtol = 'high': a number is needed, not a string"),
     _value("solver.atol=0", f"solver.atol = 0: {GREATER}"),
-    _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'BDF', 'DOP853', 'IDA', 'LSODA', 'RK23', 'RK45'"),
-    _value("solver.backend=cuda", "solver.backend = 'cuda'; valid: 'auto', "),
+    _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'DOP853', 'RK45', 'Radau', 'auto'"),
+    _value("solver.method=BDF", "solver.method = 'BDF'; valid: 'DOP853', 'RK45', 'Radau', 'auto'"),
+    _value("solver.backend=native", "solver: unknown key 'backend'; valid: method, rtol"),
+    _value("spf_coordinates=y", "spf_coordinates = 'y'; valid: 'w', 'z'"),
     _value("solver.projection=yes", "solver.projection = 'yes': true or false is needed, not a string"),
-    _value("solver.spf_equation=9", "solver.spf_equation = 9; valid: 8, 17"),
     _value("solver.max_rhs=0", "solver.max_rhs = 0: an integer of at least 1 is needed"),
     _value("solver.max_rhs=1.5", "solver.max_rhs = 1.5: an integer is needed, not a number"),
     _value("solver.max_wall_s=0", f"solver.max_wall_s = 0: {GREATER}"),
@@ -72,8 +73,6 @@ SOLVER = [
     _value("solver={min_step=1.0, max_step=0.1}", "solver: min_step = 1 is above max_step = 0.1"),
     _value("solver.output_dt=0", f"solver.output_dt = 0: {GREATER}"),
     _value("solver.output_dt=1e-300", "solver.output_dt = 1e-300 gives more than 1000000 output instants in 2 s"),
-    _value("solver.method=BDF", "BDF is a multistep method", "RK23, RK45, DOP853, Radau, or projection = false"),
-    _value("solver.method=LSODA", "LSODA is a multistep method", "projection = false"),
 ]
 
 START = [

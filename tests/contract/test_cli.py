@@ -25,7 +25,8 @@ TERMS = """coordinates independent dependent q_tree v_tree D_tree C_tree h_tree 
            energy"""
 RUN = """status message t coordinates q_tree v_tree u tau points max_abs_u max_abs_tau max_phi max_phi_dot energy_start
          energy_end formulation epsilon stats"""
-STATS = """rhs steps rejected newton factorizations jacobians switches wall_s method backend"""
+STATS = """rhs steps rejected newton factorizations jacobians switches python_calls wall_s method
+           steps_by_method terms"""
 
 Q, V = '{"theta_1": -1.2, "theta_3": -1.9}', '{"theta_1": 0.4, "theta_3": -0.3}'
 
@@ -179,8 +180,11 @@ def test_run(formulation: str) -> None:
     assert 0 <= found["max_phi"] <= 1e-12
     assert found["max_phi_dot"] < 1e-12
     assert set(found["stats"]) >= set(STATS.split())
-    assert found["stats"]["backend"] in ("python", "native")
-    assert all(isinstance(found["stats"][key], int) for key in STATS.split()[:7])
+    assert found["stats"]["method"] in found["stats"]["steps_by_method"]
+    assert sum(found["stats"]["steps_by_method"].values()) == found["stats"]["steps"]
+    assert found["stats"]["python_calls"] == 0
+    assert found["stats"]["terms"] == "pinocchio"
+    assert all(isinstance(found["stats"][key], int) for key in STATS.split()[:8])
 
 
 def test_the_point_is_where_the_angles_put_it() -> None:

@@ -170,13 +170,11 @@ def test_a_controller_that_gives_nan_cannot_start() -> None:
 # --- on the way ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backend", ["python", "auto"])
-def test_progress_is_told_on_the_way(backend: str) -> None:
+def test_progress_is_told_on_the_way() -> None:
     told: list[tuple[float, float]] = []
-    changes = {"t_end": 0.5, "solver.backend": backend}
-    found = simulate("five_bar/swing", changes, progress=lambda t, t_end: told.append((t, t_end)))
-    assert len(told) == found.stats["steps"] or found.stats["backend"] == "native"
-    assert told[-1] == (0.5, 0.5)
+    simulate("five_bar/swing", {"t_end": 100.0}, progress=lambda t, t_end: told.append((t, t_end)))
+    assert len(told) > 2
+    assert told[-1] == (100.0, 100.0)
     assert all(before < after for (before, _), (after, _) in pairwise(told))
 
 

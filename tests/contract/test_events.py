@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ckc_pin import Event, InputError, Run, Terms, load, load_scene, simulate
-from ckc_pin.simulation.crossings import PLACES, walk
-from ckc_pin.simulation.events import Events
+from ckc_pin.native import _core
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 from tests.contract.helpers.bad import Bad, expect
@@ -29,8 +28,8 @@ T_END = 0.6
 
 
 def _walk(function: Callable[[float], float], sign: int = 0, start: float = 0.0, end: float = 1.0) -> Any:
-    times = start + (end - start) * PLACES
-    return walk(function, times, np.array([function(t) for t in times.tolist()]), sign, 0.0)
+    """(found, the sign at the end, whether the end is on zero)."""
+    return _core.walk(function, start, end, sign, 0.0)
 
 
 R = 1e-4  # half the distance of two roots
@@ -60,7 +59,7 @@ R = 1e-4  # half the distance of two roots
          "jump", "touch", "touch at a node", "miss", "constant", "zero"],
 )  # fmt: skip
 def test_sign_changes_within_a_step(function: Callable[[float], float], roots: list[tuple[float, int]]) -> None:
-    found = _walk(function).found
+    found, _, _ = _walk(function)
     assert [direction for _, direction in found] == [direction for _, direction in roots]
     # near a double root its value's rounding moves it: 1e-16 over the slope
     assert_close([t for t, _ in found], [t for t, _ in roots], 2e-12)
@@ -68,16 +67,13 @@ def test_sign_changes_within_a_step(function: Callable[[float], float], roots: l
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])
 def test_what_starts_on_zero_has_crossed_if_it_came_from_the_other_side(sign: int) -> None:
-    found = _walk(lambda t: t, sign)
-    assert found.found == ([(0.0, 1)] if sign == -1 else [])
-    assert found.sign == 1
+    assert _walk(lambda t: t, sign) == ([(0.0, 1)] if sign == -1 else [], 1, False)
 
 
 def test_what_ends_on_zero_waits_for_the_next_step() -> None:
-    found = _walk(lambda t: t - 1.0)
-    assert (found.found, found.sign, found.on_zero) == ([], -1, True)
-    assert _walk(lambda t: t - 1.0, -1, 1.0, 2.0).found == [(1.0, 1)]
-    assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0).found == []
+    assert _walk(lambda t: t - 1.0) == ([], -1, True)
+    assert _walk(lambda t: t - 1.0, -1, 1.0, 2.0)[0] == [(1.0, 1)]
+    assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0)[0] == []
 
 
 # --- against numpy and SciPy ---------------------------------------------------------------------
@@ -180,8 +176,15 @@ def test_events_do_not_change_the_motion() -> None:
     assert_close(watched.q_tree, plain.q_tree, 1e-12)
 
 
-def test_nothing_is_computed_without_events() -> None:
-    assert Events([], [], load("five_bar")).check(None, None) is None  # type: ignore[arg-type]
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_an_event_that_is_far_from_happening_is_not_looked_for(formulation: str) -> None:
+    """A coordinate's value is ruled out by what a step knows already: after the first no state in between is closed."""
+    changes: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
+    plain = simulate("five_bar/swing", changes, profile=True)
+    far = [{"coordinate": "theta_2", "value": 50.0}, {"coordinate": "theta_1", "of": "q_dot", "value": 1e3}]
+    watched = simulate("five_bar/swing", {**changes, "event": far}, profile=True)
+    assert watched.events == []
+    assert watched.profile["J"]["calls"] < 1.1 * plain.profile["J"]["calls"]
 
 
 # --- limits --------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,12 +10,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.dynamics import Terms
-from ckc_pin.simulation.integrate import Stepper
-from ckc_pin.simulation.scene import SolverSpec
-from ckc_pin.simulation.systems import Dae, LevelSet, System
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
-from tests.conftest import Pair, assert_close
+from tests.conftest import assert_close
+from tests.convergence.steps import steps_of
 from tests.regression.reference import trajectory
 
 T_END = 0.5
@@ -39,52 +39,47 @@ def exact() -> Exact:
     ).sol
 
 
-def errors(pair: Pair, exact: Exact, formulation: str, method: str, **solver: Any) -> tuple[Array, Array]:
+def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]:
     """Largest errors of (q, q_dot) at the steps and at three instants within each."""
-    mechanism, _ = pair
-    start = mechanism.sigma(START).at
+    changes = {f"solver.{key}": value for key, value in solver.items()}
+    start = {"theta_1": float(START[0]), "theta_3": float(START[1])}
+    ready = prepare(load_scene("five_bar/swing", {"formulation": formulation, "initial.q": start, **changes}))
 
-    def no_force(t: float, terms: Terms) -> Array:
-        return np.zeros(4)
-
-    system: System = LevelSet(mechanism, start, np.zeros(2), no_force)
-    if formulation == "dae":
-        system = Dae(mechanism, start, np.zeros(4), no_force)
-    stepper = Stepper(system, method, SolverSpec(**solver), T_END)
-
-    def error(t: float, y: Array) -> Array:
-        q, q_dot = (y[:2], y[2:]) if formulation == "reduced" else (y[Q], y[4:][Q])
-        gap = np.abs(np.concatenate([q, q_dot]) - exact(t))
+    def error(t: float, q_tree: Array, v_tree: Array) -> Array:
+        gap = np.abs(np.concatenate([q_tree[Q], v_tree[Q]]) - exact(t))
         return np.array([gap[:2].max(), gap[2:].max()])
 
-    at_steps, between = [], []
-    while stepper.solver.status == "running":
-        step = stepper.step()
-        at_steps.append(error(step.t, stepper.solver.y))
-        if step.t - step.t_old > SHORTEST:
-            times = step.t_old + np.array([0.25, 0.5, 0.75]) * (step.t - step.t_old)
-            between += [error(t, step.interpolant(t)) for t in times]
-    return np.max(at_steps, axis=0), np.max(between, axis=0)
+    ends = steps_of(ready.loop, ready.begin, T_END)
+    starts = np.concatenate([[0.0], ends[:-1]])
+    told = ends - starts > SHORTEST
+    within = np.sort(np.concatenate([(starts + x * (ends - starts))[told] for x in (0.25, 0.5, 0.75)]))
+    found = []
+    for times in (ends, within):
+        rows = np.empty((len(times) + 1, ready.loop.width))
+        ready.begin()
+        ready.loop.record(times, rows)
+        assert ready.loop.advance(T_END, True, math.inf, math.inf)[0] == "end"
+        found.append(np.max([error(row[0], row[1:5], row[5:9]) for row in rows[: len(times)]], axis=0))
+    return found[0], found[1]
 
 
 @formulations
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])
-def test_errors_fall_with_the_tolerance(five_bar: Pair, exact: Exact, formulation: str, method: str) -> None:
+def test_errors_fall_with_the_tolerance(exact: Exact, formulation: str, method: str) -> None:
     """At steps and between: by more than half the decades that rtol falls, and never far above rtol itself."""
     tolerances = np.array([1e-4, 1e-6, 1e-8, 1e-10])
-    found = np.array([errors(five_bar, exact, formulation, method, rtol=rtol) for rtol in tolerances])
+    found = np.array([errors(exact, formulation, method=method, rtol=rtol) for rtol in tolerances])
     for of_q, of_q_dot in found.transpose(1, 2, 0):
         assert np.all(of_q <= 3 * tolerances)
         assert np.all(of_q_dot <= 20 * tolerances)  # rates reach 4 rad/s
-    assert np.all(found[1:] < 0.1 * found[:-1])
+    along = found.max(axis=1)
+    assert np.all(along[1:] < 0.1 * along[:-1])
 
 
 @formulations
-def test_outputs_of_Radau_between_steps_are_as_good_as_its_steps(
-    five_bar: Pair, exact: Exact, formulation: str
-) -> None:
-    """Its own interpolant is of order 3 and would be off by thousands of times as much."""
-    at_steps, between = errors(five_bar, exact, formulation, "Radau", rtol=1e-8)
+def test_outputs_of_Radau_between_steps_are_as_good_as_its_steps(exact: Exact, formulation: str) -> None:
+    """Its own interpolant is of the order of its stages, and would be off by more."""
+    at_steps, between = errors(exact, formulation, method="Radau", rtol=1e-8)
     assert np.all(between <= 15 * at_steps)
 
 

@@ -237,8 +237,8 @@ def test_closed_with_more_rows_than_it_takes(tmp_path: Path, loop: str, rows: in
 
 @pytest.mark.parametrize("name", ["delta", "stewart", "talos", "two_ur5"])
 def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
-    with pytest.raises(InputError, match=r"rotation of a free root is none; give spf_equation = 17"):
-        simulate(name, {"formulation": "spf", "solver.spf_equation": 8, "t_end": 0.01})
+    with pytest.raises(InputError, match='rotation of a free root is none; take "w"'):
+        simulate(name, {"formulation": "spf", "spf_coordinates": "z", "t_end": 0.01})
     assert simulate(name, {"formulation": "spf", "t_end": 0.01}).status == "done"
 
 

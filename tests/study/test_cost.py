@@ -55,19 +55,20 @@ def test_problem_of_a_scene_takes_its_controller_along() -> None:
 def test_iterations_are_those_of_the_integrator(
     problem: Problem, monkeypatch: pytest.MonkeyPatch, method: str, module: Any, name: str
 ) -> None:
-    counted = 0
+    counted, tried = 0, set[tuple[float, float]]()
     solve: Callable[..., Any] = getattr(module, name)
 
-    def counting(*args: Any) -> Any:
+    def counting(fun: Any, t: float, y: Any, h: float, *args: Any) -> Any:
         nonlocal counted
-        result = solve(*args)
+        result = solve(fun, t, y, h, *args)
         counted += result[1]
+        tried.add((t, h))
         return result
 
     monkeypatch.setattr(module, name, counting)
     outcome = march(problem.printed_spf(1e-3), method, 1e-5, SHORT)
     assert outcome.iterations is not None
-    slack = outcome.stats["rejected"] / 3 if method == "Radau" else 0
+    slack = (len(tried) - outcome.stats["steps"]) / 3 if method == "Radau" else 0
     assert counted <= outcome.iterations <= counted + slack
     assert counted > outcome.stats["steps"]
 
@@ -92,7 +93,7 @@ def test_explicit_right_hand_sides_grow_like_one_over_epsilon(problem: Problem) 
 
 @pytest.mark.parametrize("first", [1e-3, 1e-6, 1e-10])
 def test_loosest_tolerance_is_found_from_wherever_it_begins(problem: Problem, first: float) -> None:
-    search = Search(target=1e-8)
+    search = Search(target=2e-8)
     reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT)
     errors = [
         max(difference(reference, march(problem.reduced(), "DOP853", rtol, SHORT).terms)) for rtol in search.rtols
@@ -137,8 +138,8 @@ def test_budget_stops_and_smaller_epsilons_are_not_tried(problem: Problem) -> No
 
 
 def fake(problem: Problem, formulation: str, epsilon: float | None, seconds: float, newton: int) -> Cost:
-    stats = {"rhs": 100, "steps": 10, "rejected": 0, "newton": newton, "factorizations": 200, "jacobians": 0}
-    terms = problem.reduced().terms(0.0, problem.reduced().start())
+    stats = {"rhs": 100, "steps": 10, "newton": newton, "factorizations": 200, "jacobians": 0}
+    terms = problem.reduced().terms(0.0, problem.reduced().y0)
     return Cost(formulation, epsilon, "DOP853", 1e-6, 1e-7, Outcome(1.0, terms, stats, 0, seconds))
 
 

@@ -9,17 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.simulate import simulate
 from ckc_pin.study.report import growth, left_out, make
 from ckc_pin.study.report.growth_said import growth_said
 from ckc_pin.study.report.left_out import LeftOut, module_costs, modules_of, terms_of
 from ckc_pin.study.report.left_out_said import left_out_said
 from ckc_pin.study.report.pace import motion, seconds
 from ckc_pin.study.report.table import Table
+from tests.conftest import assert_close
 
 # --- what a scene leaves out ------------------------------------------------------------------------------------------
 
@@ -100,7 +102,7 @@ def test_the_section_says_what_was_measured() -> None:
     assert "- c/d: no such \\*robot\\*" in text
     assert "C' by 1 of 1 (+1 %)" in text
     assert "| a/b | 100 | +1.0 µs, 1 % |  |  |  |  | used |  | 2 |" in text
-    assert "| scipy.integrate | the solvers; `ckc_pin.terms` needs none | 500 | 1.0 | all |" in text
+    assert "| scipy.integrate | a second opinion by SciPy's solvers | 500 | 1.0 | all |" in text
 
 
 def test_a_scene_whose_robot_is_not_installed_is_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,19 +143,21 @@ def test_a_case_has_the_loops_and_freedoms_it_says(N: int, loops: int, tmp_path:
 def test_a_case_is_counted_and_timed() -> None:
     family = growth.FAMILIES[0]
     for formulation in growth.FORMULATIONS:
-        rows = [growth.measure(growth.Case(2, 2), family, formulation, backend, "k") for backend in growth.backends()]
-        assert all(row.reason == "" and row.rhs_s and row.x == 2 for row in rows)
-        assert rows[0].rhs is not None
-        assert rows[0].rhs > 50
+        row = growth.measure(growth.Case(2, 2), family, formulation, "k")
+        assert (row.reason, row.x) == ("", 2)
+        assert row.rhs_s is not None
+        assert row.rhs_s > 0
+        assert row.rhs is not None
+        assert row.rhs > 50
 
 
 def test_a_case_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "FORMULATIONS", {"dae": {"formulation": "dae", "solver.max_rhs": 20}})
-    stopped = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", growth.backends()[0], "k")
+    stopped = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", "k")
     assert stopped.rhs is None
     assert "max_rhs = 20" in stopped.reason
     monkeypatch.setattr(growth, "FORMULATIONS", {"dae": {"formulation": "none"}})
-    wrong = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", "python", "k")
+    wrong = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", "k")
     assert wrong.rhs_s is None
     assert "formulation" in wrong.reason
     text = "\n".join(growth_said([stopped, wrong], {}))
@@ -162,43 +166,40 @@ def test_a_case_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_right_hand_side_is_timed_where_it_is_called() -> None:
-    calls: list[float] = []
+    calls: list[tuple[np.ndarray, int]] = []
 
-    class Slow:
-        def start(self) -> np.ndarray:
-            return np.zeros(1)
-
-        def rhs(self, t: float, y: np.ndarray) -> np.ndarray:
-            calls.append(t)
-            return np.ones(1)
-
-    states = motion(Slow(), 2.0, states=5)
-    assert [t for t, _ in states] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
-    assert [float(y[0]) for _, y in states] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
-    calls.clear()
-    assert seconds(Slow(), states) > 0
-    assert set(calls) == {t for t, _ in states}
-
-
-def test_states_are_nearer_each_other_where_steps_overshoot() -> None:
-    class Stiff:
-        def start(self) -> np.ndarray:
-            return np.ones(1)
+    class Loop:
+        y = np.zeros(1)
 
         def rhs(self, t: float, y: np.ndarray) -> np.ndarray:
-            if abs(y[0]) > 10:
-                raise NumericalError("out of reach")
-            return -1e5 * y
+            return np.ones(1)
 
-    states = motion(Stiff(), 2.0, states=4)
-    assert [t for t, _ in states] == pytest.approx([0.0, 1e-5, 2e-5, 3e-5])
+        def seconds(self, states: np.ndarray, rounds: int) -> float:
+            calls.append((states, rounds))
+            return 1e-3 / rounds
+
+    states = motion(Loop())
+    assert states[:5, 0] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
+    assert states[:5, 1] == pytest.approx([0.0, 1e-4, 2e-4, 3e-4, 4e-4])
+    assert seconds(Loop()) == pytest.approx(1e-3 / 15)  # of 0.02 s a round
+    assert [rounds for _, rounds in calls] == [1, 15]
+    assert all(np.array_equal(timed, states) for timed, _ in calls)
+
+
+def test_the_states_that_are_timed_are_those_of_the_motion() -> None:
+    scene = load_scene("five_bar/swing", {"formulation": "reduced", "t_end": 0.0019, "solver.output_dt": 1e-4})
+    ready = prepare(scene)
+    ready.begin()
+    states, run = motion(ready.loop), simulate(scene)
+    q = [run.column(name) for name in run.independent]
+    assert_close(states[:, 0], run.t, 1e-15)
+    assert_close(states[:, 1:], np.hstack([run.q_tree[:, q], run.v_tree[:, q]]), 1e-8)
+    assert 0 < seconds(ready.loop) < 1e-2
 
 
 def test_exponents_are_in_the_sentences() -> None:
     rows = [
-        growth.Growth(
-            key=f"{x}", family="N", formulation="dae", backend=growth.backends()[0], x=x, rhs_s=1e-6 * x**2, rhs=100
-        )
+        growth.Growth(key=f"{x}", family="N", formulation="dae", x=x, rhs_s=1e-6 * x**2, rhs=100)
         for x in (1, 2, 4, 8, 16)
     ]
     text = "\n".join(growth_said(rows, {}))

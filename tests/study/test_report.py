@@ -95,8 +95,8 @@ def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> N
 
 
 def test_a_repeated_run_is_the_same_run() -> None:
-    """What is measured, warm and from a system made once more, is what a user's run computes."""
-    setting = ours.Setting("reduced", "DOP853", False, 1e-6)
+    """What is measured, warm and from a loop that has run before, is what a user's run computes."""
+    setting = ours.Setting("reduced", "DOP853", 1e-6)
     motion = ours.compute(SHORT, setting.changes, 60.0)
     run = simulate(SHORT.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6))
     assert np.array_equal(motion.q_tree, run.q_tree)
@@ -106,7 +106,7 @@ def test_a_repeated_run_is_the_same_run() -> None:
 
 
 def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
-    setting = ours.Setting("dae", "auto", False, 1e-8)
+    setting = ours.Setting("dae", "auto", 1e-8)
     row = judged("k", SHORT, ours.PROGRAM, setting.name, ours.compute(SHORT, setting.changes, 60.0), exact)
     assert row.error_max is not None
     assert row.error_max < 1e-7
@@ -138,18 +138,16 @@ def test_others_are_set_up_as_the_same_tree(work: str) -> None:
         assert bias < 1e-9
 
 
-def test_both_backends_are_measured_where_there_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ours, "unavailable", lambda: None)
-    both = list(ours.settings(quick=True))
-    assert len({setting.name for setting in both}) == len(both)
-    assert {setting.changes["solver.backend"] for setting in both} == {"auto", "python"}
-    native, python = ([one for one in both if one.in_python == here] for here in (False, True))
-    assert len(native) == 4 * len(ours.QUICK_TOLERANCES)
-    assert len(python) == 4 * len(ours.QUICK_FEW)
-    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    alone = list(ours.settings(quick=True))
-    assert len(alone) == len(native)
-    assert all("in Python" in setting.name for setting in alone)
+def test_every_formulation_is_measured_by_every_method() -> None:
+    quick, full = (list(ours.settings(quick=how)) for how in (True, False))
+    for every in (quick, full):
+        assert len({setting.name for setting in every}) == len(every)
+    assert len(quick) == 4 * len(ours.QUICK_TOLERANCES)
+    assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.FEW))
+    assert {setting.changes["solver.method"] for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
+    assert {setting.changes.get("spf_coordinates") for setting in full} == {None, "w", "z"}
+    for setting in full:
+        assert SHORT.load(**{name.replace(".", "__"): x for name, x in setting.changes.items()})
 
 
 def test_a_row_tells_its_setting() -> None:
@@ -160,7 +158,7 @@ def test_a_row_tells_its_setting() -> None:
 def test_a_reason_is_no_list_of_coordinates() -> None:
     """The reduced model of squares in a row stops where they lie flat, and says near which coordinates."""
     flat = replace(EVERY["n_four_bar_4"], t_end=2.0)
-    stopped = ours.compute(flat, ours.Setting("reduced", "DOP853", True, 1e-6).changes, 60.0)
+    stopped = ours.compute(flat, ours.Setting("reduced", "DOP853", 1e-6).changes, 60.0)
     assert stopped.status == "stopped"
     assert re.match(r"stopped at t = 0\.\d+ s: J loses rank at t = 0\.7179\d+ s", stopped.reason)
     assert "theta" not in stopped.reason
@@ -170,8 +168,7 @@ def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
-    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
-    monkeypatch.setattr(make, "BUDGET", Budget(native=1e-6, python=1e-6, peer=1e-6))
+    monkeypatch.setattr(make, "BUDGET", Budget(own=1e-6, peer=1e-6))
     rows = list(make._Measured(SHORT, Table(tmp_path / "t.csv", Row), lambda said: None).ours(quick=True))
     first, second = rows[:2]
     assert first.status == "stopped"
@@ -295,7 +292,6 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make, "WORKS", (SHORT, away))
     monkeypatch.setattr(make, "peers", lambda: [*peers()[:1], Nobody(), Breaks()])
     monkeypatch.setattr(ours, "QUICK_METHODS", {"auto": (1e-3, 1e-6)})
-    monkeypatch.setattr(ours, "unavailable", lambda: "not built")
     monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.QUICK_STEPS", 1)
     monkeypatch.setattr("ckc_pin.study.report.peers.mujoco.SOFT_STEPS", 1)
     monkeypatch.setattr(left_out, "MODULES", {"json": ("import json", "an example"), "no_such": ("import no_such", "")})
@@ -308,8 +304,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     measured: list[str] = []
     found = make.report(tmp_path / "r", quick=True, progress=measured.append)
     assert len(found.rows["short"]) == 4 * 2 + 5 + 1
-    grown = 3 * len(growth.backends())
-    assert len(measured) == 1 + 14 + grown + 3
+    assert len(measured) == 1 + 14 + 3 + 3
     tables = ["report.csv", "growth.csv", "left_out.csv"]
     figures = [f"{name}.{kind}" for name in ("report", "growth", "short") for kind in ("png", "svg")]
     assert [path.name for path in found.files] == ["report.html", "report.md", *tables, *figures]
@@ -318,7 +313,7 @@ def test_a_report_is_gone_on_with(tmp_path: Path, tiny: None) -> None:
     text = (tmp_path / "r" / "report.md").read_text(encoding="utf-8")
     assert "Nobody : not compared, not installed: pip install nobody." in text
     assert "Breaks 0.1: it agrees." in text
-    assert "A run may take 1.5 s here, 0.8 s in Python and 2 s in another program" in text
+    assert "A run may take 1.5 s here and 2 s in another program" in text
     assert "- Not measured: robots that are away, no mechanism 'no_such'; shipped: " in text
     html = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
     assert html.count('src="data:image/png;base64,') == 3

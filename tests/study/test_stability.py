@@ -168,7 +168,7 @@ def test_a_crash_and_a_case_that_cannot_be_run_have_failed(monkeypatch: pytest.M
 
 def some_cells() -> list[Cell]:
     def cell(verdict: str, **more: object) -> Cell:
-        return Cell("mass", "a|b", "spf", "auto: BDF", 1e-8, "by hand", verdict, **more)  # type: ignore[arg-type]
+        return Cell("mass", "a|b", "spf", "auto: Radau", 1e-8, "by hand", verdict, **more)  # type: ignore[arg-type]
 
     within = [cell("within", error=1e-9, allowed=1e-5, uncertainty=1e-12, rhs=12)] * 9
     return [*within, cell("stopped", t=0.5, message="why it stopped")]

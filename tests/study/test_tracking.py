@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.control import Tracking
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import load_scene
 from ckc_pin.study import tracking
 from ckc_pin.study import tracking_experiments as experiments
-from ckc_pin.study.deviations import PERIOD, Deviation, FromLast, OwnSigma, Track, deviation, instants, track
-from ckc_pin.study.tracking_experiments import EXACT, SCENE, SETTINGS, W0, Setting, lyapunov_along, off_manifold
+from ckc_pin.study.deviations import PERIOD, Deviation, FromLast, OwnSigma, Setting, Track, deviation, instants, track
+from ckc_pin.study.experiment import Problem
+from ckc_pin.study.tracking_experiments import EXACT, SCENE, SETTINGS, W0, lyapunov_along, off_manifold
 from ckc_pin.study.tracking_identities import (
     Skewness,
     _defect,
@@ -217,12 +216,10 @@ def test_periodic_and_irregular_deviations_are_told_apart() -> None:
 
 
 def own_sigma(tolerance: float) -> tuple[OwnSigma, Terms]:
-    scene = load_scene(SCENE)
-    mechanism = scene_mechanism(scene)
-    inner = scene_controller(scene, mechanism)
-    assert isinstance(inner, Tracking)
-    start = mechanism.kinematics(FIVE_BAR.equilibrium())
-    return OwnSigma(inner, FromLast(mechanism, start, tolerance)), Terms(mechanism, start, np.zeros(4))
+    problem = Problem.of_scene(load_scene(SCENE))
+    start = problem.mechanism.kinematics(FIVE_BAR.equilibrium())
+    sigma = FromLast(problem.mechanism, start, tolerance)
+    return OwnSigma(problem.force, sigma), Terms(problem.mechanism, start, np.zeros(4))
 
 
 def test_a_controllers_own_sigma_keeps_its_z_within_the_tolerance() -> None:
@@ -235,8 +232,9 @@ def test_a_controllers_own_sigma_keeps_its_z_within_the_tolerance() -> None:
         controller, start = own_sigma(tolerance)
         assert_close(controller.sigma.keep(start.q).q_tree, FIVE_BAR.equilibrium(), 1e-12)
         at = start.mechanism.kinematics(moved)
-        u = controller.u(0.3, Terms(start.mechanism, at, at.rho @ q_dot))
-        assert_close(u, numpy_tracking(FIVE_BAR)(0.3, z_from, q_dot), 1e-10)
+        u_tree = controller(0.3, Terms(start.mechanism, at, at.rho @ q_dot))
+        assert_close(u_tree[Q], numpy_tracking(FIVE_BAR)(0.3, z_from, q_dot), 1e-10)
+        assert_close(u_tree[Z], 0.0, 0.0)
     right, wrong = (numpy_tracking(FIVE_BAR)(0.3, x, q_dot) for x in (moved, stale))
     assert np.abs(right - wrong).max() > 1e-3
 
@@ -244,11 +242,11 @@ def test_a_controllers_own_sigma_keeps_its_z_within_the_tolerance() -> None:
 def test_under_a_shared_loose_sigma_only_the_start_is_felt_in_q_and_the_controllers_own_goes_on_deviating() -> None:
     times = np.linspace(0.0, 0.4, 9)
     exact, shared, own = (
-        track(SCENE, changes, times, **loose)
-        for changes, loose in (
-            (EXACT, {}),
-            ({**EXACT, "solver.rtol": 1e-8}, {"tolerance": 1e-2}),
-            ({**EXACT, "solver.method": "RK45", "solver.rtol": 1e-3}, {"own": 1e-2}),
+        track(SCENE, setting, times)
+        for setting in (
+            EXACT,
+            replace(EXACT, rtol=1e-8, tolerance=1e-2),
+            replace(EXACT, method="RK45", rtol=1e-3, own=1e-2),
         )
     )
     assert exact.open < 1e-12
@@ -271,10 +269,10 @@ def test_eq_8_and_the_reduced_model_track_like_numpy() -> None:
 
     y0 = np.concatenate([FIVE_BAR.equilibrium()[Q], np.zeros(2)])
     expected = solve_ivp(rate, (0.0, 0.2), y0, t_eval=times, method="Radau", rtol=1e-9, atol=1e-11).y[:2].T
-    for changes in (EXACT, next(iter(SETTINGS["nothing"].values())).changes):
-        assert_close(track(SCENE, changes, times).q, expected, 1e-7)
+    for setting in (EXACT, next(iter(SETTINGS["nothing"].values()))):
+        assert_close(track(SCENE, setting, times).q, expected, 1e-7)
     with pytest.raises(InputError, match="a scene with a controller is needed"):
-        track("five_bar/swing", EXACT, times, own=1e-2)
+        track("five_bar/swing", EXACT, times)
 
 
 # --- the claims --------------------------------------------------------------------------------------------------
@@ -336,10 +334,10 @@ def test_verdict_on_deviations_follows_the_numbers(
 def test_deviations_are_measured_from_the_exact_run(monkeypatch: pytest.MonkeyPatch) -> None:
     tracks: list[tuple[object, object]] = []
 
-    def fake(scene: str, changes: object, times: Array, *, tolerance: object = None, own: object = None) -> Track:
-        tracks.append((tolerance, own))
+    def fake(scene: str, setting: Setting, times: Array) -> Track:
+        tracks.append((setting.tolerance, setting.own))
         q_d = np.array([desired(float(t))[0] for t in times])
-        return Track(q_d + (0.25 if changes is EXACT else 0.375 + 0.125 * np.sin(times)[:, None]), 0.0)
+        return Track(q_d + (0.25 if setting is EXACT else 0.375 + 0.125 * np.sin(times)[:, None]), 0.0)
 
     monkeypatch.setattr(experiments, "track", fake)
     own = SETTINGS["controller's sigma"]

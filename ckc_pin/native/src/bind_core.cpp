@@ -1,6 +1,8 @@
 // A mechanism from Python's tables, and its terms.
 #include <limits>
 
+#include <nanobind/stl/unique_ptr.h>
+
 #include "checks.hpp"
 #include "core.hpp"
 
@@ -29,17 +31,13 @@ std::vector<Vector3> triples(const Matrix& table, const char* what) {
   return list;
 }
 
-template <class T>
-T get(const nb::dict& table, const char* key) {
-  require(table.contains(key), std::string("table: no key ") + key);
-  return nb::cast<T>(table[key]);
-}
-
 Matrix3 matrix3(const Matrix& rows, Eigen::Index k) {
   Matrix3 m;
   for (int i = 0; i < 3; ++i) m.row(i) = rows.row(k).segment<3>(3 * i);
   return m;
 }
+
+}  // namespace
 
 Closure closure_of(const nb::dict& table) {
   Closure c;
@@ -67,6 +65,8 @@ Closure closure_of(const nb::dict& table) {
   return c;
 }
 
+namespace {
+
 SpringTable springs_of(const nb::dict& table) {
   SpringTable s;
   s.point_joint = get<Indices>(table, "point_joint");
@@ -81,54 +81,44 @@ SpringTable springs_of(const nb::dict& table) {
   return s;
 }
 
+}  // namespace
+
+std::unique_ptr<Core> core_of(const nb::dict& table) {
+  Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
+  auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
+                                     closure_of(nb::cast<nb::dict>(table["closure"])),
+                                     springs_of(nb::cast<nb::dict>(table["springs"])), get<int>(table, "rank"), scales);
+  require(core->scales.rows, core->rows.closure.rows, "row_scale"), require(core->scales.columns, core->n, "column_scale");
+  const auto q = get<Indices>(table, "q"), z = get<Indices>(table, "z");
+  require_partition(*core, q, z);
+  core->split(q, z);
+  return core;
+}
+
+namespace {
+
 // Everything at one state, for comparison.
 nb::dict terms(Core& core, Given q_tree, Given v_tree) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-  core.set(q_tree), core.factor(), core.reduce(), core.inertia(), core.bias(v_tree);
+  core.set(q_tree), core.inertia(), core.bias(v_tree), core.coriolis();
   nb::dict found;
-  found["phi"] = core.rows.phi, found["J"] = core.rows.J, found["rho"] = core.rho, found["D"] = core.D;
-  found["bias_tree"] = core.bias_tree, found["J_dot_v"] = core.J_dot_v;
-  Matrix D_tree(core.n, core.n), C(core.d, core.d), rho_dot = Matrix::Zero(core.n, core.d);
-  for (int k = 0; k < core.n; ++k) core.D_times(Vector::Unit(core.n, k), D_tree.col(k));
-  found["D_tree"] = D_tree;
-  core.coriolis();
-  found["C_tree"] = core.C_tree, found["h_tree"] = core.h_tree, found["J_dot"] = core.rows.J_dot;
-  Vector h(core.d), z(core.z.size());
-  for (int k = 0; k < core.d; ++k) {
-    core.C_times(Vector::Unit(core.d, k), C.col(k));
-    core.solve_z(-core.rows.J_dot * core.rho.col(k), z);
-    for (size_t i = 0; i < core.z.size(); ++i) rho_dot(core.z[i], k) = z(i);
-  }
-  core.reduced(core.h_tree, h);
-  found["C"] = C, found["rho_dot"] = rho_dot, found["h"] = h;
+  for (const char* name : {"phi", "J", "rho", "D_tree", "D", "bias_tree", "C_tree", "h_tree", "C", "rho_dot", "h"})
+    found[name] = term_of(core, name);
+  found["J_dot_v"] = core.J_dot_v, found["J_dot"] = core.rows.J_dot;
   return found;
-}
-
-Vector phi(Core& core, Given q_tree) {
-  require(q_tree, core.tree.nq, "q_tree");
-  core.set(q_tree);
-  return core.rows.phi;
 }
 
 Matrix jacobian(Core& core, Given q_tree) {
   require(q_tree, core.tree.nq, "q_tree");
-  core.set(q_tree), core.rows.jacobian(core.tree);
+  core.set(q_tree), core.jacobian();
   return core.rows.J;
-}
-
-nb::tuple jacobians(Core& core, Given q_tree, Given v_tree) {
-  require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-  core.set(q_tree), core.rows.jacobian(core.tree), core.bias(v_tree);
-  core.rows.jacobian_dot(core.tree, core.tree.jacobian_rate(q_tree, v_tree));
-  return nb::make_tuple(core.rows.J, core.rows.J_dot);
 }
 
 Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree, Given u_tree, bool actual) {
   require(q_tree, core.tree.nq, "q_tree"), require(q_dot, core.d, "q_dot");
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
   Vector q_ddot(core.d);
-  core.set(q_tree), core.factor(), core.reduce(), core.inertia();
-  core.bias(v_tree);
+  core.set(q_tree), core.inertia(), core.bias(v_tree);
   if (actual) {
     core.coriolis();
     core.actual_acceleration(u_tree, q_dot, q_ddot);
@@ -142,7 +132,7 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   require(u_tree, core.n, "u_tree"), require(correction, core.rows.closure.rows, "correction");
   Vector acceleration(core.n);
-  core.set(q_tree, true), core.rows.jacobian(core.tree), core.bias(v_tree);
+  core.set(q_tree, true), core.jacobian(), core.bias(v_tree);
   if (!core.dae_acceleration(u_tree, correction, acceleration))
     acceleration.setConstant(std::numeric_limits<double>::quiet_NaN());
   return acceleration;
@@ -150,25 +140,48 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
 
 }  // namespace
 
+nb::object term_of(Core& core, const std::string& name) {
+  if (name == "phi") return nb::cast(core.rows.phi);
+  if (name == "J") return core.jacobian(), nb::cast(core.rows.J);
+  if (name == "rho") return core.reduce(), nb::cast(core.rho);
+  if (name == "D") return core.inertia(), nb::cast(core.D);
+  if (name == "bias_tree") return nb::cast(core.bias_tree);
+  if (name == "potential_energy")
+    return nb::cast(core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree));
+  if (name == "D_tree") {
+    core.tree_inertia();
+    Matrix D_tree(core.n, core.n);
+    for (int k = 0; k < core.n; ++k) core.D_times(Vector::Unit(core.n, k), D_tree.col(k));
+    return nb::cast(D_tree);
+  }
+  core.reduce(), core.tree_inertia(), core.coriolis();
+  if (name == "C_tree") return nb::cast(core.C_tree);
+  if (name == "h_tree") return nb::cast(core.h_tree);
+  Vector x(core.d);
+  if (name == "h") return core.reduced(core.h_tree, x), nb::cast(x);
+  Matrix of_q(core.d, core.d), of_tree(core.n, core.d);
+  for (int k = 0; k < core.d; ++k) {
+    x = Vector::Unit(core.d, k);
+    if (name == "C")
+      core.C_times(x, of_q.col(k));
+    else
+      core.rho_dot_times(x, of_tree.col(k));
+  }
+  if (name == "C") return nb::cast(of_q);
+  require(name == "rho_dot", "term: no " + name);
+  return nb::cast(of_tree);
+}
+
 void bind_core(nb::module_& m) {
   nb::class_<Core>(m, "Core")
-      .def("__init__",
-           [](Core* self, const std::string& model, const Indices& place, const nb::dict& closure,
-              const nb::dict& springs, int rank, const Indices& q, const Indices& z) {
-             new (self) Core(model, place, closure_of(closure), springs_of(springs), rank);
-             require_partition(*self, q, z);
-             self->split(q, z);
-           },
-           "model"_a, "place"_a, "closure"_a, "springs"_a, "rank"_a, "q"_a, "z"_a)
+      .def(nb::new_(&core_of), "table"_a)
       .def("split",
            [](Core& core, const Indices& q, const Indices& z) {
              require_partition(core, q, z);
              core.split(q, z);
            },
            "q"_a, "z"_a)
-      .def("phi", &phi, "q_tree"_a)
       .def("jacobian", &jacobian, "q_tree"_a)
-      .def("jacobians", &jacobians, "q_tree"_a, "v_tree"_a)  // J and J_dot
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)
       .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a);

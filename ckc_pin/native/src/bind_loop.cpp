@@ -1,13 +1,12 @@
-// The step loop as Python sees it. It runs without the interpreter's lock.
+// The step loop as Python sees it. It runs without the interpreter's lock, but for callers' functions.
+#include <algorithm>
+#include <chrono>
 #include <cmath>
-#include <memory>
 
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/vector.h>
+#include <nanobind/stl/unique_ptr.h>
 
-#include "bdf.hpp"
-#include "checks.hpp"
-#include "loop.hpp"
+#include "bind_run.hpp"
+#include "printed_spf.hpp"
 
 namespace ckc {
 
@@ -15,159 +14,228 @@ using namespace nb::literals;
 
 namespace {
 
-// A loop with all it works on.
-struct Run {
-  Run(System& system_, std::unique_ptr<Method> method_, Watch watch_, std::unique_ptr<Leap> leap, double closed)
-      : system(system_), method(std::move(method_)), watch(std::move(watch_)),
-        crossing(system_, *method, watch, std::move(leap), closed), record(system_.core),
-        loop(system_, *method, watch, crossing, record) {}
+using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-  System& system;
-  std::unique_ptr<Method> method;
-  Watch watch;
-  Crossing crossing;
-  Record record;
-  Loop loop;
-};
+constexpr const char* reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
+                                   "rank", "chart", "control", "function",   "output",      "raised"};
+constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control"};
+constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
-// `t_old`, `y_old`: where the last step began.
-void begin(Run& run, double t, Given y, Given f, double h_abs, double t_old, Given y_old) {
-  require(y, run.system.size, "y"), require(f, run.system.size, "f"), require(y_old, run.system.size, "y_old");
-  require(std::isfinite(t) && h_abs > 0, "a time and a positive step are needed");
-  Method& method = *run.method;
-  method.t = t, method.y = y, method.f = f, method.h_abs = h_abs;
-  method.t_old = t_old, method.y_old = y_old;
-  run.crossing.begin();
+std::unique_ptr<System> system_of(Core& core, Control& control, const nb::dict& table) {
+  const auto kind = get<std::string>(table, "kind");
+  const double tolerance = get<double>(table, "tolerance");
+  require(tolerance > 0, "tolerance must be positive");
+  if (kind == "dae") {
+    const double alpha = get<double>(table, "alpha"), beta = get<double>(table, "beta");
+    require(alpha >= 0 && beta >= 0, "alpha and beta must not be negative");
+    return std::make_unique<Dae>(core, control, tolerance, get<bool>(table, "projects"), alpha, beta);
+  }
+  const double epsilon = get<double>(table, "epsilon");
+  const bool actual = get<bool>(table, "actual");
+  require(epsilon > 0, "epsilon must be positive");
+  if (kind == "level_set")
+    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "slack"));
+  require(kind == "printed" && core.tree.roots.empty(), "eq. 8 as printed has no free root: its place is no number");
+  return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
 
-Bdf& bdf_of(Run& run) {
-  Bdf* bdf = dynamic_cast<Bdf*>(run.method.get());
-  require(bdf, "differences: the method is not BDF");
-  return *bdf;
-}
-
-// BDF's memory: differences, a row each, order, steps of one length, and the Jacobian.
-void remember(Run& run, Matrix D, int order, int equal, Matrix J) {
-  Bdf& bdf = bdf_of(run);
-  const auto size = run.system.size;
-  require(order >= 1 && order <= Bdf::most && equal >= 0, "differences: an order of 1 to 5 is needed");
-  require(D.rows() == Bdf::most + 3 && D.cols() == size && D.topRows(order + 1).allFinite(),
-          "differences: eight rows are needed, as long as y");
-  require_square(J, size, "J");
-  bdf.now.D = D.transpose(), bdf.now.order = order, bdf.now.equal = equal, bdf.J = J;
-}
-
-nb::tuple memory(Run& run) {
-  const Bdf& bdf = bdf_of(run);
-  return nb::make_tuple(Matrix(bdf.now.D.transpose()), bdf.now.order, bdf.now.equal, bdf.J);
-}
-
-// `table`: DOP853's coefficients, BDF's tolerance of Newton's method.
-std::unique_ptr<Method> method_of(const std::string& name, nb::handle table, Tolerance tolerance, int size) {
-  if (name == "DOP853") return std::make_unique<Dop853>(nb::cast<Dop853::Table>(table), tolerance, size);
-  require(name == "BDF", "method: DOP853 or BDF");
-  return std::make_unique<Bdf>(tolerance, nb::cast<double>(table), size);
-}
-
-std::unique_ptr<Leap> leap_of(System& system, const nb::list& tables) {
-  if (nb::len(tables) == 0) return nullptr;
-  Dae* dae = dynamic_cast<Dae*>(&system);
-  require(dae && dae->crosses && nb::len(tables) == 2, "leap: two tables and a DAE that is projected are needed");
-  return std::make_unique<Leap>(*dae, nb::cast<Leap::Table>(tables[0]), nb::cast<Leap::Table>(tables[1]));
-}
-
-void make_table(Leap::Table* table, Vector nodes, Matrix at_nodes, Matrix at_places, Matrix integration,
-                Matrix derivation) {
-  const auto stages = nodes.size();
-  const auto fits = [&](const Matrix& a, Eigen::Index rows, Eigen::Index columns) {
-    return a.rows() == rows && a.cols() == columns;
+// (of, coordinate, value, sign, direction, stop, floor, function or None)
+Event event_of(const nb::tuple& row, const Core& core, const std::shared_ptr<View>& view) {
+  const int of = nb::cast<int>(row[0]), coordinate = nb::cast<int>(row[1]);
+  require(of >= Event::q && of <= Event::function, "event: of what?");
+  require_indices({coordinate}, core.n, "event");
+  Event event{static_cast<Event::Of>(of), coordinate,           nb::cast<double>(row[2]), nb::cast<double>(row[3]),
+              nb::cast<int>(row[4]),      nb::cast<bool>(row[5]), nb::cast<double>(row[6]), {}};
+  if (event.of != Event::function) return event;
+  auto function = std::make_shared<nb::object>(row[7]);
+  event.call = [function, view](double t, System& system, double& value) {
+    nb::object answer;
+    Problem& problem = system.control.problem;
+    if (!view->call(*function, system.measured(t), problem, answer)) return false;
+    nb::gil_scoped_acquire acquired;
+    if (nb::isinstance<nb::str>(answer))
+      problem.says = nb::cast<std::string>(answer);
+    else
+      value = nb::cast<double>(answer);
+    answer.reset();
+    return problem.says.empty();
   };
-  require(stages > 0 && fits(at_nodes, stages + 1, stages) && at_places.rows() == stages + 1 &&
-              fits(integration, stages, stages + 1) && fits(derivation, stages + 1, stages),
-          "leap: matrices of one number of stages are needed");
-  new (table) Leap::Table{std::move(nodes), std::move(at_nodes), std::move(at_places), std::move(integration),
-                          std::move(derivation)};
+  return event;
 }
 
-// (why, rows): the instants recorded, a row each.
-nb::tuple go(Run& run, double t_bound, double min_step, long most_rhs, double seconds,
-             double last_output, bool fine, Given times, long most_rows) {
-  Matrix rows(run.record.width, most_rows);
-  Vector instants = times;
-  Eigen::Index due = 0, filled = 0;
-  Why why;
+void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
+          const nb::list& events) {
+  new (self) Run;
+  self->core = core_of(core);
+  auto acting = control_of(control, *self->core, self->view);
+  auto system = system_of(*self->core, *acting, formulation);
+  const Options options{get<std::string>(solver, "method"), get<double>(solver, "rtol"),   get<double>(solver, "atol"),
+                        get<double>(solver, "max_step"),    get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
+                        get<double>(solver, "closed")};
+  require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
+  std::vector<Event> watched;
+  for (const auto& row : events) watched.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
+  self->core->tally.on = get<bool>(solver, "profile");
+  self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(watched));
+}
+
+void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {
+  const Core& core = *run.core;
+  require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(w, core.rows.closure.rows, "w");
+  require(std::isfinite(t), "t: a number is not finite");
+  run.view->calls = 0;
+  run.loop->start(t, q_tree, v_tree, w);
+}
+
+void record(Run& run, Given instants, Rows rows) {
+  require(instants, instants.size(), "instants");
+  require(rows.shape(1) == static_cast<size_t>(run.loop->recorder.width), "rows: another width");
+  run.rows = nb::cast(rows);
+  run.loop->record(instants, rows.data(), static_cast<Eigen::Index>(rows.shape(0)));
+}
+
+// (why, t, value, event, filled rows)
+nb::tuple advance(Run& run, double until, bool final, double pause, double budget) {
+  Stop stop;
   {
     nb::gil_scoped_release released;
-    why = run.loop.run({t_bound, min_step, most_rhs, seconds, last_output, fine}, instants, due, rows, filled);
+    stop = run.loop->advance(until, final, pause, budget);
   }
-  const char* names[] = {"finished", "pause", "python"};
-  return nb::make_tuple(names[static_cast<int>(why)], Matrix(rows.leftCols(filled).transpose()));
+  if (stop.why == Stop::raised) {
+    run.loop->control->problem = {};
+    std::rethrow_exception(std::exchange(run.view->raised, nullptr));
+  }
+  return nb::make_tuple(reasons[stop.why], stop.t, stop.value, stop.which, run.loop->recorder.filled);
+}
+
+// The present state, closed: (t, an array of q', velocity, v' of the terms and w, q, z); none where that does not exist.
+nb::object state(Run& run) {
+  Loop& loop = *run.loop;
+  if (!loop.settle_core()) return nb::none();
+  System& system = *loop.system;
+  const Vector* parts[] = {&run.core->q_tree, &system.velocity, &system.v_tree, &system.w};
+  size_t size = 0;
+  for (const Vector* x : parts) size += x->size();
+  double* place;
+  nb::object numbers = array(size, place);
+  for (const Vector* x : parts) place = std::copy(x->data(), x->data() + x->size(), place);
+  run.places.are(*run.core);
+  return nb::make_tuple(loop.now.t, numbers, run.places.q, run.places.z);
+}
+
+// Why no step could be made: (trouble, what a controller says, its u, phi_z's least singular value and that over |J|,
+// the core's q', q, z).
+nb::tuple trouble(Run& run) {
+  Loop& loop = *run.loop;
+  const Problem& problem = loop.control->problem;
+  const std::string why = troubles[static_cast<int>(loop.system->trouble)], says = problem.says;
+  const Vector u = problem.u;
+  const bool here = loop.settle_core(), of_q = loop.control->acts() || std::isfinite(loop.system->margin());
+  const double margin = here && of_q ? loop.system->phi_z_margin() : std::nan("");
+  const double size = here ? run.core->rows.J.norm() : std::nan("");
+  return nb::make_tuple(why, says, u, margin * size, margin, Vector(run.core->q_tree), run.core->q, run.core->z);
+}
+
+nb::dict stats(const Run& run) {
+  const Loop& loop = *run.loop;
+  const Counts& counts = loop.system->counts;
+  nb::dict found, by_method;
+  long steps = 0;
+  for (int k = 0; k < 3; ++k) {
+    steps += loop.steps[k];
+    if (loop.steps[k]) by_method[methods[k]] = loop.steps[k];
+  }
+  found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
+  found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
+  found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;
+  found["method"] = loop.method() ? loop.method()->name() : "";
+  found["steps_by_method"] = by_method, found["python_calls"] = run.view->calls;
+  return found;
+}
+
+nb::list met(const Run& run) {
+  nb::list found;
+  for (const Crossed& crossed : run.loop->events.met)
+    found.append(nb::make_tuple(crossed.t, crossed.event, crossed.direction));
+  return found;
+}
+
+nb::dict profile(const Run& run) {
+  nb::dict found;
+  const Tally& tally = run.core->tally;
+  for (int k = 0; k < Tally::terms; ++k)
+    if (tally.calls[k]) found[Tally::names[k]] = nb::make_tuple(tally.calls[k], tally.seconds[k]);
+  return found;
+}
+
+// y' at the present state of the system with another (q', v') put in; for tests and timings.
+nb::object rhs(Run& run, double t, Given y) {
+  System& system = *run.loop->system;
+  require(y, system.size, "y");
+  Vector y_dot(system.size);
+  return system.rhs(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
+}
+
+nb::object jacobian(Run& run, double t, Given y) {
+  System& system = *run.loop->system;
+  require(y, system.size, "y");
+  Vector f(system.size);
+  Matrix found;
+  long evaluations = 0;
+  const bool exists = system.rhs(t, y, f) && system.jacobian(t, y, f, found, evaluations);
+  return exists ? nb::cast(found) : nb::none();
+}
+
+// Seconds of a right-hand side as the loop calls it, the least of several rounds over states: rows of (t, y).
+double seconds(Run& run, Table states, int rounds) {
+  System& system = *run.loop->system;
+  require(states.cols() == 1 + system.size && states.rows() > 0 && rounds > 0, "states: rows of (t, y) are needed");
+  const Matrix columns = states.transpose();
+  Vector y_dot(system.size);
+  double least = std::numeric_limits<double>::infinity();
+  nb::gil_scoped_release released;
+  for (int round = 0; round < rounds; ++round) {
+    const auto start = std::chrono::steady_clock::now();
+    for (Eigen::Index k = 0; k < columns.cols(); ++k)
+      require(system.rhs(columns(0, k), columns.col(k).tail(system.size), y_dot), "states: no right-hand side there");
+    least = std::min(least, std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
+  }
+  return least / static_cast<double>(columns.cols());
 }
 
 }  // namespace
 
 void bind_loop(nb::module_& m) {
-  nb::class_<Dop853::Table>(m, "Dop853Table")
-      .def("__init__",
-           [](Dop853::Table* table, Matrix A, Matrix A_extra, Matrix D, Vector B, Vector C, Vector C_extra, Vector E3,
-              Vector E5) {
-             new (table) Dop853::Table{std::move(A), std::move(A_extra), std::move(D),  std::move(B),
-                                       std::move(C), std::move(C_extra), std::move(E3), std::move(E5)};
+  nb::class_<View>(m, "View").def("term", &View::term, "stamp"_a, "name"_a);
+  nb::class_<Run> loop(m, "Loop");
+  loop.def("__init__", &make, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a)
+      .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
+      .def("hold",
+           [](Run& run, nb::handle u) {
+             Vector held(run.core->d);
+             require(read(u, held), "u: an array of d doubles is needed");
+             const bool finite = held.allFinite();
+             if (finite) run.loop->hold(held);
+             return finite;
            },
-           "A"_a, "A_extra"_a, "D"_a, "B"_a, "C"_a, "C_extra"_a, "E3"_a, "E5"_a);
-  nb::class_<Leap::Table>(m, "LeapTable")
-      .def("__init__", &make_table, "nodes"_a, "at_nodes"_a, "at_places"_a, "integration"_a, "derivation"_a);
-  nb::class_<Run>(m, "Loop")
-      .def("__init__",
-           [](Run* self, System& system, const std::string& method, nb::handle table, double rtol, double atol, double max_step,
-              Given row_scale, Given column_scale, const nb::list& leap, double closed) {
-             const Core& core = system.core;
-             require(row_scale, core.rows.closure.rows, "row_scale"), require(column_scale, core.n, "column_scale");
-             require(rtol > 0 && atol > 0 && max_step > 0, "tolerances must be positive");
-             new (self) Run(system, method_of(method, table, {rtol, atol, max_step}, system.size),
-                            Watch(core, row_scale, column_scale), leap_of(system, leap), closed);
-           },
-           nb::keep_alive<1, 2>(), "system"_a, "method"_a, "table"_a, "rtol"_a, "atol"_a, "max_step"_a, "row_scale"_a,
-           "column_scale"_a, "leap"_a, "closed"_a)
-      .def("rank",
-           [](Run& run, Given y) {  // (value, rate) at a state, as closed as it is
-             require(y, run.system.size, "y");
-             require(run.system.at_last(0.0, y), "y: the core cannot be set from it");
-             const Watch::Rank found = run.watch.rank(run.system);
-             return nb::make_tuple(found.value, found.rate);
-           },
-           "y"_a)
-      .def_prop_rw(
-          "chart_margin", [](const Run& run) { return run.watch.chart_margin; },
-          [](Run& run, double margin) { run.watch.chart_margin = margin; })
-      .def("begin", &begin, "t"_a, "y"_a, "f"_a, "h_abs"_a, "t_old"_a, "y_old"_a)
-      .def("remember", &remember, "D"_a, "order"_a, "equal"_a, "J"_a)
-      .def("memory", &memory)
-      .def("go", &go, "t_bound"_a, "min_step"_a, "most_rhs"_a, "seconds"_a, "last_output"_a, "fine"_a,
-           "times"_a, "most_rows"_a)
-      .def_prop_rw(
-          "growing", [](const Run& run) { return run.method->growing; },
-          [](Run& run, bool growing) { run.method->growing = growing; })
-      .def_prop_ro("t", [](const Run& run) { return run.method->t; })
-      .def_prop_ro("y", [](const Run& run) { return Vector(run.method->y); })
-      .def_prop_ro("f", [](const Run& run) { return Vector(run.method->f); })
-      .def_prop_ro("h_abs", [](const Run& run) { return run.method->h_abs; })
-      .def_prop_ro("before", [](const Run& run) { return nb::make_tuple(run.method->t_old, Vector(run.method->y_old)); })
-      .def_prop_ro("length", [](const Run& run) { return run.loop.length; })
-      .def_prop_ro("ahead", [](const Run& run) { return run.loop.ahead; })
-      .def("crossings", [](Run& run) { return nb::cast(std::exchange(run.loop.crossings, {})); })  // since the last time
-      .def_prop_rw(
-          "end",
-          [](const Run& run) { return nb::make_tuple(run.loop.end.value, run.loop.end.rate); },
-          [](Run& run, std::pair<double, double> end) {
-            run.loop.end = {end.first, end.second}, run.loop.begun = true;
-          })
-      .def("counts", [](Run& run) {  // since the last time: steps, refused ones, evaluations, Jacobians, factorizations of its own
-        Method& method = *run.method;
-        const auto found = nb::make_tuple(run.loop.steps, method.rejected, method.rhs, method.jacobians, method.lu);
-        run.loop.steps = method.rejected = method.rhs = method.jacobians = method.lu = 0;
-        return found;
-      });
+           "u"_a)
+      .def("record", &record, "instants"_a, "rows"_a)
+      .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
+      .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)
+      .def("state", &state)
+      .def("trouble", &trouble)
+      .def("stats", &stats)
+      .def("met", &met)
+      .def("forget_met", [](Run& run) { run.loop->events.met.clear(); })
+      .def("crossings", [](const Run& run) { return run.loop->crossings; })
+      .def("profile", &profile)
+      .def("rhs", &rhs, "t"_a, "y"_a)
+      .def("jacobian", &jacobian, "t"_a, "y"_a)
+      .def("seconds", &seconds, "states"_a, "rounds"_a)
+      .def_prop_ro("t", [](const Run& run) { return run.loop->now.t; })
+      .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->now.y); })
+      .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });
+  bind_parts(m, loop);
 }
 
 }  // namespace ckc

@@ -3,13 +3,14 @@
 
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <stdexcept>
 #include <string>
 
-#include "types.hpp"
+#include "core.hpp"
 
 namespace ckc {
 
@@ -39,8 +40,46 @@ inline void require_indices(const Indices& at, int end, const char* what) {
                                    std::to_string(end - 1));
 }
 
+template <class T>
+T get(const nb::dict& table, const char* key) {
+  require(table.contains(key), std::string("table: no key ") + key);
+  return nb::cast<T>(table[key]);
+}
+
+// Read doubles from an array, ten times sooner than an array's way through DLPack; false where it is none of that size.
+inline bool read(nb::handle from, Out to) {
+  Py_buffer found;
+  if (PyObject_GetBuffer(from.ptr(), &found, PyBUF_STRIDES) != 0) return PyErr_Clear(), false;
+  const bool fits = found.ndim == 1 && found.shape[0] == to.size() && found.itemsize == sizeof(double);
+  const auto* data = static_cast<const char*>(found.buf);
+  for (Eigen::Index i = 0; fits && i < to.size(); ++i)
+    to(i) = *reinterpret_cast<const double*>(data + i * found.strides[0]);
+  PyBuffer_Release(&found);
+  return fits;
+}
+
+// One new array of vectors one after the other; `data` points into it.
+inline nb::object array(size_t size, double*& data) {
+  data = new double[size];
+  nb::capsule owner(data, [](void* owned) noexcept { delete[] static_cast<double*>(owned); });
+  return nb::cast(nb::ndarray<nb::numpy, double, nb::ndim<1>>(data, {size}, owner));
+}
+
+// Lists of q and z, made again only when the partition has changed.
+struct Places {
+  Indices at;
+  nb::object q, z;
+  void are(const Core& core) {
+    if (core.q != at) at = core.q, q = nb::cast(core.q), z = nb::cast(core.z);
+  }
+};
+
+// A mechanism from Python's tables; one of its terms by name.
+std::unique_ptr<Core> core_of(const nb::dict& table);
+Closure closure_of(const nb::dict& table);
+nb::object term_of(Core& core, const std::string& name);
+
 void bind_core(nb::module_& m);
-void bind_systems(nb::module_& m);
 void bind_loop(nb::module_& m);
 
 }  // namespace ckc

@@ -5,26 +5,32 @@
 
 namespace ckc {
 
-// Relative size of the last pivot of J at which its rank counts as lost; and at which Python closes with care.
-constexpr double singular = 1e-12, weak = 1e-2;
+// Relative size of the last pivot of J at which its rank counts as lost; and below which the metric of D' is given up.
+constexpr double singular = 1e-12, weak = 1e-3;
 // Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
+constexpr int small = 12;        // coordinates
+constexpr double crowded = 0.2;  // share of D' that is not zero, from which a product with all of it costs less
 constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
 
-Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_)
+Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_, Scales scales_)
     : tree(model, std::move(place)),
       rows(tree, std::move(closure)),
       springs(tree, std::move(table)),
       n(tree.n),
-      d(0),
       rank(rank_),
+      scales(std::move(scales_)),
+      d(0),
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree.setZero(n, n);
-  x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m);
+  x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
-  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank, n - rank, full_pattern(n - rank));
+  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
   moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
+  size_t entries = 0;
+  for (const Indices& above : tree.ancestors) entries += 2 * above.size();
+  dense_ = n > small && static_cast<double>(entries) > crowded * n * n;
 }
 
 // phi_z's pattern by rows.
@@ -45,27 +51,41 @@ void Core::split(Indices q_, Indices z_) {
   const auto pattern = pattern_of(rows, z, n);
   phi_z.shape(m, k, pattern), basis_.shape(m, k, pattern);
   basis_q_ = q, basis_z_ = z, basis_at_ = -1;
-  D_factor.shape(d, d, full_pattern(d));
+  D_factor.shape(d);
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
 
 void Core::set(In q_tree_, bool with_inertia) {
   ++sets;
   q_tree = q_tree_;
+  Tally::Entry entry(tally, with_inertia ? Tally::D_tree : Tally::phi);
   if (with_inertia)
     tree.inertia(q_tree);
   else
     tree.set(q_tree);
-  D_here_ = with_inertia, rates_here_ = false;
+  here_ = with_inertia ? inertia_of_tree : 0u;
   rows.set(tree, q_tree);
 }
 
-void Core::factor() {
+void Core::jacobian() {
+  if (has(jacobian_of_rows)) return;
+  Tally::Entry entry(tally, Tally::J);
   rows.jacobian(tree);
+  here_ |= jacobian_of_rows;
+}
+
+void Core::factor() {
+  if (has(factor_of_phi_z)) return;
+  jacobian();
+  Tally::Entry entry(tally, Tally::phi_z);
   phi_z.compute(rows.J, z);
+  here_ |= factor_of_phi_z;
 }
 
 void Core::reduce() {
+  if (has(rho_of_phi_z)) return;
+  factor();
+  Tally::Entry entry(tally, Tally::rho);
   for (int k = 0; k < d; ++k) {
     residual_ = -rows.J.col(q[k]);
     phi_z.solve(residual_, z_);
@@ -73,6 +93,30 @@ void Core::reduce() {
     rho(q[k], k) = 1.0;
     for (size_t i = 0; i < z.size(); ++i) rho(z[i], k) = z_(i);
   }
+  here_ |= rho_of_phi_z;
+}
+
+void Core::tree_inertia() {
+  if (has(inertia_of_tree)) return;
+  Tally::Entry entry(tally, Tally::D_tree);
+  tree.inertia(q_tree);
+  here_ |= inertia_of_tree;
+}
+
+void Core::inertia() {
+  if (has(inertia_of_q)) return;
+  tree_inertia(), reduce();
+  Tally::Entry entry(tally, Tally::D);
+  if (dense_) {
+    D_rho_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * rho;
+    D.noalias() = rho.transpose() * D_rho_;
+  } else {
+    for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
+    for (int i = 0; i < d; ++i)
+      for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
+  }
+  D_factor.compute(D);
+  here_ |= inertia_of_q;
 }
 
 void Core::D_times(In x, Out product) const {
@@ -98,29 +142,23 @@ void Core::reduced(In force, Out generalized) const {
   for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
 }
 
-void Core::inertia() {
-  if (!D_here_) tree.inertia(q_tree);
-  D_here_ = true;
-  for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
-  for (int i = 0; i < d; ++i)
-    for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
-  D_factor.compute(D);
-}
-
 void Core::rates(In v) {
-  if (rates_here_ && v_tree == v) return;
+  if (has(row_rates) && v_tree == v) return;
   v_tree = v;
+  here_ &= ~(bias_of_tree | coriolis_of_tree);
   tree.bias(q_tree, v_tree);
   rows.rates(tree);
-  rates_here_ = true;
+  here_ |= row_rates;
 }
 
 void Core::bias(In v) {
+  if (has(bias_of_tree) && v_tree == v) return;
+  Tally::Entry entry(tally, Tally::bias_tree);
   v_tree = v;
   bias_tree = tree.bias(q_tree, v_tree);
   rows.rates(tree);
-  rates_here_ = true;
   rows.bias(J_dot_v);
+  here_ = (here_ & ~coriolis_of_tree) | row_rates | bias_of_tree;
   if (springs.any || springs.any_damping) springs.set(tree);
   if (!springs.any) return;
   elastic_.setZero();
@@ -129,34 +167,46 @@ void Core::bias(In v) {
 }
 
 void Core::coriolis() {
+  if (has(coriolis_of_tree)) return;
+  Tally::Entry entry(tally, Tally::C_tree);
   C_tree = tree.coriolis(q_tree, v_tree);
   rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);
   if (springs.any) h_tree -= elastic_;
+  here_ |= coriolis_of_tree;
+}
+
+void Core::rho_dot_times(In x, Out product) {
+  velocity(x, moved_);
+  residual_.noalias() = -rows.J_dot * moved_;
+  phi_z.solve(residual_, z_);
+  product.setZero();
+  for (size_t i = 0; i < z.size(); ++i) product(z[i]) = z_(i);
 }
 
 void Core::C_times(In x, Out product) {
-  velocity(x, x_);  // rho x
-  residual_.noalias() = -rows.J_dot * x_;
-  phi_z.solve(residual_, z_);  // of rho_dot x
-  y_.noalias() = C_tree * x_;
-  x_.setZero();
-  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
-  D_times(x_, moved_);
-  y_ += moved_;
+  rho_dot_times(x, x_);
+  D_times(x_, y_);
+  velocity(x, x_);
+  y_.noalias() += C_tree * x_;
   reduced(y_, product);
 }
 
 void Core::reduced_acceleration(In u_tree, Out q_ddot) {
   residual_ = -J_dot_v;
-  phi_z.solve(residual_, z_);  // rho_dot q_dot, J rho = 0 differentiated
-  x_.setZero();
-  for (size_t i = 0; i < z.size(); ++i) x_(z[i]) = z_(i);
-  D_times(x_, y_);
+  phi_z.solve(residual_, z_);  // J rho = 0 differentiated
+  rho_dot_q_dot_.setZero();
+  for (size_t i = 0; i < z.size(); ++i) rho_dot_q_dot_(z[i]) = z_(i);
+  D_times(rho_dot_q_dot_, y_);
   x_ = u_tree - bias_tree - y_;
   if (springs.any_damping) springs.add_damping(v_tree, x_);
   reduced(x_, d_);
   D_factor.solve(d_, q_ddot);
+}
+
+void Core::tree_acceleration(In q_ddot, Out a) const {
+  a = rho_dot_q_dot_;
+  for (int k = 0; k < d; ++k) a += q_ddot(k) * rho.col(k);
 }
 
 void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
@@ -205,7 +255,7 @@ void Core::repartition() {
   basis_.shape(rows.closure.rows, rank, pattern_of(rows, basis_z_, n));
 }
 
-// As Python's `null_space`: J P = Q [R S], and the columns that the pivoting left over are the freedoms.
+// J P = Q [R S], and the columns that the pivoting left over are the freedoms.
 bool Core::basis_by_pivoting(double least) {
   qr_.compute(rows.J);
   const auto& r = qr_.matrixQR();
@@ -234,6 +284,7 @@ bool Core::basis_by_pivoting(double least) {
 }
 
 bool Core::tangent_basis(In residual, double least) {
+  jacobian();
   x_.setZero();
   negative_ = -residual;  // which may be residual_
   if (!rows.closure.rows)
@@ -246,7 +297,11 @@ bool Core::tangent_basis(In residual, double least) {
 }
 
 void Core::tangent_inertia() {
-  for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
+  tree_inertia();
+  if (dense_)
+    D_tangent_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * tangent_;
+  else
+    for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
   square_factor_.compute(square_);
 }
@@ -259,7 +314,7 @@ void Core::with_force(In force, Out x) {
 }
 
 bool Core::closing_step(In residual, Out x) {
-  if (!tangent_basis(residual, weak)) return false;
+  if (!tangent_basis(residual, weak)) return shortest_step(residual, x);
   tangent_inertia();
   D_times(x_, y_);
   y_ = -y_;
@@ -274,6 +329,11 @@ bool Core::shortest_step(In residual, Out x) {
   y_ = -x_;
   with_force(y_, x);
   return true;
+}
+
+const Matrix* Core::tangent() {
+  residual_.setZero();
+  return tangent_basis(residual_, singular) ? &tangent_ : nullptr;
 }
 
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {

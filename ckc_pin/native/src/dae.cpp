@@ -9,19 +9,22 @@ constexpr double negligible = 1e-9;  // rad, m: Newton's last step onto the clos
 
 static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
 
-Dae::Dae(Core& core_, double tolerance, bool projects, double alpha, double beta)
-    : System(core_, core_.tree.nq + core_.n), tolerance_(tolerance), alpha_(alpha), beta_(beta), projects_(projects) {
-  needs_chart = false, crosses = projects;
+Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double alpha, double beta)
+    : System(core_, control_, core_.tree.nq + core_.n),
+      tolerance_(tolerance),
+      alpha_(alpha),
+      beta_(beta),
+      projects_(projects) {
+  crosses = projects;
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  z_step_.setZero(static_cast<Eigen::Index>(core.z.size()));
 }
+
+void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
 
 void Dae::set(In q_tree, bool with_inertia) {
   core.set(q_tree, with_inertia);
-  if (drive.controls()) {
-    core.factor(), core.reduce(), core.inertia();
-  } else {
-    core.rows.jacobian(core.tree);
-  }
+  core.jacobian();
   placed_ = with_inertia ? core.sets : -1;
 }
 
@@ -35,7 +38,7 @@ bool Dae::place(In y) {
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {
-  if (!y.allFinite()) return false;
+  if (!y.allFinite()) return fails(Trouble::infinite);
   place(y);
   return rate(t, y.tail(core.n), y_dot);
 }
@@ -48,7 +51,8 @@ bool Dae::rate(double t, In v, Out y_dot) {
   const int n = core.n;
   core.bias(v);
   independent(v);
-  drive.act(t, core, q, q_dot);
+  v_tree = v;
+  if (!act(t)) return false;
   residual_.setZero();
   if (alpha_ != 0.0 || beta_ != 0.0) {
     residual_.noalias() = core.rows.J * core.v_tree;
@@ -56,14 +60,25 @@ bool Dae::rate(double t, In v, Out y_dot) {
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  return core.dae_acceleration(drive.u_tree, residual_, y_dot.tail(n)) && y_dot.allFinite();
+  if (!core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n))) return fails(Trouble::rank);
+  return y_dot.allFinite() || fails(Trouble::infinite);
+}
+
+// Stiff control would answer to any change of what it sees: where one acts, z alone is moved.
+bool Dae::closing_step(In residual) {
+  if (control.acts()) core.factor();
+  if (!control.acts() || core.phi_z.singular()) return core.closing_step(residual, step_);
+  core.solve_z(residual, z_step_);
+  step_.setZero();
+  for (size_t j = 0; j < core.z.size(); ++j) step_(core.z[j]) = -z_step_(static_cast<Eigen::Index>(j));
+  return step_.allFinite();
 }
 
 bool Dae::project(In y) {
   const int n = core.n;
   place(y);
   for (int k = 0; largest(core.rows.phi) > tolerance_; ++k) {
-    if (k == most_steps || !core.rows.phi.allFinite() || !core.closing_step(core.rows.phi, step_)) return false;
+    if (k == most_steps || !core.rows.phi.allFinite() || !closing_step(core.rows.phi)) return false;
     ++counts.newton, counts.factorizations += 2;
     residual_.noalias() = core.rows.J * step_;
     core.tree.integrate(q_tree_, step_);
@@ -71,7 +86,7 @@ bool Dae::project(In y) {
     if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
   }
   residual_.noalias() = core.rows.J * y.tail(n);
-  if (!core.closing_step(residual_, step_)) return false;
+  if (!closing_step(residual_)) return false;
   velocity = y.tail(n) + step_;
   return velocity.allFinite();
 }
@@ -96,6 +111,27 @@ bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   return rate(t, velocity, y_dot);
 }
 
+void Dae::rates(std::vector<std::pair<int, int>>& of) const {
+  of.clear();
+  for (int k : core.tree.single) of.emplace_back(core.tree.place[k], core.tree.nq + k);
+}
+
+// Along the velocities that the loops allow: across them nothing moves, whatever the Jacobian off the closure says.
+bool Dae::modes(In y, Matrix& jacobian) {
+  const int n = core.n, nq = core.tree.nq, d = n - core.rank;
+  place(y);
+  const Matrix* tangent = core.tangent();
+  if (!tangent) return false;
+  Matrix moves(nq, d), found = Matrix::Zero(2 * d, 2 * d);
+  for (int k = 0; k < d; ++k) core.tree.configuration_rate(q_tree_, tangent->col(k), moves.col(k));
+  const auto along = (tangent->transpose() * *tangent).ldlt();
+  found.topRightCorner(d, d).setIdentity();
+  found.bottomLeftCorner(d, d) = along.solve(tangent->transpose() * (jacobian.bottomLeftCorner(n, nq) * moves));
+  found.bottomRightCorner(d, d) = along.solve(tangent->transpose() * (jacobian.bottomRightCorner(n, n) * *tangent));
+  jacobian = found;
+  return true;
+}
+
 bool Dae::exact(double, In y) {
   const int n = core.n;
   if (projects_) {
@@ -115,18 +151,16 @@ bool Dae::at_last(double, In y) {
   return true;
 }
 
-bool Dae::accept(double, Out y, bool& changed) {
+Accepted Dae::accept(double, Out y, double) {
   const int n = core.n;
-  changed = false;
-  if (!projects_) return true;
+  if (!projects_) return Accepted::kept;
   place(y);
   residual_.noalias() = core.rows.J * y.tail(n);
   const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
-  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return true;
-  if (!project(y)) return false;
+  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return Accepted::kept;
+  if (!project(y)) return Accepted::refused;
   y.head(core.tree.nq) = core.q_tree, y.tail(n) = velocity;
-  changed = true;
-  return true;
+  return Accepted::changed;
 }
 
 }  // namespace ckc

@@ -8,28 +8,33 @@ namespace ckc {
 class Dae : public System {
  public:
   // `alpha`, `beta` of Baumgarte's stabilisation, zero for none.
-  Dae(Core& core, double tolerance, bool projects, double alpha, double beta);
+  Dae(Core& core, Control& control, double tolerance, bool projects, double alpha, double beta);
 
+  void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override;
   bool at_last(double t, In y) override;
   bool place(In y) override;
-  bool accept(double t, Out y, bool& changed) override;
+  Accepted accept(double t, Out y, double margin) override;
+  void rates(std::vector<std::pair<int, int>>& of) const override;
+  bool modes(In y, Matrix& jacobian) override;
+  bool tree_acceleration(In f, Out a) const override { return a = f.tail(core.n), true; }
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
   bool rate_on_closure(double t, In y, Out y_dot);
-  // Into core.q_tree and velocity, by the shortest steps in the metric of the inertia; false also where J is nearly
-  // singular, which Python closes with care.
-  bool project(In y);
 
  private:
-  void set(In q_tree, bool with_inertia = true);  // the core at a configuration, with D' and what controllers need
-  void independent(In v);  // q of the core's configuration, and q_dot
-  bool rate(double t, In v, Out y_dot);  // at the core's configuration
+  void set(In q_tree, bool with_inertia = true);  // the core at a configuration, with J
+  void independent(In v);                         // q of the core's configuration, and q_dot
+  bool rate(double t, In v, Out y_dot);           // at the core's configuration
+  // Into core.q_tree and velocity. Where nothing is controlled, by the shortest steps in the metric of the inertia: the
+  // correction with the least work on the motion.
+  bool project(In y);
+  bool closing_step(In residual);  // into step_
 
-  double tolerance_, alpha_, beta_;
-  bool projects_;
+  const double tolerance_, alpha_, beta_;
+  const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
-  Vector q_tree_, step_, residual_;
+  Vector q_tree_, step_, z_step_, residual_;
 };
 
 }  // namespace ckc

@@ -7,43 +7,62 @@ namespace ckc {
 
 constexpr double max_step = 0.5;  // rad or m: a longer Newton step in one coordinate is not local any more
 constexpr int max_iterations = 12;
-constexpr double difference = 1.5e-8;  // step of forward differences, rad or m
+constexpr double switch_margin = 0.03;  // of |J|: phi_z's least singular value where an uncontrolled run looks for a better q;
+constexpr double fallen = 0.7;          // it looks again at so much of the margin at which none was found,
+constexpr double poor = 1e-3;           // and from there on at every step
+constexpr double clearly = 2.0;         // times as far from singular: a better q
 
-LevelSet::LevelSet(Core& core_, double epsilon, bool actual, In w0, double tolerance, double slack)
-    : System(core_, 2 * core_.d),
-      trail(core_, epsilon),
+LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double slack)
+    : System(core_, control_, 2 * core_.d),
       epsilon_(epsilon),
       tolerance_(tolerance),
       slack_(slack),
       actual_(actual),
-      on_manifold_(w0.isZero(0)),
-      w0_(w0) {
+      own_{core.q, core.z},
+      alarm_(switch_margin),
+      predictor_(core, epsilon) {
   const int m = core.rows.closure.rows;
-  q_tree_.setZero(core.tree.nq), tree_.setZero(core.n), step_.setZero(core.n);
-  residual_.setZero(m), damping_.setZero(core.n, core.n);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), w0_.setZero(m), z_.setZero(core.z.size());
 }
 
-void LevelSet::start(In q_tree) {
-  const int d = core.d;
-  z_.setZero(core.z.size()), gradient_.setZero(d, d), column_.setZero(d);
-  moved_.setZero(2 * d), y_dot_.setZero(2 * d), f_.setZero(2 * d);
-  trail.start(core, q_tree);
+void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
+  if (core.q != own_.q) core.split(own_.q, own_.z);
+  t_start_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
+  core.set(q_tree);
+  core.reduce();
+  begin(q_tree);
+  chart_numbers(y);
+  for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
 }
 
-void LevelSet::level(double t, Out level) const {
+void LevelSet::begin(In q_tree) {
+  chart_.start(core, q_tree);
+  predictor_.start(core, q_tree);
+  anchor_ = arrived_ = q_tree;
+  alarm_ = switch_margin;
+  new_partition();
+}
+
+void LevelSet::chart_numbers(Out y) { chart_.numbers(core, core.q_tree, y.head(core.d)); }
+
+void LevelSet::level(double t) {
   if (on_manifold_)
-    level.setZero();
+    w.setZero();
   else
-    level = w0_ * std::exp(-t / epsilon_);
+    w = w0_ * std::exp(-(t - t_start_) / epsilon_);
 }
 
 bool LevelSet::state(double t, In y, double tolerance) {
   const int d = core.d;
-  level(t, w);
-  q = y.head(d), q_dot = y.tail(d);
-  trail.predict(t, q, core, w, q_tree_);
-  if (!newton(tolerance)) return false;
+  level(t);
+  predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
+  if (!newton(tolerance) && !(from_anchor(y.head(d)) && newton(tolerance))) return false;
+  if (chart_.plain())
+    q = y.head(d);
+  else
+    for (int k = 0; k < d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]);
   core.reduce();
+  q_dot = y.tail(d);
   core.velocity(q_dot, v_tree);
   velocity = v_tree;
   if (!on_manifold_) {
@@ -51,7 +70,26 @@ bool LevelSet::state(double t, In y, double tolerance) {
     for (size_t k = 0; k < core.z.size(); ++k) velocity(core.z[k]) -= z_(k) / epsilon_;
     if (actual_) v_tree = velocity;
   }
-  trail.add(t, core, q_tree_, velocity, w);
+  predictor_.add(t, core, core.q_tree, velocity, w);
+  return true;
+}
+
+// Predict z to first order from the last accepted state.
+bool LevelSet::from_anchor(In numbers) {
+  core.set(anchor_);
+  core.reduce();
+  if (core.phi_z.singular()) return false;
+  chart_.step(core, anchor_, numbers, q_dot);
+  core.velocity(q_dot, step_);
+  q_tree_ = anchor_;
+  core.tree.integrate(q_tree_, step_);
+  return true;
+}
+
+// A state next to where phi_z is singular has to be closed exactly, or nothing after it can be.
+bool LevelSet::at_last(double t, In y) {
+  if (margin() < poor && !exact(t, y)) return false;
+  arrived_ = core.q_tree;
   return true;
 }
 
@@ -59,6 +97,7 @@ bool LevelSet::state(double t, In y, double tolerance) {
 bool LevelSet::newton(double tolerance) {
   double size = 0.0;
   for (int iteration = 0; iteration <= max_iterations; ++iteration) {
+    if (!q_tree_.allFinite()) return false;
     core.set(q_tree_, iteration == expected_);  // D' will be wanted at the end, which is mostly where it was last time
     core.factor();
     residual_ = core.rows.phi - w;
@@ -91,69 +130,84 @@ double LevelSet::unclosed() {
   return residual_.size() ? residual_.lpNorm<Eigen::Infinity>() : 0.0;
 }
 
-void LevelSet::finish(In u_tree, Out y_dot) {
+bool LevelSet::rhs(double t, In y, Out y_dot) {
+  const int d = core.d;
+  if (!y.allFinite()) return fails(Trouble::infinite);
+  if (!state(t, y, std::max(tolerance_, slack_))) return fails(Trouble::open);
   core.inertia();
   core.bias(v_tree);
-  accelerate(u_tree, y_dot);
-}
-
-void LevelSet::accelerate(In u_tree, Out y_dot) {
-  const int d = core.d;
+  if (!act(t)) return false;
   counts.factorizations += 2;  // phi_z and D
-  y_dot.head(d) = q_dot;
+  if (chart_.plain())
+    y_dot.head(d) = q_dot;
+  else
+    chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
   if (actual_ && !on_manifold_) {
     core.coriolis();
-    core.actual_acceleration(u_tree, q_dot, y_dot.tail(d));
+    core.actual_acceleration(control.u_tree, q_dot, y_dot.tail(d));
   } else {
-    core.reduced_acceleration(u_tree, y_dot.tail(d));
+    core.reduced_acceleration(control.u_tree, y_dot.tail(d));
   }
+  return y_dot.allFinite() || fails(Trouble::infinite);
 }
 
-bool LevelSet::rhs(double t, In y, Out y_dot) {
-  if (!y.allFinite() || !open(t, y)) return false;
-  core.inertia();
-  core.bias(v_tree);
-  drive.act(t, core, q, q_dot);
-  accelerate(drive.u_tree, y_dot);
-  return y_dot.allFinite();
+void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
+  of.clear();
+  const Indices& single = core.tree.single;
+  for (int k = 0; k < core.d; ++k)
+    if (std::binary_search(single.begin(), single.end(), core.q[k])) of.emplace_back(k, core.d + k);
 }
 
-bool LevelSet::jacobian(double t, In y, Matrix& jacobian) {
-  const int d = core.d;
-  if (!rhs(t, y, f_) || !exact(t, y)) return false;
-  core.inertia();
-  core.bias(v_tree);
-  core.coriolis();
-  jacobian.setZero();
-  for (int k = 0; k < d; ++k) {  // C(x) y = C(y) x, so that d(C q_dot)/d q_dot = 2 C
-    column_.setZero();
-    column_(k) = 1.0;
-    core.C_times(column_, gradient_.col(k));
-  }
-  jacobian.bottomRightCorner(d, d) = -2 * gradient_;
-  if (core.springs.any_damping) {
-    damping_.setZero();
-    core.springs.add_damping_gradient(damping_);
-    for (int k = 0; k < d; ++k) {
-      tree_.noalias() = damping_ * core.rho.col(k);
-      core.reduced(tree_, column_);
-      jacobian.col(d + k).tail(d) += column_;
+bool LevelSet::tree_acceleration(In f, Out a) const {
+  if (!on_manifold_) return false;
+  core.tree_acceleration(f.tail(core.d), a);
+  return true;
+}
+
+// Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.
+Accepted LevelSet::accept(double t, Out y, double here) {
+  anchor_ = arrived_;
+  level(t);
+  if (may_switch && here < alarm_ && !(w.lpNorm<Eigen::Infinity>() > tolerance_)) {
+    alarm_ = std::max(fallen * here, poor);
+    Partition better;
+    if (exact(t, y) && best_partition(core, better) && better.q != core.q) {
+      const Partition present{core.q, core.z};
+      if (move_to(better, t, y)) {
+        if (margin() > clearly * here) {
+          ++counts.switches;
+          return Accepted::restarted;
+        }
+        move_to(present, t, y);
+        alarm_ = std::max(fallen * here, poor);
+      }
     }
   }
-  drive.rate_gradient(t, core, q, q_dot, gradient_);
-  jacobian.bottomRightCorner(d, d) += gradient_;
-  for (int k = 0; k < d; ++k) {
-    column_ = jacobian.col(d + k).tail(d);
-    core.D_factor.solve(column_, jacobian.col(d + k).tail(d));
-    jacobian(k, d + k) = 1.0;
-  }
-  for (int k = 0; k < d; ++k) {
-    moved_ = y;
-    moved_(k) += difference;
-    if (!rhs(t, moved_, y_dot_)) return false;
-    jacobian.col(k).tail(d) = (y_dot_.tail(d) - f_.tail(d)) / (moved_(k) - y(k));
-  }
-  return jacobian.allFinite();
+  if (!(here > chart_margin)) return Accepted::refused;
+  if (!chart_.outgrown(y.head(core.d))) return Accepted::kept;
+  if (!exact(t, y)) return Accepted::refused;
+  begin(core.q_tree);
+  chart_numbers(y);
+  return Accepted::restarted;
+}
+
+// Tell the core's state in other coordinates; false where phi_z is singular in them.
+bool LevelSet::move_to(const Partition& partition, double t, Out y) {
+  const Vector q_tree = core.q_tree, v = velocity;
+  core.split(partition.q, partition.z);
+  z_.setZero(core.z.size());
+  core.set(q_tree);
+  core.reduce();
+  begin(q_tree);
+  chart_numbers(y);
+  for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
+  return !core.phi_z.singular() && exact(t, y);
+}
+
+bool LevelSet::own_partition(double t, Out y, bool& changed) {
+  changed = core.q != own_.q;
+  if (!changed) return true;
+  return exact(t, y) && move_to(own_, t, y) && margin() > chart_margin;
 }
 
 }  // namespace ckc

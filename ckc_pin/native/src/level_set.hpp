@@ -1,41 +1,51 @@
-// The reduced model, eq. 6, on a level set of phi; with w(t) of eq. 17 that is the SPF. Every q a joint of one freedom.
+// The reduced model, eq. 6, on a level set of phi; with w(t) of eq. 17 that is the SPF. y = (q in a chart, q_dot).
 #pragma once
 
+#include "partition.hpp"
+#include "predictor.hpp"
 #include "system.hpp"
-#include "trail.hpp"
 
 namespace ckc {
 
 class LevelSet : public System {
  public:
-  LevelSet(Core& core, double epsilon, bool actual, In w0, double tolerance, double slack);
+  // A right-hand side may be off the level set by `slack`, which an integrator of a given tolerance does not notice.
+  LevelSet(Core& core, Control& control, double epsilon, bool actual, double tolerance, double slack);
 
-  Trail trail;
-
-  void start(In q_tree);  // with the core's present partition
-  void level(double t, Out w) const;
-  // Close z at y = (q, q_dot), then rho and the tree's velocities; false where Newton's method does not get there.
-  bool state(double t, In y, double tolerance);
-  bool open(double t, In y) { return state(t, y, std::max(tolerance_, slack_)); }
-  void finish(In u_tree, Out y_dot);  // after `open`
-  bool jacobian(double t, In y, Matrix& jacobian) override;  // exact along q_dot, differences along q
-  bool rhs(double t, In y, Out y_dot) override;              // `open` and `finish` with what drives
+  void start(double t, In q_tree, In v_tree, In w, Out y) override;
+  bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override { return state(t, y, tolerance_); }
-  bool at_last(double, In) override { return true; }
-  bool accept(double, Out, bool& changed) override { return changed = false, true; }
+  bool at_last(double t, In y) override;
+  double margin() override { return phi_z_margin(); }
+  Accepted accept(double t, Out y, double margin) override;
+  bool own_partition(double t, Out y, bool& changed) override;
+  void rates(std::vector<std::pair<int, int>>& of) const override;
   double decay() const override { return -1.0 / epsilon_; }
+  double layer() const override { return on_manifold_ ? System::layer() : epsilon_; }
+  bool tree_acceleration(In f, Out a) const override;
 
  private:
-  void accelerate(In u_tree, Out y_dot);
+  void level(double t);
+  void begin(In q_tree);  // coordinates and predictor, with the core's partition
+  // Close z at y, then rho and the tree's velocities; false where Newton's method does not get there.
+  bool state(double t, In y, double tolerance);
   bool newton(double tolerance);
+  bool from_anchor(In numbers);
   double unclosed();
+  bool move_to(const Partition& partition, double t, Out y);
+  void chart_numbers(Out y);
 
-  double epsilon_, tolerance_, slack_;
-  bool actual_, on_manifold_;
+  const double epsilon_, tolerance_, slack_;
+  const bool actual_;
+  const Partition own_;
+  bool on_manifold_ = true;
+  double t_start_ = 0.0;
+  double alarm_;      // margin at which a better q is looked for
   int expected_ = 0;  // corrections that closing will take
-  Vector w0_, q_tree_, residual_, z_, moved_, y_dot_, tree_, step_;
-  Vector f_, column_;
-  Matrix gradient_, damping_;
+  Chart chart_;
+  Predictor predictor_;
+  Vector anchor_, arrived_;  // configurations of the last accepted state, and of the one that may be next
+  Vector w0_, q_tree_, residual_, z_, step_;
 };
 
 }  // namespace ckc

@@ -60,6 +60,23 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
   eliminate();
 }
 
+void Definite::shape(int size) {
+  few_ = size <= few;
+  if (few_)
+    small_.shape(size, size, full_pattern(size));
+  else
+    large_ = Eigen::LLT<Matrix>(size);
+}
+
+void Definite::compute(const Matrix& a) { few_ ? small_.compute(a) : void(large_.compute(a)); }
+
+void Definite::solve(In b, Out x) {
+  if (few_) return small_.solve(b, x);
+  x = b;
+  large_.matrixL().solveInPlace(x);
+  large_.matrixU().solveInPlace(x);
+}
+
 std::vector<Indices> full_pattern(int size) {
   Indices every(size);
   std::iota(every.begin(), every.end(), 0);
@@ -191,6 +208,19 @@ void Factor::solve(In b, Out x) {
     for (int j = k + 1; j < high_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
     x(column_at_[k]) = value / lu_(row, k);
   }
+}
+
+void Factor::solve_transposed(In b, Out x) {
+  work_.setZero();
+  for (int k = 0; k < columns_; ++k)
+    work_(k) = (b(k) - qr_.col(k).head(k).dot(work_.head(k))) / qr_(k, k);
+  for (int k = columns_ - 1; k >= 0; --k) {
+    const auto v = qr_.col(k).tail(rows_ - k - 1);
+    const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+    work_(k) -= along;
+    work_.segment(k + 1, rows_ - k - 1) -= along * v;
+  }
+  x = work_.head(rows_);
 }
 
 }  // namespace ckc

@@ -1,6 +1,8 @@
 // Factorizations without allocation after the first use.
 #pragma once
 
+#include <Eigen/Cholesky>
+
 #include "types.hpp"
 
 namespace ckc {
@@ -17,6 +19,7 @@ class Factor {
   // Of columns of a matrix (all when none are named); entries outside the pattern are zero.
   void compute(const Matrix& a, const Indices& columns = {});
   void solve(In b, Out x);            // least squares when tall
+  void solve_transposed(In b, Out x); // A^T x = b, of minimum norm; of a tall matrix only
   bool singular() const { return singular_; }
   double pivot_ratio() const;         // the smallest pivot to the largest
 
@@ -37,6 +40,19 @@ class Factor {
   std::vector<Indices> below_;        // by column: rows that its elimination touched
   Indices active_;                    // rows met and not yet pivots
   bool small_ = false, singular_ = false;
+};
+
+// Cholesky's factorization of a symmetric positive definite matrix; a small one is eliminated as it is.
+class Definite {
+ public:
+  void shape(int size);
+  void compute(const Matrix& a);
+  void solve(In b, Out x);
+
+ private:
+  Factor small_;
+  Eigen::LLT<Matrix> large_;
+  bool few_ = true;
 };
 
 // The pattern of a full square matrix.

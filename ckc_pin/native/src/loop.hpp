@@ -1,61 +1,110 @@
-// The step loop: plain steps one after the other, and leaps over positions where J loses rank. Whatever else there is
-// to a run is Python's, between two calls.
+// The step loop: the one place where time advances. It owns its state, and says why it stopped as a value.
 #pragma once
 
-#include <chrono>
+#include <array>
 
 #include "crossing.hpp"
-#include "record.hpp"
+#include "events.hpp"
+#include "explicit.hpp"
+#include "radau.hpp"
+#include "recorder.hpp"
 
 namespace ckc {
 
-enum class Why {
-  finished,  // t_bound is reached
-  pause,     // time is up, or the rows are full
-  python,    // the next step, or what follows it, is not plain
+struct Options {
+  std::string method;  // "auto", or one by name
+  double rtol, atol, max_step, min_step;
+  long max_rhs;
+  double closed;       // rad or m: how far the loops may be open along a collocation step
 };
 
-struct Stretch {
-  double t_bound, min_step;
-  long most_rhs;       // evaluations left
-  double seconds;      // from now, to the next pause
-  double last_output;  // instants up to there
-  bool fine;           // whether the tolerance is one that crossings come out well with
+struct Stop {
+  enum Why {
+    end,          // the time asked for is reached
+    event,        // one that stops
+    pause,        // the interpreter is to be let in
+    rhs_budget,
+    wall_budget,
+    min_step,
+    step,         // no step can be made: see `trouble`
+    rank,         // J loses rank and that cannot be passed
+    chart,        // q has stopped to determine z
+    control,      // a controller has no u
+    function,     // an event's function has no finite value
+    output,       // the state has no terms
+    raised,       // a caller's function did
+  } why;
+  double t = 0.0, value = 0.0;  // when; least singular value, or what a function gave
+  int which = -1;               // whose function
 };
 
 class Loop {
  public:
-  Loop(System& system, Method& method, Watch& watch, Crossing& crossing, Record& record)
-      : system_(system), method_(method), watch_(watch), crossing_(crossing), record_(record), y_out_(method.y) {}
+  Loop(std::unique_ptr<Control> control, std::unique_ptr<System> system, Options options, std::vector<Event> events);
 
-  // Record the instants `times` from `due` on into rows, as many as there are.
-  Why run(const Stretch& stretch, In times, Eigen::Index& due, Eigen::Ref<Matrix> rows, Eigen::Index& filled);
+  // Begin at t from a configuration closed on phi = w, moving with v'; what was before has no influence.
+  void start(double t, In q_tree, In v_tree, In w);
+  void record(Vector instants, double* rows, Eigen::Index most) { recorder.begin(std::move(instants), rows, most); }
+  // Let a u act from now on, held.
+  void hold(In u);
+  // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
+  Stop advance(double until, bool final, double pause, double budget);
+  // Record the present state, unless that instant is recorded already.
+  bool record_now();
+  // The core at the present state, closed, with the system's velocity and w; false where that does not exist.
+  bool settle_core() { return system->exact(now.t, now.y); }
 
-  long steps = 0;
-  Watch::Rank end;     // at the end of the last step
-  bool begun = false;  // whether `end` is known
-  double length = 0;   // of the last step
-  double ahead = 0;    // when J is about to lose rank, where the loop stopped for that; else NaN
-
+  const std::unique_ptr<Control> control;
+  const std::unique_ptr<System> system;
+  Step now;
+  Work work;
+  Recorder recorder;
+  Events events;
+  std::array<long, 3> steps{};  // by method: DOP853, RK45, Radau
   std::vector<double> crossings;  // when J lost rank
+  const Method* method() const { return method_; }
+  double& newton_tolerance() { return tolerance_.newton; }
 
  private:
-  enum class Made {
-    all,      // a step, to be recorded
-    shorter,  // none yet: the next one tried is shorter
-    none,     // none: it is Python's
-  };
-  Made step(const Stretch& stretch, Watch::Rank& after);
-  Made leap(const Stretch& stretch, double left, Watch::Rank& after);
-  bool outputs(const Stretch& stretch, bool leapt, In times, Eigen::Index& due, Eigen::Ref<Matrix> rows,
-               Eigen::Index& filled);
+  std::optional<Stop> begin(double bound);
+  std::optional<Stop> one_step(double bound, bool last);
+  std::optional<Stop> ordinary(double bound, bool last);
+  std::optional<Stop> across(double met, double left, double bound, bool last);
+  std::optional<Stop> keep(Interpolant& motion, const RankMonitor::Rank& after, double margin, bool last);
+  std::optional<Stop> look(Interpolant& motion, bool last, double& halt);
+  std::optional<Stop> outputs(Interpolant& motion, double until);
+  std::optional<Stop> redo();
+  int number() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // of the method
+  std::optional<Stop> sample();
+  Stop trouble();
+  Stop untold();
+  void jump();
+  void choose(double bound);      // a method, at the start
+  void choose_again(double bound);  // of the explicit ones, for another segment
+  bool is_stiff(double duration);
+  void take(Method& method);
 
-  System& system_;
-  Method& method_;
-  Watch& watch_;
-  Crossing& crossing_;
-  Record& record_;
-  Vector y_out_;
+  const Options options_;
+  Tolerance tolerance_;
+  Explicit dop853_, rk45_;
+  std::unique_ptr<Radau> radau_;
+  Method* method_ = nullptr;
+  RankMonitor monitor_;
+  Crossing crossing_;
+  RankMonitor::Rank end_;     // at the present state
+  double length_ = 0.0;       // of the last step
+  bool begun_ = false;        // whether the present state was accepted, and end_ is known
+  bool f_known_ = false;
+  bool jumped_ = false;       // something has changed since the start that a second try would not know
+  bool silent_ = false;       // nothing is recorded, no event is looked for
+  long kept_ = 0, doubt_ = 0; // steps since the start; when stiffness is looked at again, 0 for never
+  double last_instant_ = 0.0; // outputs up to there are of the present segment,
+  double segment_ = 0.0;      // which ends there; the start, before the first one
+  struct Begin {
+    double t = 0.0;
+    Vector q_tree, v_tree, w;
+  } begin_;
+  Vector y_out_, held_before_;
 };
 
 }  // namespace ckc

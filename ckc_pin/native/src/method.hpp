@@ -1,4 +1,4 @@
-// What the step loop needs of a method, and the explicit one.
+// What the step loop needs of a method, and the step that it makes.
 #pragma once
 
 #include "system.hpp"
@@ -7,76 +7,73 @@ namespace ckc {
 
 struct Tolerance {
   double rtol, atol, max_step;
+  double newton = 0.2;  // of an implicit method's iteration, relative to the local error
 };
 
-class Method {
- public:
-  virtual ~Method() = default;
+struct Step {
+  double t = 0, h = 0;  // from (t, y) with rate f; h: a length to try
+  Vector y, f;
+  double t_new = 0, h_next = 0;  // to (t_new, y_new)
+  Vector y_new, f_new;
+  double t_old = 0;  // where the one before began
+  Vector y_old;
+};
 
-  // Try steps from (t, y, f) until one is accepted; false where a right-hand side does not exist or steps vanish:
-  // nothing is lost then but the work, and Python goes on from (t, y).
-  virtual bool step(System& system, double t_bound) = 0;
-  // Forget the step just made and try a shorter one next; false where the method cannot.
-  virtual bool again(double) { return false; }
-  // Make a step that something else integrated, and let the next one try a length; false where the method cannot.
-  virtual bool adopt(System&, double, In, double) { return false; }
-  // y within the step just made; false where a right-hand side does not exist.
-  virtual bool between(System& system, double t, Out y) = 0;
-  // Make the step's end the present state, as the system accepts it; false where it does not.
-  bool settle(System& system, double t_bound) {
-    bool changed = false;
-    if (t_new < t_bound) {
-      if (!system.accept(t_new, y_new, changed) || (changed && !evaluate(system, t_new, y_new, f_new))) return false;
-    }
-    commit();
-    return true;
-  }
+struct Work {
+  long rhs = 0, rejected = 0, jacobians = 0, factorizations = 0;
+  long most_rhs = std::numeric_limits<long>::max();
+  bool spent = false;  // the budget was met
+};
+
+// y within the step just made.
+class Interpolant {
+ public:
+  virtual ~Interpolant() = default;
+  virtual bool between(double t, Out y) = 0;  // false where a right-hand side does not exist
+};
+
+class Method : public Interpolant {
+ public:
+  Method(System& system, Step& step, Work& work, const Tolerance& tolerance)
+      : system_(system), step_(step), work_(work), tolerance_(tolerance) {}
+  // Try steps from (t, y, f) until one is accepted; false where none can be, and then nothing is lost but the work.
+  virtual bool step(double t_bound) = 0;
+  // Forget the step just made and try one of another length next.
+  virtual void retry(double length) { step_.h = length, ++work_.rejected; }
   // Take over the step just made.
   virtual void commit() {
-    t_old = t, y_old = y;
-    t = t_new, y = y_new, f = f_new, h_abs = h_next, growing = growing_next;
+    step_.t_old = step_.t, step_.y_old = step_.y;
+    step_.t = step_.t_new, step_.y = step_.y_new, step_.f = step_.f_new, step_.h = step_.h_next;
   }
+  // Remember nothing of former steps.
+  virtual void forget() {}
+  virtual const char* name() const = 0;
+  // A first length, of a method whose error estimate is of this order; (t, y, f) are known.
+  double first_length(double t_bound, int order);
+  virtual int error_order() const = 0;
 
-  double t = 0, h_abs = 0;  // h_abs: length of the next step to try
-  bool growing = false;     // whether the last step asked for one of more than twice its length
-  Vector y, f;
-  double t_new = 0, h_next = 0;
-  bool growing_next = false;
-  Vector y_new, f_new;
-  double t_old = 0;  // where the last step began
-  Vector y_old;
-  long rhs = 0, rejected = 0, jacobians = 0, lu = 0;
+  bool evaluate(double t, In y, Out y_dot) {
+    if (work_.rhs >= work_.most_rhs) {
+      work_.spent = true;
+      return false;
+    }
+    ++work_.rhs;
+    return system_.rhs(t, y, y_dot);
+  }
 
  protected:
-  bool evaluate(System& system, double at, In y_at, Out y_dot) {
-    ++rhs;
-    return system.rhs(at, y_at, y_dot);
+  // Whether a shorter step would be of no use.
+  bool over() const { return work_.spent || system_.control.problem.raised; }
+  // The shortest step that changes t.
+  double shortest(double t_bound) const;
+  double norm(In x, const Vector& scale) const {
+    return std::sqrt((x.array() / scale.array()).square().sum() / static_cast<double>(x.size()));
   }
-};
 
-// SciPy's DOP853 with SciPy's coefficients and step control, so that its steps are Python's.
-class Dop853 : public Method {
- public:
-  struct Table {
-    Matrix A, A_extra, D;
-    Vector B, C, C_extra, E3, E5;
-  };
-
-  Dop853(Table table, Tolerance tolerance, int size);
-  bool step(System& system, double t_bound) override;
-  bool again(double length) override;
-  bool adopt(System& system, double to, In y_to, double length) override;
-  bool between(System& system, double t, Out y) override;
-
- private:
-  bool stages(System& system, double h);
-  double error(double h);
-
-  Table table_;
-  Tolerance tolerance_;
-  Matrix K_, F_;  // (size, stages), (size, powers)
-  Vector y_stage_, scale_, error_;
-  bool dense_ = false;
+  System& system_;
+  Step& step_;
+  Work& work_;
+  const Tolerance& tolerance_;
 };
 
 }  // namespace ckc

@@ -60,13 +60,6 @@ void Springs::add_damping(In v, Out force) const {
   }
 }
 
-void Springs::add_damping_gradient(Matrix& gradient) const {
-  gradient.diagonal() -= table_.joint_damping;
-  for (int k = 0; k < count_; ++k)
-    for (int i : pattern_[k])
-      for (int j : pattern_[k]) gradient(i, j) -= table_.damping(k) * jacobian_(k, i) * jacobian_(k, j);
-}
-
 double Springs::energy(const Tree& tree, In q) const {
   double energy = 0.0;
   for (int j = 0; j < tree.n; ++j) {

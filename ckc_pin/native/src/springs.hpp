@@ -21,7 +21,6 @@ class Springs {
   void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
   void add_elastic(const Tree& tree, In q, Out force) const;
   void add_damping(In v, Out force) const;
-  void add_damping_gradient(Matrix& gradient) const;  // of the force along v'
   double energy(const Tree& tree, In q) const;
 
  private:

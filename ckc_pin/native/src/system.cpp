@@ -1,10 +1,43 @@
 #include "system.hpp"
 
+#include <algorithm>
+
 namespace ckc {
 
-System::System(Core& core_, int size_) : core(core_), size(size_), drive(core_.d, core_.n) {
+constexpr double difference = 1.5e-8;  // step of forward differences, relative, or rad, m, and their rates
+
+System::System(Core& core_, Control& control_, int size_) : core(core_), control(control_), size(size_) {
   velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.rows.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
+}
+
+double System::phi_z_margin() {
+  if (!core.rank) return std::numeric_limits<double>::infinity();
+  if (!phi_z_) {
+    std::vector<Indices> pattern(core.rows.closure.rows);
+    for (size_t i = 0; i < pattern.size(); ++i)
+      for (int j : core.rows.pattern[i])
+        if (std::find(core.z.begin(), core.z.end(), j) != core.z.end()) pattern[i].push_back(j);
+    phi_z_ = std::make_unique<Spectrum>(std::move(pattern), core.n, core.rank);
+    ones_.setOnes(std::max(core.rows.closure.rows, core.n));
+  }
+  core.jacobian();
+  phi_z_->compute(core.rows.J, ones_, ones_);
+  return phi_z_->least() / std::max(core.rows.J.norm(), 1e-300);
+}
+
+bool System::jacobian(double t, In y, In f, Matrix& jacobian, long& evaluations) {
+  jacobian.resize(size, size), rate_.resize(size);
+  moved_ = y;
+  for (int k = 0; k < size; ++k) {
+    moved_(k) = y(k) + difference * std::max(1.0, std::abs(y(k)));
+    const double step = moved_(k) - y(k);
+    ++evaluations;
+    if (!rhs(t, moved_, rate_)) return false;
+    jacobian.col(k) = (rate_ - f) / step;
+    moved_(k) = y(k);
+  }
+  return jacobian.allFinite();
 }
 
 }  // namespace ckc

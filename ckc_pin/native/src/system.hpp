@@ -1,19 +1,42 @@
-// A formulation as a first-order system y' = f(t, y), as the step loop needs it: `simulation.systems`.
+// A formulation as a first-order system y' = f(t, y), as the step loop needs it.
 #pragma once
 
-#include "drive.hpp"
+#include "control.hpp"
+#include "spectrum.hpp"
 
 namespace ckc {
 
+// Of |J|: phi_z's least singular value at which q has stopped to be a chart.
+constexpr double chart_margin = 1e-5;
+
 struct Counts {
-  long newton = 0, factorizations = 0;
+  long newton = 0, factorizations = 0, switches = 0;
+};
+
+// Why a right-hand side does not exist.
+enum class Trouble {
+  none,
+  open,      // the loops could not be closed
+  rank,      // J has lost rank
+  infinite,  // a number is not finite
+  control,   // a controller has no u
+};
+
+// What becomes of an accepted state.
+enum class Accepted {
+  kept,
+  changed,    // y is another one now, on the same motion
+  restarted,  // y is told in other coordinates: nothing that is remembered of former steps holds
+  refused,    // the coordinates end here
 };
 
 class System {
  public:
-  System(Core& core, int size);
+  System(Core& core, Control& control, int size);
   virtual ~System() = default;
 
+  // Begin at t from a configuration closed on phi = w, moving with v' (at rho q_dot, off the manifold too).
+  virtual void start(double t, In q_tree, In v_tree, In w, Out y) = 0;
   // False where it does not exist or is not finite.
   virtual bool rhs(double t, In y, Out y_dot) = 0;
   // The core at the state, closed as well as the formulation closes it, with everything below; false where it fails.
@@ -22,23 +45,51 @@ class System {
   virtual bool at_last(double t, In y) = 0;
   // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
   virtual bool place(In) { return false; }
-  // What becomes of an accepted state: `changed` says whether y is another one now.
-  virtual bool accept(double t, Out y, bool& changed) = 0;
-  // d rhs / d y; false where it is not known, or not finite.
-  virtual bool jacobian(double, In, Matrix&) { return false; }
+  // How far q is from failing as coordinates, at the core's state: phi_z's least singular value over |J|; infinite where
+  // no q is needed.
+  virtual double margin() { return std::numeric_limits<double>::infinity(); }
+  double phi_z_margin();
+  virtual Accepted accept(double t, Out y, double margin) = 0;
+  // Make the user's own partition that of q; false where phi_z is singular there.
+  virtual bool own_partition(double, Out, bool& changed) { return changed = false, true; }
+  // d rhs / d y by differences, f = rhs(t, y), counted in `evaluations`; false where one does not exist.
+  virtual bool jacobian(double t, In y, In f, Matrix& jacobian, long& evaluations);
+  // Entries of y whose rate is another entry: (where, which).
+  virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
+  // Time in which the motion may change, known from the start, s: that of a boundary layer.
+  virtual double layer() const { return std::numeric_limits<double>::infinity(); }
   // Rate of phi over phi on a level set: what phi_dot should be.
   virtual double decay() const { return 0.0; }
+  // The part of a Jacobian at y whose eigenvalues tell how the freedoms move; false where there is none.
+  virtual bool modes(In, Matrix&) { return true; }
+  // Acceleration of the tree at the state that `rhs` was evaluated at last; false where it is not known.
+  virtual bool tree_acceleration(In f, Out a) const = 0;
 
   Core& core;
+  Control& control;
   const int size;         // of y
-  Drive drive;
   Counts counts;
-  bool needs_chart = true;  // q has to determine z
-  bool crosses = false;     // Python passes positions where J loses rank
+  bool crosses = false;     // positions where J loses rank are passed
+  bool may_switch = false;  // q may become other coordinates
   Vector velocity;          // of the tree, (n)
   Vector v_tree;            // what C takes its velocity from, (n)
   Vector w;                 // what phi should be, (rows)
   Vector q, q_dot;          // (d)
+
+  Trouble trouble = Trouble::none;  // of the last right-hand side that did not exist
+
+  // Everything that acts at the core's state; false where a controller has no u.
+  bool act(double t) { return control.act(measured(t)) || fails(Trouble::control); }
+  Measured measured(double t) { return {t, core, q, q_dot, v_tree}; }
+
+ protected:
+  bool fails(Trouble why) { return trouble = why, false; }
+  void new_partition() { phi_z_.reset(); }  // of the core
+
+ private:
+  std::unique_ptr<Spectrum> phi_z_;
+  Vector ones_;
+  Vector moved_, rate_;
 };
 
 }  // namespace ckc

@@ -125,6 +125,12 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
   }
 }
 
+Matrix3 Tree::orientation(In q, Root root) const { return turned(q, root).toRotationMatrix(); }
+
+Vector6 Tree::twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const {
+  return pin::log6(placement(q, root).actInv(pin::SE3(orientation, position))).toVector();
+}
+
 void Tree::to_coordinates(In q, Out numbers) const {
   for (int k : single) numbers(k) = q(place[k]);
   for (const Root& root : roots) {
@@ -134,6 +140,14 @@ void Tree::to_coordinates(In q, Out numbers) const {
 }
 
 Vector3 log3(const Matrix3& rotation) { return pin::log3(rotation); }
+
+Matrix3 exp3(const Vector3& vector) { return pin::exp3(vector); }
+
+Matrix3 Jlog3(const Matrix3& rotation) {
+  Matrix3 j;
+  pin::Jlog3(rotation, j);
+  return j;
+}
 
 std::string pinocchio_version() { return PINOCCHIO_VERSION; }
 

@@ -44,21 +44,26 @@ class Tree {
   const Matrix6x& jacobian_rate(In q, In v); // the same without C'
   double potential_energy(In q);
 
-  // As Python's, on q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
+  // On q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
   void normalize(Out q) const;
   void integrate(Out q, In step) const;  // by a tangent step, in place
   void difference(In from, In to, Out step) const;
   void difference_rate(In from, In to, In v, Out rate) const;  // where `to` moves with v
   void configuration_rate(In q, In v, Out q_dot) const;
   void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
+  Matrix3 orientation(In q, Root root) const;
+  // The twist in a free root's axes that takes it to another place.
+  Vector6 twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const;
 
  private:
   struct Workspace;
   std::unique_ptr<Workspace> own;
 };
 
-// The rotation vector of a rotation, angle at most pi.
+// The rotation vector of a rotation, angle at most pi; its inverse; and d log3 along a rotation in its own axes.
 Vector3 log3(const Matrix3& rotation);
+Matrix3 exp3(const Vector3& vector);
+Matrix3 Jlog3(const Matrix3& rotation);
 
 // The version of Pinocchio that this was compiled against.
 std::string pinocchio_version();

@@ -94,9 +94,9 @@ def _which(family: str, told: Sequence[tuple[str, float]], rows: Rows) -> str:
 
 def _keys(family: str) -> str:
     """Write a family as a scene has it."""
-    formulation, _, method = family.removesuffix(", in Python").rpartition(", ")
-    equation = ", `spf_equation = 8`" if "eq. 8" in formulation else ""
-    return f'`formulation = "{formulation.split(",")[0]}"`, `method = "{method}"`{equation}'
+    formulation, _, method = family.rpartition(", ")
+    coordinates = ', `spf_coordinates = "z"`' if "eq. 8" in formulation else ""
+    return f'`formulation = "{formulation.split(",")[0]}"`, `method = "{method}"`{coordinates}'
 
 
 def _tolerance(family: str, works: Sequence[Work], rows: Rows) -> str:

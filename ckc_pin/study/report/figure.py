@@ -17,7 +17,6 @@ __all__ = ["MAIN", "draw", "draw_main"]
 
 MAIN = ("swing", "andrews", "n_four_bar_16", "n_four_bar_4")  # the first three of them that were measured
 MARKERS = "osD^vPX<>"
-GRAY = "#666666"
 FLOOR = 1e-17  # a number of zero has no logarithm
 APART = 11.0  # points between the labels of two curves
 REACH = 100.0  # points: labels further apart do not meet
@@ -83,12 +82,8 @@ def draw_main(
 
 
 def _programs(rows: Sequence[Row], others: Sequence[str]) -> Iterator[Curve]:
-    """Each program's best: this one's backends, and the others."""
-    own = here(rows)
-    native = [row for row in own if not of_row(row).in_python]
-    python = [row for row in own if of_row(row).in_python]
-    yield Curve(PROGRAM, _front(native), {"color": BLACK, "marker": "o", "linewidth": 2.2})
-    yield Curve(f"{PROGRAM}, in Python", _front(python), {"color": GRAY, "marker": "o", "linestyle": ":"})
+    """Each program's best, this one's first."""
+    yield Curve(PROGRAM, _front(here(rows)), {"color": BLACK, "marker": "o", "linewidth": 2.2})
     for k, name in enumerate(others):
         look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[(k + 1) % len(MARKERS)]}
         line = "--" if k < len(COLOURS) else "-."
@@ -96,15 +91,10 @@ def _programs(rows: Sequence[Row], others: Sequence[str]) -> Iterator[Curve]:
 
 
 def _formulations(rows: Sequence[Row]) -> Iterator[Curve]:
-    """Each formulation's best, in the native core where there is one; and the best in Python."""
-    own = here(rows)
-    native = [row for row in own if not of_row(row).in_python]
+    """Each formulation's best."""
     for k, (key, name) in enumerate(NAMES.items()):
-        there = [row for row in native or own if of_row(row).formulation == key]
+        there = [row for row in here(rows) if of_row(row).formulation == key]
         yield Curve(name, _front(there), {"color": COLOURS[k], "marker": MARKERS[k]})
-    if native:
-        python = [row for row in own if of_row(row).in_python]
-        yield Curve("the best in Python", _front(python), {"color": GRAY, "marker": "o", "linestyle": ":"})
 
 
 def _front(rows: Sequence[Row]) -> tuple[Row, ...]:

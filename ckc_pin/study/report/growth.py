@@ -18,21 +18,20 @@ import numpy as np
 
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.generators import GeneratorSpec, generate
-from ckc_pin.native import unavailable
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.simulate import simulate
-from ckc_pin.study.report.pace import motion, seconds
+from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.study.report.pace import seconds
 from ckc_pin.study.report.table import Keyed
 
-__all__ = ["FAMILIES", "FORMULATIONS", "Case", "Family", "Growth", "backends", "exponent", "measure"]
+__all__ = ["FAMILIES", "FORMULATIONS", "Case", "Family", "Growth", "exponent", "measure"]
 
 RTOL, T_END = 1e-10, 0.4  # s: before the row lies flat
 LEAN = 1.2  # rad: squares lean, so that at rest they are no equilibrium
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "dae": {"formulation": "dae"},
     "reduced": {"formulation": "reduced"},
-    "spf, eq. 8": {"formulation": "spf", "epsilon": 1e-2, "solver.spf_equation": 8},
+    "spf, eq. 8": {"formulation": "spf", "epsilon": 1e-2, "spf_coordinates": "z"},
 }
 BUDGET = 60.0  # s for a counted run
 
@@ -82,47 +81,39 @@ FAMILIES = (
 
 
 class Growth(Keyed, frozen=True, kw_only=True):
-    """A case in one formulation on one backend.
+    """A case in one formulation.
 
     Attributes
     ----------
-    key, family, formulation, backend : str
+    key, family, formulation : str
     x : int
         What grows along the family.
     rhs_s : float or None
         A right-hand side, s.
     rhs : int or None
-        Right-hand sides of a run of 0.4 s at rtol 1e-10 by DOP853, which both backends share.
+        Right-hand sides of a run of 0.4 s at rtol 1e-10 by DOP853.
     reason : str
         Why there is no number.
     """
 
     family: str
     formulation: str
-    backend: str
     x: int
     rhs_s: float | None = None
     rhs: int | None = None
     reason: str = ""
 
 
-def backends() -> tuple[str, ...]:
-    """Those there are."""
-    return ("python",) if unavailable() else ("native", "python")
-
-
-def measure(case: Case, family: Family, formulation: str, backend: str, key: str) -> Growth:
-    """Time a right-hand side of a case; count those of a run where the backend is the fastest there is."""
-    row = Growth(key=key, family=family.key, formulation=formulation, backend=backend, x=getattr(case, family.along))
-    changes = {**FORMULATIONS[formulation], "solver.backend": backend, "solver.method": "DOP853"}
+def measure(case: Case, family: Family, formulation: str, key: str) -> Growth:
+    """Time a right-hand side of a case, and count those of a run."""
+    row = Growth(key=key, family=family.key, formulation=formulation, x=getattr(case, family.along))
+    changes = {**FORMULATIONS[formulation], "solver.method": "DOP853"}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            scene = load_scene(_written(case, Path(folder)), changes)
-            system = prepare(scene).system
-            rhs_s = seconds(system, motion(system, T_END))
-            if backend != backends()[0]:
-                return msgspec.structs.replace(row, rhs_s=rhs_s)
-            run = simulate(scene)
+            ready = prepare(load_scene(_written(case, Path(folder)), changes))
+        ready.begin()
+        rhs_s = seconds(ready.loop)
+        run = run_prepared(ready)
     except CkcError as error:
         return msgspec.structs.replace(row, reason=str(error))
     if run.status != "done":
@@ -169,10 +160,9 @@ def exponent(points: Mapping[float, float], whole: bool = False) -> float | None
     return float(np.polyfit(np.log(xs), np.log([points[x] for x in xs]), 1)[0])
 
 
-def every_case(quick: bool) -> Iterator[tuple[Family, Case, str, str]]:
-    """Family, case, formulation, backend, in the order in which they are measured."""
+def every_case(quick: bool) -> Iterator[tuple[Family, Case, str]]:
+    """Family, case, formulation, in the order in which they are measured."""
     for family in FAMILIES:
         for case in family.quick if quick else family.cases:
             for formulation in FORMULATIONS:
-                for backend in backends():
-                    yield family, case, formulation, backend
+                yield family, case, formulation

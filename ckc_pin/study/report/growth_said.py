@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ckc_pin.study.chart import COLOURS, chart, save, whole_decades
 from ckc_pin.study.markdown import escaped, table
-from ckc_pin.study.report.growth import FAMILIES, Family, Growth, backends, exponent
+from ckc_pin.study.report.growth import FAMILIES, Family, Growth, exponent
 from ckc_pin.study.report.ours import of_row
 from ckc_pin.study.report.row import Row
 from ckc_pin.study.report.sentences import here
@@ -15,17 +15,13 @@ from ckc_pin.study.report.sentences import here
 __all__ = ["draw_growth", "growth_said"]
 
 NAMES = {"dae": "DAE", "reduced": "reduced model", "spf, eq. 8": "SPF, eq. 8"}
-LINES = {"native": "-", "python": ":"}
-WHERE = {"native": "native core", "python": "Python"}
 MARKERS = "osD"
 
 
-def _points(rows: Sequence[Growth], family: Family, formulation: str, backend: str) -> dict[float, float]:
+def _points(rows: Sequence[Growth], family: Family, formulation: str) -> dict[float, float]:
     """Seconds of a right-hand side by what grows."""
     return {
-        row.x: row.rhs_s
-        for row in rows
-        if (row.family, row.formulation, row.backend) == (family.key, formulation, backend) and row.rhs_s
+        row.x: row.rhs_s for row in rows if (row.family, row.formulation) == (family.key, formulation) and row.rhs_s
     }
 
 
@@ -47,25 +43,22 @@ def growth_said(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]]) -
     lines += [f"- {said}" for said in _tolerances(measured)]
     lines += ["", "![how cost grows](growth.png)", ""]
     failed = [
-        f"- {row.family} = {row.x}, {NAMES[row.formulation]}, {WHERE[row.backend]}: {escaped(row.reason)}"
-        for row in rows
-        if row.reason
+        f"- {row.family} = {row.x}, {NAMES[row.formulation]}: {escaped(row.reason)}" for row in rows if row.reason
     ]
     return [*lines, *_table(rows), "", *failed, ""]
 
 
 def _table(rows: Sequence[Growth]) -> list[str]:
-    """Return a row a case: a right-hand side's time by formulation and backend, and a run's right-hand sides."""
-    ways = [(formulation, backend) for formulation in NAMES for backend in backends()]
+    """Return a row a case: a right-hand side's time by formulation, and a run's right-hand sides."""
     cells = []
     for family in FAMILIES:
-        times_of = [_points(rows, family, *way) for way in ways]
+        times_of = [_points(rows, family, formulation) for formulation in NAMES]
         counts = [_counts(rows, family, formulation) for formulation in NAMES]
         for x in sorted({row.x for row in rows if row.family == family.key}):
             spent = [f"{1e6 * points[x]:.3g}" if x in points else "" for points in times_of]
             cells.append([family.says, str(x), *spent, *(_text(found.get(x)) for found in counts)])
-    header = [f"{NAMES[formulation]}, {WHERE[backend]}, µs" for formulation, backend in ways]
-    return table(["along", "", *header, *(f"{name}, right-hand sides" for name in NAMES.values())], cells)
+    header = [f"{name}, {what}" for what in ("µs", "right-hand sides") for name in NAMES.values()]
+    return table(["along", "", *header], cells)
 
 
 def _text(x: float | None) -> str:
@@ -76,15 +69,11 @@ def _grows(rows: Sequence[Growth], family: Family) -> Iterator[str]:
     """Say with which exponents a right-hand side's time and a run's right-hand sides grow along a family."""
     parts = []
     for formulation, name in NAMES.items():
-        own = [
-            f"{p:.1f} ({WHERE[backend]})"
-            for backend in backends()
-            if (p := exponent(_points(rows, family, formulation, backend))) is not None
-        ]
+        p = exponent(_points(rows, family, formulation))
         count = exponent(_counts(rows, family, formulation), whole=True)
-        if own:
+        if p is not None:
             number = "" if count is None else f", the number of them with {count:.2f}"
-            parts.append(f"{name}: {', '.join(own)}{number}")
+            parts.append(f"{name}: {p:.1f}{number}")
     if parts:
         yield f"{family.says}: a right-hand side's time grows with the power of {family.along}: {'; '.join(parts)}."
 
@@ -94,9 +83,7 @@ def _by_tolerance(rows: Sequence[Row], formulation: str) -> dict[float, tuple[in
     found = {}
     for row in here(rows):
         setting = of_row(row)
-        if (setting.formulation, setting.method) != (formulation, "auto") or row.status != "done" or not row.rhs:
-            continue
-        if setting.in_python == ("native" not in backends()):
+        if (setting.formulation, setting.method) == (formulation, "auto") and row.status == "done" and row.rhs:
             found[1 / setting.rtol] = (row.rhs, row.wall_s)
     return found
 
@@ -122,15 +109,12 @@ def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], f
     figure, axes = chart(columns=(len(FAMILIES) + 1) // 2, rows=2, size=(6.2, 4.2))
     for ax, family in zip(axes, FAMILIES, strict=False):
         for k, (formulation, name) in enumerate(NAMES.items()):
-            for backend in backends():
-                points = _points(rows, family, formulation, backend)
-                p = exponent(points)
-                if p is None:
-                    continue
-                label = f"{name}, {WHERE[backend]}: ∝ {family.along}^{p:.1f}"
+            points = _points(rows, family, formulation)
+            p = exponent(points)
+            if p is not None:
                 xs = sorted(points)
                 look = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4, "clip_on": False}
-                ax.plot(xs, [1e6 * points[x] for x in xs], LINES[backend], label=label, **look)
+                ax.plot(xs, [1e6 * points[x] for x in xs], label=f"{name}: ∝ {family.along}^{p:.1f}", **look)
         ax.set(xscale="log", yscale="log", xlabel=family.along, title=family.says)
         ax.set_ylabel("one right-hand side, µs")
     last, work = axes[-1], next(iter(measured))

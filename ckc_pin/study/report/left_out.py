@@ -1,7 +1,8 @@
 """What a scene leaves out: modules that its run does not load, terms that its right-hand side does not evaluate.
 
-Each is measured by switching it on: a module imported in a fresh interpreter after a run, a term evaluated beside
-the right-hand side at states of the motion, where everything that the right-hand side evaluates is there already.
+Each is measured by switching it on: a module imported in a fresh interpreter after a run, a term evaluated in NumPy
+at states of the motion, where everything that the step loop's right-hand side evaluates is there already, beside the
+same right-hand side in NumPy.
 """
 
 from __future__ import annotations
@@ -19,32 +20,32 @@ import numpy as np
 
 from ckc_pin.dynamics.formulations import multipliers
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import CkcError
-from ckc_pin.mechanism.lazy import Tally
+from ckc_pin.errors import CkcError, NumericalError
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import catalogue, load_scene
-from ckc_pin.study.report.pace import motion, seconds
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.ivp import Ivp, as_ivp
+from ckc_pin.simulation.scene import Scene, catalogue, load_scene
+from ckc_pin.simulation.simulate import simulate
 from ckc_pin.study.report.table import Keyed
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 
 MISSING = "the scene itself"  # in the place of a module or term, where it cannot be loaded
-BRIEF = 0.02  # s of a scene's motion: enough to load what its run loads
+BRIEF = 0.02  # s of a scene's motion: enough to load and evaluate what its run does
 START = "five_bar/swing"  # the run after which a module is switched on
 REPEATS = 3  # fresh interpreters a module
-ROUNDS = 8  # over the states, of a term
+STATES, SPACING = 20, 1e-4  # of the motion, how many and s between them
+ROUNDS = 8  # over the states
 
 # Module, what its import statement is, what it is for.
 MODULES: dict[str, tuple[str, str]] = {
     "meshcat": ("import meshcat", "playback in a browser"),
     "matplotlib": ("import matplotlib.figure, matplotlib.backends.backend_agg", "figures"),
     "yourdfpy": ("import yourdfpy", "visual meshes"),
-    "sksundae": ("import sksundae", 'method = "IDA"'),
+    "sksundae": ("import sksundae", "SUNDIALS, for `ckc report`"),
     "mujoco": ("import mujoco", "checking what `ckc export` writes"),
     "typer": ("import typer, rich", "the command line; a run from Python needs none"),
-    "scipy.integrate": ("import scipy.integrate", "the solvers; `ckc_pin.terms` needs none"),
-    "ckc_pin.native._core": ("import ckc_pin.native; ckc_pin.native.core()", "the native core"),
+    "scipy.integrate": ("import scipy.integrate", "a second opinion by SciPy's solvers"),
 }
 
 RUN = """
@@ -109,7 +110,7 @@ class LeftOut(Keyed, frozen=True, kw_only=True):
     bytes : int or None
         Of memory: a module's of peak resident memory, a term's while it is evaluated.
     rhs_s : float or None
-        A right-hand side, in Python, beside which a term was measured.
+        A right-hand side in NumPy, beside which a term was measured.
     reason : str
         Why there is no number.
     """
@@ -131,12 +132,9 @@ def every_scene() -> list[str]:
 def module_costs(key: str, repeats: int = REPEATS) -> Iterator[LeftOut]:
     """Measure what each module costs where it is switched on after a run: the least of several interpreters."""
     for name, (statement, _) in MODULES.items():
-        # what a run loads anyway is measured on top of `import ckc_pin` alone
-        plain = name in ("scipy.integrate", "ckc_pin.native._core")
-        code = SWITCHED_ON.replace("ckc_pin.simulate(scene, changes)", "") if plain else SWITCHED_ON
         words = (json.dumps([START, {"t_end": BRIEF}]), statement)
         try:
-            found = [json.loads(_interpreter(code, *words)) for _ in range(repeats)]
+            found = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
         except CkcError as error:
             yield LeftOut(key=f"{key}.{name}", scene="", what=name, reason=str(error))
             continue
@@ -170,20 +168,20 @@ def _interpreter(code: str, *words: str) -> str:
 
 
 def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
-    """Measure what each term would cost beside a scene's right-hand side, in Python, at states of its motion."""
-    loaded = load_scene(scene, {**(changes or {}), "solver.backend": "python"})
+    """Measure what each term would cost beside a scene's right-hand side, at states of its motion."""
     try:
-        system = prepare(loaded).system
-        states = motion(system, loaded.spec.t_end)
-        rhs_s, evaluated = seconds(system, states), _evaluated(system, states)
+        loaded = load_scene(scene, {**(changes or {}), "t_end": BRIEF})
+        evaluated, ivp = _evaluated(loaded), as_ivp(loaded)
+        states = _motion(ivp)
     except CkcError as error:
         yield from (LeftOut(key=f"{key}.{what}", scene=scene, what=what, reason=str(error)) for what in TERMS)
         return
+    rhs_s = _rhs_seconds(ivp, states)
     for what, (name, probe) in TERMS.items():
         row = LeftOut(key=f"{key}.{what}", scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
         if name not in evaluated:
             try:
-                spent, memory = _beside(system, states, evaluated, probe)
+                spent, memory = _beside(ivp, states, evaluated, probe)
             except CkcError as error:
                 row = msgspec.structs.replace(row, reason=str(error))
             else:
@@ -191,33 +189,61 @@ def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> 
         yield row
 
 
-def _evaluated(system: Any, states: list[tuple[float, Any]]) -> set[str]:
-    """Return what right-hand sides evaluate: names of terms as a tally books them, and sigma."""
-    tree, tally = system.mechanism.tree, Tally()
-    before = system.counts.newton
-    tree.tally = tally
-    try:
-        for t, y in states:
-            system.rhs(t, y)
-    finally:
-        tree.tally = None
-    return set(tally.calls) | ({"sigma"} if system.counts.newton > before else set())
+def _evaluated(scene: Scene) -> set[str]:
+    """Return what the step loop's right-hand sides evaluate: names of terms, as it books them, and sigma."""
+    run = simulate(scene, profile=True)
+    found = set(run.profile)
+    if "C_tree" in found:  # the two are computed in one pass; of rho_dot and C there are products alone
+        found.add("J_dot")
+    if run.stats["newton"] and scene.spec.formulation != "dae":  # whose corrections are the projection's
+        found.add("sigma")
+    return found
 
 
-def _beside(system: Any, states: list[tuple[float, Any]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
+def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
+    """Return t and y of states of a motion.
+
+    Raises
+    ------
+    NumericalError
+        It does not go so far.
+    """
+    from scipy.integrate import solve_ivp
+
+    times = SPACING * np.arange(STATES)
+    with np.errstate(all="ignore"):
+        solution = solve_ivp(ivp.f, (0.0, times[-1]), ivp.y0, "DOP853", times)
+    if not solution.success:
+        raise NumericalError(solution.message)
+    return list(zip(times.tolist(), solution.y.T, strict=True))
+
+
+def _rhs_seconds(ivp: Ivp, states: list[tuple[float, Array]]) -> float:
+    """Return the mean time of a right-hand side over the states, s, the least of several rounds."""
+    best = np.inf
+    with one_blas_thread():
+        for _ in range(ROUNDS):
+            began = perf_counter()
+            for t, y in states:
+                ivp.f(t, y)
+            best = min(best, (perf_counter() - began) / len(states))
+    return best
+
+
+def _beside(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
     """Return a probe's mean time over the states, s, the least of several rounds, and its memory, bytes."""
     best = np.inf
     with one_blas_thread():
         for _ in range(ROUNDS):
-            spent, before = 0.0, _as_evaluated(system, *states[0], evaluated)
+            spent, before = 0.0, _as_evaluated(ivp, *states[0], evaluated)
             for t, y in states[1:]:
-                terms = _as_evaluated(system, t, y, evaluated)
+                terms = _as_evaluated(ivp, t, y, evaluated)
                 began = perf_counter()
                 probe(terms, before)
                 spent += perf_counter() - began
                 before = terms
             best = min(best, spent / (len(states) - 1))
-        first, second = (_as_evaluated(system, *state, evaluated) for state in states[:2])
+        first, second = (_as_evaluated(ivp, *state, evaluated) for state in states[:2])
         tracemalloc.start()
         try:
             probe(second, first)
@@ -227,9 +253,9 @@ def _beside(system: Any, states: list[tuple[float, Any]], evaluated: set[str], p
     return best, memory
 
 
-def _as_evaluated(system: Any, t: float, y: Any, evaluated: set[str]) -> Terms:
+def _as_evaluated(ivp: Ivp, t: float, y: Array, evaluated: set[str]) -> Terms:
     """Return the terms at a state as a right-hand side leaves them: what it evaluates is there."""
-    terms: Terms = system.terms(t, y)
+    terms = ivp.terms(t, y)
     for name in evaluated:
         for owner in (terms, terms.at):
             if hasattr(type(owner), name):

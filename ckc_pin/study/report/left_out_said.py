@@ -21,9 +21,9 @@ def left_out_said(rows: Sequence[LeftOut]) -> list[str]:
 
 
 _NOTE = (
-    "Terms, beside the right-hand side of each scene, in Python, where what the right-hand side evaluates is there "
-    "already: how much longer it would take with them. J̇, ρ̇ and C are the whole matrices; "
-    "the native core has J̇ v' without J̇."
+    "Terms: which of them the step loop's right-hand side uses, and how much longer one would take with the others. "
+    "That is told in NumPy, of terms and right-hand side alike, where what the right-hand side uses is there already. "
+    "J̇, ρ̇ and C are the whole matrices; the step loop has J̇ v' without J̇, and products with ρ̇ and C."
 )
 
 

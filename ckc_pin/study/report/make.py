@@ -27,7 +27,7 @@ from ckc_pin.study.report.work import WORKS, Budget, Work
 __all__ = ["Report", "report"]
 
 
-BUDGET = Budget(native=1.5, python=0.8, peer=2.0)
+BUDGET = Budget(own=1.5, peer=2.0)
 
 Progress = Callable[[str], None]  # what is being measured
 
@@ -128,8 +128,7 @@ class _Measured:
         """Rows of this program; what used up its budget at one tolerance is not tried with a tighter one."""
         spent: dict[str, str] = {}
         for setting in ours.settings(quick):
-            allowed = BUDGET.python if setting.in_python else BUDGET.native
-            compute = partial(ours.compute, self.work, setting.changes, allowed)
+            compute = partial(ours.compute, self.work, setting.changes, BUDGET.own)
             if setting.family in spent:
                 compute = partial(ours.refused, self.work, spent[setting.family])
             row = self._row(ours.PROGRAM, "", setting.name, compute)
@@ -167,11 +166,11 @@ def _checked(peer: Peer, works: list[Work]) -> PeerNote:
 def _grown(out: Path, quick: bool, progress: Progress) -> list[Growth]:
     """How cost grows: rows of the table, measured where it has none."""
     table, found = Table(out / "growth.csv", Growth), []
-    for family, case, formulation, backend in growth.every_case(quick):
-        own = digest("growth", family.key, msgspec.to_builtins(case), formulation, backend)
+    for family, case, formulation in growth.every_case(quick):
+        own = digest("growth", family.key, msgspec.to_builtins(case), formulation)
         if own not in table.rows:
-            progress(f"growth: {family.says}, {getattr(case, family.along)}, {formulation}, {backend}")
-            table.add(growth.measure(case, family, formulation, backend, own))
+            progress(f"growth: {family.says}, {getattr(case, family.along)}, {formulation}")
+            table.add(growth.measure(case, family, formulation, own))
         found.append(table.rows[own])
     table.write([row.key for row in found])
     return found

@@ -1,4 +1,4 @@
-"""The program itself: formulations, methods, tolerances, backends."""
+"""The program itself: formulations, methods, tolerances."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from ckc_pin.errors import CkcError
-from ckc_pin.native import unavailable
-from ckc_pin.simulation.prepare import again, prepare
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.simulate import run_prepared
 from ckc_pin.study.report.row import Motion, Row
 from ckc_pin.study.report.work import Work
@@ -22,18 +21,14 @@ PROGRAM = "ckc_pin"
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "dae": {"formulation": "dae"},
     "reduced": {"formulation": "reduced"},
-    "spf": {"formulation": "spf", "solver.spf_equation": 17},
-    "spf, eq. 8": {"formulation": "spf", "solver.spf_equation": 8},
+    "spf": {"formulation": "spf", "spf_coordinates": "w"},
+    "spf, eq. 8": {"formulation": "spf", "spf_coordinates": "z"},
 }
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
-FEW = (1e-3, 1e-6, 1e-9, 1e-12)
-QUICK_FEW = (1e-3, 1e-7, 1e-11)
-# Few tolerances of what is not the fastest here, and in Python, whose steps are the native core's, but later.
-METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, **dict.fromkeys(("RK45", "Radau", "BDF", "LSODA"), FEW)}
+FEW = (1e-3, 1e-6, 1e-9, 1e-12)  # of what is not the fastest
+METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "RK45": FEW, "Radau": FEW}
 QUICK_METHODS = {"auto": QUICK_TOLERANCES}
-IN_PYTHON = {"auto": FEW}
-QUICK_IN_PYTHON = {"auto": QUICK_FEW}
 ENOUGH = 0.1  # s of runs, set-up included; up to then they are repeated
 REPEATS = 50
 LONG = 1.0  # s: one run of that is enough
@@ -43,18 +38,17 @@ LONG = 1.0  # s: one run of that is enough
 class Setting:
     """How a scene is run: what the report calls it, and values of the scene by dotted key.
 
-    The name says it all, so that a row's setting can be read back: "dae, auto, in Python, rtol 1e-06".
+    The name says it all, so that a row's setting can be read back: "dae, auto, rtol 1e-06".
     """
 
     formulation: str
     method: str
-    in_python: bool
     rtol: float
 
     @property
     def family(self) -> str:
         """The name without the tolerance."""
-        return f"{self.formulation}, {self.method}{', in Python' if self.in_python else ''}"
+        return f"{self.formulation}, {self.method}"
 
     @property
     def name(self) -> str:
@@ -64,26 +58,21 @@ class Setting:
     @property
     def changes(self) -> dict[str, Any]:
         """Values of the scene."""
-        backend = "python" if self.in_python else "auto"
-        solver = {"solver.method": self.method, "solver.rtol": self.rtol, "solver.backend": backend}
-        return {**FORMULATIONS[self.formulation], **solver}
+        return {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
 
 
 def of_row(row: Row) -> Setting:
     """Read a row's setting back."""
     family, _, rtol = row.setting.rpartition(", rtol ")
-    plain = family.removesuffix(", in Python")
-    formulation, _, method = plain.rpartition(", ")
-    return Setting(formulation, method, plain != family, float(rtol))
+    formulation, _, method = family.rpartition(", ")
+    return Setting(formulation, method, float(rtol))
 
 
 def settings(quick: bool) -> Iterator[Setting]:
-    """Every formulation, method and tolerance, both backends; eq. 8 as printed is a formulation of its own."""
-    every, python = (QUICK_METHODS, QUICK_IN_PYTHON) if quick else (METHODS, IN_PYTHON)
-    for in_python, methods in [(True, every)] if unavailable() else [(False, every), (True, python)]:
-        for (method, tolerances), formulation in product(methods.items(), FORMULATIONS):
-            for rtol in tolerances:
-                yield Setting(formulation, method, in_python, rtol)
+    """Every formulation, method and tolerance; eq. 8 as printed is a formulation of its own."""
+    for (method, tolerances), formulation in product((QUICK_METHODS if quick else METHODS).items(), FORMULATIONS):
+        for rtol in tolerances:
+            yield Setting(formulation, method, rtol)
 
 
 def refused(work: Work, reason: str) -> Motion:
@@ -98,31 +87,23 @@ def used_up(row: Row) -> bool:
 
 
 def compute(work: Work, changes: dict[str, Any], budget: float) -> Motion:
-    """Run a work, stopped after a budget in s; short runs are repeated, after one that warms up, the fastest counts.
-
-    As the other programs are, it is set up before it is repeated; to be measured when warm that is done twice.
-    """
+    """Run a work, stopped after a budget in s; short runs are repeated, after one that warms up, the fastest counts."""
     limited = {**changes, "solver.max_wall_s": budget}
     walls: list[float] = []
-    started = perf_counter()
-    while True:
-        began = perf_counter()
-        try:
-            if len(walls) < 2:
-                scene = work.load(**{name.replace(".", "__"): x for name, x in limited.items()})
-                ready = prepare(scene)
-                setup = perf_counter() - began
-            else:
-                ready = again(scene, ready)
-            run = run_prepared(scene, ready)
-        except CkcError as error:
-            return refused(work, str(error))
-        if run.status == "interrupted":  # the report is, not only this run
-            raise KeyboardInterrupt("SIGTERM" if "SIGTERM" in run.message else "")
-        walls.append(float(run.stats["wall_s"]))
-        enough = perf_counter() - started > ENOUGH and len(walls) > 1
-        if run.status != "done" or enough or walls[-1] > LONG or len(walls) > REPEATS:
-            break
+    began = perf_counter()
+    try:
+        ready = prepare(work.load(**{name.replace(".", "__"): x for name, x in limited.items()}))
+        setup = perf_counter() - began
+        while True:
+            run = run_prepared(ready)
+            if run.status == "interrupted":  # the report is, not only this run
+                raise KeyboardInterrupt("SIGTERM" if "SIGTERM" in run.message else "")
+            walls.append(float(run.stats["wall_s"]))
+            enough = perf_counter() - began > ENOUGH and len(walls) > 1
+            if run.status != "done" or enough or walls[-1] > LONG or len(walls) > REPEATS:
+                break
+    except CkcError as error:
+        return refused(work, str(error))
     stats = run.stats
     method = f" ({stats['method']})" if changes["solver.method"] == "auto" else ""
     without_place = re.sub(r" near [^:]*:", ":", run.message)  # a line of 81 coordinates

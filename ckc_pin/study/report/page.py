@@ -111,7 +111,7 @@ def _of_work(work: Work, measured: Measured) -> list[str]:
 
 def _method(measured: Measured) -> list[str]:
     used = ", ".join(f"{name} {version}" for name, version in versions().items())
-    own, python, others = measured.budget.native, measured.budget.python, measured.budget.peer
+    own, others = measured.budget.own, measured.budget.peer
     said = [
         f"Measured on {machine()}, one process at a time, with {used}. Each motion is compared at the same ten "
         "instants; the error is the largest along the run, the table has that at the end as well. A time is the least "
@@ -119,8 +119,8 @@ def _method(measured: Measured) -> list[str]:
         "kinetic energy: soft constraints trade one for another. Every run, those that failed too with their "
         "reasons, is in `report.csv`; what a scene leaves out in `left_out.csv`, how cost grows in `growth.csv`. "
         "Curves show each program's best settings, those that no other one beats in both time and error. A run may "
-        f"take {own:g} s here, {python:g} s in Python and {others:g} s in another program; one that would take longer "
-        "counts as not getting there."
+        f"take {own:g} s here and {others:g} s in another program; one that would take longer counts as not getting "
+        "there."
     ]
     if measured.unmade:
         said += ["", *(f"- Not measured: {name}, {escaped(why)}" for name, why in measured.unmade.items())]

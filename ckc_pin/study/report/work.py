@@ -21,10 +21,9 @@ INSTANTS = 10  # at which motions are compared, the end among them
 
 @dataclass(frozen=True)
 class Budget:
-    """Seconds that one run may take, here, in Python, and in the other programs."""
+    """Seconds that one run may take, here and in the other programs."""
 
-    native: float
-    python: float
+    own: float
     peer: float
 
 

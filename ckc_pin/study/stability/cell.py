@@ -31,28 +31,27 @@ BUDGET = {"solver.max_rhs": 30_000, "solver.max_wall_s": 300.0}
 
 @dataclass(frozen=True)
 class How:
-    """A formulation and a method; `equation` of the SPF, 8 as printed or 17."""
+    """A formulation and a method; the SPF in the coordinates of eq. 17, or as eq. 8 is printed."""
 
     formulation: str
     method: str = "auto"
     rtol: float = 1e-8
-    equation: int | None = None
+    printed: bool = False
 
     @property
     def changes(self) -> dict[str, Any]:
         """As a scene's keys."""
-        changes: dict[str, Any] = {"formulation": self.formulation, "solver.method": self.method}
-        changes["solver.rtol"] = self.rtol
-        if self.equation is not None:
-            changes["solver.spf_equation"] = self.equation
-        if self.formulation == "dae" and self.method in ("BDF", "LSODA"):
-            changes["solver.projection"] = False  # whose history projection would corrupt
-        return changes
+        return {
+            "formulation": self.formulation,
+            "spf_coordinates": "z" if self.printed else "w",
+            "solver.method": self.method,
+            "solver.rtol": self.rtol,
+        }
 
     @property
     def label(self) -> str:
         """Such as "spf (8)"."""
-        return f"{self.formulation} ({self.equation})" if self.equation else self.formulation
+        return f"{self.formulation} (8)" if self.printed else self.formulation
 
 
 @dataclass(frozen=True)

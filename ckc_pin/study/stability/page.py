@@ -102,8 +102,8 @@ def page(cells: Sequence[Cell], long_runs: Sequence[LongRun]) -> str:
         f"A run may take {BUDGET['solver.max_rhs']:,} right-hand sides. All that was measured, max |phi|, energy "
         "drift, steps and changes of the partition included, is in [stability.csv](stability.csv).",
         "",
-        f"Computed with {versions}; the cells took {sum(cell.cpu_s for cell in cells) / 60:.0f} minutes of processor "
-        "time. `./scripts/stability` writes this page and the table again; `./scripts/stability GROUP` prints a group.",
+        f"Computed with {versions}; the cells took {sum(cell.cpu_s for cell in cells):.0f} seconds of processor time. "
+        "`./scripts/stability` writes this page and the table again; `./scripts/stability GROUP` prints a group.",
     ]
     for key, members in groups:
         lines += ["", f"## {TITLES[key]}", "", *_group(members)]

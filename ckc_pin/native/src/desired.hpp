@@ -1,0 +1,76 @@
+// Desired trajectories q_d(t) with their first two derivatives: sums of sines, splines, or a point's path.
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "core.hpp"
+
+namespace ckc {
+
+// A function of time with two derivatives.
+class Motion {
+ public:
+  virtual ~Motion() = default;
+  // False where there is none: `problem` says why.
+  virtual bool operator()(double t, Out x, Out x_dot, Out x_ddot) = 0;
+  std::string problem;
+};
+
+class Harmonics : public Motion {
+ public:
+  // offset + sum of amplitude sin(frequency t + phase); (size, waves)
+  Harmonics(Vector offset, Matrix amplitude, Matrix frequency, Matrix phase);
+  bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+
+ private:
+  Vector offset_;
+  Matrix amplitude_, frequency_, phase_;
+};
+
+class Spline : public Motion {
+ public:
+  // Polynomials in pieces: by power, the highest first, a row of coefficients a piece.
+  Spline(Vector breaks, std::vector<Matrix> coefficients);
+  bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+
+ private:
+  Vector breaks_;
+  std::vector<Matrix> coefficients_;
+};
+
+// q_d(t) that takes a point along a path, by Newton's method on Psi(q') = [phi; the point's told coordinates].
+class PointMotion : public Motion {
+ public:
+  struct Told {
+    Closure closure;      // of Psi and more
+    Indices psi;          // its n rows that determine q'
+    std::vector<int> axis;  // by row of psi: which of x, y, z it tells, -1 for one that keeps its level
+    Vector level;         // of psi; zero where told
+  };
+  // `knots`: configurations along the path, (nq, count), at `times`; past `end` the path leaves the workspace.
+  PointMotion(const std::string& model, Indices place, Told told, std::unique_ptr<Motion> path, Indices q,
+              Vector times, Matrix knots, double tolerance, double end, std::string past_end);
+  bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+
+ private:
+  bool close();
+
+  Tree tree_;
+  Rows rows_;
+  Told told_;
+  std::unique_ptr<Motion> path_;
+  Indices q_;
+  Vector times_;
+  Matrix knots_;
+  double tolerance_, end_;
+  std::string past_end_;
+  double t_ = 0;  // of the last one: where it was and how fast it moved
+  bool known_ = false;
+  Vector q_tree_, v_, a_, wanted_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
+  Matrix J_;
+  Factor factor_;
+};
+
+}  // namespace ckc

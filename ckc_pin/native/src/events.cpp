@@ -1,0 +1,296 @@
+#include "events.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <boost/math/tools/minima.hpp>
+#include <boost/math/tools/toms748_solve.hpp>
+
+namespace ckc {
+
+constexpr double rounding = 1e-12;    // of the largest value in the step: counts as zero
+constexpr double near_zero = 0.25;    // of the function's range in the step: an extremum so near to zero is refined
+constexpr double t_tolerance = 1e-12; // s
+constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
+constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
+constexpr double doubtful = 3.0;      // times how far two interpolations of different order are apart
+
+namespace {
+
+// From values at the places to Chebyshev coefficients, and from those to the fine places.
+struct Chebyshev {
+  Matrix to_fine;
+  Vector fine_places;
+  Chebyshev() {
+    const int n = walk_degree;
+    const auto polynomials = [](const Vector& x) {
+      Matrix values(x.size(), walk_degree + 1);
+      for (Eigen::Index i = 0; i < x.size(); ++i)
+        for (int k = 0; k <= walk_degree; ++k) values(i, k) = std::cos(k * std::acos(std::clamp(x(i), -1.0, 1.0)));
+      return values;
+    };
+    const Vector x = 2 * walk_places().array() - 1;
+    fine_places = Vector::LinSpaced(n * fine + 1, 0.0, 1.0);
+    to_fine = polynomials(2 * fine_places.array() - 1) * polynomials(x).inverse();
+  }
+};
+
+const Chebyshev& chebyshev() {
+  static const Chebyshev once;
+  return once;
+}
+
+void insert(Points& points, double t, double value) {
+  const auto at = std::lower_bound(points.begin(), points.end(), t, [](const auto& p, double t) { return p.first < t; });
+  if (at == points.end() || at->first != t) points.insert(at, {t, value});
+}
+
+// Add the points between the given ones where the function comes nearest to zero.
+bool with_extrema(const Gap& gap, double from, double to, In values, double zero, Walk& walked) {
+  Points &points = walked.points, &tips = walked.tips;
+  const double spread = values.maxCoeff() - values.minCoeff();
+  if (!(values.cwiseAbs().minCoeff() <= spread)) return true;  // too far from zero to reach it and come back
+  Vector& curve = walked.curve;
+  curve.noalias() = chebyshev().to_fine * values;
+  for (Eigen::Index i = 1; i + 1 < curve.size(); ++i) {
+    const double before = curve(i) - curve(i - 1), after = curve(i + 1) - curve(i);
+    if (!(before * after < 0.0)) continue;
+    const double step = chebyshev().fine_places(1), shift = 0.5 * (before + after) / (before - after);
+    const double t = from + (to - from) * (chebyshev().fine_places(i) + shift * step);
+    double value;
+    if (!gap(t, value)) return false;
+    insert(points, t, value);
+  }
+  tips.clear();
+  for (size_t k = 0; k < points.size(); ++k) {
+    const auto& [t, value] = points[k];
+    const auto &left = points[k ? k - 1 : 0], &right = points[std::min(k + 1, points.size() - 1)];
+    const bool nearest = value * left.second > 0 && value * right.second > 0 &&
+                         std::abs(value) <= std::abs(left.second) && std::abs(value) <= std::abs(right.second);
+    if (!nearest || !(std::abs(value) > zero) || !(std::abs(value) < near_zero * spread)) continue;
+    const double sign = value > 0 ? 1.0 : -1.0, width = right.first - left.first, start = left.first;
+    bool exists = true;
+    const auto height = [&](double x) {
+      double found = 0.0;
+      exists = exists && gap(start + (x - 1) * width, found);
+      return sign * found;
+    };
+    const auto [x, least] = boost::math::tools::brent_find_minima(height, 1.0, 2.0, tip_bits);
+    if (!exists) return false;
+    tips.emplace_back(start + (x - 1) * width, sign * least);
+  }
+  for (const auto& [t, value] : tips) insert(points, t, value);
+  return true;
+}
+
+bool root(const Gap& gap, const std::pair<double, double>& start, const std::pair<double, double>& end, double& t) {
+  t = start.first;
+  if (start.second * end.second >= 0) return true;  // zero at the start of the step, or by what counts as zero
+  bool exists = true;
+  const auto value = [&](double at) {
+    double found = start.second;
+    exists = exists && gap(at, found);
+    return found;
+  };
+  const auto close = [](double a, double b) {
+    return std::abs(b - a) <= t_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(a);
+  };
+  std::uintmax_t most = 200;
+  const auto [a, b] = boost::math::tools::toms748_solve(value, start.first, end.first, start.second, end.second, close, most);
+  t = 0.5 * (a + b);
+  return exists;
+}
+
+}  // namespace
+
+const Vector& walk_places() {
+  static const Vector once =
+      Vector::NullaryExpr(walk_degree + 1, [](Eigen::Index k) { return (1.0 - std::cos(M_PI * k / walk_degree)) / 2; });
+  return once;
+}
+
+bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked) {
+  const double zero = std::max(floor, rounding * values.cwiseAbs().maxCoeff());
+  const Vector& places = walk_places();
+  Points& points = walked.points;
+  points.clear();
+  for (Eigen::Index k = 0; k < places.size(); ++k)
+    points.emplace_back(k + 1 == places.size() ? to : from + (to - from) * places(k), values(k));
+  if (!with_extrema(gap, from, to, values, zero, walked)) return false;
+  walked.found.clear(), walked.sign = sign, walked.on_zero = false;
+  auto last = points.front();
+  for (const auto& point : points) {
+    const int now = std::abs(point.second) <= zero ? 0 : point.second > 0 ? 1 : -1;
+    walked.on_zero = now == 0;
+    if (now && walked.sign && walked.sign != now) {
+      double t;
+      if (!root(gap, last, point, t)) return false;
+      walked.found.emplace_back(t, now);
+    }
+    if (now) walked.sign = now, last = point;
+  }
+  return true;
+}
+
+Events::Events(System& system, Step& step, std::vector<Event> events)
+    : system_(system), step_(step), events_(std::move(events)), places_(walk_places()) {
+  const Core& core = system.core;
+  const auto count = static_cast<Eigen::Index>(events_.size());
+  for (End* end : {&start_, &end_}) end->q.setZero(core.n), end->v.setZero(core.n), end->a.setZero(core.n);
+  walks_.resize(events_.size());
+  values_.setZero(places_.size(), count), y_.setZero(system.size), coordinates_.setZero(core.n);
+  begin();
+}
+
+void Events::begin() {
+  met.clear();
+  signs_.assign(events_.size(), 0);
+  jump();
+}
+
+void Events::jump() {
+  known_ = false;
+  last_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN());
+}
+
+// The core is at the end of the step, which the right-hand side was evaluated at last.
+void Events::take_end(End& end) {
+  system_.core.tree.to_coordinates(system_.core.q_tree, end.q);
+  end.v = system_.velocity;
+  end.accelerated = system_.tree_acceleration(step_.f_new, end.a);
+}
+
+// Whether a coordinate, or its rate, stays away from its value all through the step: by Hermite interpolation of its
+// ends, with the accelerations and without them, which tells how far off that may be.
+bool Events::ruled_out(const Event& event) const {
+  if (!known_ || !start_.accelerated || !end_.accelerated || event.of > Event::q_dot) return false;
+  const int k = event.coordinate;
+  const double h = step_.t_new - step_.t;
+  const double v0 = h * start_.v(k), v1 = h * end_.v(k), a0 = h * h * start_.a(k), a1 = h * h * end_.a(k);
+  const double way = end_.q(k) - start_.q(k), gap = way - v0 - a0 / 2, slope = v1 - v0 - a0, bend = a1 - a0;
+  const double c3 = 10 * gap - 4 * slope + bend / 2, c4 = -15 * gap + 7 * slope - bend, c5 = 6 * gap - 3 * slope + bend / 2;
+  double low = std::numeric_limits<double>::infinity(), high = -low, apart = 0.0;
+  for (double s = 0.0; s <= 1.0; s += 0.125) {
+    double fine_value, coarse;
+    if (event.of == Event::q) {
+      fine_value = start_.q(k) + s * (v0 + s * (a0 / 2 + s * (c3 + s * (c4 + s * c5))));
+      coarse = start_.q(k) + s * (v0 + s * (3 * way - 2 * v0 - v1 + s * (v0 + v1 - 2 * way)));
+    } else {
+      fine_value = (v0 + s * (a0 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
+      coarse = (v0 + s * (a0 + s * (3 * (v1 - v0) - 2 * a0 - a1 + s * (a0 + a1 - 2 * (v1 - v0))))) / h;
+    }
+    low = std::min(low, fine_value), high = std::max(high, fine_value);
+    apart = std::max(apart, std::abs(fine_value - coarse));
+  }
+  const double room = doubtful * apart + 0.1 * (high - low) + event.floor;
+  return event.value < low - room || event.value > high + room;
+}
+
+bool Events::at(Interpolant& motion, double t) {
+  if (t == step_.t_new)
+    y_ = step_.y_new;
+  else if (t == step_.t)
+    y_ = step_.y;
+  else if (!motion.between(t, y_))
+    return false;
+  return system_.exact(t, y_);
+}
+
+bool Events::value(int k, double t, double& gap) {
+  const Event& event = events_[k];
+  Core& core = system_.core;
+  switch (event.of) {
+    case Event::q:
+      core.tree.to_coordinates(core.q_tree, coordinates_);
+      gap = coordinates_(event.coordinate) - event.value;
+      break;
+    case Event::q_dot:
+      gap = system_.velocity(event.coordinate) - event.value;
+      break;
+    case Event::sigma_min_phi_z:
+      core.jacobian();
+      phi_z_.resize(core.rows.J.rows(), static_cast<Eigen::Index>(core.z.size()));
+      for (size_t j = 0; j < core.z.size(); ++j) phi_z_.col(j) = core.rows.J.col(core.z[j]);
+      gap = svd_phi_z_.compute(phi_z_).singularValues()(core.rank - 1) - event.value;
+      break;
+    case Event::sigma_min_J:
+      core.jacobian();
+      gap = svd_J_.compute(core.rows.J).singularValues()(core.rank - 1) - event.value;
+      break;
+    case Event::function:
+      if (!event.call(t, system_, gap)) return false;
+  }
+  gap *= event.sign;
+  if (std::isfinite(gap)) return true;
+  failed = k, failed_value = gap;
+  return false;
+}
+
+void Events::arrived() {
+  if (!events_.empty()) take_end(end_);
+}
+
+bool Events::sample(Interpolant& motion) {
+  const double h = step_.t_new - step_.t;
+  const bool first_known = values_at_ == step_.t && std::none_of(wanted_.begin(), wanted_.end(), [&](int k) {
+    return std::isnan(last_[k]);
+  });
+  for (Eigen::Index i = 0; i < places_.size(); ++i) {
+    if (i == 0 && first_known) {
+      for (int k : wanted_) values_(0, k) = last_[k];
+      continue;
+    }
+    const double t = i + 1 == places_.size() ? step_.t_new : step_.t + h * places_(i);
+    if (!at(motion, t)) return false;
+    for (int k : wanted_)
+      if (!value(k, t, values_(i, k))) return false;
+  }
+  return true;
+}
+
+bool Events::check(Interpolant& motion, bool last, double& halt) {
+  halt = std::numeric_limits<double>::infinity();
+  if (events_.empty()) return true;
+  wanted_.clear();
+  for (int k = 0; k < static_cast<int>(events_.size()); ++k)
+    if (!signs_[k] || !ruled_out(events_[k])) wanted_.push_back(k);
+  if (!wanted_.empty() && !(sample(motion) && find(motion, last, halt))) return false;
+  values_at_ = step_.t_new;
+  std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
+  known_ = !std::isfinite(halt);
+  if (known_)
+    for (int k : wanted_) last_[k] = values_(places_.size() - 1, k);
+  std::swap(start_, end_);
+  return true;
+}
+
+bool Events::find(Interpolant& motion, bool last, double& halt) {
+  found_.clear();
+  for (int k : wanted_) {
+    const auto gap = [&](double t, double& value_there) { return at(motion, t) && value(k, t, value_there); };
+    if (!walk(std::cref(gap), step_.t, step_.t_new, values_.col(k), signs_[k], events_[k].floor, walks_[k])) return false;
+    Walk& walked = walks_[k];
+    if (last && walked.on_zero && walked.sign) walked.found.emplace_back(step_.t_new, -walked.sign);
+    for (const auto& [t, direction] : walked.found) {
+      if (events_[k].direction != 0 && events_[k].direction != direction) continue;
+      found_.push_back({t, k, direction});
+      if (events_[k].stop) halt = std::min(halt, t);
+    }
+  }
+  std::sort(found_.begin(), found_.end(), [](const Crossed& a, const Crossed& b) {
+    return a.t != b.t ? a.t < b.t : a.event < b.event;
+  });
+  for (const Crossed& crossed : found_)
+    if (crossed.t <= halt) met.push_back(crossed);
+  for (int k : wanted_) {
+    if (!std::isfinite(halt)) {
+      signs_[k] = walks_[k].sign;
+      continue;
+    }
+    for (const auto& [t, direction] : walks_[k].found)  // the sign that a function goes on with from there
+      if (t <= halt) signs_[k] = direction;
+  }
+  return true;
+}
+
+}  // namespace ckc

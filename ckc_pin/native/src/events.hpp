@@ -1,0 +1,98 @@
+// Events: functions of the state that cross zero, located within the step that crosses.
+//
+// A function is known at Chebyshev points of a step. Between them it can still dip through zero and come back, so it is
+// also evaluated at the extrema of the polynomial through those points; and where it comes near to zero there, the
+// nearest point is searched for, which finds the tip of a kink as well. Coordinates and their rates are looked at only
+// where what is known at the ends of a step does not rule a crossing out.
+#pragma once
+
+#include <functional>
+#include <vector>
+
+#include <Eigen/SVD>
+
+#include "method.hpp"
+
+namespace ckc {
+
+struct Event {
+  enum Of { q, q_dot, sigma_min_phi_z, sigma_min_J, function };
+  Of of;
+  int coordinate = 0;
+  double value = 0.0, sign = 1.0;  // it crosses where sign (what is watched - value) crosses zero
+  int direction = 0;               // 1: rising, -1: falling, 0: both
+  bool stop = false;
+  double floor = 0.0;              // what counts as zero
+  // Of a caller's own: the value at (t, the core's state); false where it raised.
+  std::function<bool(double, System&, double&)> call;
+};
+
+struct Crossed {
+  double t;
+  int event, direction;
+};
+
+using Points = std::vector<std::pair<double, double>>;  // (t, value), increasing in t
+
+// Sign changes of a function within a step, and what was needed to find them.
+struct Walk {
+  std::vector<std::pair<double, int>> found;  // (t, direction), in order
+  int sign = 0;                               // at the end, or the last one it had; 0 while it has had none
+  bool on_zero = false;                       // at the end
+  Points points, tips;
+  Vector curve;
+};
+using Gap = std::function<bool(double, double&)>;
+
+constexpr int walk_degree = 8;
+const Vector& walk_places();  // in the step, from 0 to 1
+// `values`: at those places of [from, to]; `sign`: what it came with; `floor`: what counts as zero, beside rounding.
+// False where the function has no value.
+bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked);
+
+class Events {
+ public:
+  Events(System& system, Step& step, std::vector<Event> events);
+
+  void begin();  // a motion begins
+  void jump();   // it goes on from a state that is not the last step's end
+  void arrived();  // the core is where the step just made ends, as the right-hand side left it
+  // Locate events in the step just made; `halt`: when the first one that stops happens, else infinite. `last`: the
+  // motion ends with this step. False where a function has no value: `failed` and the system's problem say which.
+  bool check(Interpolant& motion, bool last, double& halt);
+
+  std::vector<Crossed> met;
+  int failed = -1;
+  double failed_value = 0.0;
+  bool any() const { return !events_.empty(); }
+
+ private:
+  struct End {  // of a step: what is known there without interpolation
+    Vector q, v, a;
+    bool accelerated = false;
+  };
+  bool ruled_out(const Event& event) const;
+  bool value(int k, double t, double& gap);
+  bool at(Interpolant& motion, double t);
+  void take_end(End& end);
+  bool sample(Interpolant& motion);
+  bool find(Interpolant& motion, bool last, double& halt);
+
+  System& system_;
+  Step& step_;
+  std::vector<Event> events_;
+  std::vector<int> signs_, wanted_;
+  const Vector& places_;
+  End start_, end_;
+  bool known_ = false;        // whether start_ is that of the step
+  double values_at_ = 0.0;    // when the last values were taken
+  std::vector<double> last_;  // and what they are; NaN where they were not
+  Matrix values_;             // (places, events)
+  std::vector<Walk> walks_;   // by event
+  std::vector<Crossed> found_;
+  Vector y_, coordinates_;
+  Eigen::JacobiSVD<Matrix> svd_J_, svd_phi_z_;
+  Matrix phi_z_;
+};
+
+}  // namespace ckc

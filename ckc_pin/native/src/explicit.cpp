@@ -1,0 +1,151 @@
+#include "explicit.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "explicit_tables.hpp"
+
+namespace ckc {
+
+constexpr double safety = 0.9, min_factor = 0.2, max_factor = 10.0;
+// Of the length that the error proposes, a third of which are refused: 7 % less work.
+constexpr double step_safety = 5.0 / 6.0;
+// Of a step; more when two steps in a row ask for it, for one may do so by chance.
+constexpr double growth = 2.0;
+
+namespace {
+
+// `first`: how many entries the first row has; each later one has one more if `triangular`.
+Matrix rows_of(const double* values, int rows, int columns, bool triangular) {
+  Matrix a = Matrix::Zero(rows, columns);
+  for (int i = triangular ? 1 : 0; i < rows; ++i)
+    for (int j = 0; j < (triangular ? i : columns); ++j) a(i, j) = *values++;
+  return a;
+}
+
+Vector vector_of(const double* values, int size) { return Eigen::Map<const Vector>(values, size); }
+
+}  // namespace
+
+Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tolerance& tolerance)
+    : Method(system, step, work, tolerance), kind_(kind), stages_(kind == dop853 ? 12 : 6) {
+  const int s = stages_, size = system.size;
+  if (kind == dop853) {
+    A_ = rows_of(dop853_A, s, s, true), A_extra_ = rows_of(dop853_A_extra, 3, 16, false);
+    B_ = vector_of(dop853_B, s), C_ = vector_of(dop853_C, s), C_extra_ = vector_of(dop853_C_extra, 3);
+    E_[0] = vector_of(dop853_E5, s + 1), E_[1] = vector_of(dop853_E3, s + 1);
+    D_ = rows_of(dop853_D, 4, 16, false);
+    F_.setZero(size, 7);
+  } else {
+    A_ = rows_of(rk45_A, s, s, true), B_ = vector_of(rk45_B, s), C_ = vector_of(rk45_C, s);
+    E_[0] = vector_of(rk45_E, s + 1), D_ = rows_of(rk45_P, s + 1, 4, false);
+    F_.setZero(size, 4);
+  }
+  K_.setZero(size, s + 1 + C_extra_.size());
+  for (Vector* x : {&y_stage_, &scale_, &error_}) x->setZero(size);
+}
+
+bool Explicit::stages(double h) {
+  K_.col(0) = step_.f;
+  for (int s = 1; s < stages_; ++s) {
+    y_stage_ = step_.y;
+    for (int i = 0; i < s; ++i)
+      if (A_(s, i) != 0.0) y_stage_ += (h * A_(s, i)) * K_.col(i);
+    if (!evaluate(step_.t + C_(s) * h, y_stage_, K_.col(s))) return false;
+  }
+  step_.y_new = step_.y;
+  for (int s = 0; s < stages_; ++s) step_.y_new += (h * B_(s)) * K_.col(s);
+  if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
+  K_.col(stages_) = step_.f_new;
+  return true;
+}
+
+double Explicit::error(double h) {
+  scale_ = tolerance_.atol + tolerance_.rtol * step_.y.cwiseAbs().cwiseMax(step_.y_new.cwiseAbs()).array();
+  double square[2] = {0.0, 0.0};
+  for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
+    error_.setZero();
+    for (int s = 0; s <= stages_; ++s) error_ += E_[k](s) * K_.col(s);
+    square[k] = (error_.array() / scale_.array()).matrix().squaredNorm();
+  }
+  const double size = static_cast<double>(step_.y.size()), of_five = h * std::sqrt(square[0] / size);
+  if (kind_ == rk45) return of_five;
+  reach_ = 0.5 * h * std::pow(std::max(of_five, 1e-10), -1.0 / 6.0);  // of RK45, whose error estimate is of order four
+  if (square[0] == 0.0 && square[1] == 0.0) return 0.0;
+  return h * square[0] / std::sqrt((square[0] + 0.01 * square[1]) * size);
+}
+
+bool Explicit::step(double t_bound) {
+  const double least = shortest(t_bound), exponent = -1.0 / (error_order() + 1);
+  double length = std::clamp(step_.h, least, std::max(least, tolerance_.max_step));
+  dense_ = false;
+  bool refused = false;
+  for (;;) {
+    if (!(length >= least)) return false;
+    step_.t_new = std::min(step_.t + length, t_bound);
+    const double h = step_.t_new - step_.t;
+    length = h;
+    const bool exists = stages(h);
+    if (!exists && over()) return false;
+    const double size = exists ? error(h) : std::numeric_limits<double>::infinity();
+    if (size < 1.0) {
+      const double most = refused ? 1.0 : max_factor;
+      const double factor = step_safety * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
+      growth_next_ = step_.t_new < t_bound && factor > growth;
+      step_.h_next = length * (growth_next_ && !growth_pending_ ? growth : factor);
+      if (step_.t_new == t_bound && !refused) step_.h_next = std::max(step_.h_next, step_.h);
+      if (kind_ == rk45) reach_ = length * step_safety * safety * std::pow(std::max(size, 1e-10), exponent);
+      return true;
+    }
+    length *= std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
+    refused = true;
+    ++work_.rejected;
+  }
+}
+
+void Explicit::retry(double length) {
+  Method::retry(length);
+  growth_pending_ = false;
+}
+
+void Explicit::commit() {
+  Method::commit();
+  growth_pending_ = growth_next_;
+}
+
+bool Explicit::extra_stages(double h) {
+  for (Eigen::Index k = 0; k < C_extra_.size(); ++k) {
+    const auto s = stages_ + 1 + k;
+    y_stage_ = step_.y;
+    for (Eigen::Index i = 0; i < s; ++i)
+      if (A_extra_(k, i) != 0.0) y_stage_ += (h * A_extra_(k, i)) * K_.col(i);
+    if (!evaluate(step_.t + C_extra_(k) * h, y_stage_, K_.col(s))) return false;
+  }
+  return true;
+}
+
+bool Explicit::between(double at, Out y_at) {
+  const double h = step_.t_new - step_.t, x = (at - step_.t) / h;
+  if (!dense_ && kind_ == rk45) {
+    F_.noalias() = h * K_ * D_;
+  } else if (!dense_) {
+    if (!extra_stages(h)) return false;
+    F_.col(0) = step_.y_new - step_.y;
+    F_.col(1) = h * step_.f - F_.col(0);
+    F_.col(2) = 2 * F_.col(0) - h * (step_.f_new + step_.f);
+    for (Eigen::Index k = 0; k < D_.rows(); ++k) {
+      F_.col(3 + k).setZero();
+      for (Eigen::Index i = 0; i < K_.cols(); ++i) F_.col(3 + k) += (h * D_(k, i)) * K_.col(i);
+    }
+  }
+  dense_ = true;
+  y_at.setZero();
+  for (Eigen::Index i = F_.cols() - 1; i >= 0; --i) {
+    y_at += F_.col(i);
+    y_at *= kind_ == rk45 || (F_.cols() - 1 - i) % 2 == 0 ? x : 1 - x;
+  }
+  y_at += step_.y;
+  return true;
+}
+
+}  // namespace ckc

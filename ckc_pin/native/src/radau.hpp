@@ -1,0 +1,87 @@
+// Radau IIA: implicit collocation of order 5, 9 or 13, stiffly accurate, in one step, so that projection, events and
+// held forces do it no harm.
+//
+// After E. Hairer and G. Wanner, Stiff differential equations solved by Radau methods, 1999; but the Jacobian is taken
+// ahead, where the last step's polynomial leads, which saves half the Newton iterations of a controlled motion.
+#pragma once
+
+#include <complex>
+
+#include <Eigen/LU>
+
+#include "method.hpp"
+
+namespace ckc {
+
+class Radau : public Method {
+ public:
+  Radau(System& system, Step& step, Work& work, const Tolerance& tolerance);
+
+  bool step(double t_bound) override;
+  bool between(double t, Out y) override;
+  void retry(double length) override;
+  void commit() override;
+  void forget() override;
+  const char* name() const override { return "Radau"; }
+  int error_order() const override { return stages_; }
+
+ private:
+  using Complex = std::complex<double>;
+
+  // A collocation polynomial from y at t on: its rate's series in Legendre's polynomials.
+  struct Polynomial {
+    Matrix series;
+    Vector y;
+    double t = 0.0, h = 0.0;
+  };
+  void integrals(double x);
+  using Method::evaluate;
+  void evaluate(const Polynomial& polynomial, double t, Out y);
+
+  enum class Newton { converged, slow, impossible };
+  void tabulate();
+  void guess(double h);
+  void extrapolate(double x, double h, Out y);  // y at t + x h, by the last step's polynomial
+  bool new_jacobian(double h);
+  void factorize(double h);
+  void solve(double h);
+  Newton newton(double h);
+  double error(const Vector& f, double h);
+  void propose(double h, double size, double effort, double exponent);
+
+  const int stages_, most_iterations_;
+  Vector c_, e_;        // nodes; weights of the error estimate
+  Matrix A_inverse_, to_series_;
+  Vector basis_;        // the integrals of Legendre's polynomials somewhere
+  Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1, one of each pair
+  Eigen::VectorXcd lambda_;
+
+  // lambda / h - J, with the entries of y whose rate is another entry eliminated: x_i = h / lambda (b_i + x_j).
+  template <class Scalar>
+  struct Shifted {
+    using Square = Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic>;
+    using Column = Eigen::Matrix<Scalar, Eigen::Dynamic, 1>;
+    Scalar shift;
+    Square left;
+    Column right, rest;
+    Eigen::PartialPivLU<Square> lu;
+    void compute(const Radau& of, Scalar shift);
+    void solve(const Radau& of, const Column& b, Column& x);
+  };
+
+  Matrix J_, Z_, F_, dZ_;
+  Shifted<double> real_;                  // of the real eigenvalue
+  std::vector<Shifted<Complex>> pairs_;   // of the others
+  std::vector<std::pair<int, int>> rates_;
+  Indices rest_, place_;                  // entries of y that are not eliminated; where they are among those, else -1
+  Eigen::VectorXcd right_, correction_;
+  Vector scale_, error_, y_stage_, f_stage_, real_right_, real_correction_;
+  double factorized_ = 0.0;  // the length that the factors are of
+  bool J_known_ = false, J_fresh_ = false;
+  double contraction_ = 0.0;
+  int iterations_ = 0, cautious_ = 0;
+  double error_old_ = 0.0, length_old_ = 0.0, error_new_ = 0.0;
+  Polynomial last_, made_;   // of the last step, and of the one just made
+};
+
+}  // namespace ckc

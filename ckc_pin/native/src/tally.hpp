@@ -1,0 +1,39 @@
+// Which terms were evaluated, how often and for how long, for who asks.
+#pragma once
+
+#include <array>
+#include <chrono>
+
+namespace ckc {
+
+struct Tally {
+  enum Term { phi, J, phi_z, rho, D_tree, D, bias_tree, C_tree, terms };
+  static constexpr const char* names[] = {"phi", "J", "phi_z", "rho", "D_tree", "D", "bias_tree", "C_tree"};
+
+  bool on = false;
+  std::array<long, terms> calls{};
+  std::array<double, terms> seconds{};
+
+  // Books one evaluation for as long as it lives.
+  class Entry {
+   public:
+    Entry(Tally& tally, Term term) : tally_(tally.on ? &tally : nullptr), term_(term) {
+      if (tally_) start_ = Clock::now();
+    }
+    ~Entry() {
+      if (!tally_) return;
+      ++tally_->calls[term_];
+      tally_->seconds[term_] += std::chrono::duration<double>(Clock::now() - start_).count();
+    }
+    Entry(const Entry&) = delete;
+    Entry& operator=(const Entry&) = delete;
+
+   private:
+    using Clock = std::chrono::steady_clock;
+    Tally* tally_;
+    Term term_;
+    Clock::time_point start_;
+  };
+};
+
+}  // namespace ckc

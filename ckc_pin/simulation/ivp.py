@@ -1,0 +1,270 @@
+"""The three formulations as y' = f(t, y) in NumPy: the readable reference, for SciPy's solvers or any other.
+
+============ ==================== =====================================================
+class        y                    equations
+============ ==================== =====================================================
+`LevelSet`   q, q_dot             eq. 6 on the level set phi = w(0) exp(-t / epsilon): with
+                                  w(0) = 0 the reduced model, else the SPF in eq. 17's
+                                  coordinates, whose w is known in closed form
+`PrintedSpf` q, q_dot, z          eq. 8 as printed
+`Dae`        q', v'               eq. 1, its closure differentiated twice; nothing is projected
+============ ==================== =====================================================
+
+The step loop has the same in C++, and nothing of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Controller
+from ckc_pin.dynamics.formulations import (
+    CoriolisVelocity,
+    dae_acceleration,
+    reduced_acceleration,
+    spf_terms,
+    spf_z_dot,
+)
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.chart import Chart
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sigma import sigma
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.scene import Scene, load_scene
+
+__all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
+
+Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
+
+
+class Ivp(Protocol):
+    """An initial value problem and what reads its states.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    y0 : array
+        At t = 0.
+    t_span : (0, t_end)
+        s.
+    counts : dict of str to int
+        "newton": corrections of sigma so far.
+    """
+
+    mechanism: Mechanism
+    y0: Array
+    t_span: tuple[float, float]
+    counts: dict[str, int]
+
+    def f(self, t: float, y: Array) -> Array:
+        """y' at (t, y); NaN where it does not exist, on which solvers shorten their steps."""
+
+    def terms(self, t: float, y: Array) -> Terms:
+        """Terms at a state; NumericalError where they do not exist."""
+
+    def velocity(self, t: float, y: Array) -> Array:
+        """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
+
+
+def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) -> Ivp:
+    """Return a scene's motion as an initial value problem.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, its shipped name or its path; its solver and its events have no meaning here.
+    changes : mapping, optional
+        Values by dotted key.
+
+    Raises
+    ------
+    InputError, MechanismError
+        The scene cannot be run as written, or its controller is sampled.
+    NumericalError
+        Its start is singular.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> problem = as_ivp("five_bar/swing", {"formulation": "reduced"})
+    >>> solution = solve_ivp(problem.f, problem.t_span, problem.y0, "LSODA", rtol=1e-8, atol=1e-10)
+    >>> problem.terms(2.0, solution.y[:, -1]).q_tree
+    """
+    if not isinstance(scene, Scene):
+        scene = load_scene(scene, changes)
+    elif changes:
+        raise InputError("as_ivp: changes go with the name of a scene; a Scene is complete")
+    spec, mechanism = scene.spec, scene_mechanism(scene)
+    if spec.controller is not None and spec.controller.sample_time is not None:
+        raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")
+    start = find_start(mechanism, scene)
+    limit = spec.controller.torque_limit if spec.controller else None
+    force = force_of(scene_controller(scene, mechanism), Actuation(mechanism, limit))
+    span = (0.0, spec.t_end)
+    if spec.formulation == "dae":
+        return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, span)
+    if spec.formulation == "reduced":
+        return LevelSet(mechanism, start.at, start.q_dot, force, span)
+    how = (spec.epsilon, start.w, spec.coriolis_velocity)
+    if spec.spf_coordinates == "z":
+        return PrintedSpf(mechanism, start.at, start.q_dot, force, span, *how)
+    return LevelSet(mechanism, start.at, start.q_dot, force, span, *how)
+
+
+def force_of(controller: Controller | None, actuation: Actuation) -> Force:
+    """Return u' on the tree as a function of (t, terms)."""
+    if controller is None:
+        return lambda t, terms: actuation.none.u_tree
+    return lambda t, terms: actuation.apply(terms, controller.u(t, terms)).u_tree
+
+
+@dataclass
+class LevelSet:
+    """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
+
+    z is found on the level set from the state evaluated last, along the straight line in q.
+    """
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    t_span: tuple[float, float]
+    epsilon: float = 1.0
+    w0: Array | None = None
+    convention: CoriolisVelocity = "rho"
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self._d, self._last = self.mechanism.d, self.initial
+        self._off = self.w0 is not None and bool(np.any(self.w0))
+        self._chart = Chart(self.mechanism.tree, self.initial.partition.q, self.initial.q_tree)
+        self.y0 = np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
+
+    def w(self, t: float) -> Array:
+        """Eq. 17's second line, exact, shape (rows,)."""
+        w0 = np.zeros(self.mechanism.closure.rows) if self.w0 is None else self.w0
+        return w0 * np.exp(-t / self.epsilon)
+
+    def close(self, t: float, numbers: Array) -> Kinematics:
+        """Return the configuration at q on the level set phi(q, z) = w(t)."""
+        step = self._chart.step(self._last.q_tree, numbers)
+        found = sigma(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
+        self.counts["newton"] += found.iterations
+        if found.verdict != "converged":
+            tree = self.mechanism.tree
+            where = tree.named(tree.to_coordinates(found.at.q_tree))
+            raise NumericalError(f"sigma(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
+        self._last = found.at
+        return found.at
+
+    def terms(self, t: float, y: Array) -> Terms:
+        at, q_dot = self.close(t, y[: self._d]), y[self._d :]
+        if self._off:
+            return spf_terms(self.mechanism, at, q_dot, self.epsilon, self.w(t), self.convention)
+        return Terms(self.mechanism, at, at.rho @ q_dot)
+
+    def velocity(self, t: float, y: Array) -> Array:
+        terms = self.terms(t, y)
+        return _spf_velocity(terms, y[self._d :], self.epsilon, self.w(t)) if self._off else terms.v_tree
+
+    def f(self, t: float, y: Array) -> Array:
+        try:
+            terms, q_dot = self.terms(t, y), y[self._d :]
+            actual = self._off and self.convention == "actual"
+            q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if actual else None)
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        return np.concatenate([self._chart.rate(terms.q_tree, q_dot), q_ddot])
+
+
+@dataclass
+class PrintedSpf:
+    """Eq. 8 as printed: y = (q, q_dot, z), with phi = w0 at the start. No free root: its rotation is no number."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    t_span: tuple[float, float]
+    epsilon: float
+    w0: Array
+    convention: CoriolisVelocity = "rho"
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self._d, partition, place = self.mechanism.d, self.mechanism.partition, self.mechanism.tree.place
+        self._q, self._z = place[partition.q], place[partition.z]
+        self.y0 = np.concatenate([self.initial.q_tree[self._q], self.q_dot, self.initial.q_tree[self._z]])
+
+    def terms(self, t: float, y: Array) -> Terms:
+        d, q_tree = self._d, np.empty(self.mechanism.tree.nq)
+        q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
+        at = self.mechanism.kinematics(q_tree)
+        return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
+
+    def velocity(self, t: float, y: Array) -> Array:
+        # with the exact w: what a tolerance leaves phi off by would be divided by epsilon
+        w = self.w0 * np.exp(-t / self.epsilon)
+        return _spf_velocity(self.terms(t, y), y[self._d : 2 * self._d], self.epsilon, w)
+
+    def f(self, t: float, y: Array) -> Array:
+        if not np.all(np.isfinite(y)):
+            return np.full_like(y, np.nan)
+        terms, q_dot = self.terms(t, y), y[self._d : 2 * self._d]
+        try:
+            u_tree = self.force(t, terms)
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        q_ddot = reduced_acceleration(terms, u_tree, q_dot if self.convention == "actual" else None)
+        return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
+
+
+@dataclass
+class Dae:
+    """Eq. 1: y = (q', v'). What is off the closure stays, and grows with time squared."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    v_tree: Array
+    force: Force
+    t_span: tuple[float, float]
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self.y0 = np.concatenate([self.initial.q_tree, self.v_tree])
+
+    def terms(self, t: float, y: Array) -> Terms:
+        tree = self.mechanism.tree
+        q_tree = y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])
+        return Terms(self.mechanism, self.mechanism.kinematics(q_tree), y[tree.nq :])
+
+    def velocity(self, t: float, y: Array) -> Array:
+        return y[self.mechanism.tree.nq :]
+
+    def f(self, t: float, y: Array) -> Array:
+        if not np.all(np.isfinite(y)):
+            return np.full_like(y, np.nan)
+        terms = self.terms(t, y)
+        try:
+            acceleration = dae_acceleration(terms, self.force(t, terms))
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        return np.concatenate([self.mechanism.tree.configuration_rate(terms.q_tree, terms.v_tree), acceleration])
+
+
+def _spf_velocity(terms: Terms, q_dot: Array, epsilon: float, w: Array) -> Array:
+    velocity = terms.at.rho @ q_dot
+    velocity[terms.at.partition.z] = spf_z_dot(terms.at, q_dot, epsilon, w)
+    return velocity

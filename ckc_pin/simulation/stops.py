@@ -1,0 +1,69 @@
+"""Why the loop stopped, in words."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.simulation.events import Watched
+from ckc_pin.simulation.scene import SolverSpec
+
+__all__ = ["Stop", "explain", "why_not_q"]
+
+NEARLY = 1e-3  # of |J|: phi_z's least singular value below which a step that cannot be made is put down to it
+
+TROUBLES = {
+    "none": "the step became so short that t does not change any more",
+    "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
+    "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
+    "infinite": "the right-hand side is not finite",
+}
+
+
+class Stop(NamedTuple):
+    """How the loop came back: why, when, a number that goes with it, which event, and how many rows are recorded."""
+
+    why: str
+    t: float
+    value: float
+    event: int
+    filled: int
+
+
+def explain(stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, events: list[Watched]) -> NumericalError:
+    """Return the error that a stop is, with the configuration where that matters."""
+    why, says, u, sigma_min, margin, q_tree, q, z = loop.trouble()
+    where = mechanism.tree.named(mechanism.tree.to_coordinates(q_tree))
+    match stop.why:
+        case "rhs_budget":
+            return NumericalError(f"the budget of max_rhs = {solver.max_rhs} right-hand sides is used up", t=loop.t)
+        case "wall_budget":
+            return NumericalError(f"the budget of max_wall_s = {solver.max_wall_s:g} s is used up", t=loop.t)
+        case "rank":
+            return NumericalError(
+                f"J loses rank at t = {stop.t:.6g} s (least singular value {stop.value:.1g}): branches of the motion "
+                "meet there, and the loops do not say which one it takes",
+                t=loop.t,
+                q_tree=where,
+            )
+        case "chart":
+            return NumericalError(why_not_q(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
+        case "control":
+            return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
+        case "function":
+            return NumericalError(f"the event {events[stop.event].label['name']!r} is {stop.value}", t=loop.t)
+    small = f"the step fell below min_step = {solver.min_step:g} s"
+    reason = small if stop.why == "min_step" else TROUBLES[why]
+    if not margin <= NEARLY:
+        return NumericalError(reason, t=loop.t)
+    return NumericalError(f"{why_not_q(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
+
+
+def why_not_q(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:
+    """Say that phi_z is singular, so that q has stopped to be coordinates."""
+    names = mechanism.coordinates
+    return (
+        f"phi_z is singular (its least singular value is {sigma_min:.2g}): "
+        f"{', '.join(names[k] for k in q)} do not determine {', '.join(names[k] for k in z)} here"
+    )

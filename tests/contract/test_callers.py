@@ -1,0 +1,176 @@
+"""A caller's own functions in the step loop: what they are given, how often, and what becomes of what they raise."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import Event, Simulator, Terms, load_scene, simulate
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.simulate import run_prepared
+
+SCENES = [
+    ("five_bar/set_point", {"formulation": "reduced", "t_end": 0.2}),
+    ("five_bar/set_point", {"formulation": "dae", "t_end": 0.2}),
+    ("five_bar/set_point", {"initial.w": [0.01, -0.01], "coriolis_velocity": "actual", "t_end": 0.2}),
+    ("five_bar/set_point", {"initial.w": [0.01, -0.01], "spf_coordinates": "z", "t_end": 0.05}),
+    ("delta/circle", {"formulation": "reduced", "t_end": 0.05}),
+    ("stewart/wave", {"formulation": "dae", "t_end": 0.02}),
+]
+# all that a controller could ask for
+NAMES = ("D_tree", "C_tree", "h_tree", "bias_tree", "phi", "J_dot", "rho", "rho_dot", "D", "C", "h", "energy",
+         "potential_energy", "q", "q_dot")  # fmt: skip
+
+
+class Own:
+    """The scene's controller as a caller's, who looks at what is given."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner, self.calls, self.kept = inner, 0, []
+
+    def u(self, t: float, terms: Terms) -> Any:
+        self.calls += 1
+        if self.calls % 100 == 1:
+            self.kept.append((terms, {name: np.copy(getattr(terms, name)) for name in NAMES}))
+        return self.inner.u(t, terms)
+
+
+@pytest.mark.parametrize(("scene", "changes"), SCENES, ids=str)
+def test_it_is_called_once_an_evaluation_with_the_terms_of_its_state(scene, changes):
+    loaded = load_scene(scene, changes)
+    own = Own(prepare(loaded).controller)
+    theirs, mine = simulate(loaded), simulate(loaded, controller=own)
+    assert np.abs(mine.q_tree - theirs.q_tree).max() <= 1e-7
+    assert theirs.stats["python_calls"] == 0
+    outputs = len(mine.t)
+    assert mine.stats["python_calls"] == own.calls
+    assert mine.stats["rhs"] <= own.calls <= mine.stats["rhs"] + outputs + 1
+    assert mine.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1)
+    assert len(own.kept) > 1
+    for terms, given in own.kept:
+        reference = Terms(mine.mechanism, terms.at, terms.v_tree)
+        for name, value in given.items():
+            wanted = np.asarray(getattr(reference, name))
+            assert np.abs(value - wanted).max(initial=0.0) <= 1e-11 * max(1.0, np.abs(wanted).max(initial=0.0)), name
+
+
+def test_terms_that_are_kept_stay_as_they_were():
+    scene = load_scene("five_bar/set_point", {"formulation": "reduced", "t_end": 0.2})
+    kept: list[Terms] = []
+    inner = prepare(scene).controller
+    assert inner is not None
+
+    class Keeps:
+        def u(self, t: float, terms: Terms) -> Any:
+            kept.append(terms)
+            return inner.u(t, terms)
+
+    mechanism = simulate(scene, controller=Keeps()).mechanism
+    assert len({terms.t for terms in kept}) > 100
+    for terms in kept[::50]:  # never asked for anything while the loop was there
+        reference = Terms(mechanism, mechanism.kinematics(terms.q_tree), terms.v_tree)
+        assert np.array_equal(terms.q, reference.q)
+        assert np.abs(terms.C - reference.C).max() <= 1e-12
+        assert np.abs(terms.phi).max() <= 1e-9
+
+
+class Broken(Exception):
+    """Nobody else's."""
+
+
+def test_what_it_raises_is_carried_out_whole_and_the_loop_can_be_started_again():
+    scene = load_scene("five_bar/set_point", {"formulation": "reduced", "t_end": 0.1})
+    inner = prepare(scene).controller
+    assert inner is not None
+    raised = Broken("sensor 3")
+
+    class Fails:
+        fails = True
+
+        def u(self, t: float, terms: Terms) -> Any:
+            if self.fails and t > 0.05:
+                raise raised
+            return inner.u(t, terms)
+
+    fails = Fails()
+    ready = prepare(scene, controller=fails)
+    with pytest.raises(Broken, match="sensor 3") as caught:
+        run_prepared(ready)
+    assert caught.value is raised
+    assert any(entry.name == "u" for entry in caught.traceback)
+    fails.fails = False
+    again = run_prepared(ready)
+    assert again.status == "done"
+    assert np.array_equal(again.q_tree, simulate(scene, controller=fails).q_tree)
+
+
+def test_what_an_event_raises_too():
+    def function(t: float, terms: Terms) -> float:
+        raise Broken("at once")
+
+    with pytest.raises(Broken, match="at once"):
+        simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(function, name="broken")])
+
+
+def test_a_keyboard_interrupt_in_it_ends_the_run_as_any():
+    class Interrupts:
+        def u(self, t: float, terms: Terms) -> Any:
+            if t > 0.5:
+                raise KeyboardInterrupt
+            return -terms.q_dot
+
+    run = simulate("five_bar/swing", {"formulation": "reduced", "t_end": 1.0}, controller=Interrupts())
+    assert run.status == "interrupted"
+    assert 0.3 < run.t[-1] <= 0.5
+
+
+def test_an_event_is_asked_a_few_times_a_step():
+    asked = []
+
+    def function(t: float, terms: Terms) -> float:
+        asked.append(t)
+        return terms.q[0] - 10.0
+
+    run = simulate("five_bar/swing", {"formulation": "reduced"}, events=[Event(function, name="far")])
+    assert run.stats["python_calls"] == len(asked)
+    assert len(asked) <= 9 * run.stats["steps"]
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+def test_simulators_in_threads_do_not_disturb_each_other(formulation: str):
+    """Four mechanisms, eight simulators, each with its own u: bit for bit what they do one after the other."""
+
+    def walk(number: int) -> Any:
+        name = ("five_bar/swing", "delta/default", "four_bar/default", "three_rrr/default")[number % 4]
+        simulator = Simulator(name, {"formulation": formulation})
+        u = 0.1 * np.random.default_rng(number).standard_normal(simulator.mechanism.d)
+        if name == "delta/default" and formulation == "dae":
+            u = 0.01 * u
+        return np.array([simulator.step(u, 2e-3).q_tree for _ in range(50)])
+
+    alone = [walk(number) for number in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        together = list(pool.map(walk, range(8)))
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_callers_controllers_in_threads_get_their_own_terms():
+    def run(number: int) -> Any:
+        target = -0.5 - 0.05 * number
+
+        class Own:
+            def u(self, t: float, terms: Terms) -> Any:
+                return terms.h + terms.D @ (20.0 * (target - terms.q) - 5.0 * terms.q_dot)
+
+        changes = {"formulation": "reduced", "t_end": 0.3}
+        return simulate("five_bar/set_point", changes, controller=Own()).q_tree
+
+    alone = [run(number) for number in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(run, range(4)))
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one, other)

@@ -1,0 +1,24 @@
+"""A loop's steps, one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from tests.analytic.five_bar import Array
+
+__all__ = ["steps_of"]
+
+
+def steps_of(loop: Any, begin: Callable[[], None], t_end: float) -> Array:
+    """The ends of its steps to t_end: with no time between pauses, it comes back after each."""
+    begin()
+    ends: list[float] = []
+    while not ends or ends[-1] < t_end:
+        assert loop.advance(t_end, True, 0.0, math.inf)[0] in ("pause", "end")
+        if not ends or loop.t > ends[-1]:
+            ends.append(loop.t)
+    return np.array(ends)

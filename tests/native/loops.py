@@ -1,0 +1,21 @@
+"""A scene's loop at its start, and the same motion as the NumPy reference has it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ckc_pin import load_scene
+from ckc_pin.simulation.ivp import Ivp, as_ivp
+from ckc_pin.simulation.prepare import Prepared, prepare
+
+
+def started(scene: str, changes: dict[str, Any] | None = None) -> Prepared:
+    """Return a scene with its loop at the start."""
+    ready = prepare(load_scene(scene, changes))
+    ready.begin()
+    return ready
+
+
+def both(scene: str, changes: dict[str, Any] | None = None) -> tuple[Prepared, Ivp]:
+    """Return a scene with its loop at the start, and its motion in NumPy."""
+    return started(scene, changes), as_ivp(scene, changes)

@@ -1,0 +1,85 @@
+"""Runs against their equations in NumPy by SciPy's solvers at 1e-11: neither the step loop nor its C++ is shared."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin import InputError, as_ivp, load_scene, simulate
+
+TIGHT = 1e-11
+SPF = {"formulation": "spf", "initial.w": [0.01, -0.02], "epsilon": 1e-2}
+Z = {**SPF, "spf_coordinates": "z"}
+DAE, REDUCED = {"formulation": "dae"}, {"formulation": "reduced"}
+
+RUNS = [
+    ("andrews/default", {**DAE, "t_end": 0.01}),
+    ("andrews/default", {**REDUCED, "t_end": 0.01}),
+    ("bricard/default", {"t_end": 1.0}),
+    ("delta/circle", {**DAE, "t_end": 0.1}),
+    ("delta/circle", {**REDUCED, "t_end": 0.1}),
+    ("delta/default", {**DAE, "t_end": 0.2}),
+    ("delta/default", {**REDUCED, "t_end": 0.1}),
+    ("delta/default", {**SPF, "initial.w": 18 * [1e-3], "t_end": 0.1}),
+    ("five_bar/set_point", {**DAE, "t_end": 0.2}),
+    ("five_bar/set_point", {**REDUCED, "t_end": 0.5}),
+    ("five_bar/set_point", {"t_end": 0.3}),
+    ("five_bar/swing", {**DAE, "t_end": 1.0}),
+    ("five_bar/swing", {**REDUCED, "t_end": 1.0}),
+    ("five_bar/swing", {**SPF, "t_end": 0.3}),
+    ("five_bar/swing", {**SPF, "t_end": 0.3, "coriolis_velocity": "actual"}),
+    ("five_bar/swing", {**Z, "t_end": 0.3}),
+    ("five_bar/swing", {**Z, "t_end": 0.3, "coriolis_velocity": "actual"}),
+    ("five_bar/tracking", {**DAE, "t_end": 0.3}),
+    ("five_bar/tracking", {**REDUCED, "t_end": 0.3}),
+    ("five_bar/tracking", {"t_end": 0.3}),
+    ("five_bar/tracking", {**REDUCED, "t_end": 0.1, "controller.torque_limit": 0.3}),
+    ("four_bar/turning", {**DAE, "t_end": 0.5}),
+    ("four_bar/turning", {**REDUCED, "t_end": 0.5}),
+    ("n_four_bar/default", {**DAE, "t_end": 0.3}),
+    ("n_four_bar/default", {**REDUCED, "t_end": 0.3}),
+    ("stewart/default", {**REDUCED, "t_end": 0.05}),
+    ("stewart/wave", {**REDUCED, "t_end": 0.05}),
+    ("talos/default", {**DAE, "t_end": 0.02}),
+    ("three_rrr/circle", {**REDUCED, "t_end": 0.2}),
+    ("three_rrr/default", {"t_end": 0.3}),
+    ("two_ur5/default", {**DAE, "t_end": 0.2}),
+    ("two_ur5/lift", {**REDUCED, "t_end": 0.1}),
+]
+
+
+@pytest.mark.parametrize(("scene", "changes"), RUNS, ids=str)
+def test_a_run_is_the_motion_of_its_equations(scene, changes):
+    run = simulate(scene, changes)
+    assert run.status == "done"
+    problem = as_ivp(scene, changes)
+    times = run.t[:: len(run.t) // 4]
+    method = "Radau" if changes.get("spf_coordinates") == "z" else "DOP853"
+    found = solve_ivp(problem.f, problem.t_span, problem.y0, method, times, rtol=TIGHT, atol=TIGHT / 100)
+    assert found.success
+    for t, y in zip(times, found.y.T, strict=True):
+        row, terms = int(np.searchsorted(run.t, t)), problem.terms(t, y)
+        wanted = problem.mechanism.tree.to_coordinates(terms.q_tree)
+        _near(run.q_tree[row], wanted)
+        _near(run.v_tree[row], problem.velocity(t, y))
+        _near(run.phi[row], terms.phi)
+
+
+def _near(found, wanted):
+    """Within a hundred times the tolerance of a step, which is what a run adds up to."""
+    assert np.abs(found - wanted).max() <= 100 * 1e-8 * max(1.0, np.abs(wanted).max())
+
+
+def test_a_sampled_controller_is_no_function_of_time_and_state():
+    with pytest.raises(InputError, match=r"controller\.sample_time"):
+        as_ivp("five_bar/set_point", {"controller.sample_time": 0.01})
+
+
+def test_changes_go_with_a_name():
+    with pytest.raises(InputError, match="a Scene is complete"):
+        as_ivp(load_scene("five_bar/swing"), {"t_end": 1.0})
+
+
+def test_where_there_is_no_state_there_is_no_rate():
+    """As SciPy's solvers take it: the step is shortened."""
+    problem = as_ivp("five_bar/swing", REDUCED)
+    assert np.isnan(problem.f(0.0, problem.y0 + np.array([1e3, 0.0, 0.0, 0.0]))).all()
