@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import Run, simulate
-from tests.regression import one_freedom
+from tests.regression import flyball, one_freedom
 
 FORMULATIONS = ("dae", "reduced", "spf")
 
@@ -94,6 +94,23 @@ def test_slider_cranks(scene: str, rate: float, mechanism: one_freedom.Mechanism
     assert np.abs(run.v_tree[:, run.column("crank")] - theta_dot).max() <= 1e-8
     slider = [mechanism(x).slider for x in theta]
     assert np.abs(run.q_tree[:, run.column("slider")] - slider).max() <= 1e-9
+
+
+# --- flyball governor ----------------------------------------------------------------------------
+
+A05 = {"slider": 0.61962292, "rod_1": 0.39007370, "rod_2": 0.39007370, "shaft": 55.93540991}  # at 10 s, to 1e-8
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_stiff_flyball_governor(formulation: str) -> None:
+    run = simulate("flyball", {"formulation": formulation, "solver.rtol": 1e-9})
+    assert run.stats["method"] == "Radau"
+    assert run.stats["rhs"] <= 6000
+    by_hand = flyball.governor(run.t[-1], 1e-12)
+    for name, expected in A05.items():
+        found = run.q_tree[-1, run.column(name)]
+        assert abs(found - expected) <= 2e-8, name
+        assert abs(found - by_hand[name]) <= 1e-8, name
 
 
 # --- N-four-bar ----------------------------------------------------------------------------------

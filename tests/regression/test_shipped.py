@@ -21,6 +21,7 @@ MOBILITY = {
     "delta": (21, 3, 18, 18),
     "five_bar": (4, 2, 2, 2),
     "five_bar_as_printed": (4, 2, 2, 2),
+    "flyball": (4, 4, 0, 0),  # a tree
     "four_bar": (3, 1, 2, 2),
     "n_four_bar": (9, 1, 8, 8),  # N = 4
     "slider_crank": (3, 1, 2, 2),
