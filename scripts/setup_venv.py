@@ -7,7 +7,6 @@ good. Where the native core alone has changed, it alone is compiled again.
 
 import fcntl
 import hashlib
-import os
 import shutil
 import subprocess
 import sys
@@ -46,17 +45,10 @@ def main() -> None:
 
 
 def wanted_stamp() -> str:
-    """Everything that .venv depends on; the place too, since a virtual environment cannot be moved.
-
-    Whether there is a compiler counts for the native core: with a new one it is worth another try.
-    """
+    """Everything that .venv depends on; the place too, since a virtual environment cannot be moved."""
     packages = digest(f"{sys.version}\n{ROOT}\n", CONSTRAINTS, ROOT / "pyproject.toml", Path(__file__))
-    native = digest(f"{compiler()}\n", *sorted(NATIVE.iterdir()))
+    native = digest("", *sorted(NATIVE.iterdir()))
     return f"{packages}\n{native}\n"
-
-
-def compiler() -> str | None:
-    return next(filter(None, map(shutil.which, (os.environ.get("CXX", "c++"), "c++", "g++", "clang++"))), None)
 
 
 def digest(text: str, *paths: Path) -> str:
@@ -98,8 +90,7 @@ def make(lock: int) -> None:
             hashed = ["--require-hashes", "--only-binary=:all:", "--progress-bar=off", "-r", str(CONSTRAINTS)]
             run_with_progress(lock, "pip", [*pip(), *hashed])
     STAMP.write_text(UNFINISHED)
-    with_core = "with the native core, a minute or two" if compiler() else "without a native core: no C++ compiler"
-    say(f"installing ckc_pin {with_core}")
+    say("installing ckc_pin: its native core is compiled, two minutes or more")
     with removed_on_failure():
         editable = ["--no-deps", "--no-build-isolation", "--no-index", "--editable", str(ROOT)]
         run_quietly(lock, "pip", [*pip(), *editable])
