@@ -1,0 +1,190 @@
+"""Processor times of what a person does with a scene, each pair in one process, the least of several repetitions."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from ckc_pin import Simulator, Terms, load_scene, simulate
+from ckc_pin.control.controllers import SetPoint
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.simulation.prepare import Prepared, prepare, scene_controller
+from ckc_pin.simulation.scene import catalogue
+from ckc_pin.simulation.simulate import run_prepared
+
+ROOT = Path(__file__).parent.parent
+INERT = [{"coordinate": "theta_1", "value": 50.0}]
+FORMULATIONS = ("dae", "reduced", "spf")
+LINES = 7000
+CIRCLE = {"center": [0.02, -0.4, 0.0], "radius": 0.03, "period": 2.0}
+
+
+def least(what: Callable[[], Any], times: int) -> float:
+    """Processor time of what is called, s."""
+
+    def once() -> float:
+        started = process_time()
+        what()
+        return process_time() - started
+
+    return min(once() for _ in range(times))
+
+
+def ready(scene: str, changes: dict[str, Any] | None = None, **options: Any) -> Prepared:
+    return prepare(load_scene(scene, changes), **options)
+
+
+def run_seconds(scene: str, changes: dict[str, Any] | None = None, times: int = 5) -> float:
+    """Of a prepared scene, s."""
+    prepared = ready(scene, changes)
+    return least(lambda: run_prepared(prepared), times)
+
+
+def python_calls() -> float:
+    """Of all shipped scenes in all their formulations, those that start."""
+    total = 0
+    for name, _, scenes in catalogue():
+        for scene in scenes:
+            for formulation in FORMULATIONS:
+                if (name, formulation) in (("talos", "reduced"), ("talos", "spf")) and scene == "default":
+                    continue  # 26 freedoms, free root: nothing else than the DAE's is asked of it
+                run = simulate(f"{name}/{scene}", {"formulation": formulation, "t_end": 0.05})
+                total += run.stats["python_calls"]
+    return float(total)
+
+
+def inert_event() -> float:
+    plain, watched = ready("five_bar/swing"), ready("five_bar/swing", {"event": INERT})
+    pairs = [(least(lambda: run_prepared(watched), 5), least(lambda: run_prepared(plain), 5)) for _ in range(5)]
+    return min(a for a, _ in pairs) / min(b for _, b in pairs)
+
+
+class Own:
+    """Eq. 14 as a caller would write it, its gains numbers."""
+
+    def __init__(self, scene: str) -> None:
+        inner = scene_controller(load_scene(scene), ready(scene).mechanism)
+        assert isinstance(inner, SetPoint)
+        self.q_d, self.K_P, self.K_V, self.h_d = inner.q_d, inner.K_P[0, 0], inner.K_V[0, 0], inner.target.h
+
+    def u(self, t: float, terms: Terms) -> Any:
+        return self.h_d - self.K_P * (terms.q - self.q_d) - self.K_V * terms.q_dot
+
+
+def own_controller() -> float:
+    """Time of a right-hand side, microseconds: a run whose end is its only output."""
+    scene = "five_bar/set_point"
+    prepared = ready(scene, {"solver.output_dt": 5.0}, controller=Own(scene))
+    spent = least(lambda: run_prepared(prepared), 15)
+    return 1e6 * spent / float(prepared.loop.stats()["rhs"])
+
+
+def step_us(scene: str, changes: dict[str, Any] | None = None) -> float:
+    simulator = Simulator(scene, changes)
+    u = np.zeros(simulator.mechanism.d)
+
+    def steps() -> None:
+        simulator.reset()
+        for _ in range(100):
+            simulator.step(u, 1e-3)
+
+    return 1e4 * least(steps, 7)
+
+
+def circle() -> float:
+    """The same motion, given as a circle of the tool and as a table of the joints' angles along it."""
+    raise NotImplementedError
+
+
+def again_us() -> float:
+    """Beyond the loop's own time, which it counts itself."""
+    prepared = ready("five_bar/swing", {"t_end": 1e-3})
+    loop = prepared.loop
+    n = len(prepared.mechanism.coordinates)
+    times = np.linspace(0.0, 1e-3, 201)
+    rows = np.empty((202, loop.width))
+
+    def native() -> None:
+        prepared.begin()
+        loop.record(times, rows)
+        loop.advance(1e-3, 0.05)
+
+    assert n
+    return 1e6 * (least(lambda: run_prepared(prepared), 200) - least(native, 200))
+
+
+def process_seconds(*words: str) -> float:
+    """User and system time of a process, s."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+
+    def once() -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(words, env=environment, check=True, stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    once()
+    return min(once() for _ in range(9))
+
+
+def command() -> float:
+    ckc = str(Path(sys.executable).parent / "ckc")
+    run = process_seconds(ckc, "run", "five_bar/swing", "--json")
+    return run / process_seconds(sys.executable, "-c", "import pinocchio")
+
+
+def lines() -> float:
+    files = [
+        path
+        for folder in ("ckc_pin/simulation", "ckc_pin/native")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in (".py", ".cpp", ".hpp")
+    ]
+    return float(sum(len(path.read_text().splitlines()) for path in files))
+
+
+def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
+    """What is measured, how, at most, in which unit."""
+    yield "Python calls in the loop, all shipped scenes", python_calls, 0, ""
+    yield "swing with an inert event / without", inert_event, 1.15, ""
+    yield "a caller's Python controller, a right-hand side", own_controller, 12, "us"
+    yield (
+        "tracking with sample_time = 1e-3, 9.5 s",
+        lambda: run_seconds("five_bar/tracking", {"controller.sample_time": 1e-3, "t_end": 9.5}, 3),
+        0.35,
+        "s",
+    )
+    for scene, bound in (("five_bar", 25), ("delta", 60), ("two_ur5", 150), ("talos", 2000)):
+        yield f"Simulator.step of 1 ms, {scene}", lambda scene=scene: step_us(scene), bound, "us"
+    yield "talos/default", lambda: run_seconds("talos/default"), 0.8, "s"
+    yield "flyball as DAE to 1e-6", lambda: run_seconds("flyball", {"solver.rtol": 1e-6}), 0.3, "s"
+    yield "a run again, beyond the loop's own time", again_us, 50, "us"
+    yield 'simulate("five_bar/swing") whole', lambda: 1e3 * least(lambda: simulate("five_bar/swing"), 20), 3, "ms"
+    yield "ckc run five_bar/swing --json / import pinocchio", command, 1.8, ""
+    yield "lines of ckc_pin/simulation and native", lines, LINES, ""
+
+
+def main() -> int:
+    """Print a Markdown table; exit 1 when a bound is missed."""
+    print("| what | measured | at most |\n|---|---|---|")
+    missed = 0
+    with one_blas_thread():
+        for what, measure, bound, unit in rows():
+            found = measure()
+            missed += found > bound
+            print(
+                f"| {what} | {found:.4g} {unit} | {bound:g} {unit}{', missed' if found > bound else ''} |", flush=True
+            )
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
