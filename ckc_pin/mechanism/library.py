@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 import re
+from copy import deepcopy
+from functools import cache
+from os.path import isfile
 from pathlib import Path
 
 from ckc_pin.errors import InputError
@@ -16,8 +19,12 @@ from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 __all__ = ["about", "build", "first_comment", "is_path", "library", "load", "mechanism_file", "shipped"]
 
 MECHANISM_FILE = "mechanism.toml"
+MOST_KEPT = 32  # of the mechanisms built
+
+_built: dict[tuple[str, str, Path | None], Mechanism] = {}  # never handed out, only copied
 
 
+@cache
 def library() -> Path:
     """Folder of the shipped mechanisms: beside the package in a checkout, inside it in a wheel."""
     package = Path(__file__).resolve().parent.parent
@@ -51,11 +58,12 @@ def mechanism_file(name: str | Path) -> Path:
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
         return path / MECHANISM_FILE if path.is_dir() else path
-    if name not in shipped():
+    path = library() / name / MECHANISM_FILE
+    if Path(name).name != name or not isfile(path):  # which takes names that no file system does
         raise InputError(
             f"no mechanism {name!r}; shipped: {', '.join(shipped())}; or give the path of a {MECHANISM_FILE}"
         )
-    return library() / name / MECHANISM_FILE
+    return path
 
 
 def load(name: str | Path | GeneratorSpec) -> Mechanism:
@@ -101,9 +109,28 @@ def _text(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
 
 
 def build(text: str, sources: Sources) -> Mechanism:
-    """Build a mechanism from the text of its file; the text is kept among its sources."""
+    """Build a mechanism from the text of its file; the text is kept among its sources.
+
+    One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
+    many a run.
+    """
+    sources.texts[MECHANISM_FILE] = text
+    key = (text, sources.name, sources.folder)
+    built = _built.get(key)
+    if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
+        twin = deepcopy(built)
+        twin.sources = sources
+        return twin
+    mechanism = _build(text, sources)
+    built = _built[key] = deepcopy(mechanism)
+    built.tree.rest()
+    while len(_built) > MOST_KEPT:
+        _built.pop(next(iter(_built)))
+    return mechanism
+
+
+def _build(text: str, sources: Sources) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    sources.texts[MECHANISM_FILE] = text
     return Mechanism(spec, sources)

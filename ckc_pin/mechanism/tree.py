@@ -8,6 +8,7 @@ of one Python object a joint; the stride is verified when the tree is made.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,7 @@ class Tree:
     def __init__(self, model: Any) -> None:
         if model.nv > MOST:
             raise MechanismError(f"{model.nv} coordinates in the tree; at most {MOST} are taken")
-        self.model = model
-        self.data = model.createData()
+        self._work_on(model)
         self.n: int = model.nv
         self.nq: int = model.nq
         self.flat = self.n == self.nq
@@ -70,9 +70,23 @@ class Tree:
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
+
+    def _work_on(self, model: Any) -> None:
+        self.model = model
+        self.data = model.createData()
         self._placement = _strided_placements(self.data)
         # a matrix of one column would come as a vector
-        self._jacobian, self._jacobian_dot = self.data.J.reshape(6, self.n), self.data.dJ.reshape(6, self.n)
+        self._jacobian, self._jacobian_dot = self.data.J.reshape(6, model.nv), self.data.dJ.reshape(6, model.nv)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tree:
+        """Copy the model, and give the copy a workspace of its own; labels and places stay as they are."""
+        twin = memo[id(self)] = copy(self)
+        twin._work_on(self.model.copy())
+        return twin
+
+    def rest(self) -> None:
+        """Let the workspace go, of a tree that is only to be copied."""
+        del self.data, self._placement, self._jacobian, self._jacobian_dot
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -135,13 +136,14 @@ def scene_file(name: str | Path) -> Path:
     if Path(f"{name}{SUFFIX}").is_file():
         raise InputError(f"no scene {name!r}; there is {name}{SUFFIX}, a path ends in .toml")
     mechanism, _, scene = name.partition("/")
+    path = library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
+    if Path(name).parts in ((mechanism,), (mechanism, scene)) and isfile(path):
+        return path
     if mechanism not in shipped():
         raise InputError(
             f"no mechanism {mechanism!r}; shipped: {', '.join(shipped())}; or give the path of a *{SUFFIX} file"
         )
-    if (scene or DEFAULT) not in scene_names(mechanism):
-        raise InputError(f"{mechanism} has no scene {scene!r}; it has {', '.join(scene_names(mechanism))}")
-    return library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
+    raise InputError(f"{mechanism} has no scene {scene!r}; it has {', '.join(scene_names(mechanism))}")
 
 
 def _default(folder: Path) -> Path:

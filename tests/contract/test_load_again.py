@@ -1,0 +1,77 @@
+"""A mechanism that is loaded again is copied: faster, and still nobody else's."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+import ckc_pin
+from ckc_pin import load
+from ckc_pin.mechanism import library as shelf
+from ckc_pin.mechanism.library import library
+
+
+def mine(folder: Path, name: str = "five_bar") -> Path:
+    return Path(shutil.copytree(library() / name, folder / name)) / "mechanism.toml"
+
+
+def test_it_is_built_once(tmp_path: Path, monkeypatch) -> None:
+    built, build = [], shelf._build
+    monkeypatch.setattr(shelf, "_build", lambda *given: built.append(1) or build(*given))
+    path = mine(tmp_path)
+    first, again = load(path), load(path)
+    assert len(built) == 1
+    assert again.independent == first.independent
+    assert np.array_equal(again.q_tree, first.q_tree)
+    assert again.sources.texts == first.sources.texts
+
+
+def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
+    path = mine(tmp_path)
+    before = load(path)
+    urdf = path.parent / "five_bar.urdf"
+    text = urdf.read_text()
+    mass = text.split('<mass value="')[1].split('"')[0]
+    urdf.write_text(text.replace(f'<mass value="{mass}"', '<mass value="7.5"', 1))
+    after = load(path)
+    assert 7.5 in [inertia.mass for inertia in after.tree.model.inertias]
+    assert 7.5 not in [inertia.mass for inertia in before.tree.model.inertias]
+    path.write_text(path.read_text() + "\n# a remark\n")
+    assert load(path).sources.texts["mechanism.toml"].endswith("# a remark\n")
+
+
+def test_what_somebody_does_to_theirs_is_theirs(tmp_path: Path) -> None:
+    path = mine(tmp_path)
+    state = ({"theta_1": -1.2, "theta_3": -1.9}, {"theta_1": 0.4, "theta_3": -0.3})
+    first = load(path)
+    known = ckc_pin.terms(first, *state).D.copy()
+    first.tree.model.inertias[1].mass = 50.0
+    first.tree.model.gravity.linear = np.zeros(3)
+    first.q_tree[:] = 0.0
+    first.springs.joint_stiffness[:] = 1e3
+    second = load(path)
+    assert second.tree is not first.tree
+    assert np.array_equal(ckc_pin.terms(second, *state).D, known)
+    assert second.tree.model.gravity.linear[1] != 0.0
+    assert second.q_tree.any()
+    assert not second.springs.joint_stiffness.any()
+
+
+def test_two_have_two_workspaces() -> None:
+    one, other = load("delta"), load("delta")
+    placements, _ = one.tree.kinematics(one.q_tree)
+    q_tree = other.tree.integrate(other.q_tree, 0.1 * np.ones(other.n))
+    other.tree.kinematics(q_tree)
+    ours = one.tree.data.oMi[5].translation
+    assert not np.array_equal(ours, other.tree.data.oMi[5].translation)
+    assert np.array_equal(placements[5, 9:], ours)
+    assert other.springs.tree is other.tree
+
+
+def test_only_so_many_are_kept(tmp_path: Path) -> None:
+    for k in range(shelf.MOST_KEPT + 3):
+        load(mine(tmp_path / str(k), "slider_crank"))
+    assert len(shelf._built) == shelf.MOST_KEPT
+    assert not any(hasattr(built.tree, "data") for built in shelf._built.values())
