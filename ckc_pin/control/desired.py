@@ -77,7 +77,7 @@ class Table:
         self._q_ddot = self._q_dot.derivative()
         self.end = float(t[-1])
 
-    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+    def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
         return self.spline(t), self._q_dot(t), self._q_ddot(t)
 
 

@@ -16,6 +16,7 @@ from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.kinematics import Kinematics
 from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.many import integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.point import Point
 from ckc_pin.mechanism.sources import Sources
@@ -26,14 +27,16 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Circle", "Line", "Place", "PointPath", "make_desired"]
 
 KNOTS = 400  # of a path
+STRIDE = 40  # knots from one that the path is followed to, to the next
+NODES = 6  # of the interpolation between those
 BISECTIONS = 50
 
 
 class Place(Protocol):
     """A place over time."""
 
-    def __call__(self, t: float) -> tuple[Array, Array, Array]:
-        """Return x, its rate and its acceleration, each of shape (3,), metres and seconds."""
+    def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,) or (count, 3), metres and seconds."""
 
 
 class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -80,9 +83,10 @@ class Circle:
         self.centre = np.array(spec.centre)
         self.a, self.b = perpendicular(normal / np.linalg.norm(normal))
 
-    def __call__(self, t: float) -> tuple[Array, Array, Array]:
-        """Return x, its rate and its acceleration, each of shape (3,)."""
-        rate, angle = self.spec.frequency, self.spec.frequency * t + self.spec.phase
+    def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,), or (count, 3) at many times."""
+        rate = self.spec.frequency
+        angle = (rate * np.asarray(t) + self.spec.phase)[..., np.newaxis]
         out = self.spec.radius * (np.cos(angle) * self.a + np.sin(angle) * self.b)
         along = self.spec.radius * (np.cos(angle) * self.b - np.sin(angle) * self.a)
         return self.centre + out, rate * along, -(rate**2) * out
@@ -96,9 +100,10 @@ class Line:
         self.middle = (np.array(spec.start) + np.array(spec.end)) / 2
         self.half = (np.array(spec.end) - np.array(spec.start)) / 2
 
-    def __call__(self, t: float) -> tuple[Array, Array, Array]:
-        """Return x, its rate and its acceleration, each of shape (3,)."""
-        rate, angle = self.spec.frequency, self.spec.frequency * t
+    def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
+        """Return x, its rate and its acceleration, each of shape (3,), or (count, 3) at many times."""
+        rate = self.spec.frequency
+        angle = (rate * np.asarray(t))[..., np.newaxis]
         cosine, sine = np.cos(angle) * self.half, np.sin(angle) * self.half
         return self.middle - cosine, rate * sine, rate**2 * cosine
 
@@ -134,14 +139,10 @@ class PointPath:
                 first = point.inverse(place(0.0)[0])
             except InputError as error:
                 raise InputError(f"controller.desired: the path cannot be started: {error}") from None
-            self.times, self.knots = [0.0], [point.kinematics(first.at.q_tree)]
-            for t in np.linspace(0.0, t_end, KNOTS + 1)[1:]:
-                at = self._follow(self.knots[-1], float(t))
-                if at is None:
-                    self._end(self.times[-1], float(t))
-                    break
-                self.times.append(float(t))
-                self.knots.append(at)
+            self.start = point.kinematics(first.at.q_tree)
+            self.times = np.linspace(0.0, t_end, KNOTS + 1)
+            together = self._together()
+            self.knots = self._one_by_one() if together is None else together
 
     @property
     def past_end(self) -> str:
@@ -151,9 +152,37 @@ class PointPath:
             f"t = {self.leaves_at or 0.0:.5f} s"
         )
 
-    def _end(self, inside: float, outside: float) -> None:
-        """Bisect for the last instant that can be reached; it becomes the last knot."""
-        at = self.knots[-1]
+    def _together(self) -> Array | None:
+        """Follow the path to every STRIDE-th knot and interpolate; what is between is then met exactly, all at once."""
+        tree, coarse = self.point.mechanism.tree, [self.start]
+        for t in self.times[STRIDE::STRIDE]:
+            at = self._follow(coarse[-1], float(t))
+            if at is None:
+                return None
+            coarse.append(at)
+        near = [self.start.q_tree[np.newaxis]]
+        weights = [_lagrange(np.arange(1, STRIDE + 1) / STRIDE + k) for k in range(NODES - 1)]
+        for k, at in enumerate(coarse[:-1]):
+            first = int(np.clip(k - NODES // 2 + 1, 0, len(coarse) - NODES))
+            steps = np.array([tree.difference(at.q_tree, other.q_tree) for other in coarse[first : first + NODES]])
+            near.append(integrate(tree, np.tile(at.q_tree, (STRIDE, 1)), weights[k - first] @ steps))
+        return self.point.meet(np.concatenate(near), self.place(self.times)[0], self.start)
+
+    def _one_by_one(self) -> Array:
+        """Follow the path from knot to knot; where it leaves the workspace, the last one is as near as can be."""
+        knots = [self.start]
+        for k, t in enumerate(self.times[1:], 1):
+            at = self._follow(knots[-1], float(t))
+            if at is None:
+                self.leaves_at, at = self._end(knots[-1], float(self.times[k - 1]), float(t))
+                self.times = np.append(self.times[:k], self.leaves_at)
+                knots.append(at)
+                break
+            knots.append(at)
+        return np.array([at.q_tree for at in knots])
+
+    def _end(self, at: Kinematics, inside: float, outside: float) -> tuple[float, Kinematics]:
+        """Bisect for the last instant that can be reached."""
         for _ in range(BISECTIONS):
             middle = 0.5 * (inside + outside)
             there = self._follow(at, middle)
@@ -161,9 +190,7 @@ class PointPath:
                 outside = middle
             else:
                 inside, at = middle, there
-        self.times.append(inside)
-        self.knots.append(at)
-        self.leaves_at = inside
+        return inside, at
 
     def _follow(self, at: Kinematics, t: float) -> Kinematics | None:
         """Go on to the place at t, unless the inverse kinematics or the independent coordinates fail on the way."""
@@ -199,8 +226,15 @@ class PointPath:
     def _near(self, t: float) -> tuple[Kinematics, Kinematics]:
         """Return the knots around t, the nearer one first; the last one may be singular, at the workspace's edge."""
         after = int(np.clip(np.searchsorted(self.times, t), 1, len(self.times) - 1))
-        around = (self.knots[after - 1], self.knots[after])
+        around = (self.point.kinematics(self.knots[after - 1]), self.point.kinematics(self.knots[after]))
         return around if t - self.times[after - 1] < self.times[after] - t else around[::-1]
+
+
+def _lagrange(x: Array) -> Array:
+    """Weights, at x, of values at 0, 1, 2 ..., shape (len(x), NODES)."""
+    nodes = np.arange(NODES)
+    others = [[m for m in nodes if m != k] for k in nodes]
+    return np.array([np.prod([(x - m) / (k - m) for m in others[k]], axis=0) for k in nodes]).T
 
 
 def make_desired(

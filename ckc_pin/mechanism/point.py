@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from ckc_pin.mechanism.closure import Closure, Selected
 from ckc_pin.mechanism.extended import Extended, Task, extend, find_point
 from ckc_pin.mechanism.following import solutions
 from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.many import evaluate, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.sigma import newton
@@ -22,6 +24,7 @@ __all__ = ["Inverse", "Point"]
 SMALLEST_PIECE = 1e-6  # of the way to a place
 LONGEST_STEP = 0.5  # rad or m of any coordinate in one piece of the way
 MOST = 64  # solutions of the inverse kinematics
+MOST_CORRECTIONS = 8  # of Newton's method from a place nearby
 OFF = 1e-9  # of the mechanism's size: how far a place that cannot be met exactly may be missed
 
 
@@ -68,6 +71,7 @@ class Point:
         chosen = np.concatenate([self.extended.loops, self.extended.fixing])
         closure = self.extended.closure
         rows = Selected(closure.groups, closure.rows, chosen)
+        self._chosen = chosen
         self._psi = Closure(closure.anchors, (rows,), tuple(closure.names[k] for k in chosen), ())
         places = Selected(closure.groups, closure.rows, self.extended.place[:3])
         self._place = Closure(closure.anchors, (places,), tuple(closure.names[k] for k in self.extended.place[:3]), ())
@@ -187,6 +191,54 @@ class Point:
                     return None
         return at if self._met(at, wanted) else None
 
+    def meet(self, near: Array, wanted: Array, begin: Kinematics) -> Array | None:
+        """Put the point at many places of a path, all at once.
+
+        Parameters
+        ----------
+        near : (count, nq) array
+            Configurations near the wanted ones, in the order of the path.
+        wanted : (count, 3) array
+            Metres in the world.
+        begin : Kinematics
+            A Psi on the path.
+
+        Returns
+        -------
+        (count, nq) array, or None
+            None unless each is met, from nearer by than neighbours are apart, on one side of what is singular.
+        """
+        tree, z = self.mechanism.tree, self.mechanism.partition.z
+        levels = self._level(wanted, begin)
+        if levels.shape[1] != self.mechanism.n:
+            return None
+        room = max(np.abs(tree.difference(a, b)).max() for a, b in itertools.pairwise(near))
+        q_tree, moved = near, np.zeros(len(near))
+        for _ in range(MOST_CORRECTIONS):
+            rows, J_rows = evaluate(tree, self.extended.closure, q_tree)
+            phi, J = rows[:, self._chosen], J_rows[:, self._chosen]
+            side = np.sign(np.linalg.det(J))
+            if not side.all() or np.any(side != side[0]):
+                return None
+            if np.abs(phi - levels).max() <= self.mechanism.tolerance:
+                break
+            step = np.asarray(np.linalg.solve(J, (levels - phi)[..., np.newaxis])[..., 0], dtype=float)
+            moved += np.abs(step).max(axis=1)
+            if not np.all(moved <= room):
+                return None
+            q_tree = integrate(tree, q_tree, step)
+        else:
+            return None
+        place = rows[:, self.extended.place[:3]]
+        place += self.position(q_tree[0]) - place[0]
+        if not np.abs(place - wanted).max() <= OFF * self.mechanism.size:
+            return None
+        if len(z) == len(self.extended.loops):
+            side = np.sign(np.linalg.det(J_rows[:, self.extended.loops][:, :, z]))
+            if not side.all() or np.any(side != side[0]):
+                return None
+        return q_tree
+
     def rates(self, psi: Kinematics, x_dot: Array, x_ddot: Array) -> tuple[Array, Array]:
         """Return v' and its rate, shape (n,) each, that give the point a velocity and an acceleration (3,)."""
         told = self.extended.fixing - self.extended.place[0]
@@ -210,12 +262,12 @@ class Point:
         return wanted
 
     def _level(self, wanted: Array, begin: Kinematics) -> Array:
-        """Psi's wanted values: the loops closed, the place as told, the orientation as at the start."""
-        level = begin.phi.copy()
-        level[: len(self.extended.loops)] = 0.0
-        for k, row in enumerate(self.extended.fixing - self.extended.place[0]):
-            if row < 3:
-                level[len(self.extended.loops) + k] = wanted[row]
+        """Psi's wanted values: the loops closed, each place of (..., 3) as told, the orientation as at the start."""
+        loops = len(self.extended.loops)
+        level = np.tile(begin.phi, (*wanted.shape[:-1], 1))
+        level[..., :loops] = 0.0
+        told = self.extended.fixing - self.extended.place[0]
+        level[..., loops + np.flatnonzero(told < 3)] = wanted[..., told[told < 3]]
         return level
 
     def _met(self, at: Kinematics, wanted: Array) -> bool:

@@ -105,7 +105,7 @@ def _point(path: PointPath) -> dict[str, Any] | None:
     told = extended.fixing - extended.place[0]
     psi = np.concatenate([extended.free, extended.fixing])
     axis = np.array([-1] * len(extended.free) + [int(k) if k < 3 else -1 for k in told])
-    kept = path.knots[0].phi[len(extended.loops) :]
+    kept = path.start.phi[len(extended.loops) :]
     level = np.concatenate([np.zeros(len(extended.free)), kept])
     return {
         "kind": "point",
@@ -117,8 +117,8 @@ def _point(path: PointPath) -> dict[str, Any] | None:
         "level": np.where(axis >= 0, 0.0, level),
         "path": place,
         "q": mechanism.partition.q.tolist(),
-        "times": np.array(path.times),
-        "knots": np.asfortranarray(np.column_stack([at.q_tree for at in path.knots])),
+        "times": path.times,
+        "knots": np.asfortranarray(path.knots.T),
         "tolerance": mechanism.tolerance,
         "end": np.inf if path.leaves_at is None else path.leaves_at,
         "past_end": path.past_end,

@@ -183,6 +183,34 @@ def test_a_path_that_leaves(pair):
 
 
 @pytest.mark.parametrize(
+    ("name", "desired", "t_end"),
+    [
+        ("five_bar", {"point": "tip", "circle": CIRCLE}, 3.0),
+        ("five_bar", {"point": "tip", "circle": {**CIRCLE, "frequency": 40.0}}, 3.0),  # a chord is no arc: one by one
+        (
+            "five_bar",
+            {"point": "tip", "line": {"start": [0.1, -0.4, 0], "end": [0.2, -0.45, 0], "frequency": 2.0}},
+            3.0,
+        ),
+        ("delta", {"point": "plate", "circle": {"centre": [0, 0, -0.29], "radius": 0.02, "frequency": 2.0}}, 2.0),
+        ("three_rrr", {"point": "plate", "circle": {"centre": [0.01, 0.01, 0], "radius": 0.02, "frequency": 1.0}}, 9.0),
+    ],
+)
+def test_knots_met_together_are_those_followed_one_by_one(name, desired, t_end):
+    """And each of them puts the point on the path, in closed form."""
+    mechanism = load(name)
+    follow = make_desired(desired, mechanism, Sources("test", None, {}), t_end)
+    together = follow._together()
+    if desired.get("circle", {}).get("frequency") == 40.0:
+        assert together is None
+    else:
+        assert_close(together, follow._one_by_one(), 1e-9)
+    for t, q_tree in zip(follow.times[::10], follow.knots[::10], strict=True):
+        assert_close(mechanism.point_positions(q_tree)[desired["point"]], follow.place(t)[0], 1e-9)
+        assert_close(mechanism.kinematics(q_tree).phi, 0.0, 1e-9)
+
+
+@pytest.mark.parametrize(
     ("desired", "says"),
     [
         ({}, "give one of file, circle and line"),
