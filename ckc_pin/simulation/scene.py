@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import cached_property
 from os.path import isfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -112,7 +113,12 @@ class Scene:
 
     def plain(self) -> dict[str, Any]:
         """Return the scene as resolved, as plain data without absent values."""
-        return _present(msgspec.to_builtins(self.spec))
+        found: dict[str, Any] = msgspec.msgpack.decode(self._packed)
+        return found
+
+    @cached_property
+    def _packed(self) -> bytes:
+        return msgspec.msgpack.encode(_present(msgspec.to_builtins(self.spec)))
 
 
 def scene_names(mechanism: str) -> list[str]:
