@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
-from ckc_pin import Event, InputError, NumericalError, Simulator, Terms, load_scene, simulate
+from ckc_pin import Event, InputError, NumericalError, Simulator, Terms, as_ivp, load_scene, simulate
 from ckc_pin.simulation.simulator import State
 from tests.conftest import assert_close
 
@@ -151,6 +152,42 @@ def test_a_step_is_cheap() -> None:
         simulator.step(None, 0.002)
     assert simulator.stats["rhs"] - before <= 20 * 7
     assert simulator.stats["python_calls"] == 0
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae"])
+def test_a_u_that_stays_costs_hardly_more_than_the_run(formulation: str) -> None:
+    """Steps of the method reach beyond those of the caller while nothing changes."""
+    changes = {"formulation": formulation, "t_end": 1.0}
+    simulator, u = Simulator("five_bar/swing", changes), np.array([0.05, -0.02])
+    for _ in range(1000):
+        simulator.step(u, 1e-3)
+    assert simulator.stats["rhs"] <= 3 * simulate("five_bar/swing", changes, controller=Push(u)).stats["rhs"]
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae"])
+@pytest.mark.parametrize("dt", [1e-3, 7e-3])
+def test_a_u_that_changes_now_and_then(formulation: str, dt: float) -> None:
+    """Against SciPy on the equations in NumPy, from change to change: what reached beyond a change is made again."""
+    held, random = [0.0, 0.0], np.random.default_rng(5)
+    simulator = Simulator("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-9})
+    q = simulator.mechanism.partition.q
+    problem: Any = as_ivp("five_bar/swing", {"formulation": formulation})
+
+    def force(t: float, terms: Terms) -> Array:
+        u_tree = np.zeros(4)
+        u_tree[q] = held
+        return u_tree
+
+    problem.force, y, t = force, problem.y0, 0.0
+    for steps in (1, 1, 2, 13, 3, 40, 1, 7):
+        held[:] = random.uniform(-0.5, 0.5, 2)
+        for _ in range(steps):
+            state = simulator.step(held, dt)
+        y = solve_ivp(problem.f, (t, t + steps * dt), y, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+        t += steps * dt
+        assert state.t == pytest.approx(t, abs=1e-12)
+        assert_close(state.q_tree, problem.terms(t, y).q_tree, 1e-7)
+        assert_close(state.v_tree, problem.velocity(t, y), 1e-7)
 
 
 # --- states --------------------------------------------------------------------------------------

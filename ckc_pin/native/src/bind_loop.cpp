@@ -120,7 +120,7 @@ nb::object state(Run& run) {
   nb::object numbers = array(size, place);
   for (const Vector* x : parts) place = std::copy(x->data(), x->data() + x->size(), place);
   run.places.are(*run.core);
-  return nb::make_tuple(loop.now.t, numbers, run.places.q, run.places.z);
+  return nb::make_tuple(loop.t(), numbers, run.places.q, run.places.z);
 }
 
 // Why no step could be made: (trouble, what a controller says, its u, phi_z's least singular value and that over |J|,
@@ -232,8 +232,8 @@ void bind_loop(nb::module_& m) {
       .def("rhs", &rhs, "t"_a, "y"_a)
       .def("jacobian", &jacobian, "t"_a, "y"_a)
       .def("seconds", &seconds, "states"_a, "rounds"_a)
-      .def_prop_ro("t", [](const Run& run) { return run.loop->now.t; })
-      .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->now.y); })
+      .def_prop_ro("t", [](const Run& run) { return run.loop->t(); })
+      .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->y()); })
       .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });
   bind_parts(m, loop);
 }

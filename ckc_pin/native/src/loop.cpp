@@ -33,7 +33,7 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
       crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed) {
-  for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_}) x->setZero(system->size);
+  for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_told_}) x->setZero(system->size);
 }
 
 void Loop::start(double t, In q_tree, In v_tree, In w) {
@@ -47,12 +47,15 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
   steps = {}, crossings.clear(), kept_ = 0, doubt_ = 0, length_ = 0.0;
   method_ = nullptr, radau_.reset(), segment_ = t;
-  begun_ = f_known_ = jumped_ = false;
+  begun_ = f_known_ = jumped_ = beyond_ = false;
+  unchanged_ = 0;
   crossing_.begin();
   events.begin();
 }
 
 void Loop::jump() {
+  back();
+  unchanged_ = 0;
   f_known_ = false, jumped_ = true;
   if (method_) method_->forget();
 }
@@ -67,11 +70,20 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
   const auto started = Clock::now();
   const auto spent = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
   system->may_switch = !control->acts();
+  const double from = t();
+  until_ = until, ++unchanged_;
+  if (beyond_) {
+    if (until < now.t_new) return within(until);
+    beyond_ = false;
+    if (const auto stop = kept(after_, margin_, now.t_new, false)) return *stop;
+  }
   if (control->acts()) {
     bool changed = false;
     if (!system->own_partition(now.t, now.y, changed)) return {Stop::chart, now.t, system->margin()};
     if (changed) begun_ = false, jump();
   }
+  // As far as nothing has changed for.
+  double ahead = final || control->law || events.any() ? 0.0 : static_cast<double>(unchanged_ - 1) * (until - from);
   for (;;) {
     const double near = control->sampling ? control->sampling->near(now.t) : 0.0;
     if (control->sampling && control->sampling->instant() <= now.t + near)
@@ -84,15 +96,35 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
     if (!(now.t < until)) return {Stop::end, now.t};
     double bound = until;
     if (control->sampling && control->sampling->instant() < until - near) bound = control->sampling->instant();
-    if (bound != segment_) choose_again(bound), segment_ = bound;  // and not where a pause has ended
-    if (const auto stop = begin(bound)) return *stop;
+    if (bound + ahead != segment_) choose_again(bound + ahead), segment_ = bound + ahead;  // not where a pause has ended
+    if (const auto stop = begin(bound + ahead)) return *stop;
     while (now.t < bound) {
-      if (const auto stop = one_step(bound, final && bound == until)) return *stop;
+      const double before = now.t;
+      if (const auto stop = one_step(bound + ahead, final && bound == until)) {
+        if (ahead == 0.0 || now.t != before || stop->why == Stop::rhs_budget) return *stop;
+        ahead = 0.0, now.h = std::min(now.h, bound - now.t);  // what is in the way may lie beyond
+        continue;
+      }
+      if (beyond_) return within(until);
       const double seconds = spent();
       if (seconds > budget) return {Stop::wall_budget, now.t};
       if (seconds > pause) return {Stop::pause, now.t};
     }
   }
+}
+
+Stop Loop::within(double until) {
+  if (!method_->between(until, y_out_)) return untold();
+  told_ = until, y_told_ = y_out_;
+  return {Stop::end, until};
+}
+
+void Loop::back() {
+  if (!beyond_) return;
+  now.t_old = now.t, now.y_old = now.y;
+  now.t = told_, now.y = y_told_;
+  now.h = std::min(now.h, now.t_new - now.t_old);
+  beyond_ = begun_ = false;
 }
 
 // What is sampled sees the state, and what is due acts from here on.
@@ -163,6 +195,7 @@ std::optional<Stop> Loop::one_step(double bound, bool last) {
   if (system->core.rank) {
     const double left = crossing_.left(end_, length_, bound);
     if (std::isfinite(left)) {
+      bound = std::min(bound, until_);
       const double met = crossing_.over(left, length_);
       if (work.spent || control->problem.raised) return trouble();
       if (std::isfinite(met)) {
@@ -203,8 +236,20 @@ std::optional<Stop> Loop::ordinary(double bound, bool last) {
     }
     if (verdict.part < 1.0) return shorter(verdict.part);
   }
-  if (const auto stop = keep(*method_, after, margin, last))
-    return stop->why == Stop::output && can_be_shorter ? shorter(0.5) : stop;
+  if (now.t_new > until_) {
+    beyond_ = true, after_ = after, margin_ = margin;
+    return {};
+  }
+  return kept(after, margin, bound, last);
+}
+
+// Make the end of the step just made the present state.
+std::optional<Stop> Loop::kept(const RankMonitor::Rank& after, double margin, double bound, bool last) {
+  const double h = now.t_new - now.t;
+  if (const auto stop = keep(*method_, after, margin, last)) {
+    if (stop->why != Stop::output || !(h > shortest_told * (bound - now.t))) return stop;
+    return method_->retry(0.5 * h), std::nullopt;
+  }
   length_ = h;
   ++steps[number()];
   if (doubt_ && ++kept_ >= doubt_) {
@@ -288,7 +333,7 @@ Stop Loop::untold() {
   return stop.why == Stop::step ? Stop{Stop::output, now.t} : stop;
 }
 
-bool Loop::record_now() { return recorder.add(*system, now.t, now.y); }
+bool Loop::record_now() { return recorder.add(*system, t(), y()); }
 
 // Come to the present time once more from the start, with the finer tolerance.
 std::optional<Stop> Loop::redo() {

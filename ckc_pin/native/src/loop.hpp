@@ -48,11 +48,16 @@ class Loop {
   // Let a u act from now on, held.
   void hold(In u);
   // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
+  // Where it does not end, and nothing has changed for some advances, a step may reach beyond; the present state is
+  // then within it, and the step is made again from there should something change.
   Stop advance(double until, bool final, double pause, double budget);
-  // Record the present state, unless that instant is recorded already.
+  // The present state.
+  double t() const { return beyond_ ? told_ : now.t; }
+  const Vector& y() const { return beyond_ ? y_told_ : now.y; }
+  // Record it, unless that instant is recorded already.
   bool record_now();
-  // The core at the present state, closed, with the system's velocity and w; false where that does not exist.
-  bool settle_core() { return system->exact(now.t, now.y); }
+  // The core there, closed, with the system's velocity and w; false where that does not exist.
+  bool settle_core() { return system->exact(t(), y()); }
 
   const std::unique_ptr<Control> control;
   const std::unique_ptr<System> system;
@@ -69,6 +74,9 @@ class Loop {
   std::optional<Stop> begin(double bound);
   std::optional<Stop> one_step(double bound, bool last);
   std::optional<Stop> ordinary(double bound, bool last);
+  std::optional<Stop> kept(const RankMonitor::Rank& after, double margin, double bound, bool last);
+  Stop within(double until);  // the step that reaches beyond
+  void back();                // to the present state
   std::optional<Stop> across(double met, double left, double bound, bool last);
   std::optional<Stop> keep(Interpolant& motion, const RankMonitor::Rank& after, double margin, bool last);
   std::optional<Stop> look(Interpolant& motion, bool last, double& halt);
@@ -105,6 +113,14 @@ class Loop {
     Vector q_tree, v_tree, w;
   } begin_;
   Vector y_out_, held_before_;
+
+  // A step that reaches beyond the present time is made, and not yet kept.
+  bool beyond_ = false;
+  double told_ = 0.0, until_ = 0.0;  // the present time, and the one that is asked for
+  Vector y_told_;
+  RankMonitor::Rank after_;   // at the end of that step, as is
+  double margin_ = 0.0;
+  long unchanged_ = 0;        // advances since something changed
 };
 
 }  // namespace ckc
