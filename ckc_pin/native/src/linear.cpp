@@ -65,7 +65,7 @@ void Definite::shape(int size) {
   if (few_)
     small_.shape(size, size, full_pattern(size));
   else
-    large_ = Eigen::LLT<Matrix>(size);
+    large_.compute(Matrix::Identity(size, size));  // used once, before anything can move it
 }
 
 void Definite::compute(const Matrix& a) { few_ ? small_.compute(a) : void(large_.compute(a)); }
