@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from ckc_pin import Event, InputError, NumericalError, Simulator, Terms, as_ivp, load_scene, simulate
 from ckc_pin.simulation.simulator import State
 from tests.conftest import assert_close
+from tests.regression.test_reference_cases import first_top_pin
 
 Array = NDArray[np.float64]
 FORMULATIONS = ["reduced", "spf", "dae"]
@@ -188,6 +189,22 @@ def test_a_u_that_changes_now_and_then(formulation: str, dt: float) -> None:
         assert state.t == pytest.approx(t, abs=1e-12)
         assert_close(state.q_tree, problem.terms(t, y).q_tree, 1e-7)
         assert_close(state.v_tree, problem.velocity(t, y), 1e-7)
+
+
+@pytest.mark.parametrize("dt", [2e-3, 0.05])
+@pytest.mark.parametrize("changing", [False, True])
+def test_steps_over_positions_where_j_loses_rank(dt: float, changing: bool) -> None:
+    """A row of parallelograms, flat three times, against its pendulum's equation; u none, or tiny and changing."""
+    simulator, random = Simulator("n_four_bar", {"mechanism.N": 7, "formulation": "dae"}), np.random.default_rng(3)
+    for k in range(round(3.0 / dt)):
+        if changing and k % 20 == 0:
+            u = 1e-9 * random.standard_normal(1)
+        state = simulator.step(u if changing else None, dt)
+    place = simulator.mechanism.point_positions(state._q_tree)["B0"]
+    assert_close(place[:2], np.array(first_top_pin(7, state.t)), 2e-6)
+    if not changing:
+        plain = simulate("n_four_bar", {"mechanism.N": 7, "formulation": "dae", "t_end": 3.0})
+        assert simulator.stats["rhs"] <= 2 * plain.stats["rhs"]
 
 
 # --- states --------------------------------------------------------------------------------------

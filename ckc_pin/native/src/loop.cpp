@@ -75,15 +75,16 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
   if (beyond_) {
     if (until < now.t_new) return within(until);
     beyond_ = false;
-    if (const auto stop = kept(after_, margin_, now.t_new, false)) return *stop;
+    const auto stop = std::isnan(met_) ? kept(after_, margin_, now.t_new, false) : crossed(met_, after_, margin_, false);
+    if (stop) return *stop;
   }
   if (control->acts()) {
     bool changed = false;
     if (!system->own_partition(now.t, now.y, changed)) return {Stop::chart, now.t, system->margin()};
     if (changed) begun_ = false, jump();
   }
-  // As far as nothing has changed for.
-  double ahead = final || control->law || events.any() ? 0.0 : static_cast<double>(unchanged_ - 1) * (until - from);
+  reaches_ = !final && !control->law && !events.any();
+  double ahead = reaches_ ? static_cast<double>(unchanged_ - 1) * (until - from) : 0.0;  // as far as nothing has changed for
   for (;;) {
     const double near = control->sampling ? control->sampling->near(now.t) : 0.0;
     if (control->sampling && control->sampling->instant() <= now.t + near)
@@ -114,7 +115,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
 }
 
 Stop Loop::within(double until) {
-  if (!method_->between(until, y_out_)) return untold();
+  if (!by_->between(until, y_out_)) return untold();
   told_ = until, y_told_ = y_out_;
   return {Stop::end, until};
 }
@@ -193,9 +194,8 @@ bool Loop::is_stiff(double duration) {
 std::optional<Stop> Loop::one_step(double bound, bool last) {
   if (const auto stop = begin(bound)) return stop;
   if (system->core.rank) {
-    const double left = crossing_.left(end_, length_, bound);
+    const double left = crossing_.left(end_, length_, reaches_ ? infinity : bound);
     if (std::isfinite(left)) {
-      bound = std::min(bound, until_);
       const double met = crossing_.over(left, length_);
       if (work.spent || control->problem.raised) return trouble();
       if (std::isfinite(met)) {
@@ -236,11 +236,15 @@ std::optional<Stop> Loop::ordinary(double bound, bool last) {
     }
     if (verdict.part < 1.0) return shorter(verdict.part);
   }
-  if (now.t_new > until_) {
-    beyond_ = true, after_ = after, margin_ = margin;
-    return {};
-  }
+  if (reach(*method_, std::nan(""), after, margin)) return {};
   return kept(after, margin, bound, last);
+}
+
+// Whether the step just made, which lost rank at `met` or nowhere, goes beyond the time asked for, and waits there.
+bool Loop::reach(Interpolant& motion, double met, const RankMonitor::Rank& after, double margin) {
+  beyond_ = now.t_new > until_;
+  by_ = &motion, met_ = met, after_ = after, margin_ = margin;
+  return beyond_;
 }
 
 // Make the end of the step just made the present state.
@@ -267,7 +271,7 @@ std::optional<Stop> Loop::kept(const RankMonitor::Rank& after, double margin, do
 // Over a position where J loses rank, by the collocation step just found.
 std::optional<Stop> Loop::across(double met, double left, double bound, bool last) {
   Collocation& motion = *crossing_.collocation;
-  now.t_new = std::min(motion.t, bound), now.h_next = length_ > 0.0 ? length_ : left;
+  now.t_new = reaches_ ? motion.t : std::min(motion.t, bound), now.h_next = length_ > 0.0 ? length_ : left;
   motion.at(now.t_new, now.y_new);
   if (!system->exact(now.t_new, now.y_new)) return trouble();
   const RankMonitor::Rank after = monitor_.at(*system);
@@ -276,7 +280,12 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
   if (!ends && !RankMonitor::kept(after)) return Stop{Stop::rank, now.t_new, after.value};
   if (!ends && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return trouble();
   events.arrived();
-  if (const auto stop = keep(motion, after, system->margin(), last)) return stop;
+  if (reach(motion, met, after, system->margin())) return {};
+  return crossed(met, after, system->margin(), last);
+}
+
+std::optional<Stop> Loop::crossed(double met, const RankMonitor::Rank& after, double margin, bool last) {
+  if (const auto stop = keep(*crossing_.collocation, after, margin, last)) return stop;
   method_->forget();
   crossings.push_back(met);
   ++steps[number()];
@@ -343,7 +352,7 @@ std::optional<Stop> Loop::redo() {
   begun_ = f_known_ = false, length_ = 0.0;
   method_->forget();
   crossing_.begin();
-  silent_ = true;
+  silent_ = true, reaches_ = false;
   std::optional<Stop> stop;
   while (now.t < until && !stop) stop = one_step(until, false);
   silent_ = false;

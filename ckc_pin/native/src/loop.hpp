@@ -75,6 +75,8 @@ class Loop {
   std::optional<Stop> one_step(double bound, bool last);
   std::optional<Stop> ordinary(double bound, bool last);
   std::optional<Stop> kept(const RankMonitor::Rank& after, double margin, double bound, bool last);
+  std::optional<Stop> crossed(double met, const RankMonitor::Rank& after, double margin, bool last);
+  bool reach(Interpolant& motion, double met, const RankMonitor::Rank& after, double margin);
   Stop within(double until);  // the step that reaches beyond
   void back();                // to the present state
   std::optional<Stop> across(double met, double left, double bound, bool last);
@@ -115,7 +117,10 @@ class Loop {
   Vector y_out_, held_before_;
 
   // A step that reaches beyond the present time is made, and not yet kept.
-  bool beyond_ = false;
+  bool reaches_ = false;      // whether one may
+  bool beyond_ = false;       // whether one does
+  Interpolant* by_ = nullptr; // which motion that is
+  double met_ = 0.0;          // when J lost rank on it, NaN for an ordinary step
   double told_ = 0.0, until_ = 0.0;  // the present time, and the one that is asked for
   Vector y_told_;
   RankMonitor::Rank after_;   // at the end of that step, as is
