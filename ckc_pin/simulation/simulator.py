@@ -106,6 +106,8 @@ class Simulator:
     Notes
     -----
     solver.max_rhs counts from each reset; solver.max_wall_s does not apply, the time between steps is the caller's.
+    While u stays as it is, a step of the method may reach beyond the caller's, and states within it are read off it, as
+    accurate as the outputs of a run; a change of u goes on from the state that was read. Events keep steps from that.
 
     >>> simulator = Simulator("five_bar/set_point", {"formulation": "reduced"})
     >>> for _ in range(10):
