@@ -13,12 +13,12 @@ import os
 import sys
 import tempfile
 from contextlib import ExitStack, nullcontext, suppress
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import msgspec
 import typer
-from rich.console import Console, RenderableType
 
 import ckc_pin
 from ckc_pin.errors import CkcError, InputError, NumericalError
@@ -34,6 +34,9 @@ from ckc_pin.simulation.report import (
     to_json,
 )
 
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+
 __all__ = ["main"]
 
 DONE, WRONG_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143
@@ -46,7 +49,20 @@ app = typer.Typer(
 )
 
 interrupts = Interrupts()
-errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+
+@cache
+def errors() -> Console:
+    """Standard error, for people; a command that has nothing to say there loads no rich."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+
+def watched() -> bool:
+    """Whether somebody is looking on."""
+    return sys.stderr.isatty() and errors().is_terminal
+
 
 BEGIN = """Dynamics and control of closed kinematic chains.
 
@@ -109,7 +125,7 @@ def check(
     found = ckc_pin.check(what, branches=branches)
     if as_json:
         for warning in found.warnings:
-            errors.print(f"warning: {warning}")
+            errors().print(f"warning: {warning}")
         _print_json(check_plain(found))
     else:
         _print_table(check_table(found))
@@ -156,7 +172,7 @@ def run(
     scene = ckc_pin.load_scene(what, read_changes("--set", changes or []))
     if scene.spec.controller is not None:
         for warning in ckc_pin.check(scene).warnings:
-            errors.print(f"warning: {warning}")
+            errors().print(f"warning: {warning}")
     if out is not None:
         _make_folder(out)
     with ExitStack() as stack:
@@ -167,7 +183,7 @@ def run(
         code = _report(finished, out, profile, as_json)
         if view is not None and finished.status != "interrupted":
             with suppress(KeyboardInterrupt):
-                view.finish(finished, stay=errors.is_terminal)
+                view.finish(finished, stay=watched())
     if code != DONE:
         raise typer.Exit(code)
 
@@ -176,7 +192,7 @@ def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: boo
     """Write and print a run; return the exit code."""
     stop = _write(finished, out) if out is not None else None
     if profile:
-        errors.print(profile_table(finished))
+        errors().print(profile_table(finished))
     if as_json:
         _print_json(finished.summary())
     else:
@@ -185,7 +201,7 @@ def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: boo
             print(f"written to {out}")
     sys.stdout.flush()  # a view may keep the command alive
     if finished.status != "done":
-        errors.print(finished.message)
+        errors().print(finished.message)
         return STOPPED if finished.status == "stopped" else _interrupted(finished.message)
     return DONE if stop is None else _interrupted(str(stop))
 
@@ -298,7 +314,7 @@ def map_(
         _print_table(maps.map_table(one) if sections is None else maps.sections_table(stack))
     if out is not None:
         for path in save_map(one, out) if sections is None else save_sections(stack, out):
-            (errors.print if as_json else print)(f"written: {path}")
+            (errors().print if as_json else print)(f"written: {path}")
 
 
 @app.command("import", epilog=_examples("ckc import cassie.xml --out mechanisms/cassie"))
@@ -351,7 +367,7 @@ def export(
         return
     print("\n".join(f"written: {path}" for path in written) if written else found.text)
     for difference in found.differs:
-        (print if written else errors.print)(f"differs: {difference}")
+        (print if written else errors().print)(f"differs: {difference}")
 
 
 @app.command(epilog=_examples("ckc report --quick", "ckc report --out docs/report"))
@@ -365,7 +381,7 @@ def report(
     """Error against run time. Every formulation and method here, and the programs people use."""
     from ckc_pin.study.report.make import report as make_report
 
-    with errors.status("measuring") if errors.is_terminal else nullcontext() as status:
+    with errors().status("measuring") if watched() else nullcontext() as status:
         found = make_report(out, quick=quick, progress=status.update if status else None)
     if as_json:
         plain = {work: [msgspec.to_builtins(row) for row in rows] for work, rows in found.rows.items()}
@@ -421,7 +437,7 @@ def _usage(error: Exception) -> str | None:
 
 
 def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoReturn:
-    errors.print(f"{status}: {message}")
+    errors().print(f"{status}: {message}")
     if as_json:
         _print_json({"status": status, "message": message})
     sys.exit(code)
@@ -440,6 +456,8 @@ def _print_json(data: dict[str, Any]) -> None:
 
 
 def _print_table(table: RenderableType) -> None:
+    from rich.console import Console
+
     Console(highlight=False, markup=False, emoji=False).print(table)
 
 
@@ -462,9 +480,9 @@ def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
 
         plot_runs([finished], out)
     except InputError as error:  # matplotlib is an extra; the run itself is saved
-        errors.print(f"no figures: {error}")
+        errors().print(f"no figures: {error}")
     except KeyboardInterrupt as stop:
-        errors.print(f"no figures: interrupted{_by(stop)}; the run is saved")
+        errors().print(f"no figures: interrupted{_by(stop)}; the run is saved")
         return stop
     return None
 
@@ -477,12 +495,12 @@ class _progress_bar:
         self.bar: Any = None
 
     def __enter__(self) -> Any:
-        if not errors.is_terminal:
+        if not watched():
             return None
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(self.says))
-        self.bar = Progress(*columns, TimeRemainingColumn(), console=errors, transient=True)
+        self.bar = Progress(*columns, TimeRemainingColumn(), console=errors(), transient=True)
         task = self.bar.add_task(self.title, total=1.0)
         self.bar.start()
         return lambda t, t_end: self.bar.update(task, completed=t, total=t_end)

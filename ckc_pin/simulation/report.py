@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import Check
 from ckc_pin.simulation.run import Run
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.table import Table
 
 __all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_plain", "terms_table", "to_json"]
 
@@ -44,6 +45,9 @@ def check_plain(found: Check) -> dict[str, Any]:
 
 def check_table(found: Check) -> Group:
     """Return a check for people."""
+    from rich.console import Group
+    from rich.text import Text
+
     table = _plain_table("", "")
     table.add_row("coordinates n", str(found.n))
     table.add_row("freedoms d", str(found.d))
@@ -85,6 +89,9 @@ def terms_plain(found: Terms) -> dict[str, Any]:
 
 def terms_table(found: Terms) -> Group:
     """Return all terms at a state for people."""
+    from rich.console import Group
+    from rich.text import Text
+
     mechanism = found.mechanism
     state = _plain_table("coordinate", "q_tree", "v_tree", "h_tree")
     numbers = mechanism.tree.to_coordinates(found.q_tree)
@@ -135,7 +142,7 @@ def _formulation(run: Run) -> str:
 
 def profile_table(run: Run) -> Table:
     """Return which terms were evaluated, how often, and what that cost."""
-    table = Table("term", box=None, pad_edge=False)
+    table = _plain_table("term")
     for title in ("evaluated", "ms"):
         table.add_column(title, justify="right")
     for name, cost in run.profile.items():
@@ -152,5 +159,7 @@ def _row(values: Array) -> str:
 
 
 def _plain_table(*titles: str) -> Table:
+    from rich.table import Table
+
     table = Table(*titles, box=None, show_header=any(titles), pad_edge=False)
     return table

@@ -60,7 +60,7 @@ def test_a_run_in_json_loads_no_pictures() -> None:
     modules, out = _modules(RUN, "run", "five_bar/swing", "--set", "t_end=0.01", "--json")
     assert json.loads(out)["status"] == "done"
     assert "ckc_pin.native._core" in modules
-    assert not modules & (VIEW | {"PIL", "tornado", "zmq", "scipy.integrate"})
+    assert not modules & (VIEW | {"PIL", "tornado", "zmq", "scipy.integrate", "rich.console"})
 
 
 def test_checking_loads_no_pictures() -> None:
