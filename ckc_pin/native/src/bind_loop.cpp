@@ -75,7 +75,7 @@ void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
   std::vector<Event> watched;
   for (const auto& row : events) watched.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
-  self->core->tally.on = get<bool>(solver, "profile");
+  self->core->profile.on = get<bool>(solver, "profile");
   self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(watched));
 }
 
@@ -162,9 +162,9 @@ nb::list met(const Run& run) {
 
 nb::dict profile(const Run& run) {
   nb::dict found;
-  const Tally& tally = run.core->tally;
-  for (int k = 0; k < Tally::terms; ++k)
-    if (tally.calls[k]) found[Tally::names[k]] = nb::make_tuple(tally.calls[k], tally.seconds[k]);
+  const Profile& profile = run.core->profile;
+  for (int k = 0; k < Profile::terms; ++k)
+    if (profile.calls[k]) found[Profile::names[k]] = nb::make_tuple(profile.calls[k], profile.seconds[k]);
   return found;
 }
 

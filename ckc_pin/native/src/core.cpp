@@ -58,7 +58,7 @@ void Core::split(Indices q_, Indices z_) {
 void Core::set(In q_tree_, bool with_inertia) {
   ++sets;
   q_tree = q_tree_;
-  Tally::Entry entry(tally, with_inertia ? Tally::D_tree : Tally::phi);
+  Profile::Entry entry(profile, with_inertia ? Profile::D_tree : Profile::phi);
   if (with_inertia)
     tree.inertia(q_tree);
   else
@@ -69,7 +69,7 @@ void Core::set(In q_tree_, bool with_inertia) {
 
 void Core::jacobian() {
   if (has(jacobian_of_rows)) return;
-  Tally::Entry entry(tally, Tally::J);
+  Profile::Entry entry(profile, Profile::J);
   rows.jacobian(tree);
   here_ |= jacobian_of_rows;
 }
@@ -77,7 +77,7 @@ void Core::jacobian() {
 void Core::factor() {
   if (has(factor_of_phi_z)) return;
   jacobian();
-  Tally::Entry entry(tally, Tally::phi_z);
+  Profile::Entry entry(profile, Profile::phi_z);
   phi_z.compute(rows.J, z);
   here_ |= factor_of_phi_z;
 }
@@ -85,7 +85,7 @@ void Core::factor() {
 void Core::reduce() {
   if (has(rho_of_phi_z)) return;
   factor();
-  Tally::Entry entry(tally, Tally::rho);
+  Profile::Entry entry(profile, Profile::rho);
   for (int k = 0; k < d; ++k) {
     residual_ = -rows.J.col(q[k]);
     phi_z.solve(residual_, z_);
@@ -98,7 +98,7 @@ void Core::reduce() {
 
 void Core::tree_inertia() {
   if (has(inertia_of_tree)) return;
-  Tally::Entry entry(tally, Tally::D_tree);
+  Profile::Entry entry(profile, Profile::D_tree);
   tree.inertia(q_tree);
   here_ |= inertia_of_tree;
 }
@@ -106,7 +106,7 @@ void Core::tree_inertia() {
 void Core::inertia() {
   if (has(inertia_of_q)) return;
   tree_inertia(), reduce();
-  Tally::Entry entry(tally, Tally::D);
+  Profile::Entry entry(profile, Profile::D);
   if (dense_) {
     D_rho_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * rho;
     D.noalias() = rho.transpose() * D_rho_;
@@ -153,7 +153,7 @@ void Core::rates(In v) {
 
 void Core::bias(In v) {
   if (has(bias_of_tree) && v_tree == v) return;
-  Tally::Entry entry(tally, Tally::bias_tree);
+  Profile::Entry entry(profile, Profile::bias_tree);
   v_tree = v;
   bias_tree = tree.bias(q_tree, v_tree);
   rows.rates(tree);
@@ -168,7 +168,7 @@ void Core::bias(In v) {
 
 void Core::coriolis() {
   if (has(coriolis_of_tree)) return;
-  Tally::Entry entry(tally, Tally::C_tree);
+  Profile::Entry entry(profile, Profile::C_tree);
   C_tree = tree.coriolis(q_tree, v_tree);
   rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);

@@ -9,7 +9,7 @@
 #include "linear.hpp"
 #include "rows.hpp"
 #include "springs.hpp"
-#include "tally.hpp"
+#include "profile.hpp"
 
 namespace ckc {
 
@@ -31,7 +31,7 @@ class Core {
   const Scales scales;
   int d;
   Indices q, z;
-  Tally tally;
+  Profile profile;
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep

@@ -13,7 +13,7 @@ constexpr double near_zero = 0.25;    // of the function's range in the step: an
 constexpr double t_tolerance = 1e-12; // s
 constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
 constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
-constexpr double doubtful = 3.0;      // times how far two interpolations of different order are apart
+constexpr double uncertain = 3.0;     // times how far two interpolations of different order are apart
 
 namespace {
 
@@ -182,7 +182,7 @@ bool Events::ruled_out(const Event& event) const {
     low = std::min(low, fine_value), high = std::max(high, fine_value);
     apart = std::max(apart, std::abs(fine_value - coarse));
   }
-  const double room = doubtful * apart + 0.1 * (high - low) + event.floor;
+  const double room = uncertain * apart + 0.1 * (high - low) + event.floor;
   return event.value < low - room || event.value > high + room;
 }
 

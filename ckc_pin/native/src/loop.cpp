@@ -12,7 +12,7 @@ using Clock = std::chrono::steady_clock;
 
 // At least, in a run that crosses losses of rank: with less they come out up to 1e-2 off after ten seconds.
 constexpr double fine_rtol = 1e-7;
-constexpr long first_doubt = 50;     // steps after which stiffness is looked at again, then twice as many
+constexpr long first_check = 50;     // steps after which stiffness is looked at again, then twice as many
 constexpr double shortest_told = 1e-9;  // of what is left: a step whose end, or inside, cannot be told is made again
 constexpr double few_steps = 2.0;    // of RK45: a segment that takes no more is its
 constexpr double infinity = std::numeric_limits<double>::infinity();
@@ -45,7 +45,7 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   control->begin();
   system->start(t, q_tree, v_tree, w, now.y);
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
-  steps = {}, crossings.clear(), kept_ = 0, doubt_ = 0, length_ = 0.0;
+  steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0;
   method_ = nullptr, radau_.reset(), segment_ = t;
   begun_ = f_known_ = jumped_ = beyond_ = false;
   unchanged_ = 0;
@@ -164,13 +164,13 @@ void Loop::take(Method& method) {
 
 // "auto": implicit where damping or a controller makes the motion stiff.
 void Loop::choose(double bound) {
-  const bool doubtful = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping);
-  if (options_.method == "Radau" || (doubtful && is_stiff(bound - now.t))) {
+  const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping);
+  if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound - now.t))) {
     radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
     take(*radau_);
   } else {
     take(options_.method == "RK45" ? rk45_ : dop853_);
-    doubt_ = doubtful ? first_doubt : 0;
+    check_at_ = may_be_stiff ? first_check : 0;
   }
   if (now.h == 0.0) now.h = method_->first_length(bound, method_->error_order());
 }
@@ -256,11 +256,11 @@ std::optional<Stop> Loop::kept(const RankMonitor::Rank& after, double margin, do
   }
   length_ = h;
   ++steps[number()];
-  if (doubt_ && ++kept_ >= doubt_) {
-    doubt_ *= 2;
+  if (check_at_ && ++kept_ >= check_at_) {
+    check_at_ *= 2;
     if (const auto stop = begin(bound)) return stop;
     if (now.t < bound && is_stiff(bound - now.t)) {
-      doubt_ = 0;
+      check_at_ = 0;
       radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
       take(*radau_);
     }

@@ -107,7 +107,7 @@ class Loop {
   bool f_known_ = false;
   bool jumped_ = false;       // something has changed since the start that a second try would not know
   bool silent_ = false;       // nothing is recorded, no event is looked for
-  long kept_ = 0, doubt_ = 0; // steps since the start; when stiffness is looked at again, 0 for never
+  long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never
   double last_instant_ = 0.0; // outputs up to there are of the present segment,
   double segment_ = 0.0;      // which ends there; the start, before the first one
   struct Begin {

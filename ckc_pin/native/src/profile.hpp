@@ -6,7 +6,7 @@
 
 namespace ckc {
 
-struct Tally {
+struct Profile {
   enum Term { phi, J, phi_z, rho, D_tree, D, bias_tree, C_tree, terms };
   static constexpr const char* names[] = {"phi", "J", "phi_z", "rho", "D_tree", "D", "bias_tree", "C_tree"};
 
@@ -17,20 +17,20 @@ struct Tally {
   // Books one evaluation for as long as it lives.
   class Entry {
    public:
-    Entry(Tally& tally, Term term) : tally_(tally.on ? &tally : nullptr), term_(term) {
-      if (tally_) start_ = Clock::now();
+    Entry(Profile& profile, Term term) : profile_(profile.on ? &profile : nullptr), term_(term) {
+      if (profile_) start_ = Clock::now();
     }
     ~Entry() {
-      if (!tally_) return;
-      ++tally_->calls[term_];
-      tally_->seconds[term_] += std::chrono::duration<double>(Clock::now() - start_).count();
+      if (!profile_) return;
+      ++profile_->calls[term_];
+      profile_->seconds[term_] += std::chrono::duration<double>(Clock::now() - start_).count();
     }
     Entry(const Entry&) = delete;
     Entry& operator=(const Entry&) = delete;
 
    private:
     using Clock = std::chrono::steady_clock;
-    Tally* tally_;
+    Profile* profile_;
     Term term_;
     Clock::time_point start_;
   };
