@@ -119,12 +119,10 @@ Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree,
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
   Vector q_ddot(core.d);
   core.set(q_tree), core.inertia(), core.bias(v_tree);
-  if (actual) {
-    core.coriolis();
+  if (actual)
     core.actual_acceleration(u_tree, q_dot, q_ddot);
-  } else {
+  else
     core.reduced_acceleration(u_tree, q_ddot);
-  }
   return q_ddot;
 }
 

@@ -210,6 +210,7 @@ void Core::tree_acceleration(In q_ddot, Out a) const {
 }
 
 void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
+  coriolis();
   C_times(q_dot, d_);
   x_ = u_tree - h_tree;
   if (springs.any_damping) springs.add_damping(v_tree, x_);
@@ -311,6 +312,12 @@ void Core::with_force(In force, Out x) {
   square_factor_.solve(small_b_, small_);
   x = x_;
   for (int k = 0; k < n - rank; ++k) x += small_(k) * tangent_.col(k);
+}
+
+void Core::z_step(In residual, Out x) {
+  phi_z.solve(residual, z_);
+  x.setZero();
+  for (size_t k = 0; k < z.size(); ++k) x(z[k]) = -z_(k);
 }
 
 bool Core::closing_step(In residual, Out x) {

@@ -46,6 +46,7 @@ class Core {
   Definite D_factor;
   Matrix rho, D;              // (n, d), (d, d)
   void solve_z(In b, Out x) { phi_z.solve(b, x); }
+  void z_step(In residual, Out x);  // the x with J x = -residual that moves z alone; phi_z is factorized
   void D_times(In x, Out product) const;  // D' x
 
   // --- at a velocity, which is that of what follows ---

@@ -17,7 +17,6 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       projects_(projects) {
   crosses = projects;
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
-  z_step_.setZero(static_cast<Eigen::Index>(core.z.size()));
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
@@ -68,9 +67,7 @@ bool Dae::rate(double t, In v, Out y_dot) {
 bool Dae::closing_step(In residual) {
   if (control.acts()) core.factor();
   if (!control.acts() || core.phi_z.singular()) return core.closing_step(residual, step_);
-  core.solve_z(residual, z_step_);
-  step_.setZero();
-  for (size_t j = 0; j < core.z.size(); ++j) step_(core.z[j]) = -z_step_(static_cast<Eigen::Index>(j));
+  core.z_step(residual, step_);
   return step_.allFinite();
 }
 

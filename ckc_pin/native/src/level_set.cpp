@@ -109,10 +109,8 @@ bool LevelSet::newton(double tolerance) {
       return true;
     }
     if (!std::isfinite(size) || core.phi_z.singular() || iteration == max_iterations) return false;
-    core.solve_z(residual_, z_);
-    if (!(z_.lpNorm<Eigen::Infinity>() <= max_step)) return false;
-    step_.setZero();
-    for (size_t k = 0; k < core.z.size(); ++k) step_(core.z[k]) = -z_(k);
+    core.z_step(residual_, step_);
+    if (!(step_.lpNorm<Eigen::Infinity>() <= max_step)) return false;
     core.tree.integrate(q_tree_, step_);
     ++counts.newton, ++counts.factorizations;
   }
@@ -142,12 +140,10 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
     y_dot.head(d) = q_dot;
   else
     chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
-  if (actual_ && !on_manifold_) {
-    core.coriolis();
+  if (actual_ && !on_manifold_)
     core.actual_acceleration(control.u_tree, q_dot, y_dot.tail(d));
-  } else {
+  else
     core.reduced_acceleration(control.u_tree, y_dot.tail(d));
-  }
   return y_dot.allFinite() || fails(Trouble::infinite);
 }
 

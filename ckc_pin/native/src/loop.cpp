@@ -33,7 +33,7 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
       crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed) {
-  for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_told_}) x->setZero(system->size);
+  for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
 
 void Loop::start(double t, In q_tree, In v_tree, In w) {
@@ -47,8 +47,8 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
   steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0;
   method_ = nullptr, radau_.reset(), segment_ = t;
-  begun_ = f_known_ = jumped_ = beyond_ = false;
-  unchanged_ = 0;
+  begun_ = f_known_ = jumped_ = false;
+  beyond_.reset(), unchanged_ = 0;
   crossing_.begin();
   events.begin();
 }
@@ -74,9 +74,9 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
   until_ = until, ++unchanged_;
   if (beyond_) {
     if (until < now.t_new) return within(until);
-    beyond_ = false;
-    const auto stop = std::isnan(met_) ? kept(after_, margin_, now.t_new, false) : crossed(met_, after_, margin_, false);
-    if (stop) return *stop;
+    const Made step = *beyond_;
+    beyond_.reset();
+    if (const auto stop = finish(step, now.t_new, false)) return *stop;
   }
   if (control->acts()) {
     bool changed = false;
@@ -90,7 +90,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
     if (control->sampling && control->sampling->instant() <= now.t + near)
       if (const auto stop = sample()) return *stop;
     last_instant_ = control->sampling ? std::min(until, control->sampling->instant()) - near : until;
-    while (!silent_ && recorder.due(now.t + near)) {
+    while (recorder.due(now.t + near)) {
       if (!recorder.add(*system, recorder.instant(), now.y)) return untold();
       recorder.passed();
     }
@@ -115,17 +115,17 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
 }
 
 Stop Loop::within(double until) {
-  if (!by_->between(until, y_out_)) return untold();
-  told_ = until, y_told_ = y_out_;
+  if (!beyond_->motion->between(until, y_out_)) return untold();
+  t_present_ = until, y_present_ = y_out_;
   return {Stop::end, until};
 }
 
 void Loop::back() {
   if (!beyond_) return;
   now.t_old = now.t, now.y_old = now.y;
-  now.t = told_, now.y = y_told_;
+  now.t = t_present_, now.y = y_present_;
   now.h = std::min(now.h, now.t_new - now.t_old);
-  beyond_ = begun_ = false;
+  beyond_.reset(), begun_ = false;
 }
 
 // What is sampled sees the state, and what is due acts from here on.
@@ -162,12 +162,16 @@ void Loop::take(Method& method) {
   method_->forget();
 }
 
+void Loop::take_implicit() {
+  radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
+  take(*radau_);
+}
+
 // "auto": implicit where damping or a controller makes the motion stiff.
 void Loop::choose(double bound) {
   const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping);
   if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound - now.t))) {
-    radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
-    take(*radau_);
+    take_implicit();
   } else {
     take(options_.method == "RK45" ? rk45_ : dop853_);
     check_at_ = may_be_stiff ? first_check : 0;
@@ -236,35 +240,35 @@ std::optional<Stop> Loop::ordinary(double bound, bool last) {
     }
     if (verdict.part < 1.0) return shorter(verdict.part);
   }
-  if (reach(*method_, std::nan(""), after, margin)) return {};
-  return kept(after, margin, bound, last);
+  return made({method_, std::nan(""), after, margin}, bound, last);
 }
 
-// Whether the step just made, which lost rank at `met` or nowhere, goes beyond the time asked for, and waits there.
-bool Loop::reach(Interpolant& motion, double met, const RankMonitor::Rank& after, double margin) {
-  beyond_ = now.t_new > until_;
-  by_ = &motion, met_ = met, after_ = after, margin_ = margin;
-  return beyond_;
+std::optional<Stop> Loop::made(const Made& step, double bound, bool last) {
+  if (!(now.t_new > until_)) return finish(step, bound, last);
+  beyond_ = step;
+  return {};
 }
 
-// Make the end of the step just made the present state.
-std::optional<Stop> Loop::kept(const RankMonitor::Rank& after, double margin, double bound, bool last) {
+std::optional<Stop> Loop::finish(const Made& step, double bound, bool last) {
   const double h = now.t_new - now.t;
-  if (const auto stop = keep(*method_, after, margin, last)) {
-    if (stop->why != Stop::output || !(h > shortest_told * (bound - now.t))) return stop;
+  const bool ordinary = std::isnan(step.met);
+  if (const auto stop = keep(step, last)) {
+    if (!ordinary || stop->why != Stop::output || !(h > shortest_told * (bound - now.t))) return stop;
     return method_->retry(0.5 * h), std::nullopt;
   }
-  length_ = h;
   ++steps[number()];
-  if (check_at_ && ++kept_ >= check_at_) {
-    check_at_ *= 2;
-    if (const auto stop = begin(bound)) return stop;
-    if (now.t < bound && is_stiff(bound - now.t)) {
-      check_at_ = 0;
-      radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
-      take(*radau_);
-    }
-  }
+  if (ordinary) return length_ = h, check_stiffness(bound);
+  method_->forget();
+  crossings.push_back(step.met);
+  return {};
+}
+
+// After a while, and then after twice as long: what was not stiff at the start may have become so.
+std::optional<Stop> Loop::check_stiffness(double bound) {
+  if (!check_at_ || ++kept_ < check_at_) return {};
+  check_at_ *= 2;
+  if (const auto stop = begin(bound)) return stop;
+  if (now.t < bound && is_stiff(bound - now.t)) check_at_ = 0, take_implicit();
   return {};
 }
 
@@ -280,21 +284,13 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
   if (!ends && !RankMonitor::kept(after)) return Stop{Stop::rank, now.t_new, after.value};
   if (!ends && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return trouble();
   events.arrived();
-  if (reach(motion, met, after, system->margin())) return {};
-  return crossed(met, after, system->margin(), last);
-}
-
-std::optional<Stop> Loop::crossed(double met, const RankMonitor::Rank& after, double margin, bool last) {
-  if (const auto stop = keep(*crossing_.collocation, after, margin, last)) return stop;
-  method_->forget();
-  crossings.push_back(met);
-  ++steps[number()];
-  return {};
+  return made({&motion, met, after, system->margin()}, bound, last);
 }
 
 // Look at what happened in the step just made, and make its end the present state.
-std::optional<Stop> Loop::keep(Interpolant& motion, const RankMonitor::Rank& after, double margin, bool last) {
+std::optional<Stop> Loop::keep(const Made& step, bool last) {
   if (!silent_) {
+    Interpolant& motion = *step.motion;
     double halt;
     if (const auto stop = look(motion, last, halt)) return stop;
     if (const auto stop = outputs(motion, std::min(now.t_new, halt))) return stop;
@@ -308,12 +304,12 @@ std::optional<Stop> Loop::keep(Interpolant& motion, const RankMonitor::Rank& aft
       return Stop{Stop::event, now.t};
     }
   }
-  const Accepted accepted = system->accept(now.t_new, now.y_new, margin);
+  const Accepted accepted = system->accept(now.t_new, now.y_new, step.margin);
   method_->commit();
-  crossing_.kept(after);
-  end_ = after;
+  crossing_.kept(step.after);
+  end_ = step.after;
   f_known_ = accepted == Accepted::kept;
-  if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, margin};
+  if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, step.margin};
   if (accepted == Accepted::restarted) method_->forget();
   return {};
 }

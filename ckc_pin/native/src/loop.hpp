@@ -52,8 +52,8 @@ class Loop {
   // then within it, and the step is made again from there should something change.
   Stop advance(double until, bool final, double pause, double budget);
   // The present state.
-  double t() const { return beyond_ ? told_ : now.t; }
-  const Vector& y() const { return beyond_ ? y_told_ : now.y; }
+  double t() const { return beyond_ ? t_present_ : now.t; }
+  const Vector& y() const { return beyond_ ? y_present_ : now.y; }
   // Record it, unless that instant is recorded already.
   bool record_now();
   // The core there, closed, with the system's velocity and w; false where that does not exist.
@@ -71,16 +71,24 @@ class Loop {
   double& newton_tolerance() { return tolerance_.newton; }
 
  private:
+  // A step that was made: how it moves, when J lost rank on it (NaN for an ordinary one), and what is known at its end.
+  struct Made {
+    Interpolant* motion;
+    double met;
+    RankMonitor::Rank after;
+    double margin;
+  };
   std::optional<Stop> begin(double bound);
   std::optional<Stop> one_step(double bound, bool last);
   std::optional<Stop> ordinary(double bound, bool last);
-  std::optional<Stop> kept(const RankMonitor::Rank& after, double margin, double bound, bool last);
-  std::optional<Stop> crossed(double met, const RankMonitor::Rank& after, double margin, bool last);
-  bool reach(Interpolant& motion, double met, const RankMonitor::Rank& after, double margin);
-  Stop within(double until);  // the step that reaches beyond
-  void back();                // to the present state
   std::optional<Stop> across(double met, double left, double bound, bool last);
-  std::optional<Stop> keep(Interpolant& motion, const RankMonitor::Rank& after, double margin, bool last);
+  // Keep a step, unless it goes beyond the time asked for: then it waits.
+  std::optional<Stop> made(const Made& step, double bound, bool last);
+  std::optional<Stop> finish(const Made& step, double bound, bool last);
+  std::optional<Stop> keep(const Made& step, bool last);
+  std::optional<Stop> check_stiffness(double bound);
+  Stop within(double until);  // the step that goes beyond
+  void back();                // from it to the present state
   std::optional<Stop> look(Interpolant& motion, bool last, double& halt);
   std::optional<Stop> outputs(Interpolant& motion, double until);
   std::optional<Stop> redo();
@@ -93,6 +101,7 @@ class Loop {
   void choose_again(double bound);  // of the explicit ones, for another segment
   bool is_stiff(double duration);
   void take(Method& method);
+  void take_implicit();
 
   const Options options_;
   Tolerance tolerance_;
@@ -116,16 +125,11 @@ class Loop {
   } begin_;
   Vector y_out_, held_before_;
 
-  // A step that reaches beyond the present time is made, and not yet kept.
-  bool reaches_ = false;      // whether one may
-  bool beyond_ = false;       // whether one does
-  Interpolant* by_ = nullptr; // which motion that is
-  double met_ = 0.0;          // when J lost rank on it, NaN for an ordinary step
-  double told_ = 0.0, until_ = 0.0;  // the present time, and the one that is asked for
-  Vector y_told_;
-  RankMonitor::Rank after_;   // at the end of that step, as is
-  double margin_ = 0.0;
-  long unchanged_ = 0;        // advances since something changed
+  bool reaches_ = false;         // whether a step may go beyond the time asked for,
+  std::optional<Made> beyond_;   // the one that does,
+  double until_ = 0.0, t_present_ = 0.0;  // that time, and the present one within it
+  Vector y_present_;
+  long unchanged_ = 0;           // advances since something changed
 };
 
 }  // namespace ckc
