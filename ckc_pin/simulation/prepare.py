@@ -20,6 +20,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import load, mechanism_file
 from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
+from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
@@ -34,6 +35,8 @@ SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relat
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
 CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a collocation step, or the branches do not meet
 UNLIMITED = 2**62
+OUTPUTS = 500  # instants when a scene gives no output_dt
+MAX_OUTPUTS = 1_000_000
 
 
 def scene_mechanism(scene: Scene) -> Mechanism:
@@ -76,8 +79,9 @@ class Prepared:
     mechanism : Mechanism
     controller : Controller or None
         What acts, beside a u that is held.
-    actuation : Actuation
     events : list of Watched
+    instants : (m,) array
+        Output instants, s; empty where the caller steps.
     start : Start
     texts : dict of str to str
         The files of mechanism, scene and controller.
@@ -87,8 +91,8 @@ class Prepared:
     scene: Scene
     mechanism: Mechanism
     controller: Controller | None
-    actuation: Actuation
     events: list[Watched]
+    instants: Array
     start: Start
     texts: dict[str, str]
     loop: Any
@@ -128,6 +132,7 @@ def prepare(
     NumericalError
         Its start is singular.
     """
+    instants = np.zeros(0) if free else _output_instants(scene)  # refused before anything is loaded
     mechanism = scene_mechanism(scene)
     texts: dict[str, str] = {}
     spec = scene.spec.controller
@@ -156,7 +161,22 @@ def prepare(
         [event.row for event in watching],
     )
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, actuation, watching, start, texts, loop)
+    return Prepared(scene, mechanism, controller, watching, instants, start, texts, loop)
+
+
+def _output_instants(scene: Scene) -> Array:
+    t_end, output_dt = scene.spec.t_end, scene.spec.solver.output_dt
+    if output_dt is None:
+        return np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float)
+    if t_end / output_dt > MAX_OUTPUTS:
+        raise InputError(
+            f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
+        )
+    times = np.arange(int(t_end / output_dt * (1 + 1e-12)) + 1, dtype=float) * output_dt
+    if t_end - times[-1] > 1e-9 * output_dt:
+        return np.append(times, t_end)
+    times[-1] = t_end
+    return times
 
 
 def _formulation(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarray[Any, Any]) -> dict[str, Any]:

@@ -19,17 +19,14 @@ from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.simulation.stops import Stop, explain
+from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["Progress", "Watch", "run_prepared", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 Watch = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
-OUTPUTS = 500  # instants when a scene gives no output_dt
-MAX_OUTPUTS = 1_000_000
 SCALARS = ("t", "energy", "lyapunov", "max_phi", "max_phi_dot")
-PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
 
 
 def simulate(
@@ -77,7 +74,6 @@ def simulate(
         scene = load_scene(scene, changes)
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
-    _output_instants(scene)  # refused before anything is loaded
     run = run_prepared(prepare(scene, controller, events, profile=profile), progress, watch)
     if controller is not None:
         run.scene.pop("controller", None)  # the caller's took its place
@@ -87,7 +83,7 @@ def simulate(
 def run_prepared(ready: Prepared, progress: Progress | None = None, watch: Watch | None = None) -> Run:
     """Run what was prepared, from its start; errors are those of `simulate`."""
     scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
-    times = _output_instants(scene)
+    times = ready.instants
     started = perf_counter()  # loading and assembling are not the run's work
     rows = np.empty((len(times) + 1, loop.width))
     if rows.nbytes > MAX_BYTES:
@@ -183,21 +179,6 @@ def _lyapunov(ready: Prepared, found: Array, parts: dict[str, Array]) -> Array |
     kinematics = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in q_tree]
     every = zip(t, kinematics, v_tree, phi, strict=True)
     return np.array([function(float(at_t), Terms(mechanism, at, v), w) for at_t, at, v, w in every])
-
-
-def _output_instants(scene: Scene) -> Array:
-    t_end, output_dt = scene.spec.t_end, scene.spec.solver.output_dt
-    if output_dt is None:
-        return np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float)
-    if t_end / output_dt > MAX_OUTPUTS:
-        raise InputError(
-            f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
-        )
-    times = np.arange(int(t_end / output_dt * (1 + 1e-12)) + 1, dtype=float) * output_dt
-    if t_end - times[-1] > 1e-9 * output_dt:
-        return np.append(times, t_end)
-    times[-1] = t_end
-    return times
 
 
 def _sentence(error: NumericalError, t: float) -> str:

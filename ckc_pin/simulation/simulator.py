@@ -21,11 +21,9 @@ from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller
 from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
-from ckc_pin.simulation.stops import Stop, explain
+from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["Simulator", "State"]
-
-PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
 
 
 class State:

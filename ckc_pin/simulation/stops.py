@@ -9,8 +9,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.events import Watched
 from ckc_pin.simulation.scene import SolverSpec
 
-__all__ = ["Stop", "explain", "why_not_q"]
+__all__ = ["PAUSE", "Stop", "explain", "why_not_q"]
 
+PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
 NEARLY = 1e-3  # of |J|: phi_z's least singular value below which a step that cannot be made is put down to it
 
 TROUBLES = {
