@@ -1,32 +1,56 @@
-"""Factorizations of small dense matrices, through LAPACK without the overhead of checks.
+"""Factorizations of small dense matrices: LU by eigenpy, which Pinocchio brings along, QR by NumPy.
 
-SciPy's `linalg` takes 0.3 s to import, more than Pinocchio itself, so it is loaded at first use.
+SciPy's `linalg` takes 0.3 s to import, more than Pinocchio itself, and `numpy.linalg.solve` is ten times
+slower for a 4 x 4 matrix than a factorization that is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
+import eigenpy
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Factorization", "null_space", "one_blas_thread"]
+__all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns"]
 
 Array = NDArray[np.float64]
-
-_lapack: Any = None
-_blas: Any = None
+IntArray = NDArray[np.intp]
 
 
-def _routines() -> Any:
-    global _lapack
-    if _lapack is None:
-        from scipy.linalg import lapack
+class _OneThread:
+    """How many `with` blocks keep BLAS on one thread, in all of Python's threads, and what it had before them."""
 
-        _lapack = lapack
-    return _lapack
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.blocks = 0
+        self.libraries: Any = None
+        self.before: list[int] = []
+
+    def enter(self) -> None:
+        with self.lock:
+            if self.libraries is None:
+                from threadpoolctl import ThreadpoolController
+
+                self.libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+            if not self.blocks:  # threadpoolctl's own `limit` asks for much else: 60 us
+                self.before = [library.num_threads for library in self.libraries]
+                for library in self.libraries:
+                    library.set_num_threads(1)
+            self.blocks += 1
+
+    def leave(self) -> None:
+        with self.lock:
+            self.blocks -= 1
+            if not self.blocks:
+                for library, threads in zip(self.libraries, self.before, strict=True):
+                    library.set_num_threads(threads)
+
+
+_one_thread = _OneThread()
 
 
 @contextmanager
@@ -36,20 +60,11 @@ def one_blas_thread() -> Iterator[None]:
     A mechanism's matrices are small: threads cost more than they give, and with the cores busy the
     factorization of a 200 x 200 matrix took 0.9 s instead of 4 ms.
     """
-    global _blas
-    if _blas is None:
-        from threadpoolctl import ThreadpoolController
-
-        _routines()  # loads the BLAS that is to be limited
-        _blas = ThreadpoolController().select(user_api="blas").lib_controllers
-    before = [library.num_threads for library in _blas]  # threadpoolctl's own `limit` asks for much else: 60 us
+    _one_thread.enter()
     try:
-        for library in _blas:
-            library.set_num_threads(1)
         yield
     finally:
-        for library, threads in zip(_blas, before, strict=True):
-            library.set_num_threads(threads)
+        _one_thread.leave()
 
 
 class Factorization:
@@ -64,21 +79,17 @@ class Factorization:
         Finite entries; full column rank unless `singular` says otherwise.
     """
 
-    __slots__ = ("_lu", "_pivots", "_q", "_r", "shape", "singular")
+    __slots__ = ("_lu", "_lu_transposed", "_matrix", "_q", "shape", "singular")
 
     def __init__(self, matrix: Array) -> None:
         self.shape = matrix.shape
-        lapack = _routines()
         if matrix.shape[0] == matrix.shape[1]:
-            self._q = None
-            if matrix.shape[0]:
-                self._lu, self._pivots, info = lapack.dgetrf(matrix)
-            else:
-                self._lu, self._pivots, info = matrix, np.zeros(0, np.int32), 0
-            self.singular = info > 0
+            self._q, self._matrix = None, matrix
         else:
-            self._q, self._r = np.linalg.qr(matrix)
-            self.singular = not bool(np.all(np.diagonal(self._r)))
+            self._q, self._matrix = np.linalg.qr(matrix)
+        self._lu = eigenpy.PartialPivLU(self._matrix)  # of a triangle it is the triangle
+        self._lu_transposed: Any = None
+        self.singular = not bool(np.all(np.diagonal(self._lu.matrixLU())))
 
     def solve(self, right: Array) -> Array:
         """Solve A x = right (least squares when tall), right of shape (m,) or (m, p)."""
@@ -86,11 +97,7 @@ class Factorization:
             return _by_columns(self.solve, right, self.shape[1])
         if self.shape[1] == 0:
             return np.zeros(0)
-        if self._q is None:
-            x, _ = _routines().dgetrs(self._lu, self._pivots, right)
-        else:
-            x, _ = _routines().dtrtrs(self._r, self._q.T @ right)
-        return np.asarray(x)
+        return np.ravel(self._lu.solve(right if self._q is None else self._q.T @ right))  # eigenpy makes (1, 1) of one
 
     def solve_transposed(self, right: Array) -> Array:
         """Solve A^T x = right (minimum norm when tall), right of shape (k,) or (k, p)."""
@@ -98,18 +105,16 @@ class Factorization:
             return _by_columns(self.solve_transposed, right, self.shape[0])
         if self.shape[1] == 0:
             return np.zeros(self.shape[0])
-        if self._q is None:
-            x, _ = _routines().dgetrs(self._lu, self._pivots, right, trans=1)
-            return np.asarray(x)
-        y, _ = _routines().dtrtrs(self._r, right, trans=1)
-        return np.asarray(self._q @ y)
+        if self._lu_transposed is None:
+            self._lu_transposed = eigenpy.PartialPivLU(self._matrix.T)
+        x = np.ravel(self._lu_transposed.solve(right))
+        return x if self._q is None else np.asarray(self._q @ x)
 
     def determinant(self) -> float:
         """Return the determinant; a tall matrix has none (ValueError)."""
         if self._q is not None:
             raise ValueError("a tall matrix has no determinant")
-        swaps = int(np.sum(self._pivots != np.arange(len(self._pivots))))
-        return float(np.prod(np.diagonal(self._lu))) * (-1.0) ** swaps
+        return float(self._lu.determinant()) if self.shape[0] else 1.0
 
 
 def _by_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> Array:
@@ -148,19 +153,42 @@ def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Arra
     pivots : (rank,) array
         Sizes of R's diagonal, which falls.
     """
-    m, n = jacobian.shape
+    n = jacobian.shape[1]
     tangent, particular = np.zeros((n, n - rank)), np.zeros((n, *residual.shape[1:]))
-    if m == 0:
-        return np.eye(n), particular, np.zeros(0)
-    lapack = _routines()
-    factored, order, tau, _, _ = lapack.dgeqp3(jacobian)
-    order -= 1
-    r = factored[:rank, :rank]
-    pivots = np.abs(np.diagonal(r))
-    tangent[order[rank:]] = np.eye(n - rank)
+    order, pivots = pivoted_columns(jacobian)
+    order, left_over, pivots = order[:rank], order[rank:], pivots[:rank]
+    tangent[left_over] = np.eye(n - rank)
     if rank and pivots[-1] > 0:
-        right = residual.reshape(m, -1)
-        turned, _, _ = lapack.dormqr("L", "T", factored[:, : len(tau)], tau, right, max(1, right.shape[1]))
-        tangent[order[:rank]] = -lapack.dtrtrs(r, factored[:rank, rank:])[0]
-        particular[order[:rank]] = -lapack.dtrtrs(r, turned[:rank])[0].reshape(rank, *residual.shape[1:])
+        basis = Factorization(jacobian[:, order])
+        tangent[order] = -basis.solve(jacobian[:, left_over])
+        particular[order] = -basis.solve(residual)
     return tangent, particular, pivots
+
+
+def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
+    """Order columns as a pivoted QR does: next is the one of which most is left beside those before it.
+
+    Parameters
+    ----------
+    matrix : (m, n) array
+
+    Returns
+    -------
+    order : (n,) int array
+    pivots : (min(m, n),) array
+        What is left of each, falling: the sizes of R's diagonal.
+    """
+    left = matrix.copy()
+    order = np.arange(matrix.shape[1])
+    pivots = np.zeros(min(matrix.shape))
+    for k in range(len(pivots)):
+        sizes = np.linalg.norm(left[:, order[k:]], axis=0)
+        best = int(np.argmax(sizes))
+        if not sizes[best] > 0:
+            break
+        order[[k, k + best]] = order[[k + best, k]]
+        pivots[k] = sizes[best]
+        direction = left[:, order[k]] / sizes[best]
+        rest = order[k + 1 :]
+        left[:, rest] -= np.outer(direction, direction @ left[:, rest])
+    return order, pivots

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.linear import pivoted_columns
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled", "scales"]
@@ -63,10 +64,8 @@ def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
     """Return one admissible choice of rows that the others imply, in the order of phi."""
     if scaled_jacobian.shape[0] == rank:
         return np.zeros(0, np.intp)
-    from scipy.linalg import qr
-
-    _, _, pivots = qr(scaled_jacobian.T, mode="economic", pivoting=True)
-    return np.sort(pivots[rank:]).astype(np.intp)
+    order, _ = pivoted_columns(scaled_jacobian.T)
+    return np.sort(order[rank:])
 
 
 def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = ()) -> IntArray | None:
@@ -85,23 +84,18 @@ def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArra
     """
     if rank == 0:
         return np.zeros(0, np.intp)
-    from scipy.linalg import qr
-
-    inside = np.concatenate([*blocks, np.zeros(0, np.intp)]).astype(np.intp)
-    if len(inside):
-        _, r, _ = qr(scaled_jacobian[:, inside], mode="economic", pivoting=True)
-        pivots = np.abs(np.diagonal(r))
+    rest = np.arange(scaled_jacobian.shape[1])
+    if len(blocks):
+        inside = np.concatenate(blocks).astype(np.intp)
+        rest = np.setdiff1d(rest, inside)
+        _, pivots = pivoted_columns(scaled_jacobian[:, inside])
         if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
             # take the blocks as dependent and choose the rest in what they leave over
             q, _ = np.linalg.qr(scaled_jacobian[:, inside])
-            rest = np.setdiff1d(np.arange(scaled_jacobian.shape[1]), inside)
             left = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
-            _, _, order = qr(left, mode="economic", pivoting=True)
-            return np.sort(np.concatenate([inside, rest[order[: rank - len(inside)]]])).astype(np.intp)
-        rest = np.setdiff1d(np.arange(scaled_jacobian.shape[1]), inside)
+            order, _ = pivoted_columns(left)
+            return np.sort(np.concatenate([inside, rest[order[: rank - len(inside)]]]))
         if rank_of(scaled_jacobian[:, rest]).rank < rank:
             return None
-        _, _, order = qr(scaled_jacobian[:, rest], mode="economic", pivoting=True)
-        return np.sort(rest[order[:rank]]).astype(np.intp)
-    _, _, order = qr(scaled_jacobian, mode="economic", pivoting=True)
-    return np.sort(order[:rank]).astype(np.intp)
+    order, _ = pivoted_columns(scaled_jacobian[:, rest])
+    return np.sort(rest[order[:rank]])
