@@ -5,6 +5,7 @@
 namespace ckc {
 
 constexpr int most_steps = 10;
+constexpr double rounding = 2e-16;   // of a product: a velocity that is allowed to the last digit stays what it is
 constexpr double negligible = 1e-9;  // rad, m: Newton's last step onto the closure
 
 static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
@@ -82,9 +83,11 @@ bool Dae::project(In y) {
     set(q_tree_);
     if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
   }
-  residual_.noalias() = core.rows.J * y.tail(n);
+  velocity = y.tail(n);
+  residual_.noalias() = core.rows.J * velocity;
+  if (largest(residual_) <= rounding * core.rows.J.norm() * velocity.norm()) return true;
   if (!closing_step(residual_)) return false;
-  velocity = y.tail(n) + step_;
+  velocity += step_;
   return velocity.allFinite();
 }
 
