@@ -18,6 +18,7 @@ TROUBLES = {
     "none": "the step became so short that t does not change any more",
     "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
     "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
+    "vague": "phi_z is so nearly singular that the other coordinates are not known as exactly as solver.rtol asks",
     "infinite": "the right-hand side is not finite",
 }
 
@@ -50,6 +51,12 @@ def explain(stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, eve
             )
         case "chart":
             return NumericalError(why_not_q(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
+        case "energy":
+            return NumericalError(
+                f"nothing acts, but a step changes the energy by {stop.value:.2g} J however short it is",
+                t=loop.t,
+                q_tree=where,
+            )
         case "control":
             return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
         case "function":

@@ -31,7 +31,7 @@ def exact() -> Callable[[float], Array]:
 
 
 # rtol, and the right-hand sides that it may take
-BUDGETS = {1e-4: 940, 1e-6: 900, 1e-8: 1_600, 1e-9: 1_850, 1e-10: 2_000}
+BUDGETS = {1e-4: 940, 1e-6: 950, 1e-8: 1_600, 1e-9: 1_850, 1e-10: 2_000}
 
 
 @pytest.mark.parametrize("rtol", BUDGETS)

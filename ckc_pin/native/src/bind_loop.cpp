@@ -17,8 +17,8 @@ namespace {
 using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 constexpr const char* reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
-                                   "rank", "chart", "control", "function",   "output",      "raised"};
-constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control"};
+                                   "rank", "chart", "energy",  "control",    "function",    "output",   "raised"};
+constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague"};
 constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
 std::unique_ptr<System> system_of(Core& core, Control& control, const nb::dict& table) {

@@ -17,6 +17,7 @@ class Dae : public System {
   bool place(In y) override;
   Accepted accept(double t, Out y, double margin) override;
   void rates(std::vector<std::pair<int, int>>& of) const override;
+  bool conserves() const override { return projects_; }
   bool modes(In y, Matrix& jacobian) override;
   bool tree_acceleration(In f, Out a) const override { return a = f.tail(core.n), true; }
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.

@@ -47,28 +47,35 @@ Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tole
 
 bool Explicit::stages(double h) {
   K_.col(0) = step_.f;
+  if (whole()) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
   for (int s = 1; s < stages_; ++s) {
     y_stage_ = step_.y;
     for (int i = 0; i < s; ++i)
       if (A_(s, i) != 0.0) y_stage_ += (h * A_(s, i)) * K_.col(i);
     if (!evaluate(step_.t + C_(s) * h, y_stage_, K_.col(s))) return false;
+    if (whole()) system_.whole(K_.col(s), x_stage_, X_.col(s));
   }
   step_.y_new = step_.y;
   for (int s = 0; s < stages_; ++s) step_.y_new += (h * B_(s)) * K_.col(s);
   if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
   K_.col(stages_) = step_.f_new;
+  if (whole()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new), X_.col(stages_) = step_.x_dot_new;
   return true;
 }
 
+// Of the whole motion, so that it does not matter which coordinates y has.
 double Explicit::error(double h) {
-  scale_ = tolerance_.atol + tolerance_.rtol * step_.y.cwiseAbs().cwiseMax(step_.y_new.cwiseAbs()).array();
+  const Vector& from = whole() ? step_.x : step_.y;
+  const Vector& to = whole() ? step_.x_new : step_.y_new;
+  const Matrix& rates = whole() ? X_ : K_;
+  scale_ = tolerance_.atol + tolerance_.rtol * from.cwiseAbs().cwiseMax(to.cwiseAbs()).array();
   double square[2] = {0.0, 0.0};
   for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
-    error_.setZero();
-    for (int s = 0; s <= stages_; ++s) error_ += E_[k](s) * K_.col(s);
+    error_.setZero(from.size());
+    for (int s = 0; s <= stages_; ++s) error_ += E_[k](s) * rates.col(s);
     square[k] = (error_.array() / scale_.array()).matrix().squaredNorm();
   }
-  const double size = static_cast<double>(step_.y.size()), of_five = h * std::sqrt(square[0] / size);
+  const double size = static_cast<double>(from.size()), of_five = h * std::sqrt(square[0] / size);
   if (kind_ == rk45) return of_five;
   reach_ = 0.5 * h * std::pow(std::max(of_five, 1e-10), -1.0 / 6.0);  // of RK45, whose error estimate is of order four
   if (square[0] == 0.0 && square[1] == 0.0) return 0.0;
@@ -87,7 +94,13 @@ bool Explicit::step(double t_bound) {
     length = h;
     const bool exists = stages(h);
     if (!exists && over()) return false;
-    const double size = exists ? error(h) : std::numeric_limits<double>::infinity();
+    double size = exists ? error(h) : std::numeric_limits<double>::infinity();
+    bool agrees = true;
+    if (exists && whole()) {
+      x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
+      const double rest = disagreement(x_stage_);
+      agrees = rest < 1.0, size = std::max(size, rest);
+    }
     if (size < 1.0) {
       const double most = refused ? 1.0 : max_factor;
       const double factor = step_safety * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
@@ -97,6 +110,7 @@ bool Explicit::step(double t_bound) {
       if (kind_ == rk45) reach_ = length * step_safety * safety * std::pow(std::max(size, 1e-10), exponent);
       return true;
     }
+    if (!agrees && !return_to_start()) return false;
     length *= std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
     refused = true;
     ++work_.rejected;

@@ -30,7 +30,9 @@ class Explicit : public Method {
   Matrix A_, A_extra_, D_;  // D_: of the dense output
   Vector B_, C_, C_extra_, E_[2];
   Matrix K_, F_;  // (size, stages), (size, powers)
+  Matrix X_;      // rates of the whole motion, (whole size, stages)
   Vector y_stage_, scale_, error_;
+  Vector x_stage_;
   bool dense_ = false, growth_pending_ = false, growth_next_ = false;
   double reach_ = 0.0;
 };

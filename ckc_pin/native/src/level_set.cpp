@@ -11,6 +11,9 @@ constexpr double switch_margin = 0.03;  // of |J|: phi_z's least singular value 
 constexpr double fallen = 0.7;          // it looks again at so much of the margin at which none was found,
 constexpr double poor = 1e-3;           // and from there on at every step
 constexpr double clearly = 2.0;         // times as far from singular: a better q
+constexpr double gains = 0.1;  // Newton's method to rounding goes on while a step leaves no more
+constexpr double weight = 3.0, patience = 100.0;  // of a refused step, in steps as before it; until none is tried
+constexpr double gone = 100.0;  // epsilons after which w is no more
 
 LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double slack)
     : System(core_, control_, 2 * core_.d),
@@ -27,7 +30,8 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   if (core.q != own_.q) core.split(own_.q, own_.z);
-  t_start_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
+  refusals_ = 0, balance_ = 0.0;
+  t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
   core.set(q_tree);
   core.reduce();
   begin(q_tree);
@@ -56,7 +60,11 @@ bool LevelSet::state(double t, In y, double tolerance) {
   const int d = core.d;
   level(t);
   predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
-  if (!newton(tolerance) && !(from_anchor(y.head(d)) && newton(tolerance))) return false;
+  if (!newton(tolerance)) {
+    predict_from_accepted();
+    predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
+    if (!newton(tolerance)) return false;
+  }
   if (chart_.plain())
     q = y.head(d);
   else
@@ -71,18 +79,6 @@ bool LevelSet::state(double t, In y, double tolerance) {
     if (actual_) v_tree = velocity;
   }
   predictor_.add(t, core, core.q_tree, velocity, w);
-  return true;
-}
-
-// Predict z to first order from the last accepted state.
-bool LevelSet::from_anchor(In numbers) {
-  core.set(anchor_);
-  core.reduce();
-  if (core.phi_z.singular()) return false;
-  chart_.step(core, anchor_, numbers, q_dot);
-  core.velocity(q_dot, step_);
-  q_tree_ = anchor_;
-  core.tree.integrate(q_tree_, step_);
   return true;
 }
 
@@ -104,7 +100,8 @@ bool LevelSet::newton(double tolerance) {
     const double previous = size;
     size = unclosed();
     if (iteration && !(size <= std::max(0.5 * previous, tolerance))) return false;
-    if (size <= tolerance) {
+    const bool polish = refusals_ > 1 && size > 0.0 && (!iteration || size < gains * previous);
+    if (size <= tolerance && (!polish || iteration == max_iterations)) {
       expected_ = iteration;
       return true;
     }
@@ -131,7 +128,7 @@ double LevelSet::unclosed() {
 bool LevelSet::rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!y.allFinite()) return fails(Trouble::infinite);
-  if (!state(t, y, std::max(tolerance_, slack_))) return fails(Trouble::open);
+  if (!state(t, y, refusals_ ? tolerance_ : std::max(tolerance_, slack_))) return fails(Trouble::open);
   core.inertia();
   core.bias(v_tree);
   if (!act(t)) return false;
@@ -160,10 +157,34 @@ bool LevelSet::tree_acceleration(In f, Out a) const {
   return true;
 }
 
+bool LevelSet::return_to_accepted() {
+  ++refusals_, balance_ += weight;
+  if (balance_ > patience) return fails(Trouble::vague);
+  alarm_ = std::numeric_limits<double>::infinity();
+  predict_from_accepted();
+  return true;
+}
+
+void LevelSet::predict_from_accepted() {
+  core.set(anchor_);
+  core.reduce();
+  predictor_.start(core, anchor_);
+}
+
+void LevelSet::whole(In f, Out x, Out x_dot) const {
+  x << core.q_tree, velocity;
+  core.tree.configuration_rate(core.q_tree, velocity, x_dot.head(core.tree.nq));
+  core.tree_acceleration(f.tail(core.d), x_dot.tail(core.n));
+}
+
 // Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.
 Accepted LevelSet::accept(double t, Out y, double here) {
   anchor_ = arrived_;
+  if (balance_ == 0.0) length_ = t - accepted_;
+  if (length_ > 0.0) balance_ = std::max(0.0, balance_ - (t - accepted_) / length_);
+  accepted_ = t;
   level(t);
+  if (!on_manifold_ && t - t_start_ > gone * epsilon_) return on_manifold_ = true, Accepted::changed;
   if (may_switch && here < alarm_ && !(w.lpNorm<Eigen::Infinity>() > tolerance_)) {
     alarm_ = std::max(fallen * here, poor);
     Partition better;
@@ -172,6 +193,7 @@ Accepted LevelSet::accept(double t, Out y, double here) {
       if (move_to(better, t, y)) {
         if (margin() > clearly * here) {
           ++counts.switches;
+          refusals_ = 0, balance_ = 0.0;
           return Accepted::restarted;
         }
         move_to(present, t, y);

@@ -15,6 +15,7 @@ class LevelSet : public System {
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override { return state(t, y, tolerance_); }
+  bool at_start(double t, In y) override { return exact(t, y) && (arrived_ = core.q_tree, true); }
   bool at_last(double t, In y) override;
   double margin() override { return phi_z_margin(); }
   Accepted accept(double t, Out y, double margin) override;
@@ -23,14 +24,18 @@ class LevelSet : public System {
   double decay() const override { return -1.0 / epsilon_; }
   double layer() const override { return on_manifold_ ? System::layer() : epsilon_; }
   bool tree_acceleration(In f, Out a) const override;
+  bool conserves() const override { return on_manifold_; }
+  bool return_to_accepted() override;
+  int whole_size() const override { return on_manifold_ && core.rank ? core.tree.nq + core.n : 0; }
+  void whole(In f, Out x, Out x_dot) const override;
 
  private:
   void level(double t);
+  void predict_from_accepted();
   void begin(In q_tree);  // coordinates and predictor, with the core's partition
   // Close z at y, then rho and the tree's velocities; false where Newton's method does not get there.
   bool state(double t, In y, double tolerance);
   bool newton(double tolerance);
-  bool from_anchor(In numbers);
   double unclosed();
   bool move_to(const Partition& partition, double t, Out y);
   void chart_numbers(Out y);
@@ -39,6 +44,10 @@ class LevelSet : public System {
   const bool actual_;
   const Partition own_;
   bool on_manifold_ = true;
+  // How often the rates of z have disagreed in these coordinates: the loops are closed without slack then, and after
+  // that to rounding. Of the balance, the time since counts against it, in steps as they were before.
+  int refusals_ = 0;
+  double balance_ = 0.0, length_ = 0.0, accepted_ = 0.0;
   double t_start_ = 0.0;
   double alarm_;      // margin at which a better q is looked for
   int expected_ = 0;  // corrections that closing will take

@@ -14,6 +14,7 @@ using Clock = std::chrono::steady_clock;
 constexpr double fine_rtol = 1e-7;
 constexpr long first_check = 50;     // steps after which stiffness is looked at again, then twice as many
 constexpr double shortest_told = 1e-9;  // of what is left: a step whose end, or inside, cannot be told is made again
+constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
 constexpr double few_steps = 2.0;    // of RK45: a segment that takes no more is its
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
@@ -32,6 +33,7 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       dop853_(Explicit::dop853, *system, now, work, tolerance_),
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
+      energy_(system->core),
       crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed) {
   for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
@@ -141,15 +143,16 @@ std::optional<Stop> Loop::sample() {
 // Everything that has to be known before a step.
 std::optional<Stop> Loop::begin(double bound) {
   if (!begun_) {
-    if (!system->exact(now.t, now.y)) return trouble();
+    if (!system->at_start(now.t, now.y)) return trouble();
     end_ = monitor_.at(*system);
+    energy_.from(*system);
     const Accepted accepted = system->accept(now.t, now.y, system->margin());
     if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, system->margin()};
     if (accepted != Accepted::kept) f_known_ = false;
     begun_ = true;
   }
   if (!f_known_) {
-    f_known_ = (method_ ? *method_ : dop853_).evaluate(now.t, now.y, now.f);
+    f_known_ = (method_ ? *method_ : dop853_).evaluate_start();
     if (!f_known_) return trouble();
     if (!method_) choose(bound);
   }
@@ -227,6 +230,10 @@ std::optional<Stop> Loop::ordinary(double bound, bool last) {
   const auto shorter = [&](double part) { return method_->retry(part * h), std::nullopt; };
   const bool can_be_shorter = h > shortest_told * (bound - now.t);
   if (!system->at_last(now.t_new, now.y_new)) return can_be_shorter ? shorter(0.5) : std::optional(trouble());
+  if (energy_.at(*system, tolerance_.rtol, tolerance_.atol) > energy_change) {
+    if (can_be_shorter) return shorter(0.5);
+    return Stop{Stop::energy, now.t, energy_.change};
+  }
   events.arrived();
   const RankMonitor::Rank after = monitor_.at(*system);
   const double margin = system->margin();
@@ -278,6 +285,7 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
   now.t_new = reaches_ ? motion.t : std::min(motion.t, bound), now.h_next = length_ > 0.0 ? length_ : left;
   motion.at(now.t_new, now.y_new);
   if (!system->exact(now.t_new, now.y_new)) return trouble();
+  energy_.from(*system);
   const RankMonitor::Rank after = monitor_.at(*system);
   events.jump();
   const bool ends = last && now.t_new == bound;  // right there, perhaps: nothing has to go on from it
@@ -307,7 +315,7 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
   const Accepted accepted = system->accept(now.t_new, now.y_new, step.margin);
   method_->commit();
   crossing_.kept(step.after);
-  end_ = step.after;
+  end_ = step.after, energy_.kept();
   f_known_ = accepted == Accepted::kept;
   if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, step.margin};
   if (accepted == Accepted::restarted) method_->forget();

@@ -4,6 +4,7 @@
 #include <array>
 
 #include "crossing.hpp"
+#include "energy_monitor.hpp"
 #include "events.hpp"
 #include "explicit.hpp"
 #include "radau.hpp"
@@ -29,6 +30,7 @@ struct Stop {
     step,         // no step can be made: see `trouble`
     rank,         // J loses rank and that cannot be passed
     chart,        // q has stopped to determine z
+    energy,       // a conservative motion's energy changes, however short the step
     control,      // a controller has no u
     function,     // an event's function has no finite value
     output,       // the state has no terms
@@ -109,6 +111,7 @@ class Loop {
   std::unique_ptr<Radau> radau_;
   Method* method_ = nullptr;
   RankMonitor monitor_;
+  EnergyMonitor energy_;
   Crossing crossing_;
   RankMonitor::Rank end_;     // at the present state
   double length_ = 0.0;       // of the last step

@@ -10,6 +10,24 @@ double Method::shortest(double t_bound) const {
   return std::max(10 * (std::nextafter(step_.t, infinity) - step_.t), 0.1 * eps * (t_bound - step_.t));
 }
 
+bool Method::evaluate_start() {
+  if (!evaluate(step_.t, step_.y, step_.f)) return false;
+  const int size = system_.whole_size();
+  for (Vector* x : {&step_.x, &step_.x_dot, &step_.x_new, &step_.x_dot_new}) x->resize(size);
+  if (size) system_.whole(step_.f, step_.x, step_.x_dot);
+  return true;
+}
+
+double Method::disagreement(In integral) {
+  x_scale_ = tolerance_.atol + tolerance_.rtol * step_.x.cwiseAbs().cwiseMax(step_.x_new.cwiseAbs()).array();
+  x_error_ = step_.x_new - step_.x - integral;
+  return norm(x_error_, x_scale_);
+}
+
+bool Method::return_to_start() {
+  return system_.return_to_accepted() && evaluate_start();
+}
+
 // E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, section II.4.
 double Method::first_length(double t_bound, int order) {
   const double duration = std::min({t_bound - step_.t, tolerance_.max_step, system_.layer()});

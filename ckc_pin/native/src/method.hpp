@@ -13,8 +13,9 @@ struct Tolerance {
 struct Step {
   double t = 0, h = 0;  // from (t, y) with rate f; h: a length to try
   Vector y, f;
+  Vector x, x_dot;      // the whole motion there
   double t_new = 0, h_next = 0;  // to (t_new, y_new)
-  Vector y_new, f_new;
+  Vector y_new, f_new, x_new, x_dot_new;
   double t_old = 0;  // where the one before began
   Vector y_old;
 };
@@ -44,6 +45,7 @@ class Method : public Interpolant {
   virtual void commit() {
     step_.t_old = step_.t, step_.y_old = step_.y;
     step_.t = step_.t_new, step_.y = step_.y_new, step_.f = step_.f_new, step_.h = step_.h_next;
+    step_.x.swap(step_.x_new), step_.x_dot.swap(step_.x_dot_new);
   }
   // Remember nothing of former steps.
   virtual void forget() {}
@@ -51,6 +53,9 @@ class Method : public Interpolant {
   // A first length, of a method whose error estimate is of this order; (t, y, f) are known.
   double first_length(double t_bound, int order);
   virtual int error_order() const = 0;
+
+  // The rate where the next step begins, and the whole motion there.
+  bool evaluate_start();
 
   bool evaluate(double t, In y, Out y_dot) {
     if (work_.rhs >= work_.most_rhs) {
@@ -66,6 +71,13 @@ class Method : public Interpolant {
   bool over() const { return work_.spent || system_.control.problem.raised; }
   // The shortest step that changes t.
   double shortest(double t_bound) const;
+  // Where y is only a part of the motion, the rest has to agree with what its rates add up to: next to where y stops to
+  // determine it, or on another branch, it does not, however small the error of y is.
+  bool whole() const { return step_.x.size(); }
+  double disagreement(In integral);  // of the rates, relative to what is allowed
+  // A step was refused for that. Find the state where it begins once more, as closed as it can be.
+  bool return_to_start();
+
   double norm(In x, const Vector& scale) const {
     return std::sqrt((x.array() / scale.array()).square().sum() / static_cast<double>(x.size()));
   }
@@ -74,6 +86,7 @@ class Method : public Interpolant {
   Step& step_;
   Work& work_;
   const Tolerance& tolerance_;
+  Vector x_scale_, x_error_;
 };
 
 }  // namespace ckc

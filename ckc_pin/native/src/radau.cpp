@@ -16,6 +16,8 @@ constexpr double ahead = 0.8;             // of a step: where the Jacobian is ta
 constexpr double refresh = 0.02;          // contraction of Newton's method from which the Jacobian is taken anew
 constexpr double keep_from = 0.9, keep_to = 1.2;  // factors of the length for which new factors do not pay
 constexpr double pessimism = 3.0;  // of the error's estimate, with five stages or more; with three it is what it says
+// How far z may be from what its rates add up to, relative to the error: the rates are those before the last correction.
+constexpr double agreement = 10.0;
 constexpr int cautious_steps = 3;  // after Newton's method has failed, and how much they may grow
 constexpr double cautious_growth = 1.5, slow_contraction = 0.3;
 
@@ -28,7 +30,8 @@ Radau::Radau(System& system, Step& step, Work& work, const Tolerance& tolerance)
     : Method(system, step, work, tolerance), stages_(stages_for(tolerance.rtol)), most_iterations_(iterations_for(stages_, tolerance.newton)) {
   const int n = system.size, s = stages_;
   tabulate();
-  J_.setZero(n, n), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
+  b_ = A_inverse_.inverse().row(s - 1);
+  J_.setZero(n, n), Z_dot_.setZero(n, s), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
   for (Vector* x : {&scale_, &error_, &y_stage_, &f_stage_, &real_right_, &real_correction_}) x->setZero(n);
   right_.setZero(n), correction_.setZero(n);
   pairs_.resize(s / 2);
@@ -153,8 +156,8 @@ void Radau::factorize(double h) {
 }
 
 // (A^-1 / h - J) dZ = F - A^-1 Z / h, in the eigenvectors of A^-1.
-void Radau::solve(double h) {
-  F_.noalias() -= (1.0 / h) * Z_ * A_inverse_.transpose();
+void Radau::solve() {
+  F_ -= Z_dot_;
   real_right_.noalias() = F_ * V_inverse_.row(0).real().transpose();
   real_.solve(*this, real_right_, real_correction_);
   dZ_.noalias() = real_correction_ * V_.col(0).real().transpose();
@@ -167,18 +170,22 @@ void Radau::solve(double h) {
 
 Radau::Newton Radau::newton(double h) {
   scale_ = tolerance_.atol + tolerance_.rtol * step_.y.array().abs();
+  if (whole()) X_.resize(step_.x.size(), stages_), x_stage_.resize(step_.x.size());
   contraction_ = 0.0;
   double before = 0.0;
   for (iterations_ = 1; iterations_ <= most_iterations_; ++iterations_) {
+    Z_dot_.noalias() = (1.0 / h) * Z_ * A_inverse_.transpose();
     for (int i = 0; i < stages_; ++i) {
       y_stage_ = step_.y + Z_.col(i);
       if (!evaluate(step_.t + c_(i) * h, y_stage_, F_.col(i))) return over() ? Newton::impossible : Newton::slow;
+      if (whole()) system_.whole(Z_dot_.col(i), x_stage_, X_.col(i));
     }
-    solve(h);
+    solve();
     double square = 0.0;
     for (int i = 0; i < stages_; ++i) square += (dZ_.col(i).array() / scale_.array()).square().sum();
     const double size = std::sqrt(square / static_cast<double>(dZ_.size()));
     if (!std::isfinite(size)) return Newton::slow;
+    correction_size_ = size;
     double left = 1e3 * size;
     if (iterations_ > 1) {
       contraction_ = size / before;
@@ -250,6 +257,15 @@ bool Radau::step(double t_bound) {
       if (over()) return false;
       shorten(0.5);
       continue;
+    }
+    if (whole()) {
+      system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
+      x_stage_.noalias() = h * X_ * b_;
+      if (!(disagreement(x_stage_) < agreement * (1.0 + correction_size_))) {
+        if (!return_to_start()) return false;
+        shorten(0.5);
+        continue;
+      }
     }
     propose(h, std::max(size, 1e-10), effort, exponent);
     if (step_.t_new == t_bound && !refused) step_.h_next = std::max(step_.h_next, step_.h);

@@ -44,7 +44,7 @@ class Radau : public Method {
   void extrapolate(double x, double h, Out y);  // y at t + x h, by the last step's polynomial
   bool new_jacobian(double h);
   void factorize(double h);
-  void solve(double h);
+  void solve();
   Newton newton(double h);
   double error(const Vector& f, double h);
   void propose(double h, double size, double effort, double exponent);
@@ -70,6 +70,8 @@ class Radau : public Method {
   };
 
   Matrix J_, Z_, F_, dZ_;
+  Matrix Z_dot_, X_;  // rates of the collocation polynomials, and with them of the whole motion
+  Vector b_, x_stage_;
   Shifted<double> real_;                  // of the real eigenvalue
   std::vector<Shifted<Complex>> pairs_;   // of the others
   std::vector<std::pair<int, int>> rates_;
@@ -78,7 +80,7 @@ class Radau : public Method {
   Vector scale_, error_, y_stage_, f_stage_, real_right_, real_correction_;
   double factorized_ = 0.0;  // the length that the factors are of
   bool J_known_ = false, J_fresh_ = false;
-  double contraction_ = 0.0;
+  double contraction_ = 0.0, correction_size_ = 0.0;
   int iterations_ = 0, cautious_ = 0;
   double error_old_ = 0.0, length_old_ = 0.0, error_new_ = 0.0;
   Polynomial last_, made_;   // of the last step, and of the one just made

@@ -20,6 +20,7 @@ enum class Trouble {
   rank,      // J has lost rank
   infinite,  // a number is not finite
   control,   // a controller has no u
+  vague,     // z is not known to the tolerance
 };
 
 // What becomes of an accepted state.
@@ -41,6 +42,8 @@ class System {
   virtual bool rhs(double t, In y, Out y_dot) = 0;
   // The core at the state, closed as well as the formulation closes it, with everything below; false where it fails.
   virtual bool exact(double t, In y) = 0;
+  // The same where a motion goes on from.
+  virtual bool at_start(double t, In y) { return exact(t, y); }
   // The same for a state that `rhs` was evaluated at last, as closed as it is.
   virtual bool at_last(double t, In y) = 0;
   // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
@@ -58,12 +61,21 @@ class System {
   virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
   // Time in which the motion may change, known from the start, s: that of a boundary layer.
   virtual double layer() const { return std::numeric_limits<double>::infinity(); }
+  // Whether the motion keeps its energy where nothing acts and nothing dampens.
+  virtual bool conserves() const { return false; }
   // Rate of phi over phi on a level set: what phi_dot should be.
   virtual double decay() const { return 0.0; }
   // The part of a Jacobian at y whose eigenvalues tell how the freedoms move; false where there is none.
   virtual bool modes(In, Matrix&) { return true; }
   // Acceleration of the tree at the state that `rhs` was evaluated at last; false where it is not known.
   virtual bool tree_acceleration(In f, Out a) const = 0;
+  // A step was refused because y does not tell the rest of the motion as its rates do: forget what was found since the
+  // last accepted state, and be more exact from there; false where that has not helped.
+  virtual bool return_to_accepted() { return true; }
+  // How many numbers the whole motion (q', v') is where y is only a part that determines it, else zero.
+  virtual int whole_size() const { return 0; }
+  // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).
+  virtual void whole(In, Out, Out) const {}
 
   Core& core;
   Control& control;

@@ -1,0 +1,37 @@
+#include "energy_monitor.hpp"
+
+#include <cmath>
+
+namespace ckc {
+
+constexpr double rounding = 1e-13;  // of kinetic and potential energy
+
+double EnergyMonitor::energy(System& system) {
+  Core& core = system.core;
+  if (!system.conserves() || system.control.acts() || core.springs.any_damping) return std::nan("");
+  core.tree_inertia();
+  core.D_times(system.velocity, momentum_);
+  const double kinetic = 0.5 * system.velocity.dot(momentum_);
+  const double potential = core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree);
+  size_ = kinetic + std::abs(potential);
+  return kinetic + potential;
+}
+
+void EnergyMonitor::from(System& system) { from_ = to_ = energy(system); }
+
+// A state within its tolerance is off by (atol + rtol |x|) in each number, and the energy by that times its gradient:
+// the momentum, and the forces, of which C'v' counts as one here.
+double EnergyMonitor::at(System& system, double rtol, double atol) {
+  to_ = energy(system);
+  if (std::isnan(from_) || std::isnan(to_)) return 0.0;
+  Core& core = system.core;
+  core.bias(system.velocity);
+  double allowed = rounding * size_;
+  for (int k = 0; k < core.n; ++k)
+    allowed += std::abs(momentum_(k)) * (atol + rtol * std::abs(system.velocity(k))) +
+               std::abs(core.bias_tree(k)) * (atol + rtol * std::abs(core.q_tree(core.tree.place[k])));
+  change = to_ - from_;
+  return std::abs(change) / allowed;
+}
+
+}  // namespace ckc
