@@ -29,7 +29,7 @@ def h_gradient(mechanism: Mechanism, at: Kinematics) -> Array:
 
 def _h_tree_gradient(terms: Terms) -> Array:
     tree, springs = terms.mechanism.tree, terms.mechanism.springs
-    gradient = np.array(pin.computeGeneralizedGravityDerivatives(tree.model, tree.data, terms.q_tree))
+    gradient = tree.evaluate(pin.computeGeneralizedGravityDerivatives, terms.q_tree)
     return gradient + springs.elastic_gradient(terms.q_tree) if springs.any else gradient
 
 

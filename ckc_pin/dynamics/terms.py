@@ -8,7 +8,6 @@ controller that needs C' asks for it, and it is computed then.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -36,7 +35,7 @@ class Terms:
 
     Notes
     -----
-    Pinocchio's workspace is shared, so results are copied. Units are SI; D' is (n, n), D is (d, d).
+    Pinocchio's workspace is shared, so results are copied (`Tree.evaluate`). Units are SI; D' is (n, n), D is (d, d).
     """
 
     def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array) -> None:
@@ -45,33 +44,28 @@ class Terms:
         self.q_tree = at.q_tree
         self.v_tree = v_tree
 
-    @lazy
-    def _tree(self) -> tuple[Any, Any]:
-        """Pinocchio's model and workspace."""
-        return self.mechanism.tree.model, self.mechanism.tree.data
-
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 
     @lazy
     def D_tree(self) -> Array:
         """D', inertia of the open chains, shape (n, n)."""
-        return np.array(pin.crba(*self._tree, self.q_tree))
+        return self.mechanism.tree.evaluate(pin.crba, self.q_tree)
 
     @lazy
     def C_tree(self) -> Array:
         """C', the Christoffel matrix, shape (n, n)."""
-        return np.array(pin.computeCoriolisMatrix(*self._tree, self.q_tree, self.v_tree))
+        return self.mechanism.tree.evaluate(pin.computeCoriolisMatrix, self.q_tree, self.v_tree)
 
     @lazy
     def h_tree(self) -> Array:
         """h', gravity of the tree and its springs, whatever has a potential: shape (n,)."""
-        h = np.array(pin.computeGeneralizedGravity(*self._tree, self.q_tree))
+        h = self.mechanism.tree.evaluate(pin.computeGeneralizedGravity, self.q_tree)
         return h - self.spring_force if self.mechanism.springs.any else h
 
     @lazy
     def bias_tree(self) -> Array:
         """C' v' + h' without the matrix C', shape (n,)."""
-        bias = np.array(pin.nonLinearEffects(*self._tree, self.q_tree, self.v_tree))
+        bias = self.mechanism.tree.evaluate(pin.nonLinearEffects, self.q_tree, self.v_tree)
         return bias - self.spring_force if self.mechanism.springs.any else bias
 
     @lazy
@@ -93,7 +87,7 @@ class Terms:
     @lazy
     def potential_energy(self) -> float:
         """V(q'), joules, zero at the world's origin."""
-        gravity = float(pin.computePotentialEnergy(*self._tree, self.q_tree))
+        gravity = float(self.mechanism.tree.evaluate(pin.computePotentialEnergy, self.q_tree))
         return gravity + self.mechanism.springs.energy(self.q_tree)
 
     @lazy

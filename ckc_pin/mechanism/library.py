@@ -6,8 +6,9 @@ import itertools
 import re
 from copy import deepcopy
 from functools import cache
-from os.path import isfile
+from os.path import exists, isdir, isfile
 from pathlib import Path
+from threading import Lock
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GENERATORS, GeneratorSpec, generate
@@ -22,6 +23,7 @@ MECHANISM_FILE = "mechanism.toml"
 MOST_KEPT = 32  # of the mechanisms built
 
 _built: dict[tuple[str, str, Path | None], Mechanism] = {}  # never handed out, only copied
+_building = Lock()
 
 
 @cache
@@ -39,12 +41,7 @@ def shipped() -> list[str]:
 
 def is_path(name: str) -> bool:
     """Whether a mechanism or scene is given by path: it exists, or ends in .toml."""
-    if name.endswith(".toml"):
-        return True
-    try:
-        return Path(name).exists()
-    except OSError:  # longer than a file system takes
-        return False
+    return name.endswith(".toml") or exists(name)  # os.path's own takes names that no file system does
 
 
 def mechanism_file(name: str | Path) -> Path:
@@ -57,9 +54,9 @@ def mechanism_file(name: str | Path) -> Path:
     """
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
-        return path / MECHANISM_FILE if path.is_dir() else path
+        return path / MECHANISM_FILE if isdir(path) else path
     path = library() / name / MECHANISM_FILE
-    if Path(name).name != name or not isfile(path):  # which takes names that no file system does
+    if Path(name).name != name or not isfile(path):
         raise InputError(
             f"no mechanism {name!r}; shipped: {', '.join(shipped())}; or give the path of a {MECHANISM_FILE}"
         )
@@ -122,10 +119,12 @@ def build(text: str, sources: Sources) -> Mechanism:
         twin.sources = sources
         return twin
     mechanism = _build(text, sources)
-    built = _built[key] = deepcopy(mechanism)
+    built = deepcopy(mechanism)
     built.tree.rest()
-    while len(_built) > MOST_KEPT:
-        _built.pop(next(iter(_built)))
+    with _building:
+        _built[key] = built
+        while len(_built) > MOST_KEPT:
+            _built.pop(next(iter(_built)))
     return mechanism
 
 

@@ -3,12 +3,15 @@
 What bites in Pinocchio 4.1 and is dealt with here: `data.oMi`, `data.J` and `data.dJ` are live views
 of one workspace, so what is kept is copied; NaN passes through every algorithm in silence, so
 states are checked where they enter. The placements of all joints are read as one strided array instead
-of one Python object a joint; the stride is verified when the tree is made.
+of one Python object a joint; the stride is verified when the tree is made. Between an algorithm and the copy of
+its result another thread may have its turn, so the two happen under a lock; Pinocchio holds the interpreter
+anyway, and a workspace for each thread would take memory by the gigabyte.
 """
 
 from __future__ import annotations
 
-from copy import copy
+from collections.abc import Callable
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -24,6 +27,8 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
+
+WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # what belongs to a tree's own data
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -74,37 +79,56 @@ class Tree:
     def _work_on(self, model: Any) -> None:
         self.model = model
         self.data = model.createData()
+        self.lock = RLock()  # held while something is in the workspace
         self._placement = _strided_placements(self.data)
         # a matrix of one column would come as a vector
         self._jacobian, self._jacobian_dot = self.data.J.reshape(6, model.nv), self.data.dJ.reshape(6, model.nv)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tree:
         """Copy the model, and give the copy a workspace of its own; labels and places stay as they are."""
-        twin = memo[id(self)] = copy(self)
+        twin = memo[id(self)] = Tree.__new__(Tree)
+        twin.__dict__.update(self.__getstate__())
         twin._work_on(self.model.copy())
         return twin
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the workspace behind, whose views would come back as arrays that nothing writes to."""
+        return {name: value for name, value in self.__dict__.items() if name not in WORKSPACE}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._work_on(self.model)
+
     def rest(self) -> None:
         """Let the workspace go, of a tree that is only to be copied."""
-        del self.data, self._placement, self._jacobian, self._jacobian_dot
+        for name in WORKSPACE:
+            del self.__dict__[name]
+
+    def evaluate(self, algorithm: Callable[..., Any], *state: Array) -> Array:
+        """Return a copy of what an algorithm of Pinocchio, (model, data, *state), leaves in the workspace."""
+        with self.lock:
+            return np.array(algorithm(self.model, self.data, *state))
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""
-        pin.computeJointJacobians(self.model, self.data, q_tree)
-        return self._placement.copy(), self._jacobian.copy()
+        with self.lock:
+            pin.computeJointJacobians(self.model, self.data, q_tree)
+            return self._placement.copy(), self._jacobian.copy()
 
     def many_kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Return what `kinematics` does for each of (count, nq) configurations: (count, joints, 12), (count, 6, n)."""
         placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
-        for k, q in enumerate(q_tree):
-            pin.computeJointJacobians(self.model, self.data, q)
-            placement[k], jacobian[k] = self._placement, self._jacobian
+        with self.lock:
+            for k, q in enumerate(q_tree):
+                pin.computeJointJacobians(self.model, self.data, q)
+                placement[k], jacobian[k] = self._placement, self._jacobian
         return placement, jacobian
 
     def jacobian_dot(self, q_tree: Array, v_tree: Array) -> Array:
         """Return d/dt of the world Jacobian (6, n) along v_tree."""
-        pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
-        return self._jacobian_dot.copy()
+        with self.lock:
+            pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
+            return self._jacobian_dot.copy()
 
     def unmodelled(self) -> list[str]:
         """Say what the URDF has and the dynamics leave out: dry friction, and limits as walls."""
@@ -131,14 +155,14 @@ class Tree:
 
     def centre_jacobians(self, q_tree: Array) -> Array:
         """Jacobians of the centres of mass of all moving bodies that have mass, stacked: (3 bodies, n)."""
-        pin.computeJointJacobians(self.model, self.data, q_tree)
+        placement, jacobian = self.kinematics(q_tree)
         rows = [np.zeros((0, self.n))]
         for joint in range(1, self.model.njoints):
             inertia = self.model.inertias[joint]
             if inertia.mass > 0:
-                lever = self.data.oMi[joint].act(inertia.lever)
-                angular = self._jacobian[3:] * self.support[joint, 0]
-                rows.append(self._jacobian[:3] * self.support[joint, 0] + np.cross(angular.T, lever).T)
+                lever = placement[joint, :9].reshape(3, 3).T @ inertia.lever + placement[joint, 9:]
+                angular = jacobian[3:] * self.support[joint, 0]
+                rows.append(jacobian[:3] * self.support[joint, 0] + np.cross(angular.T, lever).T)
         return np.vstack(rows)
 
     def integrate(self, q_tree: Array, step: Array) -> Array:
