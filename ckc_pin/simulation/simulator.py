@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,9 +26,11 @@ from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["Simulator", "State"]
 
+T = TypeVar("T")
+
 
 class State:
-    """Where a simulator is. It stays as it is when the simulator goes on.
+    """Where a simulator is. It stays as it is when the simulator goes on; its arrays are read-only.
 
     Attributes
     ----------
@@ -43,6 +46,7 @@ class State:
         n, nq = mechanism.n, mechanism.tree.nq
         self._mechanism, self._q, self._z = mechanism, q, z
         self.t = t
+        numbers.setflags(write=False)
         self._q_tree, self.v_tree = numbers[:nq], numbers[nq : nq + n]
         self._v_terms, self.w = numbers[nq + n : nq + 2 * n], numbers[nq + 2 * n :]
 
@@ -107,6 +111,9 @@ class Simulator:
     While u stays as it is, a step of the method may reach beyond the caller's, and states within it are read off it, as
     accurate as the outputs of a run; a change of u goes on from the state that was read. Events keep steps from that.
 
+    It takes one call at a time: an InputError refuses one from another thread, or from an event's function, while it is
+    at work. Simulators of their own in several threads do not wait for each other.
+
     >>> simulator = Simulator("five_bar/set_point", {"formulation": "reduced"})
     >>> for _ in range(10):
     ...     state = simulator.step(-2.0 * simulator.state.q_dot, 0.002)
@@ -128,6 +135,7 @@ class Simulator:
         self.mechanism = self._ready.mechanism
         self.controller: Controller | None = scene_controller(scene, self.mechanism)
         self._none = np.zeros(self.mechanism.d)
+        self._gate, self._at_work = Lock(), False
         self.reset()
 
     @property
@@ -138,12 +146,12 @@ class Simulator:
     @property
     def events(self) -> list[dict[str, Any]]:
         """Events met since the last reset."""
-        return [self._ready.events[k].met(t, direction) for t, k, direction in self._loop.met()]
+        return [self._ready.events[k].met(t, direction) for t, k, direction in self._alone("events", self._loop.met)]
 
     @property
     def stats(self) -> dict[str, Any]:
         """What was evaluated since the last reset, by the names of `Run.stats`."""
-        return {**self._loop.stats(), "terms": "pinocchio"}
+        return {**self._alone("stats", self._loop.stats), "terms": "pinocchio"}
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state; what was before has no influence on what follows.
@@ -161,8 +169,11 @@ class Simulator:
         Raises
         ------
         InputError, NumericalError
-            A state of another mechanism, out of reach or singular.
+            A state of another mechanism, out of reach or singular; a step is under way.
         """
+        return self._alone("reset", lambda: self._reset(state))
+
+    def _reset(self, state: State | Mapping[str, Any] | None) -> State:
         if isinstance(state, State):
             self._ready.begin(self._start(state), state.t)
             numbers = np.concatenate([state._q_tree, state.v_tree, state._v_terms, state.w])
@@ -190,11 +201,14 @@ class Simulator:
         Raises
         ------
         InputError
-            u of the wrong shape or not finite, dt not positive; nothing has moved.
+            u of the wrong shape or not finite, dt not positive, another step is under way; nothing has moved.
         NumericalError
             The numerics stopped within the step; `state` is the last one that was reached.
         """
         held = self._none if u is None else require_u(u, self.mechanism, "u")
+        return self._alone("step", lambda: self._step(held, dt))
+
+    def _step(self, held: Array, dt: float) -> State:
         until = self._state.t + self._require_dt(dt)
         loop = self._loop
         if not loop.hold(held):
@@ -207,6 +221,22 @@ class Simulator:
         if stop[0] not in ("end", "event"):
             raise explain(Stop(*stop), loop, self.mechanism, self._ready.scene.spec.solver, self._ready.events)
         return self._state
+
+    def _alone(self, what: str, act: Callable[[], T]) -> T:
+        """Do something with the loop, which has one state, unless something is being done with it."""
+        mine = False
+        try:
+            with self._gate:  # held for no longer than it takes to look
+                if self._at_work:
+                    raise InputError(
+                        f"{what}: this simulator is at work on another call; it takes one at a time, and none from an "
+                        "event's function"
+                    )
+                self._at_work = mine = True
+            return act()
+        finally:
+            if mine:
+                self._at_work = False
 
     def _present(self) -> State:
         told = self._loop.state()
