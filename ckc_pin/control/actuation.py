@@ -16,6 +16,8 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Actuation", "Effort", "require_u"]
 
+NO_NUMBERS = "cSUmMV"  # what NumPy would make real numbers of, in silence or with a warning
+
 
 def require_u(u: Any, mechanism: Mechanism, what: str = "the controller's u") -> Array:
     """Return u as an array of the right shape, finite or not.
@@ -26,8 +28,11 @@ def require_u(u: Any, mechanism: Mechanism, what: str = "the controller's u") ->
         Not numbers, or not one for each independent coordinate.
     """
     try:
-        vector = np.asarray(u, dtype=float)
-    except (TypeError, ValueError):
+        given = np.asarray(u)
+        if given.dtype.kind in NO_NUMBERS:
+            raise TypeError
+        vector = given.astype(float, copy=False)
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what} is no vector of numbers: {u!r:.80}") from None
     if vector.shape != (mechanism.d,):
         names = ", ".join(mechanism.independent)

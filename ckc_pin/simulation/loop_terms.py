@@ -116,6 +116,9 @@ def event_call(function: Callable[[float, Terms], Any], name: str, mechanism: Me
         number = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
         if not isinstance(number, int | float):
             raise InputError(f"the event {name!r} gave {value!r:.80}; a number is needed")
-        return float(number)
+        try:
+            return float(number)
+        except OverflowError:
+            raise InputError(f"the event {name!r} gave an integer too large for a number") from None
 
     return call

@@ -128,7 +128,7 @@ def _drive(ready: Prepared, rows: Array, progress: Progress | None, watch: Watch
             filled = stop.filled
             if watch is not None:
                 for row in rows[shown:filled]:
-                    watch(float(row[0]), row[1 : 1 + n])
+                    watch(float(row[0]), row[1 : 1 + n].copy())  # theirs, to change as they like
                 shown = filled
             if progress is not None:
                 progress(loop.t, t_end)
