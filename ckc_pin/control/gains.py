@@ -12,6 +12,8 @@ from ckc_pin.mechanism.tree import Array
 
 __all__ = ["gain_matrix", "require_positive_definite"]
 
+LARGEST = 1e100  # of a gain: its products with others, and their squares, do not overflow
+
 
 def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
     """Return a gain as a (d, d) matrix.
@@ -37,6 +39,8 @@ def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
         matrix = float(gain) * np.eye(d)
     if not np.all(np.isfinite(matrix)):
         raise InputError(f"controller.{what}: an entry is not a finite number")
+    if np.abs(matrix).max(initial=0.0) > LARGEST:
+        raise InputError(f"controller.{what}: an entry is above {LARGEST:g}")
     return matrix
 
 

@@ -27,6 +27,7 @@ __all__ = ["HELD_IN_PART", "Mechanism"]
 
 EXACT = 1e-10  # |phi| in units of the mechanism's size that a closed mechanism of exact data reaches
 ROUNDED = 1e-5  # the same when the numbers in the files are rounded to six digits: 2.35619 rad is 5e-6 off
+LARGEST = 1e100  # m: squares of what is larger overflow, and their products
 
 HELD_IN_PART = (
     "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
@@ -88,7 +89,7 @@ class Mechanism:
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
         if len(self.points) < len(spec.point):
             raise MechanismError("point: two points have the same name")
-        self.size = _size(self.tree, self.closure)
+        self.size = _size(self.tree, self.closure, sources.name)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
         self.warnings += self.tree.unmodelled()
@@ -313,8 +314,12 @@ def _build_model(text: str, source: str) -> pin.Model:
         raise MechanismError(f"{source}: Pinocchio cannot build this tree: {error}") from None
 
 
-def _size(tree: Tree, closure: Closure) -> float:
+def _size(tree: Tree, closure: Closure, source: str) -> float:
     """Characteristic length: the largest offset between joints, or from a joint to a loop's point, metres."""
     offsets = [placement.translation for placement in tree.model.jointPlacements]
-    lengths = np.linalg.norm(np.array([*offsets, *closure.anchors.point_local]).reshape(-1, 3), axis=1)
-    return float(lengths.max(initial=0.0)) or 1.0
+    parts = np.array([*offsets, *closure.anchors.point_local]).reshape(-1, 3)
+    if not np.abs(parts).max(initial=0.0) <= LARGEST:
+        raise MechanismError(
+            f"{source}: offsets of joints or loops of {np.abs(parts).max():g} m, more than {LARGEST:g}: units?"
+        )
+    return float(np.linalg.norm(parts, axis=1).max(initial=0.0)) or 1.0

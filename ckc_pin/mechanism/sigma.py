@@ -22,6 +22,7 @@ Verdict = Literal["converged", "out of reach", "singular"]
 MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
 MAX_ITERATIONS = 12
 FAR = 500  # Newton steps, a hundred radians or more: no step of a motion is so long, but a trial of one may be
+FARTHEST = 5000  # the same for a q that somebody asks for; what is further is looked for without the way there
 SMALLEST_PIECE = 1e-9  # of the straight line in q
 STARTS = 20  # of z, when the line does not lead to q
 ROUNDING = 1e-9  # of |J|: below that, phi_z is singular to working precision
@@ -137,6 +138,8 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, a
         iterations += trial.iterations
         if not anywhere and iterations > FAR:
             return Sigma("out of reach", at, done, float("nan"), iterations, "that is too far away for one step")
+        if iterations > FARTHEST:
+            return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
         if trial.converged and _same_branch(at, trial.at):
             at, done, piece = trial.at, done + piece if piece < 1.0 - done else 1.0, 2.0 * piece
         else:

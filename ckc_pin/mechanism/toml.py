@@ -19,6 +19,7 @@ __all__ = ["by_coordinate", "convert", "read_text", "read_toml"]
 T = TypeVar("T")
 
 MAX_BYTES = 16 * 2**20  # no mechanism, scene or URDF that a person wrote is larger
+INTEGERS = range(-(2**63), 2**63)  # TOML's
 DEEPEST = 50  # tables and lists inside each other; tomllib reads dotted keys to any depth, what follows recurses
 
 
@@ -93,19 +94,21 @@ def convert(data: Any, kind: type[T], source: str, at: str = "") -> T:
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {explain(str(error), data, kind, at)}") from None
     for steps, value in _numbers((), data):
+        if isinstance(value, int) and value not in INTEGERS:
+            raise InputError(f"{source}: {place_name(steps, at)}: an integer of more than 64 bits; write it as 1e20")
         if not math.isfinite(value):
             raise InputError(f"{source}: {place_name(steps, at)} = {value}: a finite number is needed")
     return converted
 
 
-def _numbers(steps: tuple[str | int, ...], value: Any) -> Iterator[tuple[tuple[str | int, ...], float]]:
+def _numbers(steps: tuple[str | int, ...], value: Any) -> Iterator[tuple[tuple[str | int, ...], int | float]]:
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _numbers((*steps, key), inner)
     elif isinstance(value, list | tuple):
         for index, inner in enumerate(value):
             yield from _numbers((*steps, index), inner)
-    elif isinstance(value, float):
+    elif isinstance(value, int | float):
         yield steps, value
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from os.path import exists
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def scene_mechanism(scene: Scene) -> Mechanism:
 
 def _beside(scene: Scene, name: str) -> str | Path:
     folder = scene.sources.folder
-    if folder is not None and (name.endswith(".toml") or (folder / name).exists()):
+    if folder is not None and (name.endswith(".toml") or exists(folder / name)):
         return mechanism_file(folder / name)
     return name
 
@@ -100,7 +101,12 @@ class Prepared:
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Put the loop to a start, as if nothing had been before."""
         start = start or self.start
-        v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+        with np.errstate(over="ignore"):
+            v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+        if not np.all(np.isfinite(v_tree)):
+            raise InputError(
+                f"initial.q_dot = {start.q_dot.tolist()}: the other coordinates' rates are not finite then"
+            )
         self.loop.start(t, start.at.q_tree, v_tree, start.w)
 
 
@@ -149,7 +155,7 @@ def prepare(
         raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
     watching = watched(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
-    D_tree = np.array(pin.crba(mechanism.tree.model, mechanism.tree.data, start.at.q_tree))
+    D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     if controller is not None or free:
         actuation.require_transmission(start.at)
@@ -167,13 +173,13 @@ def prepare(
 def _output_instants(scene: Scene) -> Array:
     t_end, output_dt = scene.spec.t_end, scene.spec.solver.output_dt
     if output_dt is None:
-        return np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float)
+        return np.unique(np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float))  # fewer in a t_end of a few denormals
     if t_end / output_dt > MAX_OUTPUTS:
         raise InputError(
             f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
         )
     times = np.arange(int(t_end / output_dt * (1 + 1e-12)) + 1, dtype=float) * output_dt
-    if t_end - times[-1] > 1e-9 * output_dt:
+    if t_end - times[-1] > 1e-9 * min(output_dt, t_end):
         return np.append(times, t_end)
     times[-1] = t_end
     return times

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
-from os.path import isfile
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -56,7 +56,7 @@ class SolverSpec(_Spec, frozen=True):
     atol: Positive | None = None
     max_step: Positive | None = None
     min_step: NonNegative = 0.0
-    max_rhs: Annotated[int, msgspec.Meta(gt=0)] | None = None
+    max_rhs: Annotated[int, msgspec.Meta(gt=0, le=2**62)] | None = None
     max_wall_s: Positive | None = None
     output_dt: Positive | None = None
     projection: bool = True
@@ -136,10 +136,10 @@ def scene_file(name: str | Path) -> Path:
     """
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
-        if path.is_dir() or path.name == MECHANISM_FILE:
-            path = _default(path if path.is_dir() else path.parent)
+        if isdir(path) or path.name == MECHANISM_FILE:
+            path = _default(path if isdir(path) else path.parent)
         return path
-    if Path(f"{name}{SUFFIX}").is_file():
+    if isfile(f"{name}{SUFFIX}"):
         raise InputError(f"no scene {name!r}; there is {name}{SUFFIX}, a path ends in .toml")
     mechanism, _, scene = name.partition("/")
     path = library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
@@ -155,7 +155,7 @@ def scene_file(name: str | Path) -> Path:
 def _default(folder: Path) -> Path:
     path = folder / f"{DEFAULT}{SUFFIX}"
     others = sorted(p.name for p in folder.glob(f"*{SUFFIX}"))
-    if others and not path.is_file():
+    if others and not isfile(path):
         raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
     return path
 

@@ -50,7 +50,7 @@ CASES = [
     Bad("URDF as scene", ["run", "bar/five_bar.urdf"], ["malformed TOML", "line 1", "named in a mechanism.toml"]),
     Bad("scene as mechanism", [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"], ["unknown key 'mechanism'"]),
     Bad("a name that no file can have", ["check", "\0.toml"], [r"'\x00.toml'", "no name of a file"]),
-    Bad("a name too long for a file", ["check", "x" * 5000 + ".toml"], ["xxx.toml: File name too long"]),
+    Bad("a name too long for a file", ["check", "x" * 5000 + ".toml"], ["xx.toml: cannot be read: File name too"]),
     # the state of terms
     Bad("state that is not JSON", [*TERMS, "theta_1=1"], ["--q theta_1=1: not JSON", "--q '{\"theta_1\": 0.4}'"]),
     Bad("state without end", [*TERMS, "[" * 100_000], ["--q [[", "not JSON"]),

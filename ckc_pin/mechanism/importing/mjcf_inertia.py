@@ -125,12 +125,12 @@ def _uniform(kind: str, size: Sequence[float]) -> tuple[float, Array]:
     if kind == "cylinder":
         across = (3 * r * r + length * length) / 12
         return math.pi * r * r * length, np.array([across, across, r * r / 2])
-    tube, ball = math.pi * r * r * length, 4 / 3 * math.pi * r**3  # a capsule: a cylinder and two half balls
+    tube, ball = length, 4 / 3 * r  # a capsule: a cylinder and two half balls; their volumes over pi r^2
     # a half ball's moment about an axis across it, through its flat side, is a ball's; its centre is 3 r / 8 from there
     shift = length * length / 4 + 3 * length * r / 8
     across = (tube * (3 * r * r + length * length) / 12 + ball * (2 * r * r / 5 + shift)) / (tube + ball)
     along = (tube * r * r / 2 + ball * 2 * r * r / 5) / (tube + ball)
-    return tube + ball, np.array([across, across, along])
+    return math.pi * r * r * (tube + ball), np.array([across, across, along])
 
 
 def _positive(size: Sequence[float], a: Attributes) -> Sequence[float]:
