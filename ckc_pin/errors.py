@@ -27,7 +27,17 @@ __all__ = ["CkcError", "InputError", "MechanismError", "NumericalError"]
 
 
 class CkcError(Exception):
-    """Base of every error that ckc_pin raises on purpose."""
+    """Base of every error that ckc_pin raises on purpose.
+
+    Its message is one line: what cannot be printed, of a stranger's names and paths, stands as an escape.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message if message.isprintable() else "".join(map(_shown, message)))
+
+
+def _shown(letter: str) -> str:
+    return letter if letter.isprintable() else letter.encode("unicode_escape").decode()
 
 
 class MechanismError(CkcError):
