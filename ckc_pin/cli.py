@@ -22,6 +22,7 @@ import typer
 
 import ckc_pin
 from ckc_pin.errors import CkcError, InputError, NumericalError
+from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes, read_table
 from ckc_pin.simulation.interrupts import Interrupts
 from ckc_pin.simulation.report import (
@@ -473,18 +474,25 @@ def _make_folder(out: Path) -> None:
 def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
     """Save a run, whatever signals come, then draw its figures; return what interrupted that."""
     try:
-        with interrupts.held():
-            finished.save(out / "run.npz")
-            (out / "scene.json").write_text(json.dumps(finished.scene, indent=2) + "\n", encoding="utf-8")
+        with ExitStack() as stack:
+            with interrupts.held():
+                stack.enter_context(alone_in(out))
+                finished.save(out / "run.npz")
+                write_whole(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")
+            _draw(finished, out)
+    except KeyboardInterrupt as stop:
+        errors().print(f"no figures: interrupted{_by(stop)}; the run is saved")
+        return stop
+    return None
+
+
+def _draw(finished: ckc_pin.Run, out: Path) -> None:
+    try:
         from ckc_pin.view.figures import plot as plot_runs
 
         plot_runs([finished], out)
     except InputError as error:  # matplotlib is an extra; the run itself is saved
         errors().print(f"no figures: {error}")
-    except KeyboardInterrupt as stop:
-        errors().print(f"no figures: interrupted{_by(stop)}; the run is saved")
-        return stop
-    return None
 
 
 class _progress_bar:

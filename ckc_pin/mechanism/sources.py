@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from os.path import lexists
 from pathlib import Path
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.toml import read_text
+from ckc_pin.mechanism.whole_file import write_whole
 
 __all__ = ["Sources", "resolve", "write_texts"]
 
@@ -73,15 +75,15 @@ def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list
     InputError
         A file is there already and may not be replaced, or the folder cannot be written to.
     """
-    there = [str(folder / file) for file in texts if (folder / file).exists()]
+    there = [str(folder / file) for file in texts if lexists(folder / file)]
     if there and not overwrite:
         raise InputError(f"{' and '.join(there)}: there already; write elsewhere with --out DIR, or say --overwrite")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for file, text in texts.items():
-            (folder / file).write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    for file, text in texts.items():
+        write_whole(folder / file, text)
     return [folder / file for file in texts]
 
 

@@ -85,8 +85,20 @@ class Run:
 
     @cached_property
     def mechanism(self) -> Mechanism:
-        """The mechanism, built again from the run's own texts."""
-        return build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts))
+        """The mechanism, built again from the run's own texts.
+
+        InputError: it is not the one that the numbers are of.
+        """
+        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts))
+        for what in ("coordinates", "independent", "actuated"):
+            own, theirs = getattr(self, what), getattr(mechanism, what)
+            if own != theirs:
+                says = f"{', '.join(own)}, its mechanism's {', '.join(theirs)}"
+                raise InputError(f"{self.scene_name}: damaged: the run's {what} are {says}")
+        if self.phi.shape[1] != mechanism.closure.rows:
+            rows = f"{self.phi.shape[1]} columns, its mechanism {mechanism.closure.rows} rows"
+            raise InputError(f"{self.scene_name}: damaged: the run's phi has {rows}")
+        return mechanism
 
     def column(self, coordinate: str) -> int:
         """Return the column of a coordinate; InputError names the valid ones."""
@@ -159,7 +171,13 @@ class Run:
     # --- files -----------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:
-        """Write the run to a file: whole or not at all, also when the machine goes down meanwhile."""
+        """Write the run to a file: whole or not at all, also when the machine goes down meanwhile.
+
+        Raises
+        ------
+        InputError
+            It cannot be written; what was there is still there.
+        """
         path = Path(path)
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL) if getattr(self, name) is not None}
         write_run(path, self.coordinates, arrays, self._meta())

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 import zipfile
-from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -17,6 +14,7 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
 
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "read_run", "write_run"]
 
@@ -48,37 +46,58 @@ class RunMeta(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     profile: dict[str, Any]
 
 
+class _Event(msgspec.Struct):
+    t: float
+    name: str
+    of: str
+    coordinate: str | None
+    value: float
+    direction: int
+    stop: bool
+
+
+class _Stats(msgspec.Struct):
+    rhs: int
+    steps: int
+    rejected: int
+    newton: int
+    factorizations: int
+    method: str
+    steps_by_method: dict[str, int]
+    python_calls: int
+    wall_s: float
+
+
+class _Controller(msgspec.Struct):
+    type: Literal["set_point", "tracking"]
+
+
+class _Scene(msgspec.Struct):
+    formulation: Literal["reduced", "spf", "dae"]
+    epsilon: Annotated[float, msgspec.Meta(gt=0)]
+    spf_coordinates: Literal["w", "z"]
+    controller: _Controller | None = None
+
+
+class _Cost(msgspec.Struct):
+    calls: int
+    seconds: float
+
+
+# what tables and figures read of them; the rest of a scene is checked where it is used
+READ = {"events": list[_Event], "stats": _Stats, "scene": _Scene, "profile": dict[str, _Cost]}
+
+
 def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array], meta: RunMeta) -> None:
-    """Write a file beside its place and move it there, so that a failure leaves what was there before."""
+    """Write a run's file (InputError where that cannot be)."""
     meta.hashes = _hashes(meta)
     content = {
         **arrays,
         "coordinates": np.array(coordinates),
         "meta": np.frombuffer(msgspec.json.encode(meta), dtype=np.uint8),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name last as well; some file systems have no such thing."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    with written_whole(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **content)
 
 
 def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
@@ -106,6 +125,11 @@ def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
         raise InputError(f"{path}: not a run file, or damaged ({type(error).__name__}: {error})") from None
     if MECHANISM_FILE not in meta.texts or meta.hashes != _hashes(meta):
         raise InputError(f"{path}: damaged: its texts do not match their hashes")
+    for name, kind in READ.items():
+        try:
+            msgspec.convert(getattr(meta, name), kind)
+        except msgspec.ValidationError as error:
+            raise InputError(f"{path}: damaged: {name}: {error}") from None
     _check_shapes(path, coordinates, content, meta)
     return coordinates, content, meta
 

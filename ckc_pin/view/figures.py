@@ -15,10 +15,11 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import panels, style
 from ckc_pin.view.desired import desired_along
-from ckc_pin.view.labels import symbol, units
+from ckc_pin.view.labels import plain, symbol, units
 from ckc_pin.view.panels import Group
 
 if TYPE_CHECKING:
@@ -126,11 +127,9 @@ def _stems(groups: Sequence[Group]) -> list[str]:
 
 def _write(figure: Figure, path: Path) -> Path:
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # the same run gives the same file
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=style.DPI, metadata=dates.get(path.suffix[1:]))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}; choose another folder") from None
+    kind = path.suffix[1:]
+    with written_whole(path) as file:
+        figure.savefig(file, dpi=style.DPI, format=kind, metadata=dates.get(kind))
     return path
 
 
@@ -219,7 +218,7 @@ def _sheet(group: Group, titles: Sequence[str], size: tuple[float, float] | None
     rows, columns = (2, 2) if len(titles) == 4 else (1, len(titles))
     figure = Figure(figsize=size or (5.2 * columns, 3.7 * rows + 0.7), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.09, h_pad=0.07)  # type: ignore[union-attr, call-arg]
-    name = group.mechanism.name.replace("$", r"\$")
+    name = plain(group.mechanism.name)
     figure.suptitle(f"{name}: {TITLES[group.kind]}", x=0.01, ha="left", fontsize=12, fontweight="bold")
     axes = [figure.add_subplot(rows, columns, k) for k in range(1, len(titles) + 1)]
     for letter, ax, title in zip("abcd", axes, titles, strict=False):

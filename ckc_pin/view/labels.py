@@ -11,12 +11,13 @@ import numpy as np
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.run import Run
 
-__all__ = ["is_length", "run_labels", "symbol", "units"]
+__all__ = ["is_length", "plain", "run_labels", "symbol", "units"]
 
 GREEK = (
     "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
     "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega",
 )  # fmt: skip
+LONGEST = 40  # characters of a name in a figure
 _PAPER = re.compile(rf"({'|'.join(GREEK)})(?:_?(\d+))?")
 _NAMES = {"reduced": "reduced", "spf": "SPF", "dae": "DAE"}
 
@@ -25,8 +26,19 @@ def symbol(coordinate: str) -> str:
     """Return a coordinate as matplotlib's mathtext: theta_1 as the paper prints it, any other name as it is."""
     letter = _PAPER.fullmatch(coordinate)
     if letter is None:
-        return coordinate.replace("$", r"\$")
+        return plain(coordinate)
     return rf"$\{letter[1]}_{{{letter[2]}}}$" if letter[2] else rf"$\{letter[1]}$"
+
+
+def plain(name: str) -> str:
+    """Return a stranger's name as matplotlib draws it as it is: no mathtext, no more than a figure has room for.
+
+    A label that begins with an underscore is none to its legends.
+    """
+    shown = "".join(letter if letter.isprintable() else "?" for letter in name)
+    shown = shown if len(shown) <= LONGEST else f"{shown[: LONGEST - 1]}…"
+    shown = shown.replace("$", r"\$")
+    return rf"$\_${shown[1:]}" if shown.startswith("_") else shown
 
 
 def is_length(mechanism: Mechanism, coordinate: str) -> bool:

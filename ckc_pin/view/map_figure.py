@@ -11,8 +11,9 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mapped import LABELS, Axis, Kind, Locus, SingularityMap
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.view import style
-from ckc_pin.view.labels import symbol
+from ckc_pin.view.labels import plain, symbol
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,12 +48,9 @@ def write(figure: Figure, folder: Path, stem: str, formats: Sequence[str]) -> li
     """Write a figure in several formats (InputError where the folder cannot be written)."""
     paths = [folder / f"{stem}.{suffix}" for suffix in formats]
     for path in paths:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with look():
-                figure.savefig(path, dpi=style.DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}; choose another folder") from None
+        kind = path.suffix[1:]
+        with look(), written_whole(path) as file:
+            figure.savefig(file, dpi=style.DPI, format=kind, metadata={"Date": None} if kind == "svg" else None)
     return paths
 
 
@@ -237,7 +235,7 @@ def _gray(ax: Any, axis: Axis, unreached: Array) -> None:
 
 
 def _title(found: SingularityMap) -> str:
-    name = found.mechanism.replace("$", r"\$")
+    name = plain(found.mechanism)
     held = ", ".join(f"{symbol(k)} = {x:.4g}" for k, x in found.held.items())
     where = f", workspace of {found.point}" if found.space == "cartesian" else ", singularity map"
     return f"{name}{where}{f' at {held}' if held else ''}"
@@ -275,7 +273,7 @@ def handles(found: SingularityMap) -> list[Any]:
         shown += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
                     for k in range(len(found.sheets))]  # fmt: skip
     if found.path is not None:
-        name = found.path.name.replace("$", r"\$")
+        name = plain(found.path.name)
         shown.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
     if len(found.axes) == 2 and not all(sheet.reached.all() for sheet in found.sheets):
         shown.append(

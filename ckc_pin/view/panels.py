@@ -14,7 +14,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.desired import Wanted
-from ckc_pin.view.labels import run_labels, symbol, units
+from ckc_pin.view.labels import plain, run_labels, symbol, units
 from ckc_pin.view.skeleton import Motion, placements, sticks, viewpoint
 
 __all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "loop_forces", "rates",
@@ -62,7 +62,7 @@ class Group:
     def labels(self) -> list[str]:
         """Each run's name."""
         ends = ["" if r.status == "done" else f" ({r.status} at {r.t[-1]:.4g} s)" for r in self.runs]
-        return [label.replace("$", r"\$") + end for label, end in zip(run_labels(self.runs), ends, strict=True)]
+        return [plain(label) + end for label, end in zip(run_labels(self.runs), ends, strict=True)]
 
     @cached_property
     def colours(self) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def loop_forces(ax: Any, group: Group) -> None:
         ax.text(0.5, 0.5, "no loop holds points together", ha="center", va="center", transform=ax.transAxes)
     shown = holding if len(holding) <= LOOPS_NAMED else [holding[0], holding[-1]]
     for loop in shown:
-        ax.plot([], [], color=colours[loop], label=loop.replace("$", r"\$"))
+        ax.plot([], [], color=colours[loop], label=plain(loop))
     if shown:
         ax.legend(loc="upper right", ncols=min(len(shown), 3), fontsize=8)
 

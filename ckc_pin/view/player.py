@@ -10,6 +10,7 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import write_whole
 from ckc_pin.simulation.run import Run
 from ckc_pin.view.bodies import missing_meshes
 from ckc_pin.view.browser import open_in_browser
@@ -104,12 +105,9 @@ def save_html(
     path = Path(path)
     ordered, drawing = _drawing(runs, speed, gap, meshes)
     text = standalone(*caption(ordered, gap), drawing)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror}; choose a file in a folder that exists"
-        ) from None
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
+    write_whole(path, text)
     return path
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ckc_pin.mechanism.mapped import SingularityMap
+from ckc_pin.view.labels import plain
 from ckc_pin.view.map_figure import det_label, draw_sheet, handles, look, write
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def draw_sections(found: Sequence[SingularityMap]) -> Figure:
         wide, high = (axis.high - axis.low for axis in first.axes)
         tall = float(np.clip(high / wide, 0.4, 1.6))
         figure = Figure(figsize=(3.3 * columns + 1.2, 3.2 * rows * tall + 1.3), layout="constrained")
-        name = first.mechanism.replace("$", r"\$")
+        name = plain(first.mechanism)
         (held,) = first.held
         title = f"{name}, workspace of {first.point}: sections across {held}, working mode as assembled"
         figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
