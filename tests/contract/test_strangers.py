@@ -1,0 +1,279 @@
+"""Numbers, files, threads and functions that nobody meant: each is one line that was a wrong answer or a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
+from ckc_pin.mechanism.importing.mjcf_inertia import _uniform
+from ckc_pin.mechanism.whole_file import UNFINISHED, written_whole
+
+# --- numbers -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("t_end", "output_dt"), [(0.02, 1e10), (0.02, 0.03), (1e-300, 1.0), (5e-324, None)])
+def test_output_instants_reach_from_zero_to_t_end_once(t_end: float, output_dt: float | None) -> None:
+    """The last instant took the place of the first where output_dt is far beyond t_end, or both were 501 times 0."""
+    run = simulate("five_bar/swing", {"t_end": t_end, "solver.output_dt": output_dt})
+    assert run.t.tolist() == [0.0, t_end]
+
+
+WORDS: list[tuple[dict[str, Any], str]] = [
+    ({"initial.q_dot": {"theta_1": 1.7e308, "theta_3": 1e308}}, "initial.q_dot = "),  # v' overflows
+    ({"solver.max_rhs": 10**40}, "solver.max_rhs = 1"),  # more than the loop counts
+    ({"mechanism": "a" * 300}, "no mechanism 'aaa"),  # longer than a file system takes
+    ({"mechanism": "a" * 300 + ".toml"}, "cannot be read: File name too long"),
+]
+
+
+@pytest.mark.parametrize(("changes", "says"), WORDS, ids=lambda x: str(x)[:40])
+def test_a_scene_out_of_range_is_refused_in_words(changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError) as error:
+        simulate("five_bar/swing", changes)
+    assert says in str(error.value)
+
+
+def test_integers_that_no_file_can_carry_are_refused() -> None:
+    """Where any value is taken they came as far as the scene's binary form."""
+    with pytest.raises(InputError, match=r"controller.desired.theta_1.offset: an integer of more than 64 bits"):
+        simulate("five_bar/tracking", {"controller.desired.theta_1.offset": 10**40})
+
+
+def test_gains_whose_squares_overflow_are_refused() -> None:
+    with pytest.raises(InputError, match=r"controller.K_D: an entry is above 1e\+100"):
+        simulate("five_bar/tracking", {"controller.K_D": 1.7e308})
+
+
+def test_lengths_whose_squares_overflow_are_refused(bar: Path) -> None:
+    """The singular values of such a closure do not exist."""
+    text = (bar / "mechanism.toml").read_text(encoding="utf-8")
+    (bar / "mechanism.toml").write_text(
+        text.replace('frame_a = "tip_left"', 'frame_a = {link = "tip_left", xyz = [1e300, 0.0, 0.0]}', 1),
+        encoding="utf-8",
+    )
+    with pytest.raises(MechanismError, match=r"offsets of joints or loops of 1e\+300 m, more than 1e\+100: units\?"):
+        load(bar)
+
+
+def test_a_start_a_thousand_turns_away_is_found_without_the_way() -> None:
+    """Newton's method went there step by step, whatever the number."""
+    far = 2 * np.pi * 10**5 + load("four_bar").assembled.q_tree[0]
+    assert load("four_bar").sigma(np.array([far])).iterations < 6000
+
+
+def test_a_capsule_without_volume_is_a_rod() -> None:
+    """Its two parts were weighed by volumes that are zero beside each other."""
+    volume, per_mass = _uniform("capsule", [1e-300, 0.5])
+    assert volume == 0.0
+    assert per_mass == pytest.approx([1 / 12, 1 / 12, 0.0])
+
+
+# --- threads -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def restless() -> Any:
+    """Threads that take turns at every chance."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def test_one_mechanism_in_threads_gives_each_its_own_terms(restless: Any) -> None:
+    """Pinocchio's workspace was read after another thread had written to it."""
+    mechanism = load("five_bar")
+    states = [({"theta_1": -1.2 + 1e-3 * k, "theta_3": -1.9}, {"theta_1": 0.01 * k}) for k in range(200)]
+
+    def numbers(state: tuple[dict[str, float], dict[str, float]]) -> Any:
+        at = terms(mechanism, *state)
+        return np.concatenate([at.D.ravel(), at.C.ravel(), at.h, at.rho_dot.ravel(), [at.energy]])
+
+    alone = [numbers(state) for state in states]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            assert np.array_equal(alone, list(pool.map(numbers, states)))
+
+
+def test_one_simulator_in_threads_steps_or_refuses(restless: Any) -> None:
+    """Two steps at once moved one state."""
+    simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
+
+    def step(_: int) -> str:
+        try:
+            simulator.step(None, 1e-3)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    with ThreadPoolExecutor(4) as pool:
+        said = list(pool.map(step, range(200)))
+    assert all(text.startswith("step: this simulator is at work") for text in said if text)
+    assert simulator.state.t == pytest.approx(1e-3 * said.count(""), abs=1e-12)
+    simulator.reset()
+    assert simulator.step(None, 1e-3).t == 1e-3
+
+
+def test_a_pickled_mechanism_is_the_same() -> None:
+    """Its views of Pinocchio's workspace came back as arrays that nothing wrote to."""
+    mechanism = load("five_bar")
+    twin = pickle.loads(pickle.dumps(mechanism))
+    q_tree = mechanism.q_tree + 0.1
+    assert np.array_equal(twin.kinematics(q_tree).phi, mechanism.kinematics(q_tree).phi)
+    assert np.array_equal(twin.kinematics(q_tree).J, mechanism.kinematics(q_tree).J)
+
+
+# --- callers' functions ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["step", "reset", "stats", "events"])
+def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
+    acts: dict[str, Callable[[], Any]] = {
+        "step": lambda: simulator.step(None, 1e-3),
+        "reset": lambda: simulator.reset(),
+        "stats": lambda: simulator.stats,
+        "events": lambda: simulator.events,
+    }
+    armed = False
+
+    def function(t: float, terms: Any) -> float:
+        if armed:
+            acts[what]()
+        return 1.0
+
+    simulator = Simulator("five_bar/swing", {"formulation": "reduced"}, events=[Event(function)])
+    armed = True
+    with pytest.raises(InputError, match=f"{what}: this simulator is at work"):
+        simulator.step(None, 1e-3)
+    armed = False
+    assert simulator.step(None, 1e-3).t > 0
+
+
+def test_what_a_watcher_does_to_its_array_is_its_own_affair() -> None:
+    """It was a view of what the run records."""
+    changes = {"t_end": 0.02}
+
+    def spoil(t: float, q_tree: Any) -> None:
+        q_tree[:] = np.nan
+
+    watched = simulate("five_bar/swing", changes, watch=spoil)
+    assert np.array_equal(watched.q_tree, simulate("five_bar/swing", changes).q_tree)
+
+
+def test_a_state_cannot_be_changed() -> None:
+    state = Simulator("five_bar/swing", {"formulation": "reduced"}).state
+    with pytest.raises(ValueError, match="read-only"):
+        state.v_tree[0] = 1.0
+
+
+@pytest.mark.parametrize("u", [np.array([1j, 0.0]), ["1", "2"], np.array([b"1", b"2"]), [10**400, 0]], ids=str)
+def test_what_numpy_would_take_for_numbers_is_no_u(u: Any) -> None:
+    """A complex u lost its imaginary part, text was read."""
+    simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
+    with pytest.raises(InputError, match="u is no vector of numbers"):
+        simulator.step(u, 1e-3)
+
+
+def test_an_event_too_large_for_a_number_is_refused() -> None:
+    with pytest.raises(InputError, match=r"the event 'big' gave an integer too large"):
+        simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: 10**400, name="big")])
+
+
+# --- files -------------------------------------------------------------------------------------------
+
+
+def _saved(tmp_path: Path) -> Path:
+    return simulate("five_bar/swing", {"t_end": 0.02}, profile=True).save(tmp_path / "run.npz")
+
+
+def _with_meta(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    from ckc_pin.simulation.run_file import RunMeta, _hashes
+
+    with np.load(path) as data:
+        content = {name: data[name] for name in data.files}
+    meta = json.loads(content["meta"].tobytes())
+    change(meta)
+    hashes = _hashes(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # a stranger can do that too
+    content["meta"] = np.frombuffer(json.dumps(meta | {"hashes": hashes}).encode(), dtype=np.uint8)
+    np.savez(path, **content)
+
+
+CHANGED: list[Callable[[dict[str, Any]], Any]] = [
+    lambda meta: meta["scene"].pop("formulation"),
+    lambda meta: meta["scene"].update(formulation="x"),
+    lambda meta: meta["scene"].update(epsilon=-1.0),
+    lambda meta: meta["scene"].update(controller={"type": "x"}),
+    lambda meta: meta["stats"].pop("rhs"),
+    lambda meta: meta["stats"].update(steps_by_method=3),
+    lambda meta: meta.update(events=[{}]),
+    lambda meta: meta.update(profile={"D": 1}),
+]
+
+
+@pytest.mark.parametrize("change", CHANGED, ids=range(len(CHANGED)))
+def test_what_tables_and_figures_read_of_a_run_is_checked(change: Callable[..., Any], tmp_path: Path) -> None:
+    """Its hashes were right, and `ckc plot` ended in a KeyError."""
+    path = _saved(tmp_path)
+    _with_meta(path, change)
+    with pytest.raises(InputError, match=r"run\.npz: damaged: (scene|stats|events|profile): "):
+        Run.load(path)
+
+
+def test_a_run_with_the_mechanism_of_another_is_refused(tmp_path: Path) -> None:
+    path = _saved(tmp_path)
+    other = load("slider_crank").sources.texts
+    _with_meta(path, lambda meta: meta.update(texts=other))
+    with pytest.raises(InputError, match=r"damaged: the run's coordinates are theta_1, .*, its mechanism's crank"):
+        Run.load(path).summary()
+
+
+def test_a_message_is_one_line_that_no_terminal_obeys() -> None:
+    assert str(CkcError("a\nb\x1b[2J é")) == r"a\nb\x1b[2J é"
+
+
+@pytest.mark.parametrize("size", [0, 100, 2000])
+def test_a_full_disk_leaves_what_was_there(size: int, tmp_path: Path) -> None:
+    """With a limit on the size of files, which a process sets for itself, in the disk's place."""
+    before = _saved(tmp_path).read_bytes()
+    program = f"""
+import resource, signal, ckc_pin
+run = ckc_pin.Run.load({str(tmp_path)!r})
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))
+try:
+    run.save({str(tmp_path / "run.npz")!r})
+except ckc_pin.InputError as error:
+    print(error)
+"""
+    env = {**os.environ, "PYTHONPATH": str(Path(ckc_pin.__file__).parent.parent), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=env)
+    assert done.stdout == f"{tmp_path / 'run.npz'}: cannot be written: File too large\n"
+    assert done.stderr == ""
+    assert (tmp_path / "run.npz").read_bytes() == before
+    assert os.listdir(tmp_path) == ["run.npz"]
+
+
+def test_what_a_killed_process_left_is_cleared_and_what_another_writes_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    for content in (b"", b"half"):
+        (tmp_path / f".run.npz.{len(content)}{UNFINISHED}").write_bytes(content)
+    with written_whole(path) as file:
+        file.write(b"first")
+        file.flush()
+        with written_whole(path) as other:
+            other.write(b"second")
+        assert path.read_bytes() == b"second"
+    assert path.read_bytes() == b"first"
+    assert os.listdir(tmp_path) == ["run.npz"]
