@@ -1,0 +1,1 @@
+"""Experiments on the package: not installed, run by ``./scripts/experiment NAME``."""

@@ -1,0 +1,1 @@
+"""Random motions, judged by an integration that shares nothing with the package."""

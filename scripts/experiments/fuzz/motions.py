@@ -1,0 +1,151 @@
+"""Random motions: start, speed, tolerance, formulation, events and control of a mechanism, as a scene's changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ckc_pin
+from ckc_pin.mechanism import Mechanism
+from scripts.experiments.fuzz.mechanisms import random_mechanism
+from scripts.experiments.fuzz.spatial import Array
+
+__all__ = ["SHIPPED", "Motion", "random_motion", "shipped_motion"]
+
+
+@dataclass(frozen=True)
+class _Shipped:
+    scene: str
+    speed: float = 20.0  # rad/s
+    spread: float = np.pi  # how far starts are from the assembled configuration, rad
+    t_end: float = 4.0
+    output_dt: float = 0.004
+    weight: float = 1.0
+
+
+SHIPPED = {
+    "five_bar": _Shipped("five_bar/swing", weight=6),
+    "five_bar_as_printed": _Shipped("five_bar_as_printed/swing"),
+    "four_bar": _Shipped("four_bar", weight=2),
+    "slider_crank": _Shipped("slider_crank", weight=2),
+    "slider_crank_spatial": _Shipped("slider_crank_spatial", weight=2),
+    "three_rrr": _Shipped("three_rrr", weight=2),
+    "delta": _Shipped("delta", spread=0.8, t_end=1.0, weight=1),
+    "stewart": _Shipped("stewart", spread=0.3, t_end=0.5, weight=1),
+    "bricard": _Shipped("bricard", t_end=2.0),
+    "andrews": _Shipped("andrews", speed=200.0, spread=1.0, t_end=0.03, output_dt=5e-5),
+    "flyball": _Shipped("flyball", spread=0.1, t_end=0.2, weight=0.3),
+    "n_four_bar": _Shipped("n_four_bar", speed=8.0, t_end=1.0, weight=0.6),
+    "two_ur5": _Shipped("two_ur5", speed=4.0, spread=0.7, t_end=0.5, weight=0.6),
+    "talos": _Shipped("talos", speed=2.0, spread=0.2, t_end=0.2, weight=0.3),
+}
+BUDGET = {"solver.max_rhs": 400_000, "solver.max_wall_s": 20.0}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A scene by name or folder, and what is changed in it."""
+
+    seed: int
+    mechanism: str
+    scene: str
+    changes: dict[str, Any]
+
+
+def shipped_motion(seed: int, name: str | None = None) -> Motion:
+    """A random motion of a shipped mechanism."""
+    random = np.random.default_rng([seed, 2])
+    weights = np.array([shipped.weight for shipped in SHIPPED.values()])
+    drawn = str(random.choice(list(SHIPPED), p=weights / weights.sum()))
+    name = name or drawn
+    return Motion(seed, name, SHIPPED[name].scene, _changes(random, ckc_pin.load(name), SHIPPED[name]))
+
+
+def random_motion(seed: int, folder: Path) -> Motion:
+    """A random motion of a random mechanism, whose files are written to a folder."""
+    random = np.random.default_rng([seed, 3])
+    made = random_mechanism(seed)
+    made.write(folder)
+    about = _Shipped("", t_end=2.0, spread=1.0)
+    return Motion(seed, made.kind, str(folder), _changes(random, ckc_pin.load(folder), about))
+
+
+def _changes(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> dict[str, Any]:
+    changes: dict[str, Any] = {
+        "formulation": str(random.choice(["reduced", "spf", "dae"])),
+        "t_end": float(about.t_end * 10 ** random.uniform(-1, 0)),
+        "solver.rtol": float(10 ** random.uniform(-10, -2)),
+        "solver.output_dt": about.output_dt,
+        **BUDGET,
+    }
+    if mechanism.splits_root:
+        changes["formulation"] = "dae"
+    if random.random() < 0.2:
+        changes["solver.method"] = str(random.choice(["DOP853", "RK45", "Radau"]))
+    q, q_dot = _start(random, mechanism, about)
+    changes["initial"] = {"q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))}
+    if q is None:
+        changes["initial"]["at"] = "assembled"
+    else:
+        changes["initial"]["q"] = dict(zip(mechanism.independent, q.tolist(), strict=True))
+    if changes["formulation"] == "spf":
+        changes["epsilon"] = float(10 ** random.uniform(-8, -1))
+        if random.random() < 0.05 and not mechanism.redundant:
+            changes["initial"]["w"] = (random.uniform(-1, 1, mechanism.closure.rows) * 1e-3 * mechanism.size).tolist()
+    if random.random() < 1 / 3:
+        changes["event"] = _events(random, mechanism, q, q_dot)
+    if q is not None and not mechanism.rooted and random.random() < 0.12:
+        changes["controller"] = _controller(random, mechanism, q)
+    else:
+        changes["controller"] = None
+    return changes
+
+
+def _start(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> tuple[Array | None, Array]:
+    """q and q_dot; q is None where only the assembled configuration can be started from."""
+    slides = mechanism.tree.in_metres[mechanism.partition.q]
+    unit = np.where(slides, 0.3 * mechanism.size, 1.0)
+    q_dot = random.uniform(-1, 1, mechanism.d) * about.speed * unit * random.choice([0.0, 0.1, 1.0, 1.0])
+    if mechanism.splits_root or random.random() < 0.1:
+        return None, q_dot
+    here = mechanism.independent_part(mechanism.q_tree)
+    for attempt in range(12):  # nearer and nearer
+        there = here + random.uniform(-1, 1, mechanism.d) * about.spread * unit * 0.75**attempt
+        found = mechanism.sigma(there)
+        if found.verdict == "converged":
+            return there, q_dot
+    return here, q_dot
+
+
+def _events(random: np.random.Generator, mechanism: Mechanism, q: Array | None, q_dot: Array) -> list[dict[str, Any]]:
+    """One or two; at any value, at the start's own value (tangential when it starts at rest), or both at one value."""
+    k = int(random.integers(mechanism.d))
+    of = str(random.choice(["q", "q_dot"]))
+    start = q_dot[k] if of == "q_dot" else 0.0 if q is None else q[k]
+    value = start if random.random() < 0.3 else start + random.normal() * (5.0 if of == "q_dot" else 0.5)
+    event = {"of": of, "coordinate": mechanism.independent[k], "value": float(value)}
+    event |= {"direction": int(random.integers(-1, 2)), "stop": bool(random.random() < 0.2)}
+    draw = random.random()
+    if draw < 0.2:
+        return [event, dict(event)]
+    if draw < 0.4:
+        other = mechanism.coordinates[int(random.integers(mechanism.n))]
+        return [event, {"of": "q_dot", "coordinate": other, "value": 0.0}]
+    return [event]
+
+
+def _controller(random: np.random.Generator, mechanism: Mechanism, q: Array) -> dict[str, Any]:
+    target = dict(zip(mechanism.independent, (q + random.uniform(-0.5, 0.5, mechanism.d)).tolist(), strict=True))
+    gain = float(10 ** random.uniform(-1, 1.5))
+    controller: dict[str, Any] = {"type": "set_point", "K_P": gain, "K_V": gain * float(random.uniform(0.05, 0.5))}
+    controller["q_d"] = target
+    if random.random() < 0.7:
+        controller["sample_time"] = float(10 ** random.uniform(-3, -2))
+        if random.random() < 0.5:
+            controller["delay"] = controller["sample_time"] * float(random.choice([0.5, 1.0, 1.7]))
+    if random.random() < 0.5:
+        controller["torque_limit"] = float(10 ** random.uniform(-1, 1.5))
+    return controller

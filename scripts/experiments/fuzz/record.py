@@ -1,0 +1,198 @@
+"""One run: computed, judged piece by piece, and written down as one record."""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import asdict, dataclass, fields
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+import ckc_pin
+from ckc_pin.errors import CkcError
+from ckc_pin.simulation import Run
+from scripts.experiments.fuzz.judge import Judge
+from scripts.experiments.fuzz.motions import Motion
+from scripts.experiments.fuzz.read import NoJudge, read
+from scripts.experiments.fuzz.spatial import Array
+from scripts.experiments.fuzz.state import energy
+
+__all__ = ["ALLOWED", "FIELDS", "Record", "run_motion"]
+
+ALLOWED, FLOOR = 1e3, 1e-9  # a piece of a run that is done may be off by ALLOWED * rtol + FLOOR
+OPEN = 1e-9  # of the mechanism's size: what a closure may be open, at most
+DOUBTFUL = 30.0  # times rtol: a piece off by more counts only if it does not magnify errors that much itself
+GROSS = 0.3  # of the largest coordinate or of the energy: no tolerance excuses it
+REVERSED = 0.05  # s
+
+
+@dataclass
+class Record:
+    """What came of one run. Errors of pieces are divided by rtol."""
+
+    seed: int
+    mechanism: str
+    scene: str = ""
+    formulation: str = ""
+    method: str = ""
+    rtol: float = np.nan
+    t_end: float = np.nan
+    control: bool = False
+    events: int = 0
+    status: str = ""
+    message: str = ""
+    t: float = np.nan
+    rhs: int = 0
+    pieces: int = 0
+    unresolved: int = 0
+    p50: float = np.nan
+    p90: float = np.nan
+    worst: float = np.nan
+    worst_t: float = np.nan
+    drift: float = np.nan
+    jump: float = np.nan
+    phi: float = np.nan
+    reversal: float = np.nan
+    verdict: str = ""
+    gross: bool = False
+    why: str = ""
+    seconds: float = np.nan
+    judging: float = np.nan
+    errors: str = ""
+
+    @property
+    def off(self) -> bool:
+        """Whether a run stopped only after it had gone wrong."""
+        return self.verdict == "stopped" and bool(self.why) and not self.why.startswith("no judge")
+
+    def row(self) -> dict[str, Any]:
+        """As a row of a table."""
+        return asdict(self)
+
+
+FIELDS = [field.name for field in fields(Record)]
+
+
+def run_motion(motion: Motion, *, reverse: bool = False) -> tuple[Record, Run | None]:
+    """Run a motion and judge it; anything but a CkcError that comes out is a finding."""
+    changes = motion.changes
+    record = Record(
+        motion.seed, motion.mechanism, motion.scene, changes["formulation"], changes.get("solver.method", "auto"),
+        changes["solver.rtol"], changes["t_end"], changes.get("controller") is not None, len(changes.get("event", [])),
+    )  # fmt: skip
+    started = perf_counter()
+    try:
+        run = ckc_pin.simulate(motion.scene, changes)
+    except CkcError as error:
+        record.status, record.message, record.verdict = "refused", str(error), "refused"
+        record.seconds = perf_counter() - started
+        return record, None
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        record.status, record.verdict = "raw", "RAW"
+        record.message = f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})"
+        record.seconds = perf_counter() - started
+        return record, None
+    record.seconds, started = perf_counter() - started, perf_counter()
+    record.status, record.message, record.t = run.status, run.message, float(run.t[-1])
+    record.rhs = int(run.stats["rhs"])
+    _judge(record, run, motion)
+    if reverse and run.status == "done" and record.jump == record.jump:
+        record.reversal = _reversal(run, motion)
+    record.judging = perf_counter() - started
+    return record, run
+
+
+def _judge(record: Record, run: Run, motion: Motion) -> None:
+    mechanism = run.mechanism
+    record.phi = run.max_phi
+    finite = all(bool(np.isfinite(x).all()) for x in (run.q_tree, run.v_tree, run.energy))
+    record.verdict = run.status
+    wrong = "" if finite else "not finite"
+    if run.status == "stopped" and not run.message:
+        wrong = "stopped without a reason"
+    allowed = max(10 * mechanism.tolerance, OPEN * max(1.0, mechanism.size))
+    if finite and not run.max_phi <= allowed:
+        wrong = f"open by {run.max_phi:.2g}"
+    if finite and not record.control and not run.w.any() and len(run.t) > 1:
+        try:
+            wrong = _pieces(record, run, motion.seed) or wrong
+        except NoJudge as error:
+            record.why = f"no judge: {error}"
+    if wrong and run.status == "done":
+        record.verdict = "WRONG"
+    record.why = wrong or record.why
+
+
+def _pieces(record: Record, run: Run, seed: int) -> str:
+    """Judge some pieces; what is wrong with them, if anything."""
+    judge = Judge(read(run.texts))
+    model, rtol = judge.model, record.rtol
+    order = [run.coordinates.index(label) for label in model.labels]
+    q, v = run.q_tree[:, order], run.v_tree[:, order]
+    kinetic, potential = energy(model, q, v)
+    total = kinetic + potential
+    weight = float(model.mass.sum() * np.linalg.norm(model.gravity) * model.size)  # at rest energy is all rounding
+    scale = max(
+        float(kinetic.max()), float(np.ptp(potential)), 1e-6 * float(np.abs(total).max()), 1e-6 * weight, 1e-300
+    )
+    wrong = ""
+    if np.abs(total - run.energy).max() > 1e-9 * max(scale, float(np.abs(total).max())):
+        wrong = "the energy written down is not that of the states"
+    if model.conservative:
+        record.drift = float(np.abs(total - total[0]).max() / scale)
+        record.jump = float(np.abs(np.diff(total)).max() / scale)
+    chosen = _choose(np.random.default_rng([seed, 4]), total if model.conservative else None, v)
+    dt = np.diff(run.t)[chosen]
+    if judge.has_no_mass(q[chosen]):
+        raise NoJudge("a freedom that moves no mass")
+    end = judge.pieces(q[chosen], v[chosen], dt, 1e-3 * rtol)
+    off = judge.error(q[chosen + 1], v[chosen + 1], end.q, end.v)
+    end.resolved[judge.sensitive(q[chosen], v[chosen], dt, end, off > DOUBTFUL * rtol)] = False
+    record.pieces, record.unresolved = int(end.resolved.sum()), int((~end.resolved).sum())
+    if record.pieces:
+        errors = off[end.resolved] / rtol
+        record.p50, record.p90, record.worst = (float(np.percentile(errors, p)) for p in (50, 90, 100))
+        record.worst_t = float(run.t[chosen[end.resolved][np.argmax(errors)]])
+        record.errors = " ".join(f"{x:.3g}" for x in errors)
+        record.gross = run.status == "done" and bool(off[end.resolved].max() > GROSS)
+        if off[end.resolved].max() > ALLOWED * rtol + FLOOR:
+            wrong = f"a piece off by {off[end.resolved].max():.2g} at t = {record.worst_t:.4g}"
+    record.gross |= run.status == "done" and record.drift > GROSS
+    if not wrong and record.jump > 10 * ALLOWED * rtol + FLOOR:
+        wrong = f"energy jumps by {record.jump:.2g}"
+    return wrong
+
+
+def _choose(random: np.random.Generator, total: Array | None, v: Array) -> np.ndarray:
+    """Up to eight pieces: where energy changes most, where v' does, and some others."""
+    last = len(v) - 1
+    by_v = np.argsort(-np.abs(np.diff(v, axis=0)).max(axis=1))[: 3 if total is not None else 5]
+    by_energy = np.argsort(-np.abs(np.diff(total)))[:3] if total is not None else by_v
+    return np.unique(np.concatenate([by_v, by_energy, random.integers(0, last, 2)]))
+
+
+def _reversal(run: Run, motion: Motion) -> float:
+    """Start at the end with the velocity turned around; how far the run's own past is missed, over rtol."""
+    back_to = int(np.searchsorted(run.t, run.t[-1] - REVERSED))
+    span = float(run.t[-1] - run.t[back_to])
+    if span <= 0:
+        return np.nan
+    changes = {key: value for key, value in motion.changes.items() if key != "event"}
+    at = {name: k for k, name in enumerate(run.coordinates)}
+    changes["initial"] = {
+        "q": {name: float(run.q_tree[-1, k]) for name, k in at.items()},
+        "q_dot": {name: -float(run.v_tree[-1, at[name]]) for name in run.independent},
+    }
+    changes |= {"t_end": span, "event": [], "solver.output_dt": span}
+    try:
+        back = ckc_pin.simulate(motion.scene, changes)
+    except CkcError:
+        return np.nan
+    if back.status != "done":
+        return np.nan
+    right_q, right_v = run.q_tree[back_to], -run.v_tree[back_to]
+    of_q = np.abs(back.q_tree[-1] - right_q).max() / max(1.0, np.abs(right_q).max())
+    of_v = np.abs(back.v_tree[-1] - right_v).max() / max(1.0, np.abs(right_v).max())
+    return float(max(of_q, of_v) / motion.changes["solver.rtol"])

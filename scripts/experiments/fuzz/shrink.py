@@ -1,0 +1,78 @@
+"""A failing run made small: fewer keys, a later start, a shorter time, rounder numbers, as long as it fails alike."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+from ckc_pin.simulation import Run
+from scripts.experiments.fuzz.motions import Motion
+from scripts.experiments.fuzz.record import Record, run_motion
+
+__all__ = ["shrink"]
+
+NEEDED = ("formulation", "t_end", "solver.rtol", "solver.output_dt", "initial", "controller")
+MOST_TRIALS = 300
+
+
+def shrink(motion: Motion) -> Motion:
+    """The smallest motion found whose run fails as this one's does; the motion itself if it does not fail."""
+    record, run = run_motion(motion)
+    wanted, trials = _kind(record), 0
+    again = record.verdict != "done" or record.gross
+    while again and trials < MOST_TRIALS:
+        again = False
+        for changes in _smaller(motion.changes, record, run):
+            trials += 1
+            smaller = replace(motion, changes=changes)
+            found, its_run = run_motion(smaller)
+            if _kind(found) == wanted:
+                motion, record, run, again = smaller, found, its_run, True
+                break
+    return motion
+
+
+def _kind(record: Record) -> tuple[str, bool, str]:
+    """What failing alike means: the verdict, and the message without its numbers."""
+    said = record.message if record.verdict in ("RAW", "stopped", "refused") else record.why
+    return record.verdict, record.off, re.sub(r"-?\d[\d.e+-]*", "#", said)[:40]
+
+
+def _smaller(changes: Mapping[str, Any], record: Record, run: Run | None) -> Iterator[dict[str, Any]]:
+    """Smaller changes, the boldest first."""
+    for key in changes:
+        if key not in NEEDED:
+            yield {k: x for k, x in changes.items() if k != key}
+    if changes.get("controller") is not None:
+        yield {**changes, "controller": None}
+    if len(changes.get("event", [])) > 1:
+        for k in range(len(changes["event"])):
+            yield {**changes, "event": [changes["event"][k]]}
+    if run is not None and record.worst_t == record.worst_t:
+        end = record.worst_t + 2 * changes["solver.output_dt"]
+        if end < 0.95 * changes["t_end"]:
+            yield {**changes, "t_end": end}
+        for part in (0.98, 0.9, 0.7, 0.5, 0.3):
+            k = run.at(part * record.worst_t)
+            if run.t[k] > 0.1 * changes["t_end"]:
+                yield {**changes, "initial": _state(run, k), "t_end": changes["t_end"] - float(run.t[k])}
+    if changes["t_end"] != (short := float(f"{changes['t_end']:.2g}")):
+        yield {**changes, "t_end": short}
+    if changes["solver.rtol"] != (round_ := float(f"{changes['solver.rtol']:.0e}")):
+        yield {**changes, "solver.rtol": round_}
+    for digits in (2, 3, 4, 6):
+        for table in ("q", "q_dot"):
+            initial = deepcopy(dict(changes["initial"]))
+            if table in initial:
+                initial[table] = {name: float(f"{x:.{digits}g}") for name, x in initial[table].items()}
+                if initial != changes["initial"]:
+                    yield {**changes, "initial": initial}
+
+
+def _state(run: Run, k: int) -> dict[str, Any]:
+    """A run's state as a start; all coordinates, so that the branch is told."""
+    q = dict(zip(run.coordinates, run.q_tree[k].tolist(), strict=True))
+    return {"q": q, "q_dot": {name: float(run.v_tree[k, run.column(name)]) for name in run.independent}}
