@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from ckc_pin.errors import NumericalError
@@ -19,7 +20,7 @@ TROUBLES = {
     "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
     "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
     "vague": "phi_z is so nearly singular that the other coordinates are not known as exactly as solver.rtol asks",
-    "infinite": "the right-hand side is not finite",
+    "infinite": "its state or its right-hand side is not finite",
 }
 
 
@@ -49,6 +50,8 @@ def explain(stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, eve
                 t=loop.t,
                 q_tree=where,
             )
+        case "chart" if not math.isfinite(sigma_min):
+            return NumericalError(f"the motion runs away: {TROUBLES['infinite']}", t=loop.t)
         case "chart":
             return NumericalError(why_not_q(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
         case "energy":

@@ -113,3 +113,19 @@ def test_a_reduced_run_stops_where_z_is_not_known_to_the_tolerance() -> None:
     assert run.t[-1] > 0.0995
     assert run.stats["rhs"] < 20_000
     assert np.abs(run.energy - run.energy[0]).max() < 100 * 4.5e-10
+
+
+def test_a_motion_that_runs_away_is_no_singular_chart() -> None:
+    """It said that phi_z's least singular value is nan: sampled velocity feedback that is too strong for its period."""
+    changes = {
+        "formulation": "dae", "t_end": 1.4, "solver.rtol": 2e-5,
+        "initial": {"q": {"crank": 4.0}, "q_dot": {"crank": 0.0}},
+        "controller": {
+            "type": "set_point", "K_P": 26.380734454728017, "K_V": 12.878174764941416,
+            "q_d": {"crank": 3.9961850746563043}, "sample_time": 0.004195423552193236,
+        },
+    }  # fmt: skip
+    run = simulate("slider_crank", changes)
+    assert run.status == "stopped"
+    assert "runs away" in run.message
+    assert "nan" not in run.message
