@@ -62,7 +62,7 @@ def assemble(
         if best.residual <= tolerance:
             break
         spread = 0.1 * 1.4**attempt
-        start = tree.integrate(q_tree, free * random.uniform(-spread, spread, tree.n))
+        start = tree.integrate(q_tree, free * tree.reach * random.uniform(-spread, spread, tree.n))
         trial = outcome(_gauss_newton(tree, start, at, tolerance))
         if trial.residual < best.residual:
             best = trial
@@ -77,8 +77,8 @@ def _gauss_newton(
     for _ in range(100):
         if np.abs(phi).max(initial=0.0) <= 1e-3 * tolerance:
             break
-        step: Array = -np.asarray(np.linalg.lstsq(jacobian(), phi, rcond=1e-6)[0], dtype=float)
-        longest = float(np.abs(step).max(initial=0.0))
+        part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.reach, phi, rcond=1e-6)[0], dtype=float)
+        longest, step = float(np.abs(part).max(initial=0.0)), part * tree.reach
         scale = min(1.0, 0.5 / longest) if longest > 0 else 0.0
         while scale > 1e-6:
             trial = tree.integrate(q, scale * step)

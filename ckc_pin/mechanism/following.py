@@ -13,7 +13,7 @@ from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["SHORTEST", "Nodes", "follow", "nodes_at", "shapes", "solutions", "solve"]
 
-MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
+MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
 ITERATIONS = 8
 SHORTEST = 2.0**-8  # of a way
 TOLERANCE = 1e-10  # of |Psi| in units of the mechanism's size
@@ -90,7 +90,7 @@ def solve(task: Task, start: Array, told: Array, iterations: int = ITERATIONS) -
         going = ~done & (size <= 0.5 * left[active]) & np.isfinite(size)
         left[active] = size
         step = -_solve(jacobian[going][:, every], residual[going])
-        local = np.abs(step).max(axis=1, initial=0.0) <= MAX_STEP
+        local = np.abs(step / mechanism.tree.reach).max(axis=1, initial=0.0) <= MAX_STEP
         active = active[going][local]
         if not len(active):
             break
@@ -135,7 +135,7 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
         part = np.minimum(piece[active], 1.0 - done[active])
         right = np.hstack([np.zeros((len(active), free)), part[:, None] * change[active]])
         step = _solve(here.J[:, task.every], right)
-        near = np.abs(step).max(axis=1) <= MAX_STEP
+        near = np.abs(step / task.extended.mechanism.tree.reach).max(axis=1) <= MAX_STEP
         guess = integrate(task.extended.mechanism.tree, here.q_tree, np.where(near[:, None], step, 0.0))
         told = start.told[active] + (done[active] + part)[:, None] * change[active]
         trial, solved = solve(task, guess, told)

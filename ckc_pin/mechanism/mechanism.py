@@ -90,6 +90,7 @@ class Mechanism:
         if len(self.points) < len(spec.point):
             raise MechanismError("point: two points have the same name")
         self.size = _size(self.tree, self.closure, sources.name)
+        self.tree.reach = np.where(self.tree.in_metres, self.size, 1.0)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
         self.warnings += self.tree.unmodelled()
@@ -198,7 +199,8 @@ class Mechanism:
         closed = self._close(self.tree.from_coordinates(guess))
         self.q_tree = closed.q_tree
         self.residual = closed.residual
-        rounding = 1e-13 * max(self.size, 1.0)
+        lengths = bool(np.all(self.closure.in_metres(self.tree)))
+        rounding = 1e-13 * (self.size if lengths else max(self.size, 1.0))
         self.tolerance = rounding if closed.residual <= EXACT * self.size else 10 * closed.residual
         self.freedoms = count_freedoms(self.tree, self.closure, self.q_tree, self.size, max(self.tolerance, rounding))
         self.d, self.rank = self.freedoms.d, self.freedoms.rank.rank

@@ -22,7 +22,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Inverse", "Point"]
 
 SMALLEST_PIECE = 1e-6  # of the way to a place
-LONGEST_STEP = 0.5  # rad or m of any coordinate in one piece of the way
+LONGEST_STEP = 0.5  # rad, or of the mechanism's size, of any coordinate in one piece of the way
 MOST = 64  # solutions of the inverse kinematics
 MOST_CORRECTIONS = 8  # of Newton's method from a place nearby
 OFF = 1e-9  # of the mechanism's size: how far a place that cannot be met exactly may be missed
@@ -180,7 +180,7 @@ class Point:
             piece = min(piece, 1.0 - done)
             step = at.phi_z_factor.solve(piece * change)
             trial = None
-            if np.abs(step).max() <= LONGEST_STEP:
+            if np.abs(step / at.tree.reach).max() <= LONGEST_STEP:
                 w = level - (1.0 - done - piece) * change
                 trial = newton(at.moved(step), w, self.mechanism.tolerance)
             if trial is not None and trial.converged and _same_side(at, trial.at):

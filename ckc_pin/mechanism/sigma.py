@@ -19,11 +19,12 @@ __all__ = ["Newton", "Sigma", "Verdict", "newton", "predict", "sigma"]
 
 Verdict = Literal["converged", "out of reach", "singular"]
 
-MAX_STEP = 0.5  # rad or m: a longer Newton step in one coordinate is not local any more
+MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
 MAX_ITERATIONS = 12
 FAR = 500  # Newton steps, a hundred radians or more: no step of a motion is so long, but a trial of one may be
 FARTHEST = 5000  # the same for a q that somebody asks for; what is further is looked for without the way there
 SMALLEST_PIECE = 1e-9  # of the straight line in q
+NEARLY = 1e5  # tolerances: as closed as Newton's method makes a singular configuration
 STARTS = 20  # of z, when the line does not lead to q
 ROUNDING = 1e-9  # of |J|: below that, phi_z is singular to working precision
 
@@ -92,7 +93,7 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
             return Newton(at, iteration, False)
         step = np.zeros(at.tree.n)
         step[at.partition.z] = -at.phi_z_factor.solve(residual)
-        if not np.abs(step).max() <= MAX_STEP:
+        if not np.abs(step / at.tree.reach).max() <= MAX_STEP:
             return Newton(at, iteration, False)
         at = at.moved(step)
         residual = at.phi - w
@@ -154,7 +155,10 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, a
 
 
 def _is_singular(at: Kinematics, margin: float) -> bool:
-    return len(at.partition.z) > 0 and at.sigma_min() <= margin * float(np.linalg.norm(at.J))
+    if not len(at.partition.z):
+        return False
+    J = at.J * at.tree.reach
+    return bool(np.linalg.svd(J[:, at.partition.z], compute_uv=False)[-1] <= margin * np.linalg.norm(J))
 
 
 def _same_branch(before: Kinematics, after: Kinematics) -> bool:
@@ -183,6 +187,7 @@ def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done
     for attempt in range(STARTS):
         spread = np.zeros(at.tree.n)
         spread[at.partition.z] = random.uniform(-np.pi, np.pi, len(at.partition.z)) if attempt else 0.0
+        spread *= at.tree.reach
         nearest = _least_squares(start.moved(spread), w, tolerance)
         miss = float(np.abs(nearest.phi - w).max(initial=0.0))
         least = min(least, miss)
@@ -191,7 +196,7 @@ def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done
             if _same_branch(at, nearest):
                 return Sigma("converged", nearest, done, 0.0, iterations)
             other = True
-        singular = singular or (flat and miss <= 1e-8)
+        singular = singular or (flat and miss <= NEARLY * tolerance)
     if singular:
         return Sigma("singular", at, done, least, iterations, "phi_z is singular there")
     if other:

@@ -69,6 +69,7 @@ class Tree:
         self.free = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
         self.free_coordinates = {self.coordinates[v + k] for _, v in self.free for k in range(6)}
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
+        self.reach = np.ones(self.n)  # of coordinates, one radian or the mechanism's size: what a step is measured in
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)

@@ -35,7 +35,7 @@ __all__ = ["Kind", "SingularPoint", "SingularSystem", "classify", "find_singular
 Kind = Literal["locked", "fold", "serial", "rank loss"]
 
 EXACT = 1e-12  # residual of the equations above (m, rad and pure numbers) that counts as solved
-MAX_STEP = 0.5  # rad or m: a longer Newton step is not local any more
+MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step is not local any more
 PROBE = 0.1  # rad or m: how far a locked mechanism is moved to see that q really stands still
 
 

@@ -25,7 +25,7 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
-  turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank);
+  turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
   square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
   moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
   size_t entries = 0;
@@ -228,6 +228,7 @@ bool Core::basis_by_partition() {
   if (basis_at_ != sets) {
     basis_at_ = -1;
     basis_.compute(rows.J, basis_z_);
+    free_ = basis_q_;
     if (!(basis_.pivot_ratio() > sound)) return false;
     for (int k = 0; k < n - rank; ++k) {
       residual_ = -rows.J.col(basis_q_[k]);
@@ -236,7 +237,7 @@ bool Core::basis_by_partition() {
       tangent_(basis_q_[k], k) = 1.0;
       for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
     }
-    if (!(tangent_.lpNorm<Eigen::Infinity>() < steep)) return false;
+    if (!(steepness() < steep)) return false;
     basis_at_ = sets;
   }
   basis_.solve(negative_, z_);
@@ -244,9 +245,18 @@ bool Core::basis_by_partition() {
   return true;
 }
 
+// The largest entry of the tangent basis, free of units: each column has a one.
+double Core::steepness() const {
+  double largest = 0.0;
+  for (int k = 0; k < n - rank; ++k)
+    for (int i = 0; i < n; ++i)
+      largest = std::max(largest, std::abs(tangent_(i, k)) / scales.columns(i) * scales.columns(free_[k]));
+  return largest;
+}
+
 // Take the pivoting's columns for the tangent basis from now on, if they are other ones and good for a while.
 void Core::repartition() {
-  if (!(tangent_.lpNorm<Eigen::Infinity>() < better)) return;
+  if (!(steepness() < better)) return;
   const auto& order = qr_.colsPermutation().indices();
   pivots_.assign(order.data(), order.data() + rank);
   std::sort(pivots_.begin(), pivots_.end());
@@ -256,9 +266,9 @@ void Core::repartition() {
   basis_.shape(rows.closure.rows, rank, pattern_of(rows, basis_z_, n));
 }
 
-// J P = Q [R S], and the columns that the pivoting left over are the freedoms.
+// J P = Q [R S], and the columns that the pivoting left over are the freedoms; slides in units of the mechanism's size.
 bool Core::basis_by_pivoting(double least) {
-  qr_.compute(rows.J);
+  qr_.compute(rows.J * scales.columns.asDiagonal());
   const auto& r = qr_.matrixQR();
   const auto& order = qr_.colsPermutation().indices();
   if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
@@ -280,7 +290,9 @@ bool Core::basis_by_pivoting(double least) {
       tangent_(order(i), j) = entry / r(i, i);
     }
   }
-  for (int j = 0; j < n - rank; ++j) tangent_(order(rank + j), j) = 1.0;
+  for (int j = 0; j < n - rank; ++j) tangent_(free_[j] = order(rank + j), j) = 1.0;
+  x_.array() *= scales.columns.array();
+  for (int j = 0; j < n - rank; ++j) tangent_.col(j).array() *= scales.columns.array() / scales.columns(free_[j]);
   return true;
 }
 

@@ -88,11 +88,13 @@ class Core {
   void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions
   bool basis_by_partition();
   bool basis_by_pivoting(double least);
+  double steepness() const;
   void repartition();
 
   bool dense_;          // whether D' is
   unsigned here_ = 0;  // parts that are those of q_tree and v_tree
   Matrix D_rho_, tangent_, D_tangent_;
+  Indices free_;  // the coordinates that the tangent basis' columns are of
   Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
   Factor basis_;
   long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1

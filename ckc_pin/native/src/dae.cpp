@@ -6,7 +6,7 @@ namespace ckc {
 
 constexpr int most_steps = 10;
 constexpr double rounding = 2e-16;   // of a product: a velocity that is allowed to the last digit stays what it is
-constexpr double negligible = 1e-9;  // rad, m: Newton's last step onto the closure
+constexpr double negligible = 1e-9;  // rad, or of the mechanism's size: Newton's last step onto the closure
 
 static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
 
@@ -102,7 +102,7 @@ bool Dae::rate_on_closure(double t, In y, Out y_dot) {
     ++counts.factorizations;
     core.tree.integrate(q_tree_, step_);
     set(q_tree_);
-    if (largest(step_) <= negligible) break;  // what is left is its square
+    if (largest(step_.cwiseQuotient(core.scales.columns)) <= negligible) break;  // what is left is its square
   }
   residual_.noalias() = core.rows.J * y.tail(n);
   if (!core.shortest_step(residual_, step_)) return false;

@@ -5,7 +5,7 @@
 
 namespace ckc {
 
-constexpr double max_step = 0.5;  // rad or m: a longer Newton step in one coordinate is not local any more
+constexpr double max_step = 0.5;  // rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
 constexpr int max_iterations = 12;
 constexpr double switch_margin = 0.03;  // of |J|: phi_z's least singular value where an uncontrolled run looks for a better q;
 constexpr double fallen = 0.7;          // it looks again at so much of the margin at which none was found,
@@ -107,7 +107,7 @@ bool LevelSet::newton(double tolerance) {
     }
     if (!std::isfinite(size) || core.phi_z.singular() || iteration == max_iterations) return false;
     core.z_step(residual_, step_);
-    if (!(step_.lpNorm<Eigen::Infinity>() <= max_step)) return false;
+    if (!(step_.cwiseQuotient(core.scales.columns).lpNorm<Eigen::Infinity>() <= max_step)) return false;
     core.tree.integrate(q_tree_, step_);
     ++counts.newton, ++counts.factorizations;
   }

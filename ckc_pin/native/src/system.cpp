@@ -1,6 +1,7 @@
 #include "system.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 namespace ckc {
 
@@ -19,11 +20,14 @@ double System::phi_z_margin() {
       for (int j : core.rows.pattern[i])
         if (std::find(core.z.begin(), core.z.end(), j) != core.z.end()) pattern[i].push_back(j);
     phi_z_ = std::make_unique<Spectrum>(std::move(pattern), core.n, core.rank);
-    ones_.setOnes(std::max(core.rows.closure.rows, core.n));
   }
   core.jacobian();
-  phi_z_->compute(core.rows.J, ones_, ones_);
-  return phi_z_->least() / std::max(core.rows.J.norm(), 1e-300);
+  const Vector &rows = core.scales.rows, &columns = core.scales.columns;
+  phi_z_->compute(core.rows.J, rows, columns);
+  double square = 0.0;
+  for (int j = 0; j < core.n; ++j)
+    for (int i = 0; i < core.rows.closure.rows; ++i) square += std::pow(rows(i) * core.rows.J(i, j) * columns(j), 2);
+  return phi_z_->least() / std::max(std::sqrt(square), 1e-300);
 }
 
 bool System::jacobian(double t, In y, In f, Matrix& jacobian, long& evaluations) {

@@ -48,8 +48,8 @@ class System {
   virtual bool at_last(double t, In y) = 0;
   // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
   virtual bool place(In) { return false; }
-  // How far q is from failing as coordinates, at the core's state: phi_z's least singular value over |J|; infinite where
-  // no q is needed.
+  // How far q is from failing as coordinates, at the core's state: phi_z's least singular value over |J|, both free of
+  // units; infinite where no q is needed.
   virtual double margin() { return std::numeric_limits<double>::infinity(); }
   double phi_z_margin();
   virtual Accepted accept(double t, Out y, double margin) = 0;
@@ -100,7 +100,6 @@ class System {
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector ones_;
   Vector moved_, rate_;
 };
 
