@@ -172,9 +172,14 @@ void LevelSet::predict_from_accepted() {
 }
 
 void LevelSet::whole(In f, Out x, Out x_dot) const {
-  x << core.q_tree, velocity;
   core.tree.configuration_rate(core.q_tree, velocity, x_dot.head(core.tree.nq));
-  core.tree_acceleration(f.tail(core.d), x_dot.tail(core.n));
+  if (on_manifold_) {
+    x << core.q_tree, velocity;
+    core.tree_acceleration(f.tail(core.d), x_dot.tail(core.n));
+  } else {
+    x << core.q_tree, q_dot;
+    x_dot.tail(core.d) = f.tail(core.d);
+  }
 }
 
 // Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.

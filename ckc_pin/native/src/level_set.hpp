@@ -26,7 +26,9 @@ class LevelSet : public System {
   bool tree_acceleration(In f, Out a) const override;
   bool conserves() const override { return on_manifold_; }
   bool return_to_accepted() override;
-  int whole_size() const override { return on_manifold_ && core.rank ? core.tree.nq + core.n : 0; }
+  // (q', v'), off the manifold (q', q_dot), while a step resolves how w decays.
+  int whole_size() const override { return core.rank ? core.tree.nq + (on_manifold_ ? core.n : core.d) : 0; }
+  double whole_within() const override { return on_manifold_ ? System::whole_within() : epsilon_; }
   void whole(In f, Out x, Out x_dot) const override;
 
  private:

@@ -73,7 +73,7 @@ class Method : public Interpolant {
   double shortest(double t_bound) const;
   // Where y is only a part of the motion, the rest has to agree with what its rates add up to: next to where y stops to
   // determine it, or on another branch, it does not, however small the error of y is.
-  bool whole() const { return step_.x.size(); }
+  bool whole(double h) const { return step_.x.size() && h <= system_.whole_within(); }
   double disagreement(In integral);  // of the rates, relative to what is allowed
   // A step was refused for that. Find the state where it begins once more, as closed as it can be.
   bool return_to_start();

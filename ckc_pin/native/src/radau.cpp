@@ -170,7 +170,7 @@ void Radau::solve() {
 
 Radau::Newton Radau::newton(double h) {
   scale_ = tolerance_.atol + tolerance_.rtol * step_.y.array().abs();
-  if (whole()) X_.resize(step_.x.size(), stages_), x_stage_.resize(step_.x.size());
+  if (whole(h)) X_.resize(step_.x.size(), stages_), x_stage_.resize(step_.x.size());
   contraction_ = 0.0;
   double before = 0.0;
   for (iterations_ = 1; iterations_ <= most_iterations_; ++iterations_) {
@@ -178,7 +178,7 @@ Radau::Newton Radau::newton(double h) {
     for (int i = 0; i < stages_; ++i) {
       y_stage_ = step_.y + Z_.col(i);
       if (!evaluate(step_.t + c_(i) * h, y_stage_, F_.col(i))) return over() ? Newton::impossible : Newton::slow;
-      if (whole()) system_.whole(Z_dot_.col(i), x_stage_, X_.col(i));
+      if (whole(h)) system_.whole(Z_dot_.col(i), x_stage_, X_.col(i));
     }
     solve();
     double square = 0.0;
@@ -258,8 +258,8 @@ bool Radau::step(double t_bound) {
       shorten(0.5);
       continue;
     }
-    if (whole()) {
-      system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
+    if (step_.x.size()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
+    if (whole(h)) {
       x_stage_.noalias() = h * X_ * b_;
       if (!(disagreement(x_stage_) < agreement * (1.0 + correction_size_))) {
         if (!return_to_start()) return false;
