@@ -166,7 +166,7 @@ def _fixing(mechanism: Mechanism, point: str) -> IntArray:
     """Choose d of the six rows of a place, each the one that adds most; turns only when positions add nothing."""
     at = mechanism.assembled
     frame = Kinematics(mechanism.tree, _point_rows(mechanism, point, "weld"), at.partition, mechanism.q_tree)
-    moves = frame.J @ at.rho * np.where(mechanism.tree.in_metres[at.partition.q], mechanism.size, 1.0)
+    moves = frame.J @ at.rho * mechanism.tree.reach[at.partition.q]
     moves[:3] /= mechanism.size
     least = RANK_TOLERANCE * max(1.0, float(np.abs(moves).max(initial=0.0)))
     chosen: list[int] = []

@@ -48,7 +48,7 @@ class Freedoms:
     warnings: tuple[str, ...]
 
 
-def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, size: float, accept: float) -> Freedoms:
+def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, accept: float) -> Freedoms:
     """Count the freedoms at a closed configuration, and around it.
 
     A change point or a collinear start has a smaller rank than every configuration nearby, so J is
@@ -58,13 +58,13 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, size: float, acc
     ----------
     q_tree : (nq,) array
         Closed.
-    size, accept : float
+    accept : float
         Characteristic length, and the residual that counts as closed, metres.
     """
-    jacobian = _scaled_at(tree, closure, q_tree, size)
+    jacobian = _scaled_at(tree, closure, q_tree)
     here = there = rank_of(jacobian)
-    for nearby in _nearby(tree, closure, q_tree, size, accept, jacobian, here.rank):
-        candidate = _scaled_at(tree, closure, nearby, size)
+    for nearby in _nearby(tree, closure, q_tree, accept, jacobian, here.rank):
+        candidate = _scaled_at(tree, closure, nearby)
         report = rank_of(candidate)
         if report.rank > there.rank:
             there, jacobian = report, candidate
@@ -111,13 +111,11 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, actuated: IntArr
     return list(dict.fromkeys(names))
 
 
-def _scaled_at(tree: Tree, closure: Closure, q_tree: Array, size: float) -> Array:
-    return scaled(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure, size)
+def _scaled_at(tree: Tree, closure: Closure, q_tree: Array) -> Array:
+    return scaled(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure)
 
 
-def _nearby(
-    tree: Tree, closure: Closure, q_tree: Array, size: float, accept: float, jacobian: Array, rank: int
-) -> list[Array]:
+def _nearby(tree: Tree, closure: Closure, q_tree: Array, accept: float, jacobian: Array, rank: int) -> list[Array]:
     """Closed configurations a small step along the tangent space, where there are any."""
     _, _, directions = np.linalg.svd(jacobian, full_matrices=True)
     tangent = directions[rank:]
@@ -125,7 +123,7 @@ def _nearby(
     found = []
     for _ in range(PERTURBATIONS if len(tangent) else 0):
         step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
-        step *= PERTURBATION / np.abs(step).max() * np.where(tree.in_metres, size, 1.0)
+        step *= PERTURBATION / np.abs(step).max() * tree.reach
         closed = assemble(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
         if closed.residual <= 10 * accept:
             found.append(closed.q_tree)

@@ -10,6 +10,7 @@ from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.pose import Pose, Rate
+from ckc_pin.mechanism.rank import scaled
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Kinematics", "Partition", "Psi"]
@@ -85,6 +86,19 @@ class Kinematics:
         if not np.all(np.isfinite(self.phi_z)):
             return float("nan")
         return float(np.linalg.svd(self.phi_z, compute_uv=False)[len(self.partition.z) - 1])
+
+    def margin(self) -> float:
+        """How far q is from failing as coordinates: phi_z's smallest singular value over |J|, both free of units.
+
+        Infinite when z is empty.
+        """
+        if not len(self.partition.z):
+            return float("inf")
+        J = scaled(self.J, self.tree, self.closure)
+        if not np.all(np.isfinite(J)):
+            return float("nan")
+        least = np.linalg.svd(J[:, self.partition.z], compute_uv=False)[len(self.partition.z) - 1]
+        return float(least / max(np.linalg.norm(J), 1e-300))
 
     def moved(self, step: Array) -> Kinematics:
         """Return the kinematics at the configuration a tangent step away."""

@@ -90,7 +90,7 @@ class Mechanism:
         if len(self.points) < len(spec.point):
             raise MechanismError("point: two points have the same name")
         self.size = _size(self.tree, self.closure, sources.name)
-        self.tree.reach = np.where(self.tree.in_metres, self.size, 1.0)
+        self.tree.measure(self.size)
         self.coordinates = self.tree.coordinates
         self.n = self.tree.n
         self.warnings += self.tree.unmodelled()
@@ -149,7 +149,7 @@ class Mechanism:
 
         None where it would split the coordinates of a free root.
         """
-        jacobian = scaled(at.J, self.tree, self.closure, self.size)
+        jacobian = scaled(at.J, self.tree, self.closure)
         z = choose_dependent(jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free])
         return None if z is None else Partition(np.setdiff1d(np.arange(self.n), z), z)
 
@@ -202,7 +202,7 @@ class Mechanism:
         lengths = bool(np.all(self.closure.in_metres(self.tree)))
         rounding = 1e-13 * (self.size if lengths else max(self.size, 1.0))
         self.tolerance = rounding if closed.residual <= EXACT * self.size else 10 * closed.residual
-        self.freedoms = count_freedoms(self.tree, self.closure, self.q_tree, self.size, max(self.tolerance, rounding))
+        self.freedoms = count_freedoms(self.tree, self.closure, self.q_tree, max(self.tolerance, rounding))
         self.d, self.rank = self.freedoms.d, self.freedoms.rank.rank
         self.redundant = tuple(".".join(name) for name in self.freedoms.redundant)
         self.warnings += self.freedoms.warnings

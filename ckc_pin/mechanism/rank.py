@@ -38,15 +38,15 @@ class RankReport:
         return self.below < SURE
 
 
-def scaled(jacobian: Array, tree: Tree, closure: Closure, size: float) -> Array:
+def scaled(jacobian: Array, tree: Tree, closure: Closure) -> Array:
     """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
-    rows, columns = scales(tree, closure, size)
+    rows, columns = scales(tree, closure)
     return rows[:, None] * jacobian * columns
 
 
-def scales(tree: Tree, closure: Closure, size: float) -> tuple[Array, Array]:
+def scales(tree: Tree, closure: Closure) -> tuple[Array, Array]:
     """Return what J's rows, shape (rows,), and its columns, shape (n,), are multiplied with for that."""
-    return np.where(closure.in_metres(tree), 1.0 / size, 1.0), np.where(tree.in_metres, size, 1.0)
+    return np.where(closure.in_metres(tree), 1.0 / tree.size, 1.0), tree.reach
 
 
 def rank_of(scaled_jacobian: Array) -> RankReport:

@@ -155,10 +155,7 @@ def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, a
 
 
 def _is_singular(at: Kinematics, margin: float) -> bool:
-    if not len(at.partition.z):
-        return False
-    J = at.J * at.tree.reach
-    return bool(np.linalg.svd(J[:, at.partition.z], compute_uv=False)[-1] <= margin * np.linalg.norm(J))
+    return at.margin() <= margin
 
 
 def _same_branch(before: Kinematics, after: Kinematics) -> bool:

@@ -69,13 +69,18 @@ class Tree:
         self.free = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
         self.free_coordinates = {self.coordinates[v + k] for _, v in self.free for k in range(6)}
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
-        self.reach = np.ones(self.n)  # of coordinates, one radian or the mechanism's size: what a step is measured in
+        self.measure(1.0)
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
+
+    def measure(self, size: float) -> None:
+        """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
+        self.size = size
+        self.reach = np.where(self.in_metres, size, 1.0)
 
     def _work_on(self, model: Any) -> None:
         self.model = model

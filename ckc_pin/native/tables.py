@@ -18,7 +18,7 @@ __all__ = ["closure_table", "core_table"]
 
 def core_table(mechanism: Mechanism) -> dict[str, Any]:
     """Return what a native core of a mechanism is made of; each has a workspace of its own."""
-    rows, columns = scales(mechanism.tree, mechanism.closure, mechanism.size)
+    rows, columns = scales(mechanism.tree, mechanism.closure)
     return {
         "model": mechanism.tree.model.saveToString(),
         "place": mechanism.tree.place.tolist(),

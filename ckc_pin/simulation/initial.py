@@ -113,7 +113,7 @@ def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
 
 
 def _is_chart(at: Kinematics) -> bool:
-    return at.sigma_min() > _core.chart_margin * float(np.linalg.norm(at.J))
+    return at.margin() > _core.chart_margin
 
 
 def _refuse_contradiction(mechanism: Mechanism, at: Kinematics, w: Array) -> None:

@@ -139,7 +139,7 @@ class SingularSystem:
             if np.abs(residual).max() <= tolerance:
                 break
             step = -np.linalg.lstsq(self.jacobian(at, v), residual, rcond=1e-10)[0]
-            scale = min(1.0, MAX_STEP / np.abs(step).max())
+            scale = min(1.0, MAX_STEP / np.abs(step / np.tile(at.tree.reach, 2)).max())
             while scale > 1e-6:
                 trial, v_trial = at.moved(scale * step[: self.mechanism.n]), v + scale * step[self.mechanism.n :]
                 left = self.residual(trial, v_trial)
@@ -212,7 +212,7 @@ def search_singular(mechanism: Mechanism, count: int, seed: int = 0, point: str 
 def classify(system: SingularSystem, at: Kinematics, v: Array) -> SingularPoint:
     """Say what kind of singular configuration a solution is, and what is lost and what is left there."""
     mechanism = system.mechanism
-    J = scaled(at.J, mechanism.tree, mechanism.closure, mechanism.size)
+    J = scaled(at.J, mechanism.tree, mechanism.closure)
     rank = rank_of(J).rank
     allowed = np.linalg.svd(J)[2][rank:]
     q_part = np.linalg.svd(allowed[:, at.partition.q], compute_uv=False)
@@ -260,7 +260,7 @@ def _kind(at: Kinematics, v: Array, tolerance: float) -> Literal["locked", "fold
         moved = moved.moved(step)
     went = at.tree.difference(at.q_tree, moved.q_tree)
     closed = np.abs(moved.phi).max() <= tolerance
-    singular = moved.sigma_min() <= 1e-6 * np.linalg.norm(moved.J)
+    singular = moved.margin() <= 1e-6
     return "locked" if closed and singular and v @ went > PROBE / 2 else "fold"
 
 

@@ -73,7 +73,7 @@ def test_the_least_singular_value_that_is_watched_is_that_of_j(N):
     """Of chains whose J is decomposed whole and of longer ones, against NumPy's and differences of NumPy's."""
     ready = started("n_four_bar", {"mechanism.N": N})
     mechanism = ready.mechanism
-    rows, columns = scales(mechanism.tree, mechanism.closure, mechanism.size)
+    rows, columns = scales(mechanism.tree, mechanism.closure)
 
     def singular_values(t):
         J = mechanism.kinematics(start + t * v_tree).J

@@ -239,7 +239,7 @@ def _kind(system: LocusSystem, serial: bool, at: Kinematics, null: Array) -> Kin
     own = mechanism.kinematics(at.q_tree)
     if not serial:
         return classify(SingularSystem(mechanism), own, null).kind
-    rank = rank_of(scaled(own.J, mechanism.tree, mechanism.closure, mechanism.size)).rank
+    rank = rank_of(scaled(own.J, mechanism.tree, mechanism.closure)).rank
     return "serial" if rank == mechanism.rank else "rank loss"
 
 
