@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 from ckc_pin import InputError, Run, simulate
 from ckc_pin.dynamics import Terms
 from ckc_pin.mechanism.spec import LoopType
+from scripts.experiments.fuzz.build import toml
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
 from tests.property.mechanisms import SPRINGS, Closed, closed_mechanism
@@ -104,22 +104,11 @@ def swing(folder: Path, closed: Closed, *, damped: bool = True, **changes: Any) 
         "solver": {"rtol": RTOL, "output_dt": T_END / 300},
     }
     for name, content in (("mechanism.toml", spec), ("swing.scene.toml", scene)):
-        (folder / name).write_text("\n".join(f"{key} = {toml(x)}" for key, x in present(content).items()), "utf-8")
+        (folder / name).write_text(
+            "\n".join(f"{key} = {toml(x)}" for key, x in content.items() if x is not None), "utf-8"
+        )
     for prefix in closed.world.stands:
         (folder / prefix).write_text(closed.world.urdf(prefix), "utf-8")
     run = simulate(folder / "swing.scene.toml", changes)
     assert run.status == "done", run.message
     return run
-
-
-def toml(value: Any) -> str:
-    """A value as TOML: JSON's way, but for tables."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(key)} = {toml(x)}" for key, x in present(value).items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    return json.dumps(value)
-
-
-def present(table: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in table.items() if value is not None}

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scripts.experiments.fuzz.build import link, words
 from tests.analytic.five_bar import Array
 
 Placement = tuple[Array, Array]  # rotation (3, 3), translation (3,)
@@ -123,13 +124,14 @@ class World:
 
     def urdf(self, prefix: str) -> str:
         """The tree as URDF, its names without the prefix."""
-        parts = [_link("0", self.root_body if prefix == "b_" else None)]
+        base = self.root_body
+        parts = [link("0", base.mass, base.com, base.inertia) if prefix == "b_" else '<link name="0"/>']
         for joint in self.trees[prefix]:
             name = joint.name.removeprefix(prefix)
             parts += [
-                _link(name[1:], joint.body),
+                link(name[1:], joint.body.mass, joint.body.com, joint.body.inertia),
                 f'<joint name="{name}" type="{joint.kind}"><parent link="{joint.parent}"/><child link="{name[1:]}"/>'
-                f'<origin xyz="{_words(joint.xyz)}" rpy="{_words(joint.rpy)}"/><axis xyz="{_words(joint.axis)}"/>'
+                f'<origin xyz="{words(joint.xyz)}" rpy="{words(joint.rpy)}"/><axis xyz="{words(joint.axis)}"/>'
                 '<limit lower="-9" upper="9" effort="0" velocity="0"/></joint>',
             ]
         return f'<robot name="tree">{"".join(parts)}</robot>'
@@ -176,18 +178,3 @@ def compose(a: Placement, b: Placement) -> Placement:
 def slope(f: Callable[[float], Array], step: float = 2e-4) -> Array:
     """df/dt at 0 by central differences of order 4: to some 1e-11 for functions with scales near 1."""
     return (8 * (f(step) - f(-step)) - (f(2 * step) - f(-2 * step))) / (12 * step)
-
-
-def _link(name: str, body: Body | None) -> str:
-    if body is None:
-        return f'<link name="{name}"/>'
-    places = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-    moments = " ".join(f'{key}="{float(body.inertia[at])!r}"' for key, at in places.items())
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{_words(body.com)}"/><mass value="{float(body.mass)!r}"/>'
-        f"<inertia {moments}/></inertial></link>"
-    )
-
-
-def _words(numbers: Array) -> str:
-    return " ".join(repr(float(x)) for x in numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ from scripts.experiments.fuzz.read import read
 from scripts.experiments.fuzz.spatial import Array, rotation, rpy
 from scripts.experiments.fuzz.state import split, state
 
-__all__ = ["Builder", "angles", "toml"]
+__all__ = ["Builder", "angles", "link", "toml", "words"]
 
 
 @dataclass
@@ -95,14 +96,14 @@ class Builder:
         return {"mechanism.toml": "\n".join(lines) + "\n", "tree.urdf": self._urdf()}
 
     def _urdf(self) -> str:
-        base = _Part("", "", "", np.zeros(3), np.zeros(3), np.zeros(3), 2.0, np.zeros(3), np.eye(3) * self.scale**2 / 9)
-        text = [_link("base", base if self.free else None)]
+        base = link("base", 2.0, np.zeros(3), np.eye(3) * self.scale**2 / 9)
+        text = [base if self.free else '  <link name="base"/>']
         for part in self.parts:
-            text.append(_link(f"{part.name}_link", part))
+            text.append(link(f"{part.name}_link", part.mass, part.com, part.inertia))
             text.append(
                 f'  <joint name="{part.name}" type="{part.kind}">\n    <parent link="{part.parent}"/>'
-                f'<child link="{part.name}_link"/>\n    <origin xyz="{_words(part.xyz)}" rpy="{_words(part.rpy)}"/>'
-                f'<axis xyz="{_words(part.axis)}"/>\n  </joint>'
+                f'<child link="{part.name}_link"/>\n    <origin xyz="{words(part.xyz)}" rpy="{words(part.rpy)}"/>'
+                f'<axis xyz="{words(part.axis)}"/>\n  </joint>'
             )
         return '<robot name="tree">\n' + "\n".join(text) + "\n</robot>\n"
 
@@ -114,27 +115,26 @@ def angles(R: Array) -> Array:
 
 
 def toml(value: Any) -> str:
-    """A value as TOML writes it."""
+    """A value as TOML writes it: JSON's way, but for tables; without what is None."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + "}"
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, np.ndarray | list | tuple):
-        return "[" + ", ".join(toml(inner) for inner in value) + "]"
-    return repr(float(value))
+        return "{" + ", ".join(f"{json.dumps(key)} = {toml(x)}" for key, x in value.items() if x is not None) + "}"
+    if isinstance(value, np.ndarray):
+        return toml(value.tolist())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value)
 
 
-def _link(name: str, part: _Part | None) -> str:
-    if part is None:
-        return f'  <link name="{name}"/>'
-    I = part.inertia
+def link(name: str, mass: float, com: Array, inertia: Array) -> str:
+    """A link with its inertia, about its centre of mass, as URDF writes it."""
     places = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-    moments = " ".join(f'{key}="{float(I[at])!r}"' for key, at in places.items())
+    moments = " ".join(f'{key}="{float(inertia[at])!r}"' for key, at in places.items())
     return (
-        f'  <link name="{name}"><inertial><origin xyz="{_words(part.com)}"/><mass value="{part.mass!r}"/>\n'
+        f'  <link name="{name}"><inertial><origin xyz="{words(com)}"/><mass value="{float(mass)!r}"/>\n'
         f"    <inertia {moments}/></inertial></link>"
     )
 
 
-def _words(numbers: Array) -> str:
+def words(numbers: Array) -> str:
+    """Numbers as an attribute of URDF has them, digit for digit."""
     return " ".join(repr(float(x)) for x in numbers)
