@@ -144,8 +144,7 @@ nb::object term_of(Core& core, const std::string& name) {
   if (name == "rho") return core.reduce(), nb::cast(core.rho);
   if (name == "D") return core.inertia(), nb::cast(core.D);
   if (name == "bias_tree") return nb::cast(core.bias_tree);
-  if (name == "potential_energy")
-    return nb::cast(core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree));
+  if (name == "potential_energy") return nb::cast(core.potential_energy());
   if (name == "D_tree") {
     core.tree_inertia();
     Matrix D_tree(core.n, core.n);

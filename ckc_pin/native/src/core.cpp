@@ -133,6 +133,17 @@ void Core::D_times(In x, Out product) const {
   }
 }
 
+double Core::potential_energy() {
+  spring_lengths();
+  return tree.potential_energy(q_tree) + springs.energy(tree, q_tree);
+}
+
+Energy Core::energy(In v, Out momentum) {
+  tree_inertia();
+  D_times(v, momentum);
+  return {0.5 * v.dot(momentum), potential_energy()};
+}
+
 void Core::velocity(In q_dot, Out v) const {
   v.setZero();
   for (int k = 0; k < d; ++k) v += q_dot(k) * rho.col(k);
@@ -159,11 +170,17 @@ void Core::bias(In v) {
   rows.rates(tree);
   rows.bias(J_dot_v);
   here_ = (here_ & ~coriolis_of_tree) | row_rates | bias_of_tree;
-  if (springs.any || springs.any_damping) springs.set(tree);
+  spring_lengths();
   if (!springs.any) return;
   elastic_.setZero();
   springs.add_elastic(tree, q_tree, elastic_);
   bias_tree -= elastic_;
+}
+
+void Core::spring_lengths() {
+  if (has(lengths_of_springs)) return;
+  if (springs.any || springs.any_damping) springs.set(tree);
+  here_ |= lengths_of_springs;
 }
 
 void Core::coriolis() {

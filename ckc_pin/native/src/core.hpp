@@ -13,6 +13,11 @@
 
 namespace ckc {
 
+struct Energy {
+  double kinetic, potential;  // of gravity and springs, J
+  double total() const { return kinetic + potential; }
+};
+
 struct Scales {
   Vector rows, columns;  // what makes J free of units
   double rank;           // relative size of a pivot of the scaled J that counts as zero
@@ -48,6 +53,8 @@ class Core {
   void solve_z(In b, Out x) { phi_z.solve(b, x); }
   void z_step(In residual, Out x);  // the x with J x = -residual that moves z alone; phi_z is factorized
   void D_times(In x, Out product) const;  // D' x
+  double potential_energy();
+  Energy energy(In v, Out momentum);
 
   // --- at a velocity, which is that of what follows ---
   void bias(In v_tree);       // C'v + h' less springs, J_dot v
@@ -80,9 +87,10 @@ class Core {
  private:
   enum Part : unsigned {
     inertia_of_tree = 1, jacobian_of_rows = 2, factor_of_phi_z = 4, rho_of_phi_z = 8, inertia_of_q = 16, row_rates = 32,
-    bias_of_tree = 64, coriolis_of_tree = 128,
+    bias_of_tree = 64, coriolis_of_tree = 128, lengths_of_springs = 256,
   };
   bool has(Part part) const { return here_ & part; }
+  void spring_lengths();
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
   void tangent_inertia();                         // factorized
   void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions

@@ -9,12 +9,9 @@ constexpr double rounding = 1e-13;  // of kinetic and potential energy
 double EnergyMonitor::energy(System& system) {
   Core& core = system.core;
   if (!system.conserves() || system.control.acts() || core.springs.any_damping) return std::nan("");
-  core.tree_inertia();
-  core.D_times(system.velocity, momentum_);
-  const double kinetic = 0.5 * system.velocity.dot(momentum_);
-  const double potential = core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree);
-  size_ = kinetic + std::abs(potential);
-  return kinetic + potential;
+  const Energy energy = core.energy(system.velocity, momentum_);
+  size_ = energy.kinetic + std::abs(energy.potential);
+  return energy.total();
 }
 
 void EnergyMonitor::from(System& system) { from_ = to_ = energy(system); }

@@ -46,30 +46,32 @@ Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tole
 }
 
 bool Explicit::stages(double h) {
+  const bool whole = this->whole(h);
   K_.col(0) = step_.f;
-  if (whole(h)) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
+  if (whole) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
   for (int s = 1; s < stages_; ++s) {
     y_stage_ = step_.y;
     for (int i = 0; i < s; ++i)
       if (A_(s, i) != 0.0) y_stage_ += (h * A_(s, i)) * K_.col(i);
     if (!evaluate(step_.t + C_(s) * h, y_stage_, K_.col(s))) return false;
-    if (whole(h)) system_.whole(K_.col(s), x_stage_, X_.col(s));
+    if (whole) system_.whole(K_.col(s), x_stage_, X_.col(s));
   }
   step_.y_new = step_.y;
   for (int s = 0; s < stages_; ++s) step_.y_new += (h * B_(s)) * K_.col(s);
   if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
   K_.col(stages_) = step_.f_new;
   if (step_.x.size()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
-  if (whole(h)) X_.col(stages_) = step_.x_dot_new;
+  if (whole) X_.col(stages_) = step_.x_dot_new;
   return true;
 }
 
 // Of the whole motion, so that it does not matter which coordinates y has.
 double Explicit::error(double h) {
-  const Vector& from = whole(h) ? step_.x : step_.y;
-  const Vector& to = whole(h) ? step_.x_new : step_.y_new;
-  const Matrix& rates = whole(h) ? X_ : K_;
-  scale_ = tolerance_.atol + tolerance_.rtol * from.cwiseAbs().cwiseMax(to.cwiseAbs()).array();
+  const bool whole = this->whole(h);
+  const Vector& from = whole ? step_.x : step_.y;
+  const Vector& to = whole ? step_.x_new : step_.y_new;
+  const Matrix& rates = whole ? X_ : K_;
+  scale_ = tolerance_.between(from, to);
   double square[2] = {0.0, 0.0};
   for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
     error_.setZero(from.size());

@@ -19,7 +19,7 @@ bool Method::evaluate_start() {
 }
 
 double Method::disagreement(In integral) {
-  x_scale_ = tolerance_.atol + tolerance_.rtol * step_.x.cwiseAbs().cwiseMax(step_.x_new.cwiseAbs()).array();
+  x_scale_ = tolerance_.between(step_.x, step_.x_new);
   x_error_ = step_.x_new - step_.x - integral;
   return norm(x_error_, x_scale_);
 }
@@ -31,7 +31,7 @@ bool Method::return_to_start() {
 // E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, section II.4.
 double Method::first_length(double t_bound, int order) {
   const double duration = std::min({t_bound - step_.t, tolerance_.max_step, system_.layer()});
-  const Vector scale = tolerance_.atol + tolerance_.rtol * step_.y.array().abs();
+  const Vector scale = tolerance_.between(step_.y, step_.y);
   const double d0 = norm(step_.y, scale), d1 = norm(step_.f, scale);
   double h0 = std::min(d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1, duration);
   Vector f1(step_.f.size());

@@ -8,6 +8,11 @@ namespace ckc {
 struct Tolerance {
   double rtol, atol, max_step;
   double newton = 0.2;  // of an implicit method's iteration, relative to the local error
+
+  // What an error may be in each number of a step from a to b; an expression, evaluated where it is assigned.
+  auto between(const Vector& a, const Vector& b) const {
+    return (rtol * a.cwiseAbs().cwiseMax(b.cwiseAbs()).array() + atol).matrix();
+  }
 };
 
 struct Step {

@@ -30,7 +30,6 @@ Radau::Radau(System& system, Step& step, Work& work, const Tolerance& tolerance)
     : Method(system, step, work, tolerance), stages_(stages_for(tolerance.rtol)), most_iterations_(iterations_for(stages_, tolerance.newton)) {
   const int n = system.size, s = stages_;
   tabulate();
-  b_ = A_inverse_.inverse().row(s - 1);
   J_.setZero(n, n), Z_dot_.setZero(n, s), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
   for (Vector* x : {&scale_, &error_, &y_stage_, &f_stage_, &real_right_, &real_correction_}) x->setZero(n);
   right_.setZero(n), correction_.setZero(n);
@@ -47,6 +46,7 @@ void Radau::tabulate() {
   Matrix integral(s, s);
   for (int i = 0; i < s; ++i) integrals(c_(i)), integral.row(i) = basis_.transpose();
   A_inverse_ = legendre(nodes, s).transpose() * integral.inverse();
+  b_ = legendre(nodes, s).partialPivLu().solve(integral.row(s - 1).transpose());
   to_series_ = integral.inverse().transpose();  // acts from the right
   // f(t, y) + sum of e_i z_i / h vanishes for polynomials up to degree s
   e_ = integral.transpose().partialPivLu().solve(-legendre(Vector::Constant(1, -1.0), s).col(0));
@@ -169,7 +169,7 @@ void Radau::solve() {
 }
 
 Radau::Newton Radau::newton(double h) {
-  scale_ = tolerance_.atol + tolerance_.rtol * step_.y.array().abs();
+  scale_ = tolerance_.between(step_.y, step_.y);
   if (whole(h)) X_.resize(step_.x.size(), stages_), x_stage_.resize(step_.x.size());
   contraction_ = 0.0;
   double before = 0.0;
@@ -206,7 +206,7 @@ Radau::Newton Radau::newton(double h) {
 double Radau::error(const Vector& f, double h) {
   real_right_.noalias() = f + (1.0 / h) * Z_ * e_;
   real_.solve(*this, real_right_, error_);
-  scale_ = tolerance_.atol + tolerance_.rtol * step_.y.cwiseAbs().cwiseMax(step_.y_new.cwiseAbs()).array();
+  scale_ = tolerance_.between(step_.y, step_.y_new);
   return norm(error_, scale_) / (stages_ > 3 ? pessimism : 1.0);
 }
 

@@ -10,7 +10,7 @@ static int width_of(const System& system) {
   return 5 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows;
 }
 
-Recorder::Recorder(const System& system) : width(width_of(system)) { product_.setZero(system.core.n); }
+Recorder::Recorder(const System& system) : width(width_of(system)) { momentum_.setZero(system.core.n); }
 
 void Recorder::begin(Vector instants, double* rows, Eigen::Index most) {
   instants_ = std::move(instants), rows_ = rows, most_ = most, next_ = filled = 0;
@@ -29,27 +29,24 @@ bool Recorder::row(System& system, double t, In y, Out row) {
   const int n = core.n, d = core.d, m = core.rows.closure.rows;
   const auto actuators = system.control.tau.size();
   if (!system.exact(t, y)) return false;
-  core.tree_inertia();
+  const Energy energy = core.energy(system.v_tree, momentum_);
   core.bias(system.v_tree);
-  core.D_times(system.v_tree, product_);
-  const double kinetic = 0.5 * system.v_tree.dot(product_);
   if (!system.act(t)) return false;
-  const double potential = core.tree.potential_energy(core.q_tree) + core.springs.energy(core.tree, core.q_tree);
   Eigen::Index at = 0;
   const auto put = [&](In part) { row.segment(at, part.size()) = part, at += part.size(); };
   row(at++) = t;
   core.tree.to_coordinates(core.q_tree, row.segment(at, n)), at += n;
   put(system.velocity), put(system.control.u.head(d)), put(system.control.tau.head(actuators));
   put(core.rows.phi), put(system.w);
-  row(at++) = kinetic + potential;
-  row(at++) = system.control.lyapunov({t, core, system.q, system.q_dot, system.v_tree}, potential, core.rows.phi);
+  row(at++) = energy.total();
+  row(at++) = system.control.lyapunov({t, core, system.q, system.q_dot, system.v_tree}, energy.potential, core.rows.phi);
   double open = 0.0, opening = 0.0;
   for (int i = 0; i < m; ++i) {
     open = std::max(open, std::abs(core.rows.phi(i) - system.w(i)));
     opening = std::max(opening, std::abs(core.rows.J.row(i).dot(system.velocity) - system.decay() * system.w(i)));
   }
   row(at++) = open, row(at++) = opening;
-  return std::isfinite(kinetic + potential) && row.head(1 + 2 * n).allFinite();
+  return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }
 
 }  // namespace ckc

@@ -25,7 +25,7 @@ class Recorder {
  private:
   bool row(System& system, double t, In y, Out row);
 
-  Vector instants_, product_;
+  Vector instants_, momentum_;
   double* rows_ = nullptr;
   Eigen::Index most_ = 0, next_ = 0;
 };

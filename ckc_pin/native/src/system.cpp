@@ -25,8 +25,11 @@ double System::phi_z_margin() {
   const Vector &rows = core.scales.rows, &columns = core.scales.columns;
   phi_z_->compute(core.rows.J, rows, columns);
   double square = 0.0;
-  for (int j = 0; j < core.n; ++j)
-    for (int i = 0; i < core.rows.closure.rows; ++i) square += std::pow(rows(i) * core.rows.J(i, j) * columns(j), 2);
+  for (int i = 0; i < core.rows.closure.rows; ++i)
+    for (int j : core.rows.pattern[i]) {
+      const double scaled = rows(i) * core.rows.J(i, j) * columns(j);
+      square += scaled * scaled;
+    }
   return phi_z_->least() / std::max(std::sqrt(square), 1e-300);
 }
 
