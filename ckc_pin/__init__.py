@@ -6,7 +6,7 @@
 >>> run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
 
 Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and the three formulations),
-`control`, `simulation`, and side by side `study` and `view`. README.md says where each equation lives.
+`control`, `simulation`, and side by side `analysis` and `view`. README.md says where each equation lives.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def play(*runs: Run, **options: Any) -> Any:
 
 
 def singularity_map(mechanism: Mechanism | str | Path, **options: Any) -> SingularityMap:
-    """Map where a mechanism can go and is singular; see `ckc_pin.study.map.singularity_map`, which this loads."""
-    from ckc_pin.study.map import singularity_map as compute
+    """Map where a mechanism can go and is singular; see `ckc_pin.analysis.map.singularity_map`, which this loads."""
+    from ckc_pin.analysis.map import singularity_map as compute
 
     return compute(mechanism, **options)

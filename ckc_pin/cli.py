@@ -12,12 +12,11 @@ import math
 import os
 import sys
 import tempfile
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-import msgspec
 import typer
 
 import ckc_pin
@@ -289,7 +288,7 @@ def map_(
     as_json: Json = False,
 ) -> None:
     """Where it can go and where it is singular. Branch by branch, as the paper's Fig. 2."""
-    from ckc_pin.study import map as maps
+    from ckc_pin.analysis import map as maps
     from ckc_pin.view.map_figure import require_figures, save_map
     from ckc_pin.view.sections_figure import save_sections
 
@@ -369,27 +368,6 @@ def export(
     print("\n".join(f"written: {path}" for path in written) if written else found.text)
     for difference in found.differs:
         (print if written else errors().print)(f"differs: {difference}")
-
-
-@app.command(epilog=_examples("ckc report --quick", "ckc report --out docs/report"))
-def report(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer motions, methods and tolerances: minutes.")] = False,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder; a report there is gone on with.")] = Path(
-        "report"
-    ),
-    as_json: Json = False,
-) -> None:
-    """Error against run time. Every formulation and method here, and the programs people use."""
-    from ckc_pin.study.report.make import report as make_report
-
-    with errors().status("measuring") if watched() else nullcontext() as status:
-        found = make_report(out, quick=quick, progress=status.update if status else None)
-    if as_json:
-        plain = {work: [msgspec.to_builtins(row) for row in rows] for work, rows in found.rows.items()}
-        _print_json({"status": "done", "written": [str(path) for path in found.files], "rows": plain})
-        return
-    for path in found.files:
-        print(f"written: {path}")
 
 
 def main() -> NoReturn:

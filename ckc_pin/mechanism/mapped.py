@@ -1,4 +1,4 @@
-"""A singularity map as a plain value: what a study computes and a figure draws."""
+"""A singularity map as a plain value: what an analysis computes and a figure draws."""
 
 from __future__ import annotations
 

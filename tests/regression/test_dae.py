@@ -16,7 +16,7 @@ from ckc_pin.simulation.initial import Start
 from ckc_pin.simulation.ivp import Dae, as_ivp
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
-from ckc_pin.study.report.peers.ida import Stabilised
+from scripts.experiments.benchmark.peers.ida import Stabilised
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.regression.reference import trajectory
 

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from ckc_pin import Run, simulate
 from ckc_pin.dynamics import Terms
 from ckc_pin.native import _core
-from ckc_pin.study.stability.cases import GROUPS
-from ckc_pin.study.stability.cell import How, run_case
+from scripts.experiments.stability.cases import GROUPS
+from scripts.experiments.stability.cell import How, run_case
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, tracking
 
 

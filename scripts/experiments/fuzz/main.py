@@ -116,3 +116,7 @@ def _watched(records: Iterator[Record], kind: str, count: int) -> list[Record]:
 
 def _single_thread() -> None:
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,285 @@
+"""What can be said about a set-point controller (eq. 14) before it runs: the gain condition on a sublevel set.
+
+With u of eq. 14, V_L = q_dot^T D q_dot / 2 + U(q) never grows along the reduced model, where
+
+    U(q) = V(q) - V(q_d) - h(q_d)^T (q - q_d) + (q - q_d)^T K_P (q - q_d) / 2
+
+is V_L at rest. So q stays on the part of {U <= V_L(start)} that is connected to the start. Let that part be
+bounded and free of singular configurations, and U's second derivative K_P + dh/dq positive definite all over
+it. Then each solution of eq. 15 there, which is where U's gradient is zero, is a strict minimum of U; and a
+connected sublevel set with strict minima alone has one of them only, q_d (between two there would be a pass).
+No convexity of the set is needed, and no M_1 over the whole workspace, which does not exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ckc_pin.analysis.gradient import symmetric_least
+from ckc_pin.analysis.sheet import Sheet, explore
+from ckc_pin.analysis.walk import Border, follow, least, margin, same_configuration
+from ckc_pin.control.controllers import SetPoint
+from ckc_pin.dynamics.equilibrium import h_gradient
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import Start
+
+__all__ = ["Certificate", "SublevelSet", "certify", "level_of", "rest_height", "sublevel_set"]
+
+DIVISIONS = 50  # of the radius that the set would have without gravity
+SINGULAR = 1e-3  # |s| that counts as singular: the search for the least |s| ends that near to one
+NEAR = 0.03  # |s| at which U hardly differs from that of the singular configuration next to it
+
+Status = Literal["certified", "not certified"]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Whether eq. 14 is proved to bring a start to q_d, on the resolution of a lattice.
+
+    Attributes
+    ----------
+    status : "certified" or "not certified"
+        "not certified" does not mean that the controller fails: only that this argument does not show it.
+    reason : str
+        Why, in a sentence.
+    level : float
+        V_L at the start, J.
+    least_eigenvalue : float
+        Of K_P + sym dh/dq on the set, N m/rad between angles; NaN where the set reaches a singular
+        configuration, at which h has no derivative.
+    least_margin : float
+        Least |s| on the set, see `ckc_pin.analysis.walk.margin`.
+    safe_level : float
+        The level up to which the set around q_d is as the argument needs it, J, by the lattice; at most `level`.
+    worst_q : (d,) array
+        Where the argument fails first as the level rises; where the eigenvalue is least when it does not.
+    sampled : bool
+        Along random rays instead of over a lattice: d > 2.
+    points : int
+    resolution : (d,) array
+        The lattice's step, rad or m.
+    """
+
+    status: Status
+    reason: str
+    level: float
+    least_eigenvalue: float
+    least_margin: float
+    safe_level: float
+    worst_q: Array
+    sampled: bool
+    points: int
+    resolution: Array
+
+
+@dataclass(frozen=True)
+class SublevelSet:
+    """The part of {U <= level} that is connected to q_d, and what was found on it.
+
+    Attributes
+    ----------
+    sheet : Sheet
+    eigenvalues, margins : (points,) arrays
+        Least eigenvalue of K_P + sym dh/dq, and |s|, at the sheet's nodes.
+    step : (d,) array
+    """
+
+    sheet: Sheet
+    eigenvalues: Array
+    margins: Array
+    step: Array
+
+
+def rest_height(mechanism: Mechanism, controller: SetPoint, at: Kinematics) -> float:
+    """V_L at a configuration at rest, U of the module's docstring, joules."""
+    return controller.lyapunov(0.0, Terms(mechanism, at, np.zeros(mechanism.n)), np.zeros(0))
+
+
+def level_of(mechanism: Mechanism, controller: SetPoint, start: Start) -> float:
+    """V_L at a start, joules."""
+    return controller.lyapunov(0.0, Terms(mechanism, start.at, start.at.rho @ start.q_dot), start.w)
+
+
+def sublevel_set(
+    mechanism: Mechanism, controller: SetPoint, level: float, divisions: int = DIVISIONS, seed: int = 0
+) -> SublevelSet:
+    """Explore the part of {U <= level} around q_d.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        Without free roots.
+    controller : SetPoint
+    level : float
+        Joules.
+    divisions : int
+        Steps of the lattice to the radius that the set would have without gravity.
+    seed : int
+        Of the rays' directions, for d > 2.
+    """
+    step = np.sqrt(2 * max(level, 1e-12) * np.diagonal(np.linalg.inv(controller.K_P))) / divisions
+    target = controller.target.at
+    level = max(level, rest_height(mechanism, controller, target))  # zero but for rounding
+    sheet = explore(mechanism, target, step, lambda at: rest_height(mechanism, controller, at), level, seed=seed)
+    return SublevelSet(
+        sheet=sheet,
+        eigenvalues=np.array([_stiffness(mechanism, controller, at) for at in sheet.nodes]),
+        margins=np.array([margin(at) for at in sheet.nodes]),
+        step=step,
+    )
+
+
+def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions: int = DIVISIONS) -> Certificate:
+    """Decide whether the argument of section II-B holds for a start.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    controller : SetPoint
+        Built for this very mechanism, and used without a torque limit.
+    start : Start
+        On phi = 0.
+    divisions : int
+        See `sublevel_set`.
+    """
+    level = level_of(mechanism, controller, start)
+    unfit = _unfit(mechanism, controller, start, level)
+    if unfit:
+        nowhere = np.full(mechanism.d, np.nan)
+        return Certificate("not certified", unfit, level, np.nan, np.nan, 0.0, nowhere, mechanism.d > 2, 0, nowhere)
+    found = sublevel_set(mechanism, controller, level, divisions)
+    search = _Search(mechanism, controller, found, level)
+    tight, soft = search.tightest(), search.softest()
+    singular = bool(found.sheet.ends) or margin(tight) <= SINGULAR
+    failure = search.first_failure([tight, soft])
+    safe_level, worst = failure or (level, soft)
+    return Certificate(
+        status="certified" if failure is None and not found.sheet.full and search.connected(start) else "not certified",
+        reason=search.reason(singular, tight, soft, start),
+        level=level,
+        least_eigenvalue=np.nan if singular else search.stiffness(soft),
+        least_margin=0.0 if singular else margin(tight),
+        safe_level=safe_level,
+        worst_q=mechanism.independent_part(worst.q_tree),
+        sampled=found.sheet.sampled,
+        points=len(found.sheet.nodes),
+        resolution=found.step,
+    )
+
+
+def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: float) -> str:
+    """Say why the argument does not even begin."""
+    if controller.target.mechanism is not mechanism:
+        return "the controller compensates the gravity of another model than the plant"
+    if not mechanism.tree.flat:
+        return "an independent coordinate belongs to a free root, whose orientation is not a vector"
+    if np.any(start.w):
+        return "the start is off phi = 0: V_L is a Lyapunov function of the reduced model only"
+    if level < -1e-12 * (1.0 + abs(controller.target.potential_energy)):
+        return "V_L is lower at the start than at q_d, where it would have to be least"
+    return ""
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What the lattice has found, searched on between its points."""
+
+    mechanism: Mechanism
+    controller: SetPoint
+    found: SublevelSet
+    level: float
+
+    def height(self, at: Kinematics) -> float:
+        return rest_height(self.mechanism, self.controller, at)
+
+    def stiffness(self, at: Kinematics) -> float:
+        return _stiffness(self.mechanism, self.controller, at)
+
+    def fails(self, at: Kinematics) -> bool:
+        return margin(at) <= SINGULAR or self.stiffness(at) <= 0
+
+    def tightest(self) -> Kinematics:
+        if self.found.sheet.ends:
+            return min(self.found.sheet.ends, key=lambda end: end.water).at
+        return self._lowest(margin, self.found.margins)
+
+    def softest(self) -> Kinematics:
+        if self.found.sheet.ends:
+            return self.found.sheet.nodes[int(np.argmin(self.found.eigenvalues))]
+        return self._lowest(self.stiffness, self.found.eigenvalues)
+
+    def first_failure(self, refined: list[Kinematics]) -> tuple[float, Kinematics] | None:
+        """Return up to which level of U nothing fails, and where something does first; None if nowhere."""
+        sheet = self.found.sheet
+        failing = [(w, at) for w, at, x in zip(sheet.water, sheet.nodes, self.found.eigenvalues, strict=True) if x <= 0]
+        failing += [(max(0.0, self.height(at)), at) for at in refined if self.fails(at)]
+        failing += [(end.water, end.at) for end in sheet.ends]
+        if not failing:
+            return None
+        water, first = min(failing, key=lambda pair: pair[0])
+        below = max((w for w in sheet.water if w < water), default=0.0)
+        near = Border(self.mechanism, NEAR, near=True) if margin(first) <= SINGULAR else self._failing
+        lowest = least(self.mechanism, first, self.height, self.found.step, near)
+        return min(below, max(0.0, self.height(lowest))), lowest if 0.0 <= self.height(lowest) < water else first
+
+    def reason(self, singular: bool, tight: Kinematics, soft: Kinematics, start: Start) -> str:
+        if singular:
+            return f"the set reaches a singular configuration, near {self._where(tight)}"
+        if self.stiffness(soft) <= 0:
+            return f"K_P + dh/dq has the eigenvalue {self.stiffness(soft):.3g} at {self._where(soft)}, inside the set"
+        if self.found.sheet.full:
+            return f"the set goes on beyond the {len(self.found.sheet.nodes)} points that were looked at"
+        if not self.connected(start):
+            return "the start is not connected to q_d within {V_L(q, 0) <= V_L(start)}"
+        return "K_P + dh/dq is positive definite on the whole set, and no singular configuration lies on it"
+
+    def connected(self, start: Start) -> bool:
+        """Whether the start is next to a node of the lattice, or seen from q_d, on the same branch."""
+        if self.found.sheet.sampled:
+            return self._seen(start.at)
+        q = self.mechanism.independent_part(start.at.q_tree)
+        for at in self.found.sheet.nodes:
+            straight = q - self.mechanism.independent_part(at.q_tree)
+            if np.all(np.abs(straight) <= 1.01 * self.found.step) and self._leads(at, straight, start.at):
+                return True
+        return False
+
+    def _seen(self, there: Kinematics) -> bool:
+        """Whether the straight line from q_d stays inside."""
+        at = self.controller.target.at
+        straight = self.mechanism.independent_part(there.q_tree) - self.controller.q_d
+        pieces = 1 + int(np.ceil(np.max(np.abs(straight) / self.found.step)))
+        for _ in range(pieces - 1):
+            at, reached = follow(self.mechanism, at, straight / pieces)
+            if reached < 1.0 or self.height(at) > self.level:
+                return False
+        return self._leads(at, straight / pieces, there)
+
+    def _leads(self, at: Kinematics, straight: Array, there: Kinematics) -> bool:
+        end, reached = follow(self.mechanism, at, straight)
+        return reached == 1.0 and same_configuration(self.mechanism, end, there)
+
+    def _lowest(self, value: Callable[[Kinematics], float], values: Array) -> Kinematics:
+        nodes, step = self.found.sheet.nodes, self.found.step
+        return least(self.mechanism, nodes[int(np.argmin(values))], value, step, self._inside)
+
+    def _failing(self, at: Kinematics) -> Kinematics | None:
+        return at if self.fails(at) else None
+
+    def _inside(self, at: Kinematics) -> Kinematics | None:
+        return at if self.height(at) <= self.level else None
+
+    def _where(self, at: Kinematics) -> str:
+        q = self.mechanism.independent_part(at.q_tree)
+        return ", ".join(f"{name} = {x:.4g}" for name, x in zip(self.mechanism.independent, q, strict=True))
+
+
+def _stiffness(mechanism: Mechanism, controller: SetPoint, at: Kinematics) -> float:
+    return symmetric_least(controller.K_P + h_gradient(mechanism, at))

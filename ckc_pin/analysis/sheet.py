@@ -1,0 +1,167 @@
+"""One assembly branch over the independent coordinates, explored by continuation of sigma.
+
+For d = 1 and 2 a lattice is flooded from a closed configuration: neighbours are reached along rho and
+corrected by Newton, so that the branch is never left. For d > 2 a lattice would have too many points, and
+straight rays in random directions are followed instead: a sample of the part that the centre sees.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ckc_pin.analysis.walk import Height, follow
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array, IntArray
+
+__all__ = ["End", "Sheet", "explore"]
+
+RAYS = 300  # for d > 2
+MAX_POINTS = 30_000
+
+
+@dataclass(frozen=True)
+class End:
+    """Where a branch ends: the water level there, the node before it, the last configuration before it."""
+
+    water: float
+    node: int
+    at: Kinematics
+
+
+@dataclass
+class Sheet:
+    """The explored part of a branch, in the order in which rising water would reach it.
+
+    Attributes
+    ----------
+    nodes : list of Kinematics
+    water : list of float
+        The lowest level at which a node is connected to the centre: the largest height on the way to it.
+    edges : list of (int, int)
+        Neighbours among the nodes.
+    ends : list of End
+        Where the branch ends inside the explored part.
+    sampled : bool
+        Rays instead of a lattice.
+    full : bool
+        The search was given up at MAX_POINTS.
+    """
+
+    nodes: list[Kinematics] = field(default_factory=list)
+    water: list[float] = field(default_factory=list)
+    edges: list[tuple[int, int]] = field(default_factory=list)
+    ends: list[End] = field(default_factory=list)
+    sampled: bool = False
+    full: bool = False
+
+
+def explore(
+    mechanism: Mechanism,
+    centre: Kinematics,
+    step: Array,
+    height: Height,
+    level: float,
+    turn: IntArray | None = None,
+    seed: int = 0,
+) -> Sheet:
+    """Explore the part of a branch around a configuration where a height stays at or below a level.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        Without free roots.
+    centre : Kinematics
+        Closed.
+    step : (d,) array
+        The lattice's, or the rays', rad or m.
+    height : callable
+        Of a configuration on the branch; infinite where the search shall not go.
+    level : float
+    turn : (d,) int array, optional
+        Steps of the lattice to a turn of each angle, after which it meets itself; 0 where it never does.
+    seed : int
+        Of the rays' directions, for d > 2.
+
+    Raises
+    ------
+    InputError
+        A free root.
+    """
+    if not mechanism.tree.flat:
+        raise InputError(f"{mechanism.name}: a free root's orientation is not a vector; there is no lattice of it")
+    if mechanism.d <= 2:
+        return _flood(mechanism, centre, step, height, level, turn)
+    return _cast(mechanism, centre, step, height, level, seed)
+
+
+def _flood(
+    mechanism: Mechanism, centre: Kinematics, step: Array, height: Height, level: float, turn: IntArray | None
+) -> Sheet:
+    sheet = Sheet()
+    origin = (0,) * mechanism.d
+    number: dict[tuple[int, ...], int] = {}
+    waiting: list[tuple[float, int, tuple[int, ...], Kinematics]] = []
+    seen, order = {origin}, 0
+    if height(centre) <= level:
+        waiting.append((height(centre), order, origin, centre))
+    while waiting:
+        water, _, place, at = heapq.heappop(waiting)
+        number[place] = len(sheet.nodes)
+        sheet.nodes.append(at)
+        sheet.water.append(water)
+        if len(sheet.nodes) >= MAX_POINTS:
+            sheet.full = True
+            break
+        for k in range(mechanism.d):
+            for sign in (-1, 1):
+                along = place[k] + sign
+                beside = (*place[:k], along % turn[k] if turn is not None and turn[k] else along, *place[k + 1 :])
+                if beside in number:
+                    sheet.edges.append((number[beside], number[place]))
+                if beside in seen:
+                    continue
+                dq = np.zeros(mechanism.d)
+                dq[k] = sign * step[k]
+                there, reached = follow(mechanism, at, dq)
+                rises = max(water, height(there))
+                if rises > level:
+                    continue
+                if reached < 1.0:
+                    sheet.ends.append(End(rises, number[place], there))
+                    continue
+                seen.add(beside)
+                order += 1
+                heapq.heappush(waiting, (rises, order, beside, there))
+    return sheet
+
+
+def _cast(mechanism: Mechanism, centre: Kinematics, step: Array, height: Height, level: float, seed: int) -> Sheet:
+    sheet = Sheet(sampled=True)
+    if height(centre) > level:
+        return sheet
+    random = np.random.default_rng(seed)
+    sheet.nodes.append(centre)
+    sheet.water.append(height(centre))
+    for _ in range(RAYS):
+        direction = random.standard_normal(mechanism.d)
+        dq = step * direction / np.linalg.norm(direction)
+        at, last, water = centre, 0, sheet.water[0]
+        while len(sheet.nodes) < MAX_POINTS:
+            at, reached = follow(mechanism, at, dq)
+            water = max(water, height(at))
+            if water > level:
+                break
+            if reached < 1.0:
+                sheet.ends.append(End(water, last, at))
+                break
+            sheet.edges.append((last, len(sheet.nodes)))
+            last = len(sheet.nodes)
+            sheet.nodes.append(at)
+            sheet.water.append(water)
+    sheet.full = len(sheet.nodes) >= MAX_POINTS
+    return sheet

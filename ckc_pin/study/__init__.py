@@ -1,1 +1,0 @@
-"""Questions over many runs: the paper's claims, each answered with numbers."""

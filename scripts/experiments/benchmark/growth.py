@@ -1,0 +1,168 @@
+"""How cost grows: with the number of squares in a row, of freedoms, of loops; exponents fitted on log-log scales.
+
+The row of squares has one freedom whatever N is. Let go of all its loops but the first, and the freedoms grow; close
+them one by one, and the loops grow while the coordinates stay. Right-hand sides are counted, a right-hand side timed.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ckc_pin.errors import CkcError
+from ckc_pin.mechanism.generators import GeneratorSpec, generate
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.simulate import run_prepared
+from scripts.experiments.benchmark.pace import seconds
+from scripts.experiments.benchmark.table import Keyed
+
+__all__ = ["FAMILIES", "FORMULATIONS", "Case", "Family", "Growth", "exponent", "measure"]
+
+RTOL, T_END = 1e-10, 0.4  # s: before the row lies flat
+LEAN = 1.2  # rad: squares lean, so that at rest they are no equilibrium
+FORMULATIONS: dict[str, dict[str, Any]] = {
+    "dae": {"formulation": "dae"},
+    "reduced": {"formulation": "reduced"},
+    "spf, eq. 8": {"formulation": "spf", "epsilon": 1e-2, "spf_coordinates": "z"},
+}
+BUDGET = 60.0  # s for a counted run
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of N squares of which the first `loops` are closed."""
+
+    N: int
+    loops: int
+
+    @property
+    def d(self) -> int:
+        """Freedoms: 2 N + 1 coordinates, two rows a loop."""
+        return 2 * self.N + 1 - 2 * self.loops
+
+
+@dataclass(frozen=True)
+class Family:
+    """Cases along which one number grows.
+
+    Attributes
+    ----------
+    key, says : str
+    along : "N", "d" or "loops"
+    cases, quick : tuple of Case
+    """
+
+    key: str
+    says: str
+    along: str
+    cases: tuple[Case, ...]
+    quick: tuple[Case, ...]
+
+
+def _family(key: str, says: str, along: str, cases: Sequence[tuple[int, int]], quick: int) -> Family:
+    made = tuple(Case(N, loops) for N, loops in cases)
+    return Family(key, says, along, made, made[:quick])
+
+
+WIDE = 20
+FAMILIES = (
+    _family("N", "N squares in a row, one freedom", "N", [(N, N) for N in (1, 2, 4, 8, 16, 40, 80, 160)], 6),
+    _family("d", "freedoms d, one loop", "d", [(N, 1) for N in (1, 2, 4, 8, 16, 32, 50)], 5),
+    _family("loops", f"loops on {2 * WIDE + 1} coordinates", "loops", [(WIDE, k) for k in (1, 2, 4, 8, 14, 20)], 6),
+)
+
+
+class Growth(Keyed, frozen=True, kw_only=True):
+    """A case in one formulation.
+
+    Attributes
+    ----------
+    key, family, formulation : str
+    x : int
+        What grows along the family.
+    rhs_s : float or None
+        A right-hand side, s.
+    rhs : int or None
+        Right-hand sides of a run of 0.4 s at rtol 1e-10 by DOP853.
+    reason : str
+        Why there is no number.
+    """
+
+    family: str
+    formulation: str
+    x: int
+    rhs_s: float | None = None
+    rhs: int | None = None
+    reason: str = ""
+
+
+def measure(case: Case, family: Family, formulation: str, key: str) -> Growth:
+    """Time a right-hand side of a case, and count those of a run."""
+    row = Growth(key=key, family=family.key, formulation=formulation, x=getattr(case, family.along))
+    changes = {**FORMULATIONS[formulation], "solver.method": "DOP853"}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            ready = prepare(load_scene(_written(case, Path(folder)), changes))
+        ready.begin()
+        rhs_s = seconds(ready.loop)
+        run = run_prepared(ready)
+    except CkcError as error:
+        return msgspec.structs.replace(row, reason=str(error))
+    if run.status != "done":
+        return msgspec.structs.replace(row, rhs_s=rhs_s, reason=run.message)
+    return msgspec.structs.replace(row, rhs_s=rhs_s, rhs=int(run.stats["rhs"]))
+
+
+def _written(case: Case, folder: Path) -> Path:
+    """Write a case as files; return the scene's path."""
+    text, sources = generate(GeneratorSpec(generator="n_four_bar", N=case.N))
+    head, *loops = text.split("[[loop]]")
+    *_, point = loops[-1].partition("# The first top pin.")
+    kept = [loop.partition("# The first top pin.")[0] for loop in loops[: case.loops]]
+    text = "[[loop]]".join([head, *kept]) + point
+    text = re.sub(r"= (-?)1\.5707963267948966", rf"= \g<1>{LEAN}", text.replace('independent = ["theta_0"]\n', ""))
+    (folder / "mechanism.toml").write_text(text, encoding="utf-8")
+    for name, content in sources.texts.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    scene = folder / "row.scene.toml"
+    scene.write_text(
+        f'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = {T_END}\n[initial]\nat = "assembled"\n'
+        f"[solver]\nrtol = {RTOL}\noutput_dt = {T_END}\nmax_wall_s = {BUDGET}\n",
+        encoding="utf-8",
+    )
+    return scene
+
+
+def exponent(points: Mapping[float, float], whole: bool = False) -> float | None:
+    """Fit y ~ x^p by least squares on log-log scales; None for fewer than three points.
+
+    Parameters
+    ----------
+    points : mapping of x to y
+        Positive.
+    whole : bool
+        Over all x; by default over the upper half of their range on its logarithmic scale, where what does not grow
+        has become small.
+    """
+    xs = np.array(sorted(points), dtype=float)
+    if len(xs) and not whole:
+        xs = xs[xs >= np.sqrt(xs[0] * xs[-1])]
+    if len(xs) < 3:
+        return None
+    return float(np.polyfit(np.log(xs), np.log([points[x] for x in xs]), 1)[0])
+
+
+def every_case(quick: bool) -> Iterator[tuple[Family, Case, str]]:
+    """Family, case, formulation, in the order in which they are measured."""
+    for family in FAMILIES:
+        for case in family.quick if quick else family.cases:
+            for formulation in FORMULATIONS:
+                yield family, case, formulation

@@ -1,0 +1,263 @@
+"""What a scene leaves out: modules that its run does not load, terms that its right-hand side does not evaluate.
+
+Each is measured by switching it on: a module imported in a fresh interpreter after a run, a term evaluated in NumPy
+at states of the motion, where everything that the step loop's right-hand side evaluates is there already, beside the
+same right-hand side in NumPy.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable, Iterator, Mapping
+from time import perf_counter
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ckc_pin.dynamics.formulations import multipliers
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import CkcError, NumericalError
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.ivp import Ivp, as_ivp
+from ckc_pin.simulation.scene import Scene, catalogue, load_scene
+from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.benchmark.table import Keyed
+
+__all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
+
+MISSING = "the scene itself"  # in the place of a module or term, where it cannot be loaded
+BRIEF = 0.02  # s of a scene's motion: enough to load and evaluate what its run does
+START = "five_bar/swing"  # the run after which a module is switched on
+REPEATS = 3  # fresh interpreters a module
+STATES, SPACING = 20, 1e-4  # of the motion, how many and s between them
+ROUNDS = 8  # over the states
+
+# Module, what its import statement is, what it is for.
+MODULES: dict[str, tuple[str, str]] = {
+    "meshcat": ("import meshcat", "playback in a browser"),
+    "matplotlib": ("import matplotlib.figure, matplotlib.backends.backend_agg", "figures"),
+    "yourdfpy": ("import yourdfpy", "visual meshes"),
+    "sksundae": ("import sksundae", "SUNDIALS, for `ckc report`"),
+    "mujoco": ("import mujoco", "checking what `ckc export` writes"),
+    "typer": ("import typer, rich", "the command line; a run from Python needs none"),
+    "scipy.integrate": ("import scipy.integrate", "a second opinion by SciPy's solvers"),
+}
+
+RUN = """
+import json, resource, sys
+import ckc_pin
+scene, changes = json.loads(sys.argv[1])
+ckc_pin.simulate(scene, changes)
+"""
+LOADED = RUN + "print(json.dumps([name for name in json.loads(sys.argv[2]) if name in sys.modules]))"
+SWITCHED_ON = (
+    RUN
+    + """
+from time import perf_counter
+def peak():
+    try:  # on Linux ru_maxrss begins with what the parent had
+        with open("/proc/self/status") as file:
+            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+there, began = peak(), perf_counter()
+exec(sys.argv[2])
+print(json.dumps([perf_counter() - began, peak() - there]))
+"""
+)
+
+Probe = Callable[[Terms, Terms], Any]  # of the state, and of the one before it
+
+
+def _sigma(terms: Terms, before: Terms) -> Any:
+    return terms.mechanism.sigma(terms.q, before.at)
+
+
+def _multipliers(terms: Terms, before: Terms) -> Any:
+    return multipliers(terms, np.zeros(terms.mechanism.n), np.zeros(terms.mechanism.n))
+
+
+# Term, the name its evaluation is booked under, and how it is switched on.
+TERMS: dict[str, tuple[str, Probe]] = {
+    "C'": ("C_tree", lambda terms, before: terms.C_tree),
+    "J̇": ("J_dot", lambda terms, before: terms.J_dot),
+    "ρ̇": ("rho_dot", lambda terms, before: terms.rho_dot),
+    "C": ("C", lambda terms, before: terms.C),
+    "λ": ("multipliers", _multipliers),
+    "σ": ("sigma", _sigma),
+    "energy": ("energy", lambda terms, before: terms.energy),
+}
+
+
+class LeftOut(Keyed, frozen=True, kw_only=True):
+    """A module or a term, and a scene.
+
+    Attributes
+    ----------
+    key : str
+    scene : str
+        Empty for a module's own cost, which is every scene's.
+    what : str
+    used : bool or None
+        Whether the scene's run loads, its right-hand side evaluates it.
+    seconds : float or None
+        What it costs to switch it on: a module once, a term beside each right-hand side.
+    bytes : int or None
+        Of memory: a module's of peak resident memory, a term's while it is evaluated.
+    rhs_s : float or None
+        A right-hand side in NumPy, beside which a term was measured.
+    reason : str
+        Why there is no number.
+    """
+
+    scene: str
+    what: str
+    used: bool | None = None
+    seconds: float | None = None
+    bytes: int | None = None
+    rhs_s: float | None = None
+    reason: str = ""
+
+
+def every_scene() -> list[str]:
+    """Names of all shipped scenes."""
+    return [f"{name}/{scene}" for name, _, scenes in catalogue() for scene in scenes]
+
+
+def module_costs(key: str, repeats: int = REPEATS) -> Iterator[LeftOut]:
+    """Measure what each module costs where it is switched on after a run: the least of several interpreters."""
+    for name, (statement, _) in MODULES.items():
+        words = (json.dumps([START, {"t_end": BRIEF}]), statement)
+        try:
+            found = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
+        except CkcError as error:
+            yield LeftOut(key=f"{key}.{name}", scene="", what=name, reason=str(error))
+            continue
+        spent, memory = (min(column) for column in zip(*found, strict=True))
+        yield LeftOut(key=f"{key}.{name}", scene="", what=name, seconds=spent, bytes=max(0, memory))
+
+
+def modules_of(scene: str, key: str) -> Iterator[LeftOut]:
+    """Run a scene's beginning in a fresh interpreter, and see what it has loaded."""
+    words = (json.dumps([scene, {"t_end": BRIEF}]), json.dumps(list(MODULES)))
+    try:
+        loaded = json.loads(_interpreter(LOADED, *words))
+    except CkcError as error:
+        yield from (LeftOut(key=f"{key}.{name}", scene=scene, what=name, reason=str(error)) for name in MODULES)
+        return
+    yield from (LeftOut(key=f"{key}.{name}", scene=scene, what=name, used=name in loaded) for name in MODULES)
+
+
+def _interpreter(code: str, *words: str) -> str:
+    """Run code in a fresh interpreter; its last line of output.
+
+    Raises
+    ------
+    CkcError
+        With the last line of its complaint.
+    """
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise CkcError((done.stderr.splitlines() or [f"exit code {done.returncode}"])[-1])
+    return done.stdout.splitlines()[-1]
+
+
+def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
+    """Measure what each term would cost beside a scene's right-hand side, at states of its motion."""
+    try:
+        loaded = load_scene(scene, {**(changes or {}), "t_end": BRIEF})
+        evaluated, ivp = _evaluated(loaded), as_ivp(loaded)
+        states = _motion(ivp)
+    except CkcError as error:
+        yield from (LeftOut(key=f"{key}.{what}", scene=scene, what=what, reason=str(error)) for what in TERMS)
+        return
+    rhs_s = _rhs_seconds(ivp, states)
+    for what, (name, probe) in TERMS.items():
+        row = LeftOut(key=f"{key}.{what}", scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
+        if name not in evaluated:
+            try:
+                spent, memory = _beside(ivp, states, evaluated, probe)
+            except CkcError as error:
+                row = msgspec.structs.replace(row, reason=str(error))
+            else:
+                row = msgspec.structs.replace(row, seconds=spent, bytes=memory)
+        yield row
+
+
+def _evaluated(scene: Scene) -> set[str]:
+    """Return what the step loop's right-hand sides evaluate: names of terms, as it books them, and sigma."""
+    run = simulate(scene, profile=True)
+    found = set(run.profile)
+    if "C_tree" in found:  # the two are computed in one pass; of rho_dot and C there are products alone
+        found.add("J_dot")
+    if run.stats["newton"] and scene.spec.formulation != "dae":  # whose corrections are the projection's
+        found.add("sigma")
+    return found
+
+
+def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
+    """Return t and y of states of a motion.
+
+    Raises
+    ------
+    NumericalError
+        It does not go so far.
+    """
+    from scipy.integrate import solve_ivp
+
+    times = SPACING * np.arange(STATES)
+    with np.errstate(all="ignore"):
+        solution = solve_ivp(ivp.f, (0.0, times[-1]), ivp.y0, "DOP853", times)
+    if not solution.success:
+        raise NumericalError(solution.message)
+    return list(zip(times.tolist(), solution.y.T, strict=True))
+
+
+def _rhs_seconds(ivp: Ivp, states: list[tuple[float, Array]]) -> float:
+    """Return the mean time of a right-hand side over the states, s, the least of several rounds."""
+    best = np.inf
+    with one_blas_thread():
+        for _ in range(ROUNDS):
+            began = perf_counter()
+            for t, y in states:
+                ivp.f(t, y)
+            best = min(best, (perf_counter() - began) / len(states))
+    return best
+
+
+def _beside(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
+    """Return a probe's mean time over the states, s, the least of several rounds, and its memory, bytes."""
+    best = np.inf
+    with one_blas_thread():
+        for _ in range(ROUNDS):
+            spent, before = 0.0, _as_evaluated(ivp, *states[0], evaluated)
+            for t, y in states[1:]:
+                terms = _as_evaluated(ivp, t, y, evaluated)
+                began = perf_counter()
+                probe(terms, before)
+                spent += perf_counter() - began
+                before = terms
+            best = min(best, spent / (len(states) - 1))
+        first, second = (_as_evaluated(ivp, *state, evaluated) for state in states[:2])
+        tracemalloc.start()
+        try:
+            probe(second, first)
+            memory = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+    return best, memory
+
+
+def _as_evaluated(ivp: Ivp, t: float, y: Array, evaluated: set[str]) -> Terms:
+    """Return the terms at a state as a right-hand side leaves them: what it evaluates is there."""
+    terms = ivp.terms(t, y)
+    for name in evaluated:
+        for owner in (terms, terms.at):
+            if hasattr(type(owner), name):
+                getattr(owner, name)
+    return terms

@@ -1,0 +1,148 @@
+"""Pinocchio's constraintDynamics under Boost.Odeint's Runge-Kutta-Fehlberg 7(8), a loop in C++ compiled on demand."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.dynamics.formulations import dae_acceleration
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from scripts.experiments.benchmark.peers.compiled import program, version
+from scripts.experiments.benchmark.peers.pinocchio import closed, not_closed
+from scripts.experiments.benchmark.peers.stepping import start_of
+from scripts.experiments.benchmark.row import Motion
+from scripts.experiments.benchmark.work import Work
+
+__all__ = ["PinocchioLoop"]
+
+TOLERANCES = tuple(10.0**-k for k in range(2, 14))
+QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+GAINS = (0.0, 100.0)  # K_p, 1/s^2; K_d = 2 sqrt(K_p)
+# mu, and how often its effect is taken off: one iteration is cheapest, where the rows lose rank only a large mu gets by
+PROXIMAL = ((1e-12, 1), (1e-8, 3), (1e-4, 10), (1e-2, 12))
+QUICK_PROXIMAL = (PROXIMAL[0], PROXIMAL[2])
+ACCURACY = 1e-13  # of the multipliers, at which the iterations end
+START = 5.0  # s for the program to start
+
+Answer = dict[str, list[list[float]]]  # its lines by their first word
+
+
+class PinocchioLoop:
+    """What a capable user of Pinocchio would write next: the strongest peer measured."""
+
+    name = "Pinocchio constraintDynamics, RKF78 in C++"
+    packaged = False  # the loop is written by hand
+
+    def missing(self, work: Work) -> str | None:
+        return not_closed(work) or program()[1]
+
+    def version(self) -> str:
+        return version()
+
+    def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        proximal = QUICK_PROXIMAL if quick else PROXIMAL
+        for gain, (mu, iterations), tolerance in product(GAINS, proximal, QUICK_TOLERANCES if quick else TOLERANCES):
+            yield f"K_p {gain:g}, mu {mu:g}, iterations {iterations}, tolerance {tolerance:g}"
+
+    def check(self, work: Work) -> str:
+        """Compare D', the bias, the energy and the constrained acceleration at the start."""
+        mechanism, tree = work.mechanism, work.mechanism.tree
+        q_tree, v_tree = start_of(work)
+        answer = _answer(_problem(work, 0.0, *PROXIMAL[1], TOLERANCES[0], []), None)
+        given = {name: np.array(lines[0]) for name, lines in answer.items()}
+        terms = Terms(mechanism, mechanism.kinematics(q_tree), v_tree)
+        bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
+        energy = pin.computeMechanicalEnergy(tree.model, tree.data, q_tree, v_tree)
+        mass = _apart(given["D"].reshape(tree.n, tree.n), terms.D_tree)
+        ours = dae_acceleration(terms, np.zeros(tree.n))
+        return (
+            f"D' agrees to {mass:.0e}, the bias to {_apart(given['bias'], bias):.0e}, the energy to "
+            f"{abs(given['energy'][0] - energy):.0e} J; the constrained acceleration differs by "
+            f"{_apart(given['acceleration'], ours):.0e}"
+        )
+
+    def compute(self, work: Work, setting: str, budget: float) -> Motion:
+        gain, mu, iterations, tolerance = (float(part.split()[1]) for part in setting.split(", "))
+        tree, none = work.mechanism.tree, np.empty((0, work.mechanism.n))
+        try:
+            given = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
+        except subprocess.TimeoutExpired:
+            return Motion("refused", f"takes longer than the budget, {budget:.0f} s", none, none, 0.0, 0.0)
+        except subprocess.CalledProcessError as error:
+            said = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
+            return Motion("failed", said, none, none, 0.0, 0.0)
+        states = np.array(given["state"])
+        q_tree = np.array([tree.to_coordinates(state) for state in states[:, : tree.model.nq]])
+        wall, steps, rhs = given["cost"][0]
+        return Motion("done", "", q_tree, states[:, tree.model.nq :], wall, 0.0, steps=int(steps), rhs=int(rhs))
+
+
+def _answer(problem: str, budget: float | None) -> Answer:
+    patience = None if budget is None else budget + START
+    done = subprocess.run(
+        [str(program()[0])], input=problem, capture_output=True, text=True, timeout=patience, check=True
+    )
+    answer: Answer = {}
+    for line in done.stdout.splitlines():
+        name, *numbers = line.split()
+        answer.setdefault(name, []).append([float(x) for x in numbers])
+    return answer
+
+
+def _problem(
+    work: Work, gain: float, mu: float, iterations: int, tolerance: float, instants: Sequence[float] | Array
+) -> str:
+    """Return a work as the numbers that the program reads, in its order; without instants only the start is told."""
+    mechanism = work.mechanism
+    constraints = list(closed(mechanism))
+    q_tree, v_tree = start_of(work)
+    kinds = {pin.ContactType.CONTACT_3D: 3, pin.ContactType.CONTACT_6D: 6}
+    parts: list[Any] = [*_tree(mechanism), gain, len(constraints)]
+    for kind, joint_a, on_a, joint_b, on_b in constraints:
+        parts += [kinds[kind], joint_a, *_placed(on_a), joint_b, *_placed(on_b)]
+    parts += [ACCURACY, mu, iterations, *_springs(mechanism), tolerance, *q_tree, *v_tree]
+    parts += [len(instants), *instants]
+    return " ".join(str(part) for part in parts)
+
+
+def _tree(mechanism: Mechanism) -> Iterator[Any]:
+    model = mechanism.tree.model
+    yield from model.gravity.linear
+    yield model.njoints - 1
+    for k in range(1, model.njoints):
+        yield from [model.parents[k], *_placed(model.jointPlacements[k])]
+        if model.joints[k].nv == 6:
+            yield "free"
+        else:
+            axis, turns = mechanism.tree.axis(k)
+            yield from ["turns" if turns else "slides", *axis]
+        inertia = model.inertias[k]
+        yield from [inertia.mass, *inertia.lever, *inertia.inertia.ravel()]
+    yield from model.armature
+
+
+def _springs(mechanism: Mechanism) -> Iterator[Any]:
+    springs = mechanism.springs
+    many = len(springs.stiffness)
+    yield many
+    for k in range(many):
+        for end in (k, many + k):
+            yield from [springs.anchors.point_joint[end], *springs.anchors.point_local[end]]
+        yield from [springs.stiffness[k], springs.rest_length[k], springs.damping[k]]
+    for on_joints in (springs.joint_stiffness, springs.joint_rest, springs.joint_damping, springs.constant):
+        yield from on_joints
+
+
+def _placed(placement: pin.SE3) -> list[float]:
+    return [*placement.rotation.ravel(), *placement.translation]
+
+
+def _apart(theirs: Array, ours: Array) -> float:
+    return float(np.abs(theirs - ours).max() / max(float(np.abs(ours).max()), 1.0))

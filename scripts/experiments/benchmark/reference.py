@@ -1,0 +1,114 @@
+"""What is right: a closed form, or two formulations at 1e-13, which tell how right by how well they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.benchmark.work import Work
+
+__all__ = ["Reference", "reference"]
+
+TIGHT = 1e-13
+GRAVITY = 9.81
+ROUNDING = 1e-13  # of elliptic functions over some turns
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a work's motion is at its instants.
+
+    Attributes
+    ----------
+    values : (INSTANTS + 1, k) array
+        As `Work.observed` gives them.
+    accuracy : float
+        How far it may be off: errors below that are not told apart.
+    how : str
+        Where it is from, a sentence.
+    """
+
+    values: Array
+    accuracy: float
+    how: str
+
+
+def reference(work: Work) -> Reference:
+    """Compute a work's reference.
+
+    Raises
+    ------
+    NumericalError
+        A run at the tight tolerance stopped.
+    """
+    if work.scene == "n_four_bar":
+        return _row_of_squares(work)
+    formulations = ("dae", "reduced")
+    first, second = (_tight(work, formulation) for formulation in formulations)
+    apart = float(np.abs(first - second).max())
+    known, where = _published(work, first)
+    how = f"DAE at {TIGHT:.0e}; the reduced model at {TIGHT:.0e} agrees to {apart:.1e}{where}"
+    return Reference(first, max(apart, known), how)
+
+
+def _tight(work: Work, formulation: str) -> Array:
+    run = simulate(work.load(formulation=formulation, solver__method="DOP853", solver__rtol=TIGHT))
+    if run.status != "done":
+        raise NumericalError(f"{work.key}: no reference, the {formulation} {run.message}", run=run)
+    return work.observed(run.q_tree)
+
+
+def _row_of_squares(work: Work) -> Reference:
+    """N squares in a row keep one angle, theta_ddot = -k cos(theta): a pendulum that turns, by elliptic functions.
+
+    With chi = (pi/2 - theta) / 2, chi_dot = sqrt(1 + 4 k sin(chi)^2) / 2, so that chi = am(t / 2, -4 k).
+    """
+    from scipy.special import ellipj, ellipk
+
+    N = int(work.changes["mechanism.N"])
+    k = GRAVITY * 3 * (3 * N + 1) / (2 * (4 * N + 1))
+    stretch = np.sqrt(1 + 4 * k)
+    m = 4 * k / (1 + 4 * k)  # Jacobi's imaginary transformation of -4 k
+    chi = np.pi / 2 - ellipj(ellipk(m) - work.instants * stretch / 2, m)[3]
+    values = np.column_stack([np.sin(2 * chi), np.cos(2 * chi), np.zeros_like(chi)])
+    return Reference(values, ROUNDING, "closed form, elliptic functions")
+
+
+# Andrews' squeezer at 0.03 s in the order beta, theta, gamma, phi, delta, omega, eps: the published solution.
+ANDREWS = {
+    "beta": 15.81077119515370,
+    "theta": -15.75637105841184,
+    "gamma": 0.04082224011964587,
+    "phi": -0.5347301163226948,
+    "delta": 0.5244099658799541,
+    "omega": 0.5347301163226948,
+    "eps": 1.048080741041938,
+}
+
+
+def _andrews(work: Work, values: Array) -> tuple[float, str]:
+    at = int(np.argmin(np.abs(work.instants - 0.03)))
+    known = np.array([ANDREWS[name] for name in work.mechanism.coordinates])
+    off = float(np.abs(values[at] - known).max())
+    return off, f"; at 0.03 s {off:.1e} from the published solution"
+
+
+def _bricard(work: Work, values: Array) -> tuple[float, str]:
+    at = int(np.argmin(np.abs(work.instants - 1.0)))
+    tree = work.mechanism.tree
+    point = work.mechanism.point_positions(tree.from_coordinates(values[at]))["P3"]
+    off = float(np.abs(point - [0.27448132, -0.88670794, -0.46233000]).max())
+    return 0.0, f"; P3 at 1 s is {off:.0e} from the published one, which has eight digits"
+
+
+PUBLISHED: dict[str, Callable[[Work, Array], tuple[float, str]]] = {"andrews": _andrews, "bricard": _bricard}
+
+
+def _published(work: Work, values: Array) -> tuple[float, str]:
+    """How far the values are from published ones, and that as words; nothing where there are none."""
+    return PUBLISHED[work.key](work, values) if work.key in PUBLISHED else (0.0, "")

@@ -1,0 +1,99 @@
+"""One measured run of one program: a line of the report's table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.tree import Array
+from scripts.experiments.benchmark.reference import Reference
+from scripts.experiments.benchmark.table import Keyed
+from scripts.experiments.benchmark.work import Work
+
+__all__ = ["Motion", "Row", "judged"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a program made of a work.
+
+    Attributes
+    ----------
+    status : str
+        "done", or how it ended otherwise.
+    reason : str
+    q_tree, v_tree : (m, n) arrays
+        By coordinate, at the first m of the work's instants.
+    wall_s, setup_s : float
+        Time of the integration, the least of its repeats, and of everything before it.
+    steps, rhs : int or None
+        Counted where the program counts them.
+    """
+
+    status: str
+    reason: str
+    q_tree: Array
+    v_tree: Array
+    wall_s: float
+    setup_s: float
+    steps: int | None = None
+    rhs: int | None = None
+
+
+class Row(Keyed, frozen=True, kw_only=True):
+    """A line of the table. Errors in rad or m; energy drift in units of the largest kinetic energy."""
+
+    work: str
+    program: str
+    setting: str
+    status: str
+    reason: str
+    error_end: float | None
+    error_max: float | None
+    closure: float | None
+    energy_drift: float | None
+    wall_s: float
+    setup_s: float
+    steps: int | None
+    rhs: int | None
+
+
+def judged(key: str, work: Work, program: str, setting: str, motion: Motion, reference: Reference) -> Row:
+    """Measure a motion against the reference: error, closure, energy."""
+    whole = motion.status == "done" and len(motion.q_tree) == len(work.instants)
+    finite = whole and bool(np.all(np.isfinite(motion.q_tree)))
+    errors = np.abs(work.observed(motion.q_tree) - reference.values).max(axis=1) if finite else np.empty(0)
+    closure, drift = _held(work, motion) if finite else (None, None)
+    return Row(
+        key=key,
+        work=work.key,
+        program=program,
+        setting=setting,
+        status=motion.status if finite or motion.status != "done" else "not finite",
+        reason=motion.reason,
+        error_end=float(errors[-1]) if finite else None,
+        error_max=float(errors.max()) if finite else None,
+        closure=closure,
+        energy_drift=drift,
+        wall_s=motion.wall_s,
+        setup_s=motion.setup_s,
+        steps=motion.steps,
+        rhs=motion.rhs,
+    )
+
+
+def _held(work: Work, motion: Motion) -> tuple[float, float | None]:
+    """Largest |phi|, and how far the energy leaves its value at the start; None where a controller acts."""
+    mechanism = work.mechanism
+    states = [
+        Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q_tree)), v_tree)
+        for q_tree, v_tree in zip(motion.q_tree, motion.v_tree, strict=True)
+    ]
+    closure = max(float(np.abs(terms.phi).max(initial=0.0)) for terms in states)
+    if work.controlled or mechanism.springs.any_damping:
+        return closure, None
+    kinetic = max(0.5 * float(terms.v_tree @ terms.D_tree @ terms.v_tree) for terms in states)
+    energies = np.array([terms.energy for terms in states])
+    return closure, float(np.abs(energies - energies[0]).max() / max(kinetic, 1e-300))

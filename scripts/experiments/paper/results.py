@@ -1,0 +1,281 @@
+"""Sections III-B and III-C: the appendix's model, Figs. 3 and 4, the torques, the law of the tracking error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Model, Tracking
+from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.library import load
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.ivp import LevelSet, force_of
+from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.paper.along_eq21 import tracking
+from scripts.experiments.paper.claim import Claim
+from scripts.experiments.paper.experiment import march
+from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED
+from scripts.experiments.paper.printed import Printed
+
+__all__ = ["Law", "appendix_difference", "claims", "error_law", "plant"]
+
+STATES = 200
+STEADY = 4.0  # s, from when on the paper's 5 N m are read as meant
+FIRST, LATER = 30.0, 5.0  # N m, the paper's bounds
+AT = 9.5  # s
+
+
+@dataclass(frozen=True)
+class Law:
+    """Tracking of eq. 21 to t = 9.5 s by one plant under one controller.
+
+    Attributes
+    ----------
+    name : str
+    error : (2,) array
+        q - q_d at the end, rad.
+    steady_u : float
+        Largest |u| from 4 s on, N m.
+    """
+
+    name: str
+    error: Array
+    steady_u: float
+
+
+def plant(mass: float = 1.0, gravity: float = 1.0) -> Mechanism:
+    """Return the five-bar with masses and inertias, and gravity, multiplied by factors."""
+    mechanism = load(FIVE_BAR)
+    model = mechanism.tree.model
+    model.gravity.linear = gravity * model.gravity.linear
+    for k, body in enumerate(model.inertias):
+        model.inertias[k] = pin.Inertia(mass * body.mass, body.lever, mass * body.inertia)
+    return mechanism
+
+
+def error_law(name: str, own: Mechanism, believed: Mechanism | None = None, rtol: float = 1e-8) -> Law:
+    """Track eq. 21 with the reduced model of one plant from the default five-bar's equilibrium.
+
+    Parameters
+    ----------
+    name : str
+    own : Mechanism
+        The plant.
+    believed : Mechanism, optional
+        What the controller takes the plant for; default: what it is.
+    rtol : float
+    """
+    _, desired, _ = tracking(FIVE_BAR)
+    model = Model(believed, own, "rho") if believed else None
+    controller = Tracking(np.eye(2), 10.0 * np.eye(2), desired, model)
+    start = own.kinematics(stable_equilibrium(load(FIVE_BAR)).q_tree)
+    reduced = LevelSet(own, start, np.zeros(2), force_of(controller, Actuation(own)), (0.0, AT))
+    u = [0.0]
+
+    def note(solver: Any) -> None:
+        if solver.t >= STEADY:
+            u.append(float(np.abs(controller.u(solver.t, reduced.terms(solver.t, solver.y))).max()))
+
+    outcome = march(reduced, "Radau", rtol, AT, on_step=note)
+    return Law(name, outcome.terms.q - desired(AT)[0], max(u))
+
+
+def appendix_difference(name: str, rows: tuple[int, int, int, int]) -> tuple[float, float, float]:
+    """Return how far eqs. 24, 25 (rates to the first power, times v') and 26 are from Pinocchio, relative."""
+    mechanism, printed, random = load(name), Printed(rows), np.random.default_rng(1)
+    worst = np.zeros(3)
+    for _ in range(STATES):
+        q, v = random.uniform(-np.pi, np.pi, 4), random.uniform(-3, 3, 4)
+        ours = Terms(mechanism, mechanism.kinematics(q), v)
+        pairs = (
+            (printed.D_tree(q), ours.D_tree),
+            (printed.C_tree(q, v, power=1) @ v, ours.C_tree @ v),
+            (printed.h_tree(q), ours.h_tree),
+        )
+        worst = np.maximum(worst, [np.abs(a - b).max() / np.abs(b).max() for a, b in pairs])
+    return float(worst[0]), float(worst[1]), float(worst[2])
+
+
+def claims(figures: Path) -> list[Claim]:
+    """Answer what the appendix and section III state outside of the other studies."""
+    cases = {
+        case: [simulate(f"{FIVE_BAR}/{case}", {"formulation": how}) for how in ("reduced", "spf")]
+        for case in ("set_point", "tracking")
+    }
+    drawn = _plot([run for runs in cases.values() for run in runs], figures)
+    # steps as short as its z is wanted between them: Radau's interpolant is no match for its steps
+    printed = {"formulation": "spf", "spf_coordinates": "z", "solver.max_step": 0.1}
+    for case, runs in cases.items():
+        runs.append(simulate(f"{FIVE_BAR}/{case}", printed))
+    laws = [
+        error_law("as it is", plant()),
+        error_law("no gravity, plant and controller", plant(gravity=0.0)),
+        error_law("masses and inertias doubled, plant and controller", plant(mass=2.0)),
+        error_law("masses and inertias 20 % above what the controller believes", plant(mass=1.2), plant()),
+    ]
+    return [
+        _appendix(),
+        _equilibrium(cases["set_point"][0]),
+        _figure_3(cases["set_point"], drawn),
+        _figure_4(cases["tracking"], drawn),
+        _torques(cases),
+        _law(laws),
+    ]
+
+
+def _plot(runs: Sequence[Run], figures: Path) -> list[str]:
+    """Draw runs by the command that a reader has, ``ckc plot``."""
+    with tempfile.TemporaryDirectory() as folder:
+        saved = [str(run.save(Path(folder) / f"{k}.npz")) for k, run in enumerate(runs)]
+        command = [sys.executable, "-m", "ckc_pin.cli", "plot", *saved, "--out", str(figures)]
+        written = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return [Path(line).name for line in written.splitlines()]
+
+
+def _appendix() -> Claim:
+    rows = []
+    for name, numbers in ((FIVE_BAR, (1, 2, 4, 3)), (PRINTED, (1, 2, 3, 4))):
+        found = appendix_difference(name, numbers)
+        rows.append((name, ", ".join(map(str, numbers)), *(f"{x:.0e}" for x in found)))
+    good = all(float(cell) < 1e-12 for row in rows for cell in row[2:])
+    return Claim(
+        key="appendix",
+        where="appendix, eqs. 23 to 26, Table I",
+        says="The terms of the open chains.",
+        command='ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',
+        found=f"Pinocchio's terms of the shipped URDFs against the printed equations at {STATES} random states: D' and "
+        "h' are the same; C' v' is once eq. 25's squares are dropped (see the errata: coriolis-power, coriolis-skew, "
+        "closure-angles and table-rows). Both readings of Table I are shipped.",
+        verdict="holds with a condition" if good else "does not hold",
+        table=(("mechanism", "rows of links 1 to 4", "D' (eq. 24)", "C' v' (eq. 25)", "h' (eq. 26)"), tuple(rows)),
+    )
+
+
+def _equilibrium(run: Run) -> Claim:
+    mechanism = load(FIVE_BAR)
+    at = mechanism.kinematics(run.q_tree[0])
+    h = float(np.abs(Terms(mechanism, at, np.zeros(4)).h).max())
+    stiffness = np.linalg.eigvalsh(h_gradient(mechanism, at))
+    angles = ", ".join(f"{x:.8f}" for x in at.q_tree)
+    return Claim(
+        key="initial-equilibrium",
+        where="section III-B, Fig. 3a",
+        says="The initial configuration happens to be a stable equilibrium for the system.",
+        command="./scripts/experiment paper --only initial-equilibrium",
+        found=f"The one shipped for both scenes is: (theta_1 ... theta_4) = ({angles}), |h| = {h:.0e} N m there, "
+        f"eigenvalues of dh/dq {stiffness[0]:.4f} and {stiffness[1]:.4f} N m/rad. The numbers are not in the paper.",
+        verdict="holds" if h < 1e-10 and stiffness[0] > 0 else "does not hold",
+    )
+
+
+def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
+    q, u = _apart(runs)
+    spf = runs[1]
+    target = [spf.scene["controller"]["q_d"][name] for name in spf.independent]
+    error = max(float(np.abs(run.q_tree[-1][[0, 2]] - target).max()) for run in runs)
+    return Claim(
+        key="figure-3",
+        where="section III-B, Fig. 3",
+        says="The controller stabilizes the system at the desired configuration, and the SPF follows the reduced model "
+        "closely throughout.",
+        command="./scripts/demo",
+        found=f"From a consistent start they are one system. Eq. 8 as printed (epsilon = {spf.scene['epsilon']:g}) and "
+        f"the reduced model differ by {q:.0e} rad and {u:.0e} N m at most over the run, the integrations' errors. The "
+        f"error at {spf.t[-1]:g} s is {error:.0e} rad. The target of Fig. 3a is not in the text; chosen here: both "
+        "proximal links 45 degrees up.",
+        verdict="holds" if q < 1e-6 and error < 1e-6 else "does not hold",
+        figures=tuple(name for name in drawn if name == "set_point.png"),
+    )
+
+
+def _figure_4(runs: list[Run], drawn: list[str]) -> Claim:
+    q, u = _apart(runs)
+    return Claim(
+        key="figure-4",
+        where="section III-C, Fig. 4",
+        says="Although the system starts from a completely different configuration, the controller makes the desired "
+        "trajectory convergent; its q-space picture is a closed ellipse.",
+        command="./scripts/demo",
+        found="Reproduced over one and a half cycles. Eq. 8 as printed "
+        f"(epsilon = {runs[1].scene['epsilon']:g}) and the reduced model differ by {q:.0e} rad and {u:.0e} N m at "
+        "most. For the error at the end see tracking-error-law.",
+        verdict="holds" if q < 1e-6 and all(run.status == "done" for run in runs) else "does not hold",
+        figures=tuple(name for name in drawn if name == "tracking.png"),
+    )
+
+
+def _torques(cases: dict[str, list[Run]]) -> Claim:
+    rows = []
+    for case, runs in cases.items():
+        for run in runs:
+            u = np.abs(run.u).max(axis=1)
+            k = int(np.argmax(u))
+            rows.append((case, _how(run), f"{u[k]:.2f}", f"{run.t[k]:g}", f"{u[run.t >= STEADY].max():.2f}"))
+    good = all(float(row[2]) <= FIRST for row in rows) and all(
+        float(row[4]) <= LATER for row in rows if row[0] == "tracking"
+    )
+    return Claim(
+        key="torques",
+        where="sections III-B and III-C",
+        says=f"The gains keep the control within {FIRST:g} N m at first, in tracking within {LATER:g} N m in steady "
+        "state.",
+        command="./scripts/demo",
+        found="They do, with the gains of eqs. 20 and 22 and the set-point target chosen here.",
+        verdict="holds" if good else "does not hold",
+        table=(
+            ("case", "formulation", "largest |u| (N m)", "at t (s)", f"largest from {STEADY:g} s on (N m)"),
+            tuple(rows),
+        ),
+    )
+
+
+def _law(laws: list[Law]) -> Claim:
+    mechanism = load(FIVE_BAR)
+    start = mechanism.independent_part(stable_equilibrium(mechanism).q_tree)
+    ratios = np.array([law.error / (np.exp(-AT) * start) for law in laws[:3]])
+    moved = max(float(np.abs(law.error - laws[0].error).max()) for law in laws[1:3])
+    other = float(np.abs(laws[3].error).max())
+    rows = tuple((law.name, *(f"{x:.4e}" for x in law.error), f"{law.steady_u:.2f}") for law in laws)
+    return Claim(
+        key="tracking-error-law",
+        where="section III-C, Figs. 4c and 4d",
+        says="The controller is effective: tracking converges as the figures show.",
+        command="./scripts/experiment paper --only tracking-error-law",
+        found="It does, but the error says nothing about the model: r of eq. 17 dies out fast and "
+        f"q_tilde_dot = -q_tilde is left, whatever the plant. At t = {AT} s the error is {ratios.min():.4f} to "
+        f"{ratios.max():.4f} times e^-t of the initial one; without gravity, or with all masses and inertias doubled, "
+        f"in plant and controller alike, it moves by {moved:.0e} rad while the torques differ. With a controller whose "
+        f"model differs from the plant it is {other:.1e} rad: that, and the torques, do test the dynamics.",
+        verdict="holds with a condition" if np.abs(ratios - 1).max() < 0.01 and other > 1e-3 else "does not hold",
+        table=(
+            (
+                "plant and controller",
+                "theta_1 error (rad)",
+                "theta_3 error (rad)",
+                f"largest |u| from {STEADY:g} s on (N m)",
+            ),
+            rows,
+        ),
+    )
+
+
+def _how(run: Run) -> str:
+    return "spf, eq. 8 as printed" if run.scene["spf_coordinates"] == "z" else str(run.scene["formulation"])
+
+
+def _apart(runs: list[Run]) -> tuple[float, float]:
+    """Largest differences in q' and in u of the reduced model and eq. 8 as printed."""
+    a, _, b = runs
+    return float(np.abs(a.q_tree - b.q_tree).max()), float(np.abs(a.u - b.u).max())

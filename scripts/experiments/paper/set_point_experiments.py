@@ -1,0 +1,147 @@
+"""Experiments on set-point control (eqs. 14 and 15); `scripts.experiments.paper.set_point` turns them into claims."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.analysis.certificate import Certificate, certify, level_of, sublevel_set
+from ckc_pin.analysis.gradient import Bound, chart_step, explore_branch, gradient_bounds
+from ckc_pin.analysis.walk import follow, margin
+from ckc_pin.control.controllers import SetPoint
+from ckc_pin.dynamics.equilibrium import h_gradient
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.branches import assembly_branches
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.simulation.initial import Start, find_start
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.paper.lyapunov import Record, record
+from scripts.experiments.paper.solutions import Equilibrium, equilibria
+
+__all__ = [
+    "DENSE",
+    "FORMULATIONS",
+    "NEAR",
+    "SCENE",
+    "Case",
+    "along_run",
+    "bounds",
+    "equilibria_of",
+    "gradient_error",
+    "load_case",
+]
+
+SCENE = "five_bar/set_point"
+MARGINS = (0.8, 0.5, 0.3, 0.1, 0.05)
+DENSE = {"solver.rtol": 1e-12, "solver.method": "DOP853", "solver.output_dt": 5e-4, "t_end": 2.0}
+NEAR = {"initial.at": None, "initial.q": {"theta_1": 0.3, "theta_3": 0.5}}  # a start half a radian from the target
+FORMULATIONS: dict[str, dict[str, Any]] = {
+    "reduced, eq. 6": {"formulation": "reduced"},
+    "SPF, eq. 17": {"formulation": "spf"},
+    # explicit methods are bound to steps of epsilon in eq. 8 as printed
+    "SPF, eq. 8": {"formulation": "spf", "spf_coordinates": "z", "solver.method": "Radau", "solver.rtol": 1e-10},
+    "DAE, eq. 1": {"formulation": "dae"},
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A set-point scene, ready to be asked about."""
+
+    mechanism: Mechanism
+    controller: SetPoint
+    start: Start
+
+    @property
+    def level(self) -> float:
+        """V_L at the start, J."""
+        return level_of(self.mechanism, self.controller, self.start)
+
+    def certificate(self, divisions: int = 50) -> Certificate:
+        """Decide on the gain condition for this start."""
+        return certify(self.mechanism, self.controller, self.start, divisions)
+
+
+def load_case(changes: Mapping[str, Any] | None = None, scene: str | Path = SCENE) -> Case:
+    """Load a set-point scene, with values replaced by dotted key.
+
+    Raises
+    ------
+    InputError
+        The scene has no set-point controller.
+    """
+    loaded = load_scene(scene, changes)
+    mechanism = scene_mechanism(loaded)
+    controller = scene_controller(loaded, mechanism)
+    if not isinstance(controller, SetPoint):
+        raise InputError(f"{loaded.name}: not a scene with set-point control (eq. 14)")
+    return Case(mechanism, controller, find_start(mechanism, loaded))
+
+
+def along_run(changes: Mapping[str, Any], scene: str | Path = SCENE) -> tuple[Run, Record]:
+    """Run a scene and compare V_L's rate with -q_dot^T K_V q_dot."""
+    case = load_case(changes, scene)
+    run = simulate(scene, changes)
+    q_dot = run.v_tree[:, [run.column(name) for name in run.independent]]
+    return run, record(run, lambda k: -float(q_dot[k] @ case.controller.K_V @ q_dot[k]))
+
+
+def gradient_error(mechanism: Mechanism, count: int, seed: int = 0, step: float = 1e-4) -> tuple[float, float, int]:
+    """Compare dh/dq by the chain rule with central differences of h at random closed configurations.
+
+    Returns
+    -------
+    error, asymmetry : float
+        Largest difference from fourth-order central differences, and of dh/dq from its transpose, relative to |dh/dq|.
+    used : int
+        Configurations that were reached, |s| >= 0.05.
+    """
+    random = np.random.default_rng(seed)
+    error = asymmetry = 0.0
+    used = 0
+    for _ in range(count):
+        at, _ = follow(mechanism, mechanism.assembled, random.uniform(-np.pi, np.pi, mechanism.d))
+        if margin(at) < 0.05:
+            continue
+        used += 1
+
+        def h(k: int, distance: float, at: Any = at) -> Any:
+            dq = np.zeros(mechanism.d)
+            dq[k] = distance
+            return Terms(mechanism, follow(mechanism, at, dq)[0], np.zeros(mechanism.n)).h
+
+        reach = step * margin(at) ** 2  # h bends ever more towards singularity
+        columns = [
+            (8 * (h(k, reach) - h(k, -reach)) - (h(k, 2 * reach) - h(k, -2 * reach))) / (12 * reach)
+            for k in range(mechanism.d)
+        ]
+        gradient = h_gradient(mechanism, at)
+        size = float(np.linalg.norm(gradient, 2))
+        error = max(error, float(np.abs(np.column_stack(columns) - gradient).max()) / size)
+        asymmetry = max(asymmetry, float(np.abs(gradient - gradient.T).max()) / size)
+    return error, asymmetry, used
+
+
+def bounds(mechanism: Mechanism, margins: Sequence[float] = MARGINS, divisions: int = 36) -> list[list[Bound]]:
+    """Bound dh/dq on |s| >= s_min over each assembly branch, the assembled one first."""
+    step = chart_step(mechanism, divisions)
+    return [
+        gradient_bounds(mechanism, explore_branch(mechanism, branch, divisions), margins, step)
+        for branch in assembly_branches(mechanism)
+    ]
+
+
+def equilibria_of(case: Case, divisions: int = 16, starts: int = 80) -> list[Equilibrium]:
+    """Solve eq. 15 from points spread over the sublevel set that a case starts in; return the solutions in it."""
+    found = sublevel_set(case.mechanism, case.controller, case.level, divisions)
+    nodes = found.sheet.nodes[:: max(1, len(found.sheet.nodes) // starts)]
+    solutions = equilibria(case.mechanism, case.controller, nodes)
+    return [solution for solution in solutions if solution.height <= case.level]

@@ -1,0 +1,103 @@
+"""The equilibria of the set-point controller: solutions of eq. 15, found from many starts.
+
+Eq. 14 at rest is u = h(q), that is h(q) - h(q_d) = K_P (q_d - q); eq. 15 prints its left side with the other sign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ckc_pin.analysis.certificate import rest_height
+from ckc_pin.analysis.walk import follow, same_configuration
+from ckc_pin.control.controllers import SetPoint
+from ckc_pin.dynamics.equilibrium import h_gradient
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Equilibrium", "equilibria"]
+
+LONGEST = 0.2  # rad or m: a longer Newton step is not local any more
+ITERATIONS = 60
+SOLVED = 1e-10  # N m or N, of K_P's size
+
+Kind = Literal["minimum", "saddle", "maximum"]
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A solution of eq. 15.
+
+    Attributes
+    ----------
+    q : (d,) array
+    at : Kinematics
+    kind : "minimum", "saddle" or "maximum"
+        Of V_L(q, 0): the closed loop is stable at a minimum only.
+    height : float
+        V_L there, J; zero at q_d.
+    found : int
+        From how many of the starts Newton ended there.
+    """
+
+    q: Array
+    at: Kinematics
+    kind: Kind
+    height: float
+    found: int
+
+
+def equilibria(mechanism: Mechanism, controller: SetPoint, starts: Iterable[Kinematics]) -> list[Equilibrium]:
+    """Solve eq. 15 by Newton from many closed configurations and keep the distinct solutions, lowest V_L first.
+
+    Angles a whole turn apart are different solutions: K_P (q_d - q) tells them apart.
+    """
+    found: list[tuple[Kinematics, int]] = []
+    for start in starts:
+        at = _solve(mechanism, controller, start)
+        if at is None:
+            continue
+        for k, (known, times) in enumerate(found):
+            apart = mechanism.independent_part(at.q_tree) - mechanism.independent_part(known.q_tree)
+            if np.abs(apart).max(initial=0.0) < 1e-6 and same_configuration(mechanism, known, at):
+                found[k] = (known, times + 1)
+                break
+        else:
+            found.append((at, 1))
+    solutions = [
+        Equilibrium(
+            q=mechanism.independent_part(at.q_tree),
+            at=at,
+            kind=_kind(controller.K_P + h_gradient(mechanism, at)),
+            height=rest_height(mechanism, controller, at),
+            found=times,
+        )
+        for at, times in found
+    ]
+    return sorted(solutions, key=lambda solution: solution.height)
+
+
+def _solve(mechanism: Mechanism, controller: SetPoint, at: Kinematics) -> Kinematics | None:
+    """Newton on grad U = h(q) - h(q_d) + K_P (q - q_d) along the branch, steps cut to what is local."""
+    for _ in range(ITERATIONS):
+        terms = Terms(mechanism, at, np.zeros(mechanism.n))
+        slope = terms.h - controller.target.h + controller.K_P @ (terms.q - controller.q_d)
+        if np.abs(slope).max() <= SOLVED * np.linalg.norm(controller.K_P, 2):
+            return at
+        step = -np.linalg.lstsq(controller.K_P + h_gradient(mechanism, at), slope, rcond=None)[0]
+        at, reached = follow(mechanism, at, step * min(1.0, LONGEST / np.abs(step).max()))
+        if reached < 1.0:
+            return None
+    return None
+
+
+def _kind(hessian: Array) -> Kind:
+    values = np.linalg.eigvalsh((hessian + hessian.T) / 2)
+    if values[0] > 0:
+        return "minimum"
+    return "maximum" if values[-1] < 0 else "saddle"

@@ -1,0 +1,54 @@
+"""Makes the pictures of docs/images: python scripts/experiments/pictures.py CHROMIUM."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+from playwright.sync_api import Page, sync_playwright
+
+import ckc_pin
+from ckc_pin.analysis.map import singularity_map, workspace_sections
+from ckc_pin.view.map_figure import draw_map, look
+from ckc_pin.view.player import play
+from ckc_pin.view.sections_figure import draw_sections
+
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+SIZE = {"width": 720, "height": 540}
+DPI = 100
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.getuid() else ["--no-sandbox"])]
+
+
+def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> None:
+    """Playback at a time of the run, without the controls."""
+    with play(runs, block=False) as server:
+        page.goto(server.url)
+        while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
+            time.sleep(0.1)
+        page.evaluate("viewer.animator.pause(); viewer.gui.domElement.style.display = 'none'")
+        page.evaluate(f"viewer.animator.seek({t}); viewer.render()")
+        time.sleep(0.5)
+        page.screenshot(path=path)
+
+
+def main(chromium: str) -> None:
+    """Playback first, then figures."""
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    tracking = ckc_pin.simulate("five_bar/tracking")
+    lift = ckc_pin.simulate("two_ur5/lift")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        page = browser.new_page(viewport=SIZE)
+        screenshot(page, [tracking], 1.45, IMAGES / "five_bar_tracking.png")
+        screenshot(page, [lift], 1.0, IMAGES / "two_ur5_lift.png")
+        browser.close()
+    with look():
+        for name in ("five_bar", "five_bar_as_printed"):
+            draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
+        draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

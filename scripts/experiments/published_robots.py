@@ -1,0 +1,171 @@
+"""The tables of docs/published_robots.md: `ckc import` and `ckc check` on published robots.
+
+    .venv/bin/python scripts/experiments/published_robots.py FOLDER
+
+FOLDER holds a checkout of each repository below, under the repository's own name, at the commit named there; robots of
+example-robot-data come from its package (pip install example-robot-data). A robot that is not there stops the script.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import ckc_pin
+from ckc_pin.mechanism.importing import read, write
+from ckc_pin.mechanism.sources import resolve
+
+PACKAGE = "package://example-robot-data/robots"
+
+
+@dataclass(frozen=True)
+class Origin:
+    title: str
+    commit: str
+    files: tuple[str, ...]
+
+    @property
+    def folder(self) -> str:
+        return self.title.rpartition("/")[2]
+
+
+PARALLEL_ROBOTS = (
+    "5bar_linkage 5bar_linkage_iso3d 5bar_linkage_iso6d battobot_6d cassie_like digit_like digit_like_2legs "
+    "digit_like_2legs_6D disney_like disney_robot kangaroo_like kangaroo_like_2legs robot_delta talos_like "
+    "true_talos_2_legs wl16_like"
+)
+
+ORIGINS = (
+    Origin(
+        "Gepetto/example-parallel-robots",
+        "52e64b31",
+        tuple(f"robots/{name}/robot.yaml" for name in PARALLEL_ROBOTS.split()),
+    ),
+    Origin(
+        "ROAM-Lab-ND/generalized_rbda",
+        "45fa7c46",
+        (
+            *(f"robot-models/{name}.urdf" for name in ("four_bar", "six_bar", "planar_leg_linkage")),
+            *(f"robot-models/{name}.urdf" for name in ("mini_cheetah", "mit_humanoid", "jvrc1_humanoid")),
+            "Benchmarking/urdfs/parallel_chains/Implicit/depth5/loop_size5.urdf",
+        ),
+    ),
+    Origin(
+        "Rhoban/placo-examples",
+        "3edf600f",
+        (
+            *(f"models/{name}/robot.urdf" for name in ("planar-2dof", "orbita", "megabot", "spm")),
+            "models/spm/robot.xml",
+        ),
+    ),
+    Origin(
+        "Rhoban/onshape-to-robot-examples",
+        "a0f8b921",
+        ("planar-2dof/robot.xml", "orbita_mujoco/robot.xml"),
+    ),
+    Origin("osudrl/cassie-mujoco-sim", "188d3d7f", ("model/cassie.xml",)),
+    Origin(
+        "kevinzakka/mink",
+        "cf1a302f",
+        tuple(f"examples/{name}.xml" for name in ("ufactory_xarm7/xarm7", "stanford_tidybot/tidybot", "aloha/aloha")),
+    ),
+    Origin(
+        "google-deepmind/mujoco_playground",
+        "d5e6b475",
+        tuple(
+            f"mujoco_playground/_src/manipulation/{name}.xml"
+            for name in ("franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85", "aero_hand/xmls/right_hand")
+        ),
+    ),
+    Origin(
+        "google-deepmind/mujoco",
+        "a7255075",
+        tuple(
+            f"test/engine/testdata/{name}.xml"
+            for name in ("core_constraint/jdotv_connect_2d", "core_constraint/jdotv_weld_3d", "armature_equivalence")
+        ),
+    ),
+    Origin(
+        "example-robot-data",
+        "package 6.0.0",
+        (
+            "talos_data/robots/talos_full_v2.urdf",
+            "romeo_description/urdf/romeo.urdf",
+            "tiago_pro_description/robots/tiago_pro.urdf",
+            "pr2_description/urdf/pr2.urdf",
+            "panda_description/urdf/panda.urdf",
+            "alex_description/urdf/alex_psyonic_hands.urdf",
+        ),
+    ),
+)
+
+
+def row(name: str, path: Path) -> str:
+    """Import and check one robot."""
+    draft = read(path)
+    motors = str(len(draft.actuated)) if draft.actuated else ""
+    remarks = _remarks(draft.guessed) + _remarks(draft.left_out)
+    with tempfile.TemporaryDirectory() as folder:
+        file, _ = write(draft, Path(folder))
+        try:
+            found = ckc_pin.check(file)
+        except ckc_pin.MechanismError as error:
+            what = str(error).partition("mechanism.toml: ")[2].partition(". Check")[0]
+            return _line(name, "yes", "no", motors, "", "", "", "", "; ".join([*remarks, what]))
+    numbers = (str(x) for x in (found.n, found.rows, found.rank, found.d))
+    return _line(name, "yes", "yes", motors, *numbers, "; ".join([*remarks, *_remarks(found.warnings)]))
+
+
+# what notes and warnings hold, and what becomes of them: {n} names follow the colon, {m} stand before it, {first}
+SHORT = {
+    "point_2d for loop": "point_2d guessed ({m})",
+    "hinge for loop": "hinge guessed ({m})",
+    "point for loop": "point guessed ({m})",
+    "joints called spherical": "joints called spherical stay hinges",
+    "ball joint": "ball joints as three hinges",
+    "the three slides": "slides and a ball as a free root",
+    "armature": "armature left out",
+    "masses of shapes": "masses of meshes left out",
+    "actuator ": "actuator on a tendon left out",
+    "coupling ": "coupling of three joints left out",
+    " follows '": "mimic of no joint left out",
+    "robot.yaml: joint_name": "joint_name of no joint left out",
+    "idle freedoms": "{n} idle",
+    "the assembled configuration is singular": "singular where it is drawn",
+    "the loops close to": "{first}",
+}
+
+
+def _remarks(notes: Iterable[str]) -> list[str]:
+    found = []
+    for note in notes:
+        short = next((short for long, short in SHORT.items() if long in note), "")
+        first, _, names = note.partition(":")
+        found.append(short.format(n=names.count(",") + 1, m=first.count(",") + 1, first=first.partition(", not")[0]))
+    return list(dict.fromkeys(filter(None, found)))
+
+
+def _line(*cells: str) -> str:
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def main() -> None:
+    root = Path(sys.argv[1])
+    for origin in ORIGINS:
+        print(f"\n## {origin.title} ({origin.commit})\n")
+        print(_line("robot", "imported", "closed", "motors", "n", "rows", "rank", "d", "remarks"))
+        print(_line(*["---"] * 9))
+        for file in origin.files:
+            named = origin.title == "example-robot-data"
+            path = resolve(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file
+            if not path.is_file():
+                sys.exit(f"{path}: not there")
+            stem = path.parent.name if path.stem == "robot" else path.stem
+            print(row(f"{stem}{'' if path.suffix != '.xml' else ' (MJCF)'}", path), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""One cell of the table: run a case in one formulation by one method, measure it, judge it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import process_time
+from typing import Any, Literal
+
+import numpy as np
+
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation import Run, simulate
+from ckc_pin.simulation.scene import make_scene, with_changes
+from scripts.experiments.stability.planar import Planar
+from scripts.experiments.stability.reference import Reference
+
+__all__ = ["ALLOWED", "BUDGET", "Case", "Cell", "How", "Verdict", "kinetic_energies", "run_case"]
+
+Verdict = Literal["within", "stopped", "FAILED"]
+
+NAN = float("nan")
+ALLOWED = 1e3  # times rtol, relative to the solution's scale
+BUDGET = {"solver.max_rhs": 30_000, "solver.max_wall_s": 300.0}
+
+
+@dataclass(frozen=True)
+class How:
+    """A formulation and a method; the SPF in the coordinates of eq. 17, or as eq. 8 is printed."""
+
+    formulation: str
+    method: str = "auto"
+    rtol: float = 1e-8
+    printed: bool = False
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """As a scene's keys."""
+        return {
+            "formulation": self.formulation,
+            "spf_coordinates": "z" if self.printed else "w",
+            "solver.method": self.method,
+            "solver.rtol": self.rtol,
+        }
+
+    @property
+    def label(self) -> str:
+        """Such as "spf (8)"."""
+        return f"{self.formulation} (8)" if self.printed else self.formulation
+
+
+@dataclass(frozen=True)
+class Case:
+    """A motion to be run, and what is right.
+
+    Attributes
+    ----------
+    group, name : str
+    mechanism : Planar, str or table
+        Written into a folder for the run, shipped, or made by rule.
+    changes : mapping
+        The rest of the scene, by dotted key.
+    reference : Reference
+    how : tuple of How
+    conserves : bool
+        Whether energy should be conserved.
+    """
+
+    group: str
+    name: str
+    mechanism: Planar | str | Mapping[str, Any]
+    changes: Mapping[str, Any]
+    reference: Reference
+    how: tuple[How, ...]
+    conserves: bool = True
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A row of the table.
+
+    Attributes
+    ----------
+    error : float
+        Largest error over the output instants up to where the run ended, relative to the solution's scale.
+    allowed : float
+    max_phi : float
+        Largest |phi - w| at the output instants, m.
+    uncertainty : float
+        Of the reference, as relative.
+    drift : float
+        Of the energy, relative to the largest kinetic energy; NaN where energy is not conserved.
+    cpu_s : float
+        Of processor time.
+    """
+
+    group: str
+    case: str
+    formulation: str
+    method: str
+    rtol: float
+    reference: str
+    verdict: Verdict
+    error: float = NAN
+    allowed: float = NAN
+    uncertainty: float = NAN
+    max_phi: float = NAN
+    drift: float = NAN
+    rhs: int = 0
+    newton: int = 0
+    steps: int = 0
+    switches: int = 0
+    t: float = 0.0
+    cpu_s: float = 0.0
+    message: str = ""
+
+
+def run_case(case: Case) -> list[Cell]:
+    """Run a case in all its ways; one reference serves them all."""
+    with tempfile.TemporaryDirectory() as folder:
+        mechanism: Any = case.mechanism
+        if isinstance(mechanism, Planar):
+            mechanism.write(Path(folder))
+            mechanism = "mechanism.toml"
+        data = with_changes({"mechanism": mechanism}, {**BUDGET, **case.changes})
+        return [_run_cell(case, how, with_changes(data, how.changes), Path(folder)) for how in case.how]
+
+
+def _run_cell(case: Case, how: How, data: dict[str, Any], folder: Path) -> Cell:
+    key: dict[str, Any] = {"group": case.group, "case": case.name, "formulation": how.label, "method": how.method}
+    key.update(rtol=how.rtol, reference=case.reference.source)
+    started = process_time()
+    try:
+        run = simulate(make_scene(data, f"{case.group}: {case.name}", Sources(case.name, folder)))
+    except NumericalError as refused:  # a singular start
+        return Cell(**key, verdict="stopped", cpu_s=process_time() - started, message=str(refused))
+    except Exception as crash:  # anything but a verdict of the program is a fault of it
+        return Cell(**key, verdict="FAILED", cpu_s=process_time() - started, message=f"{type(crash).__name__}: {crash}")
+    spent = process_time() - started
+    allowed = ALLOWED * how.rtol
+    if how.method == "auto":
+        key["method"] = f"auto: {run.stats['method']}"
+    right = case.reference
+    error, max_phi = right.error(run), right.phi(run)
+    return Cell(
+        **key,
+        verdict=_verdict(run, error, max_phi, allowed),
+        error=error,
+        allowed=allowed,
+        uncertainty=right.uncertainty(run),
+        max_phi=max_phi,
+        drift=_drift(run) if case.conserves else NAN,
+        rhs=run.stats["rhs"],
+        newton=run.stats["newton"],
+        steps=run.stats["steps"],
+        switches=run.stats["switches"],
+        t=float(run.t[-1]),
+        cpu_s=spent,
+        message="" if run.status == "done" else run.message,
+    )
+
+
+def _verdict(run: Run, error: float, max_phi: float, allowed: float) -> Verdict:
+    if run.status != "done":
+        return "stopped"
+    closed = max_phi <= allowed * max(1.0, run.mechanism.size)
+    return "within" if error <= allowed and closed else "FAILED"
+
+
+def _drift(run: Run) -> float:
+    largest = float(kinetic_energies(run).max())
+    return float(np.abs(run.energy - run.energy[0]).max() / largest) if largest > 0 else 0.0
+
+
+def kinetic_energies(run: Run) -> Array:
+    """Return the kinetic energy at a run's output instants, J."""
+    mechanism = run.mechanism
+    return np.array(
+        [
+            0.5 * v @ Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q)), v).D_tree @ v
+            for q, v in zip(run.q_tree, run.v_tree, strict=True)
+        ]
+    )

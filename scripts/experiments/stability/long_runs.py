@@ -1,0 +1,81 @@
+"""A thousand seconds: how far the energy drifts, and whether the loops stay closed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation import simulate
+from scripts.experiments.stability.cell import kinetic_energies
+from scripts.experiments.stability.equations import to_absolute
+
+__all__ = ["LONG", "LongRun", "long_run"]
+
+RTOL = 1e-10
+T_END = 1000.0
+OUTPUT_DT = 0.1
+# name, formulation, changes of five_bar/swing
+LONG: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("swing", "reduced", {}),
+    ("swing", "spf", {}),
+    ("swing", "dae", {}),
+    ("across type 2", "dae", {"initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0}}),
+)
+
+
+@dataclass(frozen=True)
+class LongRun:
+    """One run.
+
+    Attributes
+    ----------
+    drift : float
+        Largest |E - E(0)|, relative to the range of the kinetic energy.
+    max_phi : float
+        Largest |phi| at the output instants, m.
+    crossings : int
+        How often the sign of det phi_z changed from one output instant to the next.
+    """
+
+    name: str
+    formulation: str
+    method: str
+    rtol: float
+    t: float
+    drift: float
+    max_phi: float
+    crossings: int
+    rhs: int
+    steps: int
+    outcome: str
+
+
+def long_run(name: str, formulation: str, changes: dict[str, Any], t_end: float = T_END) -> LongRun:
+    """Run one of `LONG`, or a shorter part of it."""
+    every = {"t_end": t_end, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT, "formulation": formulation}
+    run = simulate("five_bar/swing", {**every, **changes})
+    kinetic = kinetic_energies(run)
+    drift = np.abs(run.energy - run.energy[0]).max() / (kinetic.max() - kinetic.min())
+    return LongRun(
+        name=name,
+        formulation=formulation,
+        method=run.stats["method"],
+        rtol=RTOL,
+        t=float(run.t[-1]),
+        drift=float(drift),
+        max_phi=run.max_phi,
+        crossings=_crossings(run.q_tree),
+        rhs=run.stats["rhs"],
+        steps=run.stats["steps"],
+        outcome=run.message if run.status != "done" else "done",
+    )
+
+
+def _crossings(q_tree: Array) -> int:
+    """Count changes of the side of the line through the distal links, which det phi_z has the sign of."""
+    angles = np.array([to_absolute(q) for q in q_tree.tolist()])
+    side = np.sign(np.sin(angles[:, 1] - angles[:, 3]))
+    return int(np.sum(side[1:] != side[:-1]))

@@ -1,0 +1,111 @@
+"""The strongest peer, a C++ loop that is compiled on demand: what it computes, and what is said where it cannot be."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scripts.experiments.benchmark.peers import compiled
+from scripts.experiments.benchmark.peers.pinocchio_loop import PinocchioLoop
+from scripts.experiments.benchmark.work import WORKS, Work
+
+LOOP = PinocchioLoop()
+compiles = pytest.mark.skipif(not compiled.compiler(), reason="no C++ compiler: that it is said is tested below")
+ONE_SQUARE = Work("one_square", "N-four-bar, N = 1, 0.5 s", "n_four_bar", 0.5, {"mechanism.N": 1}, point="B0")
+TIGHT = "K_p 0, mu 1e-08, iterations 3, tolerance 1e-12"
+
+
+@pytest.fixture
+def anew() -> Iterator[None]:
+    """No program yet, before the test and after it."""
+    kept = compiled.program
+    compiled.program.cache_clear()
+    yield
+    kept.cache_clear()
+
+
+@compiles
+@pytest.mark.parametrize("key", ["andrews", "bricard", "delta", "two_ur5"])
+def test_it_is_the_same_mechanism(key: str) -> None:
+    """Springs, a hinge of redundant rows, balls, and a free root: the sorts of closure and state there are."""
+    work = next(work for work in WORKS if work.key == key)
+    assert LOOP.missing(work) is None
+    mass, bias, energy, acceleration = (float(x) for x in re.findall(r"(\d\S*e[-+]\d+)", LOOP.check(work)))
+    assert mass < 1e-12
+    assert bias < 1e-12
+    assert energy < 1e-12
+    assert acceleration < 1e-9
+
+
+@compiles
+def test_it_follows_the_closed_form() -> None:
+    """Half a second of the pendulum that a square's angle is, by quadrature of its energy in numpy alone."""
+    from scipy.integrate import quad
+    from scipy.optimize import brentq
+
+    k = 9.81 * 3 * 4 / (2 * 5)
+
+    def moment(theta: float) -> float:
+        return quad(lambda x: 1 / np.sqrt(1 + 2 * k * (1 - np.sin(x))), theta, np.pi / 2, epsabs=1e-13)[0]
+
+    theta = brentq(lambda theta: moment(theta) - ONE_SQUARE.t_end, 0.0, np.pi / 2, xtol=1e-14)
+    motion = LOOP.compute(ONE_SQUARE, TIGHT, 60.0)
+    assert motion.status == "done"
+    assert motion.q_tree.shape == (11, ONE_SQUARE.mechanism.n)
+    assert np.abs(ONE_SQUARE.observed(motion.q_tree)[-1] - [np.cos(theta), np.sin(theta), 0.0]).max() < 1e-11
+    assert motion.steps is not None
+    assert motion.rhs is not None
+    assert motion.rhs >= 13 * motion.steps
+    assert 0 < motion.wall_s < 60.0
+
+
+@compiles
+def test_its_springs_and_its_free_root_move_as_ours() -> None:
+    from ckc_pin.simulation.simulate import simulate
+
+    for key, t_end in (("andrews", 0.01), ("two_ur5", 0.2)):
+        work = next(work for work in WORKS if work.key == key)
+        short = Work(key, work.says, work.scene, t_end)
+        run = simulate(short.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-11))
+        motion = LOOP.compute(short, TIGHT, 60.0)
+        assert np.abs(motion.q_tree - run.q_tree).max() < 1e-8
+        assert np.abs(motion.v_tree - run.v_tree).max() < 1e-8 * max(1.0, np.abs(run.v_tree).max())
+
+
+@compiles
+def test_a_run_over_its_budget_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scripts.experiments.benchmark.peers.pinocchio_loop.START", 0.1)
+    motion = LOOP.compute(next(work for work in WORKS if work.key == "n_four_bar_40"), TIGHT, 0.1)
+    assert motion.status == "refused"
+    assert motion.reason == "takes longer than the budget, 0 s"
+
+
+@pytest.mark.usefixtures("anew")
+def test_without_a_compiler_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert LOOP.missing(ONE_SQUARE) == "no C++ compiler was found"
+
+
+@pytest.mark.usefixtures("anew")
+def test_what_the_compiler_says_is_handed_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    compiler = tmp_path / "c++"
+    compiler.write_text(
+        f"#!{sys.executable}\nimport sys\nsys.exit('a note\\nloop.cpp:3: error: no such   header\\nmore')\n"
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert LOOP.missing(ONE_SQUARE) == "it does not compile: loop.cpp:3: error: no such header"
+
+
+@pytest.mark.usefixtures("anew")
+def test_without_eigen_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_prefix", lambda: Path("nowhere"))
+    monkeypatch.setattr(compiled, "compiler", lambda: "c++")
+    assert LOOP.missing(ONE_SQUARE) == "Eigen's headers are missing: pip install cmeel-eigen"

@@ -1,0 +1,53 @@
+"""Other programs on motions that need more than the five-bar's swing: slides, many turns, springs, forces, bushings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.benchmark.peers import Peer, peers
+from scripts.experiments.benchmark.peers.exudyn_plane import in_plane
+from scripts.experiments.benchmark.work import WORKS, Work
+
+EVERY = {work.key: work for work in WORKS}
+EXUDYN = next(peer for peer in peers() if peer.name == "Exudyn")
+DRAKE = next(peer for peer in peers() if peer.name == "Drake")
+MUJOCO = next(peer for peer in peers() if peer.name == "MuJoCo")
+SWING = Work("swing", "five-bar, free swing, 0.3 s", "five_bar/swing", 0.3)
+TURNS = Work("turns", "slider-crank, 1 s, some three turns", "slider_crank", 1.0)
+SPRING = Work("spring", "Andrews' squeezer, 2 ms", "andrews", 0.002)
+
+
+@pytest.mark.parametrize(
+    ("peer", "work", "setting", "allowed"),
+    [
+        (EXUDYN, TURNS, "GeneralizedAlpha, spectral radius 0.9, dt 0.0003", 1e-2),
+        (EXUDYN, TURNS, "TrapezoidalIndex2, spectral radius 1, dt 0.0003", 1e-2),
+        (EXUDYN, SPRING, "GeneralizedAlpha, spectral radius 0.9, dt 1e-05", 1e-4),
+        (DRAKE, SWING, "RungeKutta3, bushings of 1e+06 N/m, accuracy 0.001", 1e-3),
+        (DRAKE, SPRING, "RungeKutta3, bushings of 1e+08 N/m, accuracy 0.001", 2e-3),
+        (MUJOCO, TURNS, "RK4, solref 2 dt, dt 0.0003", 1e-3),
+        (MUJOCO, SPRING, "RK4, solref 4 dt, dt 1e-05", 1e-3),
+    ],
+)
+def test_it_moves_as_ours(peer: Peer, work: Work, setting: str, allowed: float) -> None:
+    run = simulate(work.load(formulation="dae", solver__rtol=1e-10))
+    motion = peer.compute(work, setting, 60.0)
+    assert motion.status == "done", motion.reason
+    assert np.abs(motion.q_tree - run.q_tree).max() < allowed
+    assert np.abs(motion.v_tree - run.v_tree).max() < allowed * max(1.0, float(np.abs(run.v_tree).max()))
+
+
+def test_the_state_read_back_is_the_one_put_in() -> None:
+    for work in (TURNS, SPRING):
+        assert in_plane(work)
+        motion = EXUDYN.compute(work, f"GeneralizedAlpha, spectral radius 0.9, dt {work.t_end / 1000}", 60.0)
+        start = simulate(work.load(formulation="dae"))
+        assert np.abs(motion.q_tree[0] - start.q_tree[0]).max() < 1e-12
+        assert np.abs(motion.v_tree[0] - start.v_tree[0]).max() < 1e-12
+
+
+@pytest.mark.parametrize("key", ["bricard", "delta", "two_ur5"])
+def test_what_moves_in_space_is_not_taken_for_planar(key: str) -> None:
+    assert not in_plane(EVERY[key])

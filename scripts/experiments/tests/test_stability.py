@@ -1,0 +1,264 @@
+"""The stability suite: what it compares with, how it judges, and some of its cells."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin.mechanism import load
+from scripts.experiments.stability import equations
+from scripts.experiments.stability.cases import EVERY, GROUPS, PAPER, SWING
+from scripts.experiments.stability.cell import Case, Cell, How, run_case
+from scripts.experiments.stability.equations import Reduced, free_motion, to_absolute
+from scripts.experiments.stability.long_runs import LONG, long_run
+from scripts.experiments.stability.page import TITLES, as_csv, page, satisfied
+from scripts.experiments.stability.planar import JointSpring, LineSpring, Planar
+from scripts.experiments.stability.reference import ByHand, gap
+from tests.analytic.five_bar import Array, Controller, FiveBar, Q, no_control, set_point, tracking
+from tests.conftest import assert_close
+
+DOCS = Path(__file__).parents[3] / "docs"
+UNEVEN = replace(PAPER.heavier((3.0, 0.2, 1.0, 5.0)), l=(0.3, 0.35, 0.25, 0.32), base=0.4)
+
+
+def in_numpy(p: Planar) -> FiveBar:
+    return FiveBar(p.l, p.c, p.m, p.I, p.base, p.g)
+
+
+def states(model: FiveBar, count: int = 10) -> list[tuple[Array, Array]]:
+    """Closed configurations near the equilibrium and rates of all joints that keep them so."""
+    random = np.random.default_rng(0)
+    found = []
+    for _ in range(count):
+        q_tree = model.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.4, 0.4, 2))
+        found.append((q_tree, model.rho(q_tree) @ random.normal(size=2)))
+    return found
+
+
+# --- what is compared with -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("p", [PAPER, UNEVEN], ids=["paper", "uneven"])
+def test_free_motion_by_hand_is_eq_1(p: Planar) -> None:
+    """The links' accelerations, by the numpy five-bar with its multipliers."""
+    model = in_numpy(p)
+    for q_tree, v_tree in states(model):
+        theirs, _ = model.acceleration_and_multipliers(q_tree, v_tree, np.zeros(2))
+        y = [*to_absolute(q_tree.tolist()), *to_absolute(v_tree.tolist())]
+        ours = free_motion(p)(0.0, y)
+        assert_close(ours, [*y[4:], *to_absolute(theirs.tolist())], 1e-12, relative=True)
+
+
+CONTROLS = {
+    "none": (equations.uncontrolled, lambda model: no_control),
+    "set point": (
+        equations.set_point(UNEVEN, (-1.2, -1.5), 7.0, 3.0),
+        lambda m: set_point(m, np.array([-1.2, -1.5]), 7.0, 3.0),
+    ),
+    "tracking": (equations.tracking(2.0, 5.0), lambda model: tracking(model, 2.0, 5.0)),
+}
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_closed_loops_by_hand_are_eq_6(control: str) -> None:
+    by_hand, numpy_control = CONTROLS[control]
+    model = in_numpy(UNEVEN)
+    u: Controller = numpy_control(model)
+    for q_tree, v_tree in states(model):
+        q, q_dot = q_tree[Q].tolist(), v_tree[Q].tolist()
+        now = Reduced(UNEVEN, q, q_dot)
+        assert_close(np.sin(now.a), np.sin(to_absolute(q_tree.tolist())), 1e-13)
+        theirs = model.acceleration(q_tree, v_tree[Q], u(0.7, q_tree, v_tree[Q]))
+        assert_close(by_hand(0.7, now, q, q_dot), theirs, 1e-11, relative=True)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_springs_by_hand_do_the_work_they_should(damping: float) -> None:
+    """dE/dt, the springs' energy included, is what the dampers take."""
+    line, joint = LineSpring(50.0, damping, 0.2, 0.1, 0.15), JointSpring(2.0, damping, 0.5)
+    p, model = replace(PAPER, line=line, joint=joint), in_numpy(PAPER)
+
+    def pose(a: Array) -> tuple[Array, Array]:
+        tip = model.l[0] * np.array([np.cos(a[0]), np.sin(a[0])]) + model.l[1] * np.array([np.cos(a[1]), np.sin(a[1])])
+        angles = np.array([a[0], a[1] - a[0], a[2], a[3] - a[2]])
+        return angles, np.linalg.norm(tip - [line.x, line.y])
+
+    def energy(y: Array) -> float:
+        (angles, length), (rates, _) = pose(y[:4]), pose(y[4:])
+        stretched = line.stiffness * (length - line.rest) ** 2 + joint.stiffness * (angles[0] - joint.rest) ** 2
+        return float(model.energy(angles, rates) + stretched / 2)
+
+    for q_tree, v_tree in states(model):
+        y = np.array([*to_absolute(q_tree.tolist()), *to_absolute(v_tree.tolist())])
+        f, h = np.array(free_motion(p)(0.0, y)), 1e-6
+        power = (energy(y + h * f) - energy(y - h * f)) / (2 * h)
+        length_rate = (pose((y + h * f)[:4])[1] - pose((y - h * f)[:4])[1]) / (2 * h)
+        assert power == pytest.approx(-damping * (length_rate**2 + v_tree[0] ** 2), abs=1e-7)
+
+
+def test_errors_are_relative_to_the_scale_of_the_solution() -> None:
+    assert gap(np.array([100.0, 0.1]), np.array([100.0, 0.0])) == pytest.approx(1e-3)
+    assert gap(np.array([0.01]), np.array([0.0])) == pytest.approx(0.01)
+    assert gap(np.array([np.nan]), np.array([0.0])) == np.inf
+
+
+def test_the_files_that_are_written_are_the_shipped_five_bar(tmp_path: Path) -> None:
+    PAPER.write(tmp_path)
+    ours, shipped = load(tmp_path / "mechanism.toml"), load("five_bar")
+    assert_close(ours.q_tree, shipped.q_tree, 1e-13)
+    assert ours.coordinates == shipped.coordinates
+
+
+# --- how it judges ---------------------------------------------------------------------------------
+
+SHORT = {"initial.q": {"theta_1": SWING[0], "theta_3": SWING[1]}, "t_end": 0.2, "solver.output_dt": 0.1}
+
+
+def judge(reference: ByHand, how: How = EVERY[2], **changes: object) -> Cell:
+    case = Case(
+        "method",
+        "short",
+        "five_bar",
+        {**SHORT, **{k.replace("__", "."): v for k, v in changes.items()}},
+        reference,
+        (how,),
+    )
+    return run_case(case)[0]
+
+
+def test_a_right_run_is_within() -> None:
+    cell = judge(ByHand(PAPER))
+    assert (cell.verdict, cell.t) == ("within", 0.2)
+    assert cell.error <= 1e-7 < cell.allowed
+    assert cell.uncertainty <= 1e-10
+
+
+def test_a_wrong_run_has_failed() -> None:
+    """A link a hundredth heavier in the reference than in the run."""
+    cell = judge(ByHand(PAPER.heavier((1.0, 1.01, 1.0, 1.0))))
+    assert cell.verdict == "FAILED"
+    assert cell.allowed < cell.error < 1e-2
+
+
+def test_loops_that_are_not_closed_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ByHand, "phi", lambda self, run: 1e-3)
+    assert judge(ByHand(PAPER)).verdict == "FAILED"
+
+
+def test_a_budget_stops_with_a_reason() -> None:
+    cell = judge(ByHand(PAPER), solver__max_rhs=50)
+    assert cell.verdict == "stopped"
+    assert "max_rhs = 50" in cell.message
+
+
+def test_a_crash_and_a_case_that_cannot_be_run_have_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert judge(ByHand(PAPER), solver__no_such_key=1).verdict == "FAILED"
+
+    def crash(*args: object) -> None:
+        raise ZeroDivisionError("here")
+
+    monkeypatch.setattr("scripts.experiments.stability.cell.simulate", crash)
+    assert judge(ByHand(PAPER)).message == "ZeroDivisionError: here"
+
+
+def some_cells() -> list[Cell]:
+    def cell(verdict: str, **more: object) -> Cell:
+        return Cell("mass", "a|b", "spf", "auto: Radau", 1e-8, "by hand", verdict, **more)  # type: ignore[arg-type]
+
+    within = [cell("within", error=1e-9, allowed=1e-5, uncertainty=1e-12, rhs=12)] * 9
+    return [*within, cell("stopped", t=0.5, message="why it stopped")]
+
+
+def test_nine_in_ten_and_no_failure_are_asked_for() -> None:
+    cells = some_cells()
+    assert satisfied(cells)
+    assert not satisfied(cells[1:])
+    assert not satisfied([*cells, *cells, replace(cells[0], verdict="FAILED")])
+
+
+def test_page_and_table_say_what_was_found() -> None:
+    text = page(some_cells(), [])
+    assert "**10 cells: 9 within, 1 stopped, 0 FAILED; 90.0 % within tolerance.**" in text
+    assert "why it stopped" in text
+    assert "| a\\|b |" in text
+    rows = list(csv.DictReader(io.StringIO(as_csv(some_cells()))))
+    assert [row["verdict"] for row in rows] == ["within"] * 9 + ["stopped"]
+    assert rows[0]["error"] == "1e-09"
+
+
+# --- its cells -------------------------------------------------------------------------------------
+
+
+def test_every_case_has_a_name_of_its_own_and_every_group_a_title() -> None:
+    names = [(case.group, case.name) for cases in GROUPS.values() for case in cases()]
+    assert len(set(names)) == len(names)
+    assert {group for group, _ in names} == set(GROUPS) == set(TITLES)
+
+
+def test_the_committed_table_is_of_these_cases_and_satisfied() -> None:
+    with (DOCS / "stability.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    found = [(row["group"], row["case"], row["formulation"], row["method"].partition(":")[0]) for row in rows]
+    cells = [(c.group, c.name, how.label, how.method) for cases in GROUPS.values() for c in cases() for how in c.how]
+    assert found == cells
+    verdicts = [row["verdict"] for row in rows]
+    assert "FAILED" not in verdicts
+    assert verdicts.count("within") >= 0.9 * len(verdicts)
+
+
+# extremes, by group: cases and the formulations that run
+THINNED = {
+    "epsilon": ({"1e-01, w(0) = (0.01, -0.006)", "1e-06, w(0) large", "1e-12, w(0) large"}, "spf"),
+    "mass": ({"link 2 x 1e+06", "link 2 x 1e-08"}, "reduced"),
+    "length": ({"base 0.001 m", "base 1000 m"}, "dae"),
+    "gain": ({"set point, K_P = 1e+06, K_V = 1e+06", "tracking, K_D = 10000"}, "spf"),
+    "singular": (
+        {"type 1 above, 1e-01 away", "type 1 above, 1e-08 away", "type 1 below, 1e-04 away", "type 2, 1e-12 away"},
+        "reduced",
+    ),
+    "speed": ({"1000 rad/s, apart", "crossing type 2, 12 rad/s"}, "reduced"),
+    "spring": ({"line 1e+09 N/m", "line 1e+09 N/m, damped"}, "reduced"),
+    "published": ({"Andrews", "Bricard at 1 s", "N-four-bar, N = 2, through rank losses"}, "dae"),
+}
+
+
+@pytest.mark.parametrize("group", THINNED)
+def test_cells_are_within_tolerance(group: str) -> None:
+    names, formulation = THINNED[group]
+    cases = [case for case in GROUPS[group]() if case.name in names]
+    assert len(cases) == len(names)
+    for case in cases:
+        how = next(how for how in case.how if how.formulation == formulation)
+        cell = run_case(replace(case, how=(how,)))[0]
+        assert cell.verdict == "within", f"{case.name}: {cell.verdict}, error {cell.error:.1e}, {cell.message}"
+        assert cell.uncertainty <= 0.1 * cell.allowed
+
+
+def test_a_start_that_is_singular_to_rounding_is_refused() -> None:
+    case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-12 away")
+    cells = run_case(case)
+    assert {cell.verdict for cell in cells} == {"stopped"}
+    assert all("start elsewhere" in cell.message for cell in cells)
+
+
+def test_a_bad_q_is_left_before_the_first_step() -> None:
+    case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-04 away")
+    assert run_case(replace(case, changes={**case.changes, "solver.max_rhs": 1}, how=EVERY[:1]))[0].switches == 1
+
+
+# --- long runs -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "formulation", "changes"), LONG[2:], ids=["swing", "across type 2"])
+def test_part_of_a_long_run(name: str, formulation: str, changes: dict[str, object]) -> None:
+    """A tenth of the time, a tenth of the drift."""
+    run = long_run(name, formulation, changes, 100.0)
+    assert run.outcome == "done"
+    assert run.drift <= 1e-9
+    assert run.max_phi <= 1e-12
+    assert (run.crossings > 5) == bool(changes)
