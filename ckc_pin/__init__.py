@@ -6,7 +6,7 @@
 >>> run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
 
 Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and the three formulations),
-`control`, `simulation`, and side by side `analysis` and `view`. README.md says where each equation lives.
+`control`, `simulation`, and side by side `formats`, `analysis` and `view`. README.md says where each equation lives.
 """
 
 from __future__ import annotations

@@ -325,7 +325,7 @@ def import_(
     as_json: Json = False,
 ) -> None:
     """Take a robot from another format. Writes a mechanism.toml and a URDF, and says what was guessed and left out."""
-    from ckc_pin.mechanism import importing
+    from ckc_pin.formats import importing
 
     draft = importing.read(file)
     written = importing.write(draft, out or Path(draft.name), overwrite)
@@ -357,7 +357,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write a mechanism for another program. Says what moves otherwise there."""
-    from ckc_pin.mechanism import exporting
+    from ckc_pin.formats import exporting
 
     found = exporting.export(ckc_pin.load(mechanism), to)
     written = [] if out is None else [exporting.write(found, out, overwrite)]

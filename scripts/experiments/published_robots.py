@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ckc_pin
-from ckc_pin.mechanism.importing import read, write
+from ckc_pin.formats.importing import read, write
 from ckc_pin.mechanism.sources import resolve
 
 PACKAGE = "package://example-robot-data/robots"

@@ -12,7 +12,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, Mechanism, load
-from ckc_pin.mechanism.exporting import export
+from ckc_pin.formats.exporting import export
 from tests.contract.helpers.command import ckc
 
 # flat trees, free roots, hinges, welds, redundant rows, couplings, massless links, constant forces, springs

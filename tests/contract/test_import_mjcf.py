@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from ckc_pin.mechanism.importing import Draft, read
+from ckc_pin.formats.importing import Draft, read
 from ckc_pin.mechanism.pose import Pose
 from tests.conftest import assert_close
 

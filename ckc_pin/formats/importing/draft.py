@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.formats.importing.orientation import to_rpy
 from ckc_pin.mechanism.frames import Frames
-from ckc_pin.mechanism.importing.orientation import to_rpy
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, Frame, FrameSpec, LoopSpec, MechanismSpec, SpringSpec, Vector3

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ckc_pin.formats.importing.draft import Draft, vector
 from ckc_pin.mechanism.assembly import assemble
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame
-from ckc_pin.mechanism.importing.draft import Draft, vector
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Array, Tree
