@@ -17,7 +17,10 @@ from scripts.experiments.fuzz.record import run_motion
 ANGLE, RATE = st.floats(-3.14, 3.14), st.floats(-20, 20)
 
 
-@pytest.mark.parametrize("seed", range(8))
+ONCE_WRONG = [100193]  # an output row on another branch
+
+
+@pytest.mark.parametrize("seed", [*range(8), *ONCE_WRONG])
 def test_random_motions_of_shipped_mechanisms_are_right(seed: int) -> None:
     record = one(seed, "shipped")
     assert record.verdict in ("done", "stopped", "refused"), record

@@ -88,3 +88,22 @@ def test_the_level_is_predicted_where_its_decay_is_resolved(five_bar: Pair) -> N
         misses.append(float(np.abs(FIVE_BAR.phi(found) - w).max()))
     assert misses[1] < misses[0] / 30
     assert misses[1] < 1e-7
+
+
+def test_points_beside_the_motion_foretell_no_worse_than_the_nearest(five_bar: Pair) -> None:
+    """Points close together in time, off the motion as stages of coarse steps are, and a time far from them all."""
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        foretells = predictor(five_bar, motion(0.0)[0])
+        visited = []
+        for t in (0.0600, 0.0693, 0.07092):
+            q, q_dot = motion(t)
+            q = q + random.uniform(-0.02, 0.02, 2)
+            q_tree = FIVE_BAR.sigma(q)
+            visited.append(q_tree)
+            foretells.add(t, q_tree, FIVE_BAR.rho(q_tree) @ q_dot, np.zeros(2))
+        wanted = motion(0.055)[0]
+        truth = FIVE_BAR.sigma(wanted)
+        nearest = min(float(np.abs(q_tree - truth)[Q].max()) for q_tree in visited)
+        error = np.abs(foretells.predict(0.055, wanted, np.zeros(2)) - truth)[Z].max()
+        assert error < 10 * nearest**2

@@ -48,14 +48,11 @@ void Predictor::predict(double t, In numbers, const Chart& chart, const Core& co
   Point& base = points_[nearest];
   int chosen[nodes] = {nearest};
   double a[nodes] = {1.0}, b[nodes] = {0.0};
-  const int count = count_ ? foretelling(t, nearest, chosen, a, b) : 1;
-  step_.setZero();
-  for (int i = 0; i < count; ++i) {
-    const Point& point = points_[chosen[i]];
-    core.tree.difference(base.q_tree, point.q_tree, part_);
-    step_ += a[i] * part_;
-    core.tree.difference_rate(base.q_tree, point.q_tree, point.v_tree, part_);
-    step_ += b[i] * part_;
+  int count = count_ ? foretelling(t, nearest, chosen, a, b) : 1;
+  foretold(base, count, chosen, a, b, core);
+  if (count > 1 && missed(core) > least) {  // points of coarse steps lie beside the motion; weights magnify that
+    count = 1, chosen[0] = nearest, a[0] = 1.0, b[0] = 0.0;
+    step_.setZero();
   }
   if (!count_) chart.step(core, base.q_tree, numbers, dq_);
   for (int k = 0; k < core.d; ++k) {
@@ -74,6 +71,27 @@ void Predictor::predict(double t, In numbers, const Chart& chart, const Core& co
   core.tree.integrate(q_tree, step_);
   if (!chart.plain()) return;
   for (int k = 0; k < core.d; ++k) q_tree(core.tree.place[core.q[k]]) = numbers(k);  // to the last digit
+}
+
+// The step from a point to what some foretell.
+void Predictor::foretold(const Point& base, int count, const int* chosen, const double* a, const double* b,
+                         const Core& core) {
+  step_.setZero();
+  if (count == 1) return;
+  for (int i = 0; i < count; ++i) {
+    const Point& point = points_[chosen[i]];
+    core.tree.difference(base.q_tree, point.q_tree, part_);
+    step_ += a[i] * part_;
+    core.tree.difference_rate(base.q_tree, point.q_tree, point.v_tree, part_);
+    step_ += b[i] * part_;
+  }
+}
+
+// How far q, which is known, is from what has been foretold.
+double Predictor::missed(const Core& core) const {
+  double most = 0.0;
+  for (int k = 0; k < core.d; ++k) most = std::max(most, std::abs(dq_(k) - step_(core.q[k])));
+  return most;
 }
 
 int Predictor::foretelling(double t, int nearest, int* chosen, double* a, double* b) const {

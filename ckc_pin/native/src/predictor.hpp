@@ -32,6 +32,8 @@ class Predictor {
     bool level = false;  // w is not zero
   };
 
+  void foretold(const Point& base, int count, const int* chosen, const double* a, const double* b, const Core& core);
+  double missed(const Core& core) const;
   int foretelling(double t, int nearest, int* chosen, double* a, double* b) const;
 
   double epsilon_;
