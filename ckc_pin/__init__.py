@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Any
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
-from ckc_pin.mechanism import Mechanism, load
-from ckc_pin.mechanism.point import Point
+from ckc_pin.kinematics import load
+from ckc_pin.kinematics.point import Point
+from ckc_pin.mechanism import Mechanism
 
 if TYPE_CHECKING:
-    from ckc_pin.mechanism.mapped import SingularityMap
+    from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, as_ivp, check, load_scene, simulate
 
 __all__ = [

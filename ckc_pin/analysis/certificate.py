@@ -25,7 +25,7 @@ from ckc_pin.analysis.walk import Border, follow, least, margin, same_configurat
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import Start

@@ -16,7 +16,7 @@ from ckc_pin.analysis.walk import Border, follow, least, margin, way
 from ckc_pin.control.desired import Desired
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 

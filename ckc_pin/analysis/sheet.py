@@ -14,7 +14,7 @@ import numpy as np
 
 from ckc_pin.analysis.walk import Height, follow
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ckc_pin.analysis.singularities import EXACT, SingularPoint, SingularSystem
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 

@@ -21,9 +21,9 @@ from typing import Literal
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.assembly import assemble
+from ckc_pin.kinematics.assembly import assemble
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import RANK_TOLERANCE, choose_dependent, rank_of, scaled

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import move
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sigma import newton, predict
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Border", "Height", "follow", "least", "margin", "margin_gradient", "same_configuration", "way"]
 
-SHORTEST = 1e-6  # of a step: where shorter ones would be needed the branch ends
 GAIN = 1e-5  # of the value: what a move of the search for a least value has to gain
 FINEST = 1e-2  # of its first step: where that search ends
 
@@ -46,23 +45,8 @@ def margin_gradient(at: Kinematics) -> Array:
 
 def follow(mechanism: Mechanism, at: Kinematics, dq: Array) -> tuple[Kinematics, float]:
     """Move q by dq along the branch; return where that led and how much of the way it was, 1 for all of it."""
-    done, piece = 0.0, 1.0
-    while done < 1.0:
-        piece = min(piece, 1.0 - done)
-        trial = newton(predict(at, piece * dq), 0.0, mechanism.tolerance)
-        if trial.converged and _same_side(at, trial.at):
-            at, done, piece = trial.at, (1.0 if piece >= 1.0 - done else done + piece), 2.0 * piece
-        else:
-            piece /= 2.0
-            if piece < SHORTEST:
-                return at, done
-    return at, 1.0
-
-
-def _same_side(before: Kinematics, after: Kinematics) -> bool:
-    if before.phi_z.shape[0] != before.phi_z.shape[1]:
-        return True
-    return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
+    moved = move(at, dq, 0.0, mechanism.tolerance, anywhere=False)
+    return moved.at, moved.reached
 
 
 def way(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Array:

@@ -15,6 +15,7 @@ from ckc_pin.control.gains import require_positive_definite
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
@@ -82,7 +83,7 @@ class SetPoint:
         require_positive_definite(K_P, "K_P")
         require_positive_definite(K_V, "K_V", semi=True)
         self.K_P, self.K_V, self.q_d = K_P, K_V, q_d
-        target = mechanism.sigma(q_d)
+        target = sigma(mechanism, q_d)
         if target.verdict != "converged":
             wanted = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
             raise InputError(f"controller.q_d: the target {wanted} is {target.verdict}: {target.reason}")

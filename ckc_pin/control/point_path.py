@@ -14,11 +14,11 @@ import numpy as np
 
 from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.point import Point
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.many import integrate
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.point import Point
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import Vector3
 from ckc_pin.mechanism.toml import convert

@@ -7,7 +7,8 @@ import pinocchio as pin
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
@@ -78,7 +79,7 @@ def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> Terms | None:
     """Shorten a step until the potential energy falls, or |h| does where the energy is flat."""
     fraction = 1.0
     while fraction > 1e-8:
-        outcome = mechanism.sigma(terms.q + fraction * step, terms.at)
+        outcome = sigma(mechanism, terms.q + fraction * step, terms.at)
         if outcome.verdict == "converged":
             trial = Terms(mechanism, outcome.at, np.zeros(mechanism.n))
             flat = 1e-14 * abs(terms.potential_energy)

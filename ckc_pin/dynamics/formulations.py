@@ -11,7 +11,7 @@ import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import Factorization, null_space
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array

@@ -13,7 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -197,7 +198,7 @@ def _kinematics_at(mechanism: Mechanism, q: Mapping[str, float]) -> Kinematics:
             f"({', '.join(mechanism.coordinates)}); {partly[0]!r} alone does not fit"
         )
     wanted = mechanism.vector(q, mechanism.independent, "q")
-    found = mechanism.sigma(wanted)
+    found = sigma(mechanism, wanted)
     if found.verdict == "converged":
         return found.at
     where = ", ".join(f"{name} = {x:g}" for name, x in zip(mechanism.independent, wanted, strict=True))

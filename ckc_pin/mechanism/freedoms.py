@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.assembly import assemble
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
-
-PERTURBATION = 0.02  # rad, or of the mechanism's size: how far along the tangent a singular start is looked at
-PERTURBATIONS = 2
 
 
 @dataclass(frozen=True)
@@ -48,23 +45,23 @@ class Freedoms:
     warnings: tuple[str, ...]
 
 
-def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, accept: float) -> Freedoms:
+def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable[[Array], list[Array]]) -> Freedoms:
     """Count the freedoms at a closed configuration, and around it.
 
-    A change point or a collinear start has a smaller rank than every configuration nearby, so J is
-    also looked at a little way along its tangent space.
+    A change point or a collinear start has a smaller rank than every configuration nearby, so J is also looked at
+    there.
 
     Parameters
     ----------
     q_tree : (nq,) array
         Closed.
-    accept : float
-        Characteristic length, and the residual that counts as closed, metres.
+    nearby : callable
+        Given a basis of J's null space there, (k, n), closed configurations a small step along it.
     """
     jacobian = _scaled_at(tree, closure, q_tree)
     here = there = rank_of(jacobian)
-    for nearby in _nearby(tree, closure, q_tree, accept, jacobian, here.rank):
-        candidate = _scaled_at(tree, closure, nearby)
+    for other in nearby(np.linalg.svd(jacobian, full_matrices=True)[2][here.rank :]):
+        candidate = _scaled_at(tree, closure, other)
         report = rank_of(candidate)
         if report.rank > there.rank:
             there, jacobian = report, candidate
@@ -113,18 +110,3 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, actuated: IntArr
 
 def _scaled_at(tree: Tree, closure: Closure, q_tree: Array) -> Array:
     return scaled(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure)
-
-
-def _nearby(tree: Tree, closure: Closure, q_tree: Array, accept: float, jacobian: Array, rank: int) -> list[Array]:
-    """Closed configurations a small step along the tangent space, where there are any."""
-    _, _, directions = np.linalg.svd(jacobian, full_matrices=True)
-    tangent = directions[rank:]
-    random = np.random.default_rng(0)
-    found = []
-    for _ in range(PERTURBATIONS if len(tangent) else 0):
-        step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
-        step *= PERTURBATION / np.abs(step).max() * tree.reach
-        closed = assemble(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
-        if closed.residual <= 10 * accept:
-            found.append(closed.q_tree)
-    return found

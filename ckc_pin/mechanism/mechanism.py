@@ -5,29 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pinocchio as pin
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.assembly import Assembly, assemble
-from ckc_pin.mechanism.closure import Closure, ClosureBuilder
-from ckc_pin.mechanism.frames import Frames
-from ckc_pin.mechanism.freedoms import count_freedoms, idle_coordinates
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
-from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
+from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
-from ckc_pin.mechanism.sigma import Sigma, sigma
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
-from ckc_pin.mechanism.springs import Springs
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
-from ckc_pin.mechanism.urdf import TreeText, merge
+from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["HELD_IN_PART", "Mechanism"]
-
-EXACT = 1e-10  # |phi| in units of the mechanism's size that a closed mechanism of exact data reaches
-ROUNDED = 1e-5  # the same when the numbers in the files are rounded to six digits: 2.35619 rad is 5e-6 off
-LARGEST = 1e100  # m: squares of what is larger overflow, and their products
 
 HELD_IN_PART = (
     "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
@@ -36,19 +23,23 @@ HELD_IN_PART = (
 
 
 class Mechanism:
-    """A closed chain: everything that does not depend on the state.
+    """A closed chain: everything that does not depend on the state. `load` makes one.
 
     Parameters
     ----------
-    spec : MechanismSpec
-        The content of ``mechanism.toml``.
-    sources : Sources
-        Where the texts of its URDFs come from.
+    linkage : Linkage
+        What its files say.
+    q_tree : (nq,) array
+        The assembled configuration.
+    residual, tolerance : float
+        Largest |phi| there; largest |phi| that counts as closed.
+    freedoms : Freedoms
+        What the rank of J says there.
 
     Raises
     ------
     MechanismError
-        Unknown names, loops that cannot be closed from q_guess, coordinates that cannot serve as q.
+        Coordinates that cannot serve as q, motors on no joint.
 
     Attributes
     ----------
@@ -69,33 +60,18 @@ class Mechanism:
     warnings : list of str
     """
 
-    def __init__(self, spec: MechanismSpec, sources: Sources) -> None:
-        self.spec = spec
-        self.sources = sources
-        self.name = spec.name
-        text, urdf = merge(self._tree_texts())
-        self.warnings = list(urdf.warnings)
-        self.tree = Tree(_build_model(text, sources.name))
-        self.tree.model.gravity.linear = np.array(spec.gravity)
-        self.frames = Frames(self.tree.model)
-        builder = ClosureBuilder(self.tree, self.frames)
-        for loop in spec.loop:
-            builder.add_loop(loop)
-        mimic = [CouplingSpec(joint=a, other=b, ratio=r, offset=c) for a, b, r, c in urdf.mimic]
-        for coupling in [*spec.coupling, *mimic]:
-            builder.add_coupling(coupling)
-        self.closure: Closure = builder.build()
-        self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)
-        self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
-        if len(self.points) < len(spec.point):
-            raise MechanismError("point: two points have the same name")
-        self.size = _size(self.tree, self.closure, sources.name)
-        self.tree.measure(self.size)
-        self.coordinates = self.tree.coordinates
-        self.n = self.tree.n
-        self.warnings += self.tree.unmodelled()
-        with one_blas_thread():
-            self._assemble()
+    def __init__(self, linkage: Linkage, q_tree: Array, residual: float, tolerance: float, freedoms: Freedoms) -> None:
+        self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
+        self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
+        self.springs, self.points, self.size = linkage.springs, linkage.points, linkage.size
+        self.coordinates, self.n = self.tree.coordinates, self.tree.n
+        self.q_tree, self.residual, self.tolerance = q_tree, residual, tolerance
+        self.freedoms = freedoms
+        self.d, self.rank = freedoms.d, freedoms.rank.rank
+        self.redundant = tuple(".".join(name) for name in freedoms.redundant)
+        self.warnings = [*linkage.warnings, *freedoms.warnings]
+        self._split()
+        self._actuate()
 
     def __repr__(self) -> str:
         return f"Mechanism({self.name!r}, n={self.n}, d={self.d}, independent={list(self.independent)})"
@@ -115,30 +91,6 @@ class Mechanism:
     def rooted(self) -> tuple[str, ...]:
         """Independent coordinates that belong to free roots."""
         return tuple(name for name in self.independent if name in self.tree.free_coordinates)
-
-    def sigma(self, q: Array, start: Kinematics | None = None, w: Array | float = 0.0) -> Sigma:
-        """Return q' = sigma(q), eq. 4, on the assembly branch of `start` (default: as assembled).
-
-        Parameters
-        ----------
-        q : (d,) array
-            The independent coordinates, rad or m.
-
-        Raises
-        ------
-        InputError
-            The loops hold a free root in part: its place is no function of numbers q.
-        """
-        if self.splits_root:
-            raise InputError(f"{self.name}: {HELD_IN_PART}")
-        start = start or self.assembled
-        if self.tree.flat:
-            step = q - start.q_tree[self.tree.place[self.partition.q]]
-        else:
-            numbers = self.tree.to_coordinates(start.q_tree)
-            numbers[self.partition.q] = q
-            step = self.tree.difference(start.q_tree, self.tree.from_coordinates(numbers))[self.partition.q]
-        return sigma(start, step, w, self.tolerance)
 
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
@@ -161,97 +113,14 @@ class Mechanism:
         }
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
-        """Turn a table by coordinate into a vector.
-
-        Raises
-        ------
-        InputError
-            An unknown name, a missing one (unless `fill` is given), a value that is not finite.
-        """
-        unknown = [name for name in values if name not in names]
-        if unknown:
-            known = unknown[0] in self.coordinates and tuple(names) == tuple(self.independent)
-            says = f"{unknown[0]!r} follows from the loops" if known else f"no coordinate {unknown[0]!r} here"
-            raise InputError(f"{what}: {says}; there are {', '.join(names)}")
-        missing = [name for name in names if name not in values]
-        if missing and fill is None:
-            raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")
-        vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
-        if not np.all(np.isfinite(vector)):
-            bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
-            raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
-        return vector
+        """Turn a table by coordinate into a vector, as `Tree.vector` does."""
+        if tuple(names) == self.independent:
+            follows = next((name for name in values if name in self.dependent), None)
+            if follows is not None:
+                raise InputError(f"{what}: {follows!r} follows from the loops; there are {', '.join(names)}")
+        return self.tree.vector(values, names, what, fill)
 
     # --- construction ----------------------------------------------------------------------------
-
-    def _tree_texts(self) -> list[TreeText]:
-        spec, where = self.spec, self.sources.name
-        if (spec.urdf is None) == (not spec.tree):
-            raise InputError(f'{where}: give either urdf = "FILE" or [[tree]] entries')
-        if spec.urdf is not None:
-            return [TreeText(self.sources.text(spec.urdf), spec.urdf)]
-        return [
-            TreeText(self.sources.text(t.file), t.file, t.prefix, t.root, t.parent, t.xyz, t.rpy) for t in spec.tree
-        ]
-
-    def _assemble(self) -> None:
-        guess = self.vector(self.spec.q_guess, self.coordinates, "q_guess", fill=0.0)
-        closed = self._close(self.tree.from_coordinates(guess))
-        self.q_tree = closed.q_tree
-        self.residual = closed.residual
-        lengths = bool(np.all(self.closure.in_metres(self.tree)))
-        rounding = 1e-13 * (self.size if lengths else max(self.size, 1.0))
-        self.tolerance = rounding if closed.residual <= EXACT * self.size else 10 * closed.residual
-        self.freedoms = count_freedoms(self.tree, self.closure, self.q_tree, max(self.tolerance, rounding))
-        self.d, self.rank = self.freedoms.d, self.freedoms.rank.rank
-        self.redundant = tuple(".".join(name) for name in self.freedoms.redundant)
-        self.warnings += self.freedoms.warnings
-        self._split()
-        self._actuate()
-
-    def _close(self, start: Array) -> Assembly:
-        """Assemble with the independent coordinates held at their guess; if that fails, with all free."""
-        closed: Assembly | None = None
-        scale = self.size
-        if self.spec.independent is not None:
-            free = np.ones(self.n)
-            free[self.tree.indices(tuple(self.spec.independent), "independent")] = 0.0
-            closed = assemble(self.tree, self.closure, start, free, EXACT * scale)
-        if closed is None or closed.residual > ROUNDED * scale:
-            closed = assemble(self.tree, self.closure, start, np.ones(self.n), EXACT * scale)
-        if closed.residual > ROUNDED * scale:
-            raise MechanismError(f"{self.sources.name}: {self._why_not_closed(closed, start)}")
-        reversed_ = self.closure.reversed_hinges(Pose(self.tree, self.closure.anchors, closed.q_tree))
-        if reversed_:
-            raise MechanismError(
-                f"{self.sources.name}: loop {reversed_[0]!r} closes with its axes against each other (a . b < 0); "
-                "turn axis_b around, or give a [q_guess] on the other branch"
-            )
-        if closed.residual > EXACT * scale:
-            self.warnings.append(
-                f"the loops close to {closed.residual:.2g} only, not to rounding: "
-                "numbers in the files are rounded, or redundant rows contradict each other slightly"
-            )
-        return closed
-
-    def _why_not_closed(self, best: Assembly, start: Array) -> str:
-        """Name the loop with the largest miss, loops that cannot close even alone, and what to do."""
-        loop, miss = max(best.misses.items(), key=lambda item: item[1])
-        message = f"not closed: nearest miss {miss:.3g} m at loop {loop}"
-        if miss > 1000 * self.size:
-            return f"{message}, {miss / self.size:.0f} times the mechanism's size of {self.size:.3g} m: units?"
-        alone = []
-        for name in dict.fromkeys(name for name, _ in self.closure.names):
-            single = self.closure.only(name)
-            closed = assemble(self.tree, single, start, np.ones(self.n), EXACT * self.size)
-            if closed.residual > ROUNDED * self.size:
-                alone.append(f"{name} (miss {closed.residual:.3g})")
-        if alone:
-            message += f"; cannot close even alone: {', '.join(alone)}"
-        elif len(best.misses) > 1:
-            others = ", ".join(f"{k} {x:.3g}" for k, x in best.misses.items() if x > ROUNDED * self.size)
-            message += f"; each loop closes alone, together they contradict each other ({others})"
-        return f"{message}. Check the loops' frames and types, or give a [q_guess] nearer to a closed configuration"
 
     def _split(self) -> None:
         """Choose q and z, or check the choice made."""
@@ -307,21 +176,3 @@ class Mechanism:
         if self.freedoms.singular or not self.d:
             return np.zeros((self.n, 0))
         return self.assembled.rho
-
-
-def _build_model(text: str, source: str) -> pin.Model:
-    try:
-        return pin.buildModelFromXML(text)
-    except (ValueError, RuntimeError) as error:
-        raise MechanismError(f"{source}: Pinocchio cannot build this tree: {error}") from None
-
-
-def _size(tree: Tree, closure: Closure, source: str) -> float:
-    """Characteristic length: the largest offset between joints, or from a joint to a loop's point, metres."""
-    offsets = [placement.translation for placement in tree.model.jointPlacements]
-    parts = np.array([*offsets, *closure.anchors.point_local]).reshape(-1, 3)
-    if not np.abs(parts).max(initial=0.0) <= LARGEST:
-        raise MechanismError(
-            f"{source}: offsets of joints or loops of {np.abs(parts).max():g} m, more than {LARGEST:g}: units?"
-        )
-    return float(np.linalg.norm(parts, axis=1).max(initial=0.0)) or 1.0

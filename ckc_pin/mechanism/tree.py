@@ -10,7 +10,7 @@ anyway, and a workspace for each thread would take memory by the gigabyte.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from threading import RLock
 from typing import Any
 
@@ -240,6 +240,26 @@ class Tree:
             if name not in self.index:
                 raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
         return np.array([self.index[name] for name in names], dtype=np.intp)
+
+    def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
+        """Turn a table by coordinate into a vector.
+
+        Raises
+        ------
+        InputError
+            An unknown name, a missing one (unless `fill` is given), a value that is not finite.
+        """
+        unknown = next((name for name in values if name not in names), None)
+        if unknown is not None:
+            raise InputError(f"{what}: no coordinate {unknown!r} here; there are {', '.join(names)}")
+        missing = [name for name in names if name not in values]
+        if missing and fill is None:
+            raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")
+        vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
+        if not np.all(np.isfinite(vector)):
+            bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
+            raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
+        return vector
 
     def one_freedom(self, joint: str, where: str) -> int:
         """Return where a joint of one freedom stands; MechanismError names those there are."""

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.mechanism.branches import assembly_branches
-from ckc_pin.mechanism.library import is_path, load
+from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism

@@ -8,9 +8,9 @@ import numpy as np
 
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import newton, sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
@@ -83,7 +83,7 @@ def _branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
 
 
 def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinematics:
-    found = mechanism.sigma(q, start, w)
+    found = sigma(mechanism, q, start, w)
     if found.verdict == "converged":
         _refuse_contradiction(mechanism, found.at, w)
         return found.at

@@ -34,10 +34,10 @@ from ckc_pin.dynamics.formulations import (
 )
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.chart import Chart
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.chart import Chart
+from ckc_pin.kinematics.sigma import move
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sigma import sigma
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
@@ -160,12 +160,12 @@ class LevelSet:
     def close(self, t: float, numbers: Array) -> Kinematics:
         """Return the configuration at q on the level set phi(q, z) = w(t)."""
         step = self._chart.step(self._last.q_tree, numbers)
-        found = sigma(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
+        found = move(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
         self.counts["newton"] += found.iterations
         if found.verdict != "converged":
             tree = self.mechanism.tree
             where = tree.named(tree.to_coordinates(found.at.q_tree))
-            raise NumericalError(f"sigma(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
+            raise NumericalError(f"move(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
         self._last = found.at
         return found.at
 

@@ -11,7 +11,7 @@ from ckc_pin.control.actuation import require_u
 from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array

@@ -19,7 +19,8 @@ from ckc_pin.control.controllers import Controller, SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.library import load, mechanism_file
+from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.library import MECHANISM_FILE, build
+from ckc_pin.kinematics.loading import build
+from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array

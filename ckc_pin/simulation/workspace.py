@@ -8,7 +8,8 @@ import numpy as np
 
 from ckc_pin.control.desired import Desired
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["DesiredCheck", "follow_desired"]
@@ -39,7 +40,7 @@ class DesiredCheck:
 def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> DesiredCheck:
     """Follow sigma(q_d(t)) over a run and find where it comes closest to a singular configuration."""
     times = np.linspace(0.0, t_end, SAMPLES + 1)
-    first = mechanism.sigma(desired(0.0)[0])
+    first = sigma(mechanism, desired(0.0)[0])
     if first.verdict != "converged":
         return DesiredCheck(0.0, 0.0, 0.0)
     at, t_at = first.at, 0.0
@@ -58,7 +59,7 @@ def _move(mechanism: Mechanism, at: Kinematics, desired: Desired, t: float) -> K
         q = desired(t)[0]
     except NumericalError:  # a point's path has no q outside the workspace
         return None
-    outcome = mechanism.sigma(q, at)
+    outcome = sigma(mechanism, q, at)
     return outcome.at if outcome.verdict == "converged" else None
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
@@ -78,7 +79,7 @@ def desired_poses(run: Run, rows: IntArray) -> Poses | None:
     at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[rows[0]]))
     poses, exists = [], []
     for q_d in wanted.q[rows]:
-        found = mechanism.sigma(q_d, at)
+        found = sigma(mechanism, q_d, at)
         exists.append(found.verdict == "converged")
         at = found.at if exists[-1] else at
         poses.append(at.q_tree)

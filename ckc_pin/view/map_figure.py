@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.mapped import LABELS, Axis, Kind, Locus, SingularityMap
+from ckc_pin.kinematics.mapped import LABELS, Axis, Kind, Locus, SingularityMap
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.view import style

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
@@ -252,7 +253,7 @@ def linkage(ax: Any, group: Group) -> None:
     start = mechanism.tree.from_coordinates(run.q_tree[0])
     poses = [(start, INITIAL)]
     for _, wanted in group.desired:
-        target = mechanism.sigma(wanted.q[-1])
+        target = sigma(mechanism, wanted.q[-1])
         if target.verdict == "converged":
             poses.append((target.at.q_tree, TARGET))
     for q_tree, colour in poses:

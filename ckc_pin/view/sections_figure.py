@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ckc_pin.mechanism.mapped import SingularityMap
+from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.view.labels import plain
 from ckc_pin.view.map_figure import det_label, draw_sheet, handles, look, write
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.mechanism.extended import extend
+from ckc_pin.kinematics.extended import extend
 from ckc_pin.mechanism.many import evaluate, integrate, joined
 from tests.conftest import assert_close
 

@@ -6,7 +6,7 @@ import pytest
 from ckc_pin import InputError, load
 from ckc_pin.analysis.map import map_plain, singularity_map
 from ckc_pin.analysis.map.loci import LocusSystem
-from ckc_pin.mechanism.extended import extend
+from ckc_pin.kinematics.extended import extend
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR
 from tests.conftest import assert_close
 

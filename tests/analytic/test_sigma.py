@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ckc_pin.mechanism import Psi, sigma
+from ckc_pin.kinematics.sigma import move, sigma
+from ckc_pin.mechanism import Psi
 from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
 from tests.conftest import Pair, assert_close
 
@@ -55,7 +56,7 @@ def test_sigma_is_the_two_circles_on_the_branch_of_the_start(pair: Pair) -> None
     nearest, reach = abs(reference.l[1] - reference.l[3]), reference.l[1] + reference.l[3]
     for q in random_q(2, 200):
         if nearest + 1e-3 < elbow_distance(reference, q) < reach - 1e-3:
-            found = mechanism.sigma(q)
+            found = sigma(mechanism, q)
             assert found.verdict == "converged", f"sigma({q}): {found.reason}"
             assert_close(turned(found.at.q_tree - reference.sigma(q)), 0, 1e-11)
             assert_close(found.at.q_tree[Q], q, 1e-14)
@@ -67,7 +68,7 @@ def test_sigma_on_a_moved_level_set(pair: Pair) -> None:
     mechanism, reference = pair
     w = np.array([0.01, -0.006])
     for q in mechanism.q_tree[Q] + np.random.default_rng(3).uniform(-0.5, 0.5, (50, 2)):
-        found = mechanism.sigma(q, w=w)
+        found = sigma(mechanism, q, w=w)
         assert found.verdict == "converged"
         assert_close(reference.phi(found.at.q_tree), w, 1e-12)
         assert reference.s(found.at.q_tree) > 0
@@ -81,11 +82,11 @@ def test_sigma_follows_from_level_to_level(pair: Pair) -> None:
     w = np.array([-away, 0.0])
     moved = replace(reference, base=reference.base - away)
     for dq in ([0.0, 0.0], [-0.05, 0.02]):
-        start = mechanism.sigma(q).at
-        there = sigma(start, np.array(dq), w, mechanism.tolerance, anywhere=False)
+        start = sigma(mechanism, q).at
+        there = move(start, np.array(dq), w, mechanism.tolerance, anywhere=False)
         assert there.verdict == "converged"
         assert_close(turned(there.at.q_tree - moved.sigma(q + dq)), 0, 1e-11)
-        back = sigma(there.at, -np.array(dq), 0.0, mechanism.tolerance, anywhere=False)
+        back = move(there.at, -np.array(dq), 0.0, mechanism.tolerance, anywhere=False)
         assert back.verdict == "converged"
         assert_close(turned(back.at.q_tree - reference.sigma(q)), 0, 1e-11)
 
@@ -94,7 +95,7 @@ def test_sigma_from_the_other_branch_stays_there(pair: Pair) -> None:
     mechanism, reference = pair
     start = mechanism.kinematics(reference.sigma(mechanism.q_tree[Q], branch=-1))
     for q in mechanism.q_tree[Q] + np.random.default_rng(4).uniform(-0.5, 0.5, (50, 2)):
-        found = mechanism.sigma(q, start)
+        found = sigma(mechanism, q, start)
         assert found.verdict == "converged"
         assert_close(turned(found.at.q_tree - reference.sigma(q, branch=-1)), 0, 1e-11)
 
@@ -106,7 +107,7 @@ def test_out_of_reach_is_said_with_the_miss(pair: Pair) -> None:
     for q in random_q(5, 60):
         gap = elbow_distance(reference, q) - reach
         if gap > 1e-3:
-            found = mechanism.sigma(q)
+            found = sigma(mechanism, q)
             seen += 1
             assert found.verdict == "out of reach"
             assert 0 < found.reached < 1
@@ -122,7 +123,7 @@ def test_sigma_close_to_the_outer_singularity(pair: Pair, inside: float) -> None
     """Type 2: links 2 and 4 all but in line; z is then as the square root of the distance, and sigma finds it."""
     mechanism, reference = pair
     q = near_type_2(pair, inside)
-    found = mechanism.sigma(q)
+    found = sigma(mechanism, q)
     assert found.verdict == "converged"
     closed = reference.sigma(q)
     assert_close(turned(found.at.q_tree - closed), 0, 1e-12 / abs(reference.s(closed)))
@@ -131,7 +132,7 @@ def test_sigma_close_to_the_outer_singularity(pair: Pair, inside: float) -> None
 @pytest.mark.parametrize("outside", [1e-3, 1e-5, 1e-7])
 def test_just_outside_is_out_of_reach(pair: Pair, outside: float) -> None:
     mechanism, _ = pair
-    assert mechanism.sigma(near_type_2(pair, -outside)).verdict == "out of reach"
+    assert sigma(mechanism, near_type_2(pair, -outside)).verdict == "out of reach"
 
 
 def test_coincident_elbows_are_singular(five_bar: Pair) -> None:
@@ -140,14 +141,14 @@ def test_coincident_elbows_are_singular(five_bar: Pair) -> None:
     for sign in (1, -1):
         q = sign * coincident_elbows(reference)
         assert_close(q, sign * TYPE_1, 5.1e-7)
-        assert mechanism.sigma(q).verdict == "singular"
+        assert sigma(mechanism, q).verdict == "singular"
 
 
 def test_elbows_cannot_coincide_as_printed(pair: Pair) -> None:
     """Erratum 3: with |l2 - l4| = 0.0254 the same q is out of reach."""
     mechanism, reference = pair
     if reference.l[1] != reference.l[3]:
-        assert mechanism.sigma(coincident_elbows(reference)).verdict == "out of reach"
+        assert sigma(mechanism, coincident_elbows(reference)).verdict == "out of reach"
 
 
 def near_type_2(pair: Pair, inside: float) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin import load
-from ckc_pin.mechanism import library as shelf
+from ckc_pin.kinematics import loading
 from ckc_pin.mechanism.library import library
 
 
@@ -18,8 +18,8 @@ def mine(folder: Path, name: str = "five_bar") -> Path:
 
 
 def test_it_is_built_once(tmp_path: Path, monkeypatch) -> None:
-    built, build = [], shelf._build
-    monkeypatch.setattr(shelf, "_build", lambda *given: built.append(1) or build(*given))
+    built, assembled = [], loading.assembled
+    monkeypatch.setattr(loading, "assembled", lambda *given: built.append(1) or assembled(*given))
     path = mine(tmp_path)
     first, again = load(path), load(path)
     assert len(built) == 1
@@ -70,8 +70,14 @@ def test_two_have_two_workspaces() -> None:
     assert other.springs.tree is other.tree
 
 
-def test_only_so_many_are_kept(tmp_path: Path) -> None:
-    for k in range(shelf.MOST_KEPT + 3):
-        load(mine(tmp_path / str(k), "slider_crank"))
-    assert len(shelf._built) == shelf.MOST_KEPT
-    assert not any(hasattr(built.tree, "data") for built in shelf._built.values())
+def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
+    """What was loaded long ago is built again, what was loaded lately is copied."""
+    paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.MOST_KEPT + 3)]
+    for path in paths:
+        load(path)
+    built, assembled = [], loading.assembled
+    monkeypatch.setattr(loading, "assembled", lambda *given: built.append(1) or assembled(*given))
+    load(paths[-1]), load(paths[3])
+    assert not built
+    load(paths[0])
+    assert len(built) == 1

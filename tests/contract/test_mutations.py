@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from ckc_pin import CkcError, Run, check, load, simulate
+from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.library import library
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert
@@ -99,7 +99,7 @@ def test_mechanisms(name: str) -> None:
 
 def _check(data: Any, name: str, folder: Path) -> None:
     by_coordinate(data, "q_guess")
-    check(Mechanism(convert(data, MechanismSpec, name), Sources(name, folder)))
+    check(assembled(convert(data, MechanismSpec, name), Sources(name, folder)))
 
 
 @pytest.mark.parametrize("file", ["five_bar.urdf", "mechanism.toml", "swing.scene.toml"])

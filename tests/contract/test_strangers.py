@@ -18,6 +18,7 @@ import pytest
 import ckc_pin
 from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
 from ckc_pin.formats.importing.mjcf_inertia import _uniform
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.whole_file import UNFINISHED, written_whole
 
 # --- numbers -----------------------------------------------------------------------------------------
@@ -70,7 +71,7 @@ def test_lengths_whose_squares_overflow_are_refused(bar: Path) -> None:
 def test_a_start_a_thousand_turns_away_is_found_without_the_way() -> None:
     """Newton's method went there step by step, whatever the number."""
     far = 2 * np.pi * 10**5 + load("four_bar").assembled.q_tree[0]
-    assert load("four_bar").sigma(np.array([far])).iterations < 6000
+    assert sigma(load("four_bar"), np.array([far])).iterations < 6000
 
 
 def test_a_capsule_without_volume_is_a_rod() -> None:

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ckc_pin
+from ckc_pin.kinematics.sigma import sigma
 from scripts.experiments.fuzz.main import drawn, one
 from scripts.experiments.fuzz.motions import Motion
 from scripts.experiments.fuzz.record import run_motion
@@ -37,7 +38,7 @@ def test_random_motions_of_random_mechanisms_are_right(seed: int) -> None:
 def test_the_five_bar_moves_right_from_anywhere(
     q_1: float, q_3: float, rate_1: float, rate_3: float, digits: float, formulation: str
 ) -> None:
-    if ckc_pin.load("five_bar").sigma(np.array([q_1, q_3])).verdict != "converged":
+    if sigma(ckc_pin.load("five_bar"), np.array([q_1, q_3])).verdict != "converged":
         return
     changes = {
         "formulation": formulation,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, Z
@@ -78,7 +79,7 @@ def test_the_level_is_predicted_where_its_decay_is_resolved(five_bar: Pair) -> N
         for k in range(NODES):
             q, q_dot = motion(k * h)
             w = w0 * np.exp(-k * h / epsilon)
-            at = mechanism.sigma(q, w=w).at
+            at = sigma(mechanism, q, w=w).at
             v_tree = FIVE_BAR.rho(at.q_tree) @ q_dot
             v_tree[Z] += np.linalg.solve(FIVE_BAR.phi_z(at.q_tree), -w / epsilon)
             foretells.add(k * h, at.q_tree, v_tree, w)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from ckc_pin.dynamics import Terms, dae_acceleration, reduced_acceleration
-from ckc_pin.mechanism.library import load, shipped
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.library import shipped
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
 
@@ -28,7 +30,7 @@ def _closed(terms):
     mechanism = terms.mechanism
     at = mechanism.kinematics(mechanism.q_tree)
     q = mechanism.independent_part(0.9 * at.q_tree + 0.1 * terms.q_tree)
-    found = mechanism.sigma(q, at)
+    found = sigma(mechanism, q, at)
     assert found.verdict == "converged"
     return Terms(mechanism, found.at, terms.v_tree)
 

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ckc_pin.dynamics import Terms
+from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType, MechanismSpec, SpringSpec, TreeSpec
@@ -45,7 +47,7 @@ class Closed:
         at = mechanism.assembled
         while spread > 1e-3:
             step = at.rho @ random.uniform(-spread, spread, mechanism.d)
-            found = mechanism.sigma(mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
+            found = sigma(mechanism, mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
             near = np.abs(found.at.rho).max() < LARGEST_RHO and found.at.sigma_min() > LEAST_SIGMA
             if found.verdict == "converged" and near:
                 v_tree = found.at.rho @ random.uniform(-1, 1, mechanism.d)
@@ -92,7 +94,7 @@ def closed_mechanism(
         spring=SPRINGS,
     )
     texts = {prefix: world.urdf(prefix) for prefix in world.stands}
-    return Closed(Mechanism(spec, Sources("a random world", None, texts)), world, q)
+    return Closed(assembled(spec, Sources("a random world", None, texts)), world, q)
 
 
 def _closing_loop(kind: LoopType, world: World, q: Numbers) -> LoopSpec:

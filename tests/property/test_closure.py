@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ckc_pin.mechanism.closure import ClosureBuilder
+from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.frames import Frames
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
 from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, merge

@@ -8,8 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ckc_pin.dynamics import Terms, dae_acceleration, h_gradient, multipliers, reduced_acceleration, tangent_basis
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Kinematics
-from ckc_pin.mechanism.kinematics import Partition
+from ckc_pin.mechanism.configuration import Partition
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
 from tests.property.mechanisms import Closed, along, closed_mechanism
@@ -47,7 +48,7 @@ def test_rho_spans_the_null_space_of_J(closed: Closed) -> None:
 @given(every_mechanism)
 def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
     at = closed.near().at
-    again = closed.mechanism.sigma(closed.mechanism.independent_part(at.q_tree))
+    again = sigma(closed.mechanism, closed.mechanism.independent_part(at.q_tree))
     assert again.verdict == "converged"
     assert_close(at.phi, 0, closed.mechanism.tolerance)
     assert_close(closed.mechanism.tree.difference(again.at.q_tree, at.q_tree), 0, 1e-11)
@@ -224,7 +225,7 @@ def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None
     q = mechanism.independent_part(at.q_tree)
 
     def h(x: Array) -> Array:
-        found = mechanism.sigma(x, at)
+        found = sigma(mechanism, x, at)
         assert found.verdict == "converged"
         return Terms(mechanism, found.at, np.zeros(mechanism.n)).h
 

@@ -14,10 +14,11 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.following import shapes
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.mapped import Approach, Locus, Path
+from ckc_pin.kinematics.nodes import shapes
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.many import evaluate
-from ckc_pin.mechanism.mapped import Approach, Locus, Path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
@@ -128,7 +129,7 @@ class _Follower:
         rows = self.domain.task.rows[self.domain.over]
         if not self.cartesian:
             return q[self.domain.over]
-        self.at = self.mechanism.sigma(q, self.at).at
+        self.at = sigma(self.mechanism, q, self.at).at
         self.passed.append(self.at.q_tree)
         told, _ = evaluate(self.mechanism.tree, self.domain.task.extended.closure, self.at.q_tree[None])
         return np.asarray(told[0, rows])

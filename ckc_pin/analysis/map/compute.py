@@ -15,11 +15,11 @@ from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.sheet import HURRIED, fill
 from ckc_pin.analysis.map.value import located, map_value, name_of
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.extended import Extended, Task, extend, find_point
-from ckc_pin.mechanism.following import nodes_at, solutions
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.mapped import Axis, SingularityMap
+from ckc_pin.kinematics.nodes import nodes_at, solutions
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.mapped import Axis, SingularityMap
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.scene import Scene, load_scene

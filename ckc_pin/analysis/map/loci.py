@@ -17,11 +17,11 @@ from ckc_pin.analysis.map.progress import Steps
 from ckc_pin.analysis.map.sheet import Grid
 from ckc_pin.analysis.singular_curve import SingularCurve, trace
 from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
-from ckc_pin.mechanism.extended import Extended
-from ckc_pin.mechanism.following import shapes
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.extended import Extended
+from ckc_pin.kinematics.mapped import Kind, Locus
+from ckc_pin.kinematics.nodes import shapes
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.many import evaluate
-from ckc_pin.mechanism.mapped import Kind, Locus
 from ckc_pin.mechanism.rank import rank_of, scaled
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 

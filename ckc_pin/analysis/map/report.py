@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from ckc_pin.mechanism.mapped import LABELS, Locus, Path, SingularityMap
+from ckc_pin.kinematics.mapped import LABELS, Locus, Path, SingularityMap
 
 __all__ = ["map_plain", "map_table", "sections_plain", "sections_table"]
 

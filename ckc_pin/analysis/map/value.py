@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from ckc_pin.analysis.map.sheet import Grid
-from ckc_pin.mechanism.extended import Extended, Task
+from ckc_pin.kinematics.extended import Extended, Task
+from ckc_pin.kinematics.mapped import Locus, Path, Sheet, SingularityMap, Space
 from ckc_pin.mechanism.many import ManyPoses
-from ckc_pin.mechanism.mapped import Locus, Path, Sheet, SingularityMap, Space
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 

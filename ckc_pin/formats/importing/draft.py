@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.importing.orientation import to_rpy
+from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
@@ -109,7 +110,7 @@ class Draft:
         MechanismError
             Loops that do not close, `independent` that cannot serve.
         """
-        return Mechanism(self.spec(), Sources(self.name, None, {self.urdf_file: self.urdf()}))
+        return assembled(self.spec(), Sources(self.name, None, {self.urdf_file: self.urdf()}))
 
 
 def frame(link: str, pose: pin.SE3) -> Frame:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ckc_pin.formats.importing.draft import Draft, vector
-from ckc_pin.mechanism.assembly import assemble
+from ckc_pin.kinematics.assembly import assemble
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.pose import Pose

@@ -21,6 +21,7 @@ import numpy as np
 from ckc_pin.dynamics.formulations import multipliers
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import CkcError, NumericalError
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import Ivp, as_ivp
@@ -75,7 +76,7 @@ Probe = Callable[[Terms, Terms], Any]  # of the state, and of the one before it
 
 
 def _sigma(terms: Terms, before: Terms) -> Any:
-    return terms.mechanism.sigma(terms.q, before.at)
+    return sigma(terms.mechanism, terms.q, before.at)
 
 
 def _multipliers(terms: Terms, before: Terms) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array
@@ -114,7 +115,7 @@ def _start(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -
     here = mechanism.independent_part(mechanism.q_tree)
     for attempt in range(12):  # nearer and nearer
         there = here + random.uniform(-1, 1, mechanism.d) * about.spread * unit * 0.75**attempt
-        found = mechanism.sigma(there)
+        found = sigma(mechanism, there)
         if found.verdict == "converged":
             return there, q_dot
     return here, q_dot

@@ -12,6 +12,7 @@ import numpy as np
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.errors import InputError
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
@@ -92,7 +93,7 @@ def _least_det(mechanism: Mechanism, desired: Desired, t_end: float) -> tuple[fl
     last = [mechanism.assembled]
 
     def det(t: float) -> float:
-        last[0] = mechanism.sigma(desired(t)[0], last[0]).at
+        last[0] = sigma(mechanism, desired(t)[0], last[0]).at
         return abs(float(np.linalg.det(last[0].phi_z)))
 
     t = _least(det, t_end)

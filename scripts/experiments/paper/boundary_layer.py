@@ -14,7 +14,8 @@ import numpy as np
 
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene
@@ -102,7 +103,7 @@ def eigenvalues_around(mechanism: Mechanism, at: Kinematics, radius: float, coun
     q = mechanism.independent_part(at.q_tree)
     values = np.full((count, len(at.partition.z)), np.nan, dtype=complex)
     for k, direction in enumerate(directions(mechanism.closure.rows, count)):
-        found = mechanism.sigma(q, at, radius * direction)
+        found = sigma(mechanism, q, at, radius * direction)
         if found.verdict == "converged":
             values[k] = np.linalg.eigvals(eq_13(found.at))
     return values

@@ -15,9 +15,9 @@ import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import newton
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import Force, Ivp, LevelSet
 from ckc_pin.simulation.scene import load_scene

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.analysis.singularities import search_singular
-from ckc_pin.mechanism.kinematics import Kinematics, Psi
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics, Psi
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import PrintedSpf
@@ -109,7 +110,7 @@ def off_manifold(mechanism: Mechanism, *, reachable: bool, count: int = STARTS, 
     for _ in range(1000):
         step = random.uniform(-np.pi, np.pi, mechanism.n)
         at = mechanism.kinematics(mechanism.tree.integrate(mechanism.q_tree, step))
-        verdict = mechanism.sigma(mechanism.independent_part(at.q_tree)).verdict
+        verdict = sigma(mechanism, mechanism.independent_part(at.q_tree)).verdict
         if verdict != ("converged" if reachable else "out of reach"):
             continue
         span = (0.0, LAYERS * EPSILON)

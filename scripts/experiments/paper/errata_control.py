@@ -10,7 +10,8 @@ import numpy as np
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import LevelSet
 from ckc_pin.simulation.prepare import scene_controller
@@ -87,7 +88,7 @@ def equilibrium_sign() -> Erratum:
     for _ in range(50):
         q = mechanism.independent_part(at.q_tree)
         force = K_P @ (q_d - q) + h_d - Terms(mechanism, at, np.zeros(4)).h
-        at = mechanism.sigma(q + np.linalg.solve(K_P + h_gradient(mechanism, at), force), at).at
+        at = sigma(mechanism, q + np.linalg.solve(K_P + h_gradient(mechanism, at), force), at).at
     q = mechanism.independent_part(at.q_tree)
     h = Terms(mechanism, at, np.zeros(4)).h
     return Erratum(
@@ -154,7 +155,7 @@ def rate_on_trajectory() -> Erratum:
     """Eq. 19's last line, as printed, is negative where V is zero."""
     problem, controller = _tracking()
     q_d, q_d_dot, _ = controller.desired(T)
-    found = problem.mechanism.sigma(q_d)
+    found = sigma(problem.mechanism, q_d)
     reduced = replace(problem, at=found.at, q_dot=q_d_dot).reduced()
     measured = _rate(reduced, T, np.concatenate([q_d, q_d_dot]), _reported(reduced, controller))
     return Erratum(

@@ -7,7 +7,7 @@ import numpy as np
 from ckc_pin.analysis.singularities import search_singular
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene

@@ -6,7 +6,8 @@ import numpy as np
 
 from ckc_pin.dynamics.formulations import CoriolisVelocity, spf_terms
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene
@@ -32,7 +33,7 @@ def fast_error() -> Erratum:
         step = np.zeros(mechanism.n)
         step[mechanism.partition.q], step[z] = t * Q_DOT, t * z_dot
         moved = mechanism.tree.integrate(at.q_tree, step)
-        return (moved - mechanism.sigma(mechanism.independent_part(moved), on).at.q_tree)[z]
+        return (moved - sigma(mechanism, mechanism.independent_part(moved), on).at.q_tree)[z]
 
     short = STEP * EPSILON
     truth = EPSILON * (y(short) - y(-short)) / (2 * short)

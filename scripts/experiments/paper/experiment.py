@@ -17,8 +17,9 @@ from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.kinematics import Kinematics
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -104,7 +105,7 @@ def five_bar_problem(moving: bool) -> Problem:
     """Free motion of the five-bar, theta_1 and theta_3 half a radian past the equilibrium, from rest or moving."""
     mechanism = load("five_bar")
     equilibrium = stable_equilibrium(mechanism)
-    start = mechanism.sigma(mechanism.independent_part(equilibrium.q_tree) + OFFSET, equilibrium)
+    start = sigma(mechanism, mechanism.independent_part(equilibrium.q_tree) + OFFSET, equilibrium)
     return Problem.free(mechanism, start.at, MOVING if moving else np.zeros(mechanism.d))
 
 
@@ -145,7 +146,7 @@ def on_level(mechanism: Mechanism, at: Kinematics, w: Array) -> Kinematics:
     NumericalError
         There is none on this branch.
     """
-    found = mechanism.sigma(mechanism.independent_part(at.q_tree), at, w)
+    found = sigma(mechanism, mechanism.independent_part(at.q_tree), at, w)
     if found.verdict != "converged":
         raise NumericalError(f"no z with phi = {np.asarray(w).tolist()} at this q: {found.reason}")
     return found.at

@@ -17,7 +17,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Model, Tracking
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import LevelSet, force_of

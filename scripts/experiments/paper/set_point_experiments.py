@@ -16,7 +16,7 @@ from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.branches import assembly_branches
+from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism

@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin.analysis.singular_curve import SingularCurve, trace_singular
 from ckc_pin.analysis.singularities import SingularPoint, search_singular
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from ckc_pin import Run, load
-from ckc_pin.mechanism.kinematics import Psi
+from ckc_pin.mechanism.configuration import Psi
 from scripts.experiments.paper.along_eq21 import approach, tracking
 from scripts.experiments.paper.domain import check_psi, off_manifold
 from scripts.experiments.paper.five_bar import elbow_distance, links

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.library import load
+from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import Scene, load_scene

@@ -17,7 +17,9 @@ from ckc_pin.control import SetPoint
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.branches import assembly_branches
+from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.simulation.initial import Start
@@ -53,11 +55,11 @@ def pendulum(links: int) -> Mechanism:
         parent, x = f"rod{k}", 1.0
     spec = MechanismSpec(name="pendulum", urdf="p.urdf", gravity=(0.0, -G, 0.0))
     urdf = f'<robot name="p">{"".join(parts)}</robot>'
-    return Mechanism(spec, Sources("pendulum", None, {"p.urdf": urdf}))
+    return assembled(spec, Sources("pendulum", None, {"p.urdf": urdf}))
 
 
 def at_rest(mechanism: Mechanism, q: list[float]) -> Start:
-    found = mechanism.sigma(np.array(q))
+    found = sigma(mechanism, np.array(q))
     assert found.verdict == "converged"
     return Start(found.at, np.zeros(mechanism.d), np.zeros(mechanism.closure.rows))
 
@@ -142,7 +144,7 @@ def test_bound_along_a_trajectory(five_bar: Pair) -> None:
 def test_margin_is_the_sine_between_the_distal_links(five_bar: Pair) -> None:
     mechanism, numpy_twin = five_bar
     for q in np.random.default_rng(1).uniform(-0.8, 0.8, (10, 2)):
-        at = mechanism.sigma(q).at
+        at = sigma(mechanism, q).at
         assert_close(margin(at), abs(numpy_twin.s(numpy_twin.sigma(q))), 1e-12)
         s = [[abs(numpy_twin.s(numpy_twin.sigma(q + sign * 1e-5 * e))) for sign in (1, -1)] for e in np.eye(2)]
         assert_close(margin_gradient(at), [(a - b) / 2e-5 for a, b in s], 1e-8)
@@ -190,7 +192,7 @@ def test_least_goes_down_to_a_constrained_minimum() -> None:
     mechanism = pendulum(2)
     found = least(
         mechanism,
-        mechanism.sigma(np.array([1.0, 1.0])).at,
+        sigma(mechanism, np.array([1.0, 1.0])).at,
         lambda at: float(1 + np.sum(at.q_tree**2)),
         np.full(2, 0.1),
         lambda at: at if at.q_tree[0] >= 0.5 else None,
@@ -200,7 +202,7 @@ def test_least_goes_down_to_a_constrained_minimum() -> None:
 
 def test_follow_stops_where_the_loops_cannot_close(five_bar: Pair) -> None:
     mechanism, _ = five_bar
-    at, reached = follow(mechanism, mechanism.sigma(np.array([0.0, 0.5])).at, np.array([3.0, -0.5]))
+    at, reached = follow(mechanism, sigma(mechanism, np.array([0.0, 0.5])).at, np.array([3.0, -0.5]))
     assert 0 < reached < 1
     assert margin(at) < 0.01
     back, whole = follow(mechanism, at, np.array([0.0, 0.5]) - mechanism.independent_part(at.q_tree))

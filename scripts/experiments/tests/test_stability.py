@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin.mechanism import load
+from ckc_pin.kinematics import load
 from scripts.experiments.stability import equations
 from scripts.experiments.stability.cases import EVERY, GROUPS, PAPER, SWING
 from scripts.experiments.stability.cell import Case, Cell, How, run_case

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.many import evaluate, joined
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors

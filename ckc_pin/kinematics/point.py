@@ -9,14 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.kinematics.continuation import follow, same_branch
+from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
+from ckc_pin.kinematics.nodes import solutions
+from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.closure import Closure, Selected
-from ckc_pin.mechanism.extended import Extended, Task, extend, find_point
-from ckc_pin.mechanism.following import solutions
-from ckc_pin.mechanism.kinematics import Kinematics, Partition
+from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.many import evaluate, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
-from ckc_pin.mechanism.sigma import newton
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Inverse", "Point"]
@@ -108,7 +109,7 @@ class Point:
         q = np.asarray(q, dtype=float)
         if q.shape != (mechanism.d,) or not np.all(np.isfinite(q)):
             raise InputError(f"q: {mechanism.d} finite numbers needed, for {', '.join(mechanism.independent)}")
-        found = mechanism.sigma(q, start)
+        found = sigma(mechanism, q, start)
         if found.verdict == "converged":
             return found.at
         where = ", ".join(f"{name} = {x:g}" for name, x in zip(mechanism.independent, q, strict=True))
@@ -173,23 +174,18 @@ class Point:
 
     def follow(self, begin: Kinematics, wanted: Array) -> Kinematics | None:
         """Follow the straight line from a Psi to a place (3,); None where it cannot be followed to its end."""
-        at, done, piece = begin, 0.0, 1.0
         level = self._level(wanted, begin)
         change = level - self._level(self.position(begin.q_tree), begin)
-        while done < 1.0:
-            piece = min(piece, 1.0 - done)
-            step = at.phi_z_factor.solve(piece * change)
-            trial = None
-            if np.abs(step / at.tree.reach).max() <= LONGEST_STEP:
-                w = level - (1.0 - done - piece) * change
-                trial = newton(at.moved(step), w, self.mechanism.tolerance)
-            if trial is not None and trial.converged and _same_side(at, trial.at):
-                at, done, piece = trial.at, (1.0 if piece >= 1.0 - done else done + piece), 2.0 * piece
-            else:
-                piece /= 2.0
-                if piece < SMALLEST_PIECE:
-                    return None
-        return at if self._met(at, wanted) else None
+
+        def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
+            step = at.phi_z_factor.solve(part * change)
+            if not np.abs(step / at.tree.reach).max() <= LONGEST_STEP:
+                return None
+            trial = newton(at.moved(step), level - (1.0 - done - part) * change, self.mechanism.tolerance)
+            return trial.at if trial.converged else None
+
+        at, done = follow(begin, advance, SMALLEST_PIECE)
+        return at if done == 1.0 and self._met(at, wanted) else None
 
     def meet(self, near: Array, wanted: Array, begin: Kinematics) -> Array | None:
         """Put the point at many places of a path, all at once.
@@ -283,7 +279,7 @@ class Point:
         """Return a solution on the same side of Psi's singular configurations, the one that is nearest."""
         tree = self.mechanism.tree
         same = [self.kinematics(q) for q in self._solutions(wanted, begin)]
-        same = [at for at in same if _same_side(begin, at)]
+        same = [at for at in same if same_branch(begin, at)]
         return min(same, key=lambda at: float(np.abs(tree.difference(begin.q_tree, at.q_tree)).max()), default=None)
 
     def _others(self, wanted: Array, begin: Kinematics) -> str:
@@ -292,9 +288,3 @@ class Point:
 
     def _inverse(self, q_tree: Array) -> Inverse:
         return Inverse(self.mechanism.kinematics(q_tree), self.mechanism.independent_part(q_tree))
-
-
-def _same_side(before: Kinematics, after: Kinematics) -> bool:
-    if before.phi_z.shape[0] != before.phi_z.shape[1]:
-        return True
-    return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0

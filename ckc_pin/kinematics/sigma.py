@@ -2,7 +2,7 @@
 
 Two uses. Inside an integration a good prediction is at hand: `newton` alone, one or two iterations.
 From anywhere else: `sigma` follows the straight line from a closed configuration to the wanted q and
-says how that ended.
+says how that ended, `move` the same for a step of q.
 """
 
 from __future__ import annotations
@@ -12,10 +12,13 @@ from typing import Literal
 
 import numpy as np
 
-from ckc_pin.mechanism.kinematics import Kinematics
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.continuation import follow, same_branch
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Newton", "Sigma", "Verdict", "newton", "predict", "sigma"]
+__all__ = ["Newton", "Sigma", "Verdict", "move", "newton", "predict", "sigma"]
 
 Verdict = Literal["converged", "out of reach", "singular"]
 
@@ -64,6 +67,36 @@ class Sigma:
     miss: float
     iterations: int
     reason: str = ""
+
+
+def sigma(mechanism: Mechanism, q: Array, start: Kinematics | None = None, w: Array | float = 0.0) -> Sigma:
+    """Return q' = sigma(q), eq. 4, on the assembly branch of `start` (default: as assembled).
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    q : (d,) array
+        The independent coordinates, rad or m.
+    start : Kinematics, optional
+        Closed.
+    w : (rows,) array or 0.0
+        The level set.
+
+    Raises
+    ------
+    InputError
+        The loops hold a free root in part: its place is no function of numbers q.
+    """
+    if mechanism.splits_root:
+        raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
+    start = start or mechanism.assembled
+    if mechanism.tree.flat:
+        step = q - start.q_tree[mechanism.tree.place[mechanism.partition.q]]
+    else:
+        numbers = mechanism.tree.to_coordinates(start.q_tree)
+        numbers[mechanism.partition.q] = q
+        step = mechanism.tree.difference(start.q_tree, mechanism.tree.from_coordinates(numbers))[mechanism.partition.q]
+    return move(start, step, w, mechanism.tolerance)
 
 
 def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
@@ -122,52 +155,39 @@ def predict(at: Kinematics, dq: Array, dw: Array | None = None) -> Kinematics:
     return at.moved(step)
 
 
-def sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
+def move(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
     """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq, and from its level to w.
 
-    Each piece is predicted along rho and corrected by Newton; a piece that fails is halved. Following
-    the line is what keeps the assembly branch: Newton from far away may close on another one.
-    Where the line ends early, q is looked for from other starts, unless `anywhere` is False.
+    Each piece is predicted along rho and corrected by Newton. Where the line ends early, q is looked for from other
+    starts, unless `anywhere` is False.
     """
-    at, done, piece, iterations = start, 0.0, 1.0, 0
-    dw = w - start.phi
+    dw, iterations, most = w - start.phi, 0, FARTHEST if anywhere else FAR
     between_levels = bool(np.abs(dw).max(initial=0.0) > tolerance)
-    while done < 1.0:
-        piece = min(piece, 1.0 - done)
-        level = w - (1.0 - done - piece) * dw if between_levels else w
-        trial = newton(predict(at, piece * dq, piece * dw if between_levels else None), level, tolerance)
+
+    def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
+        nonlocal iterations
+        if iterations > most:
+            return None
+        level = w - (1.0 - done - part) * dw if between_levels else w
+        trial = newton(predict(at, part * dq, part * dw if between_levels else None), level, tolerance)
         iterations += trial.iterations
-        if not anywhere and iterations > FAR:
-            return Sigma("out of reach", at, done, float("nan"), iterations, "that is too far away for one step")
-        if iterations > FARTHEST:
-            return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
-        if trial.converged and _same_branch(at, trial.at):
-            at, done, piece = trial.at, done + piece if piece < 1.0 - done else 1.0, 2.0 * piece
-        else:
-            piece /= 2.0
-            if piece < SMALLEST_PIECE:
-                if anywhere:
-                    return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
-                return _end_of_line(at, done, iterations)
-    if _is_singular(at, ROUNDING):
+        return trial.at if trial.converged else None
+
+    at, done = follow(start, advance, SMALLEST_PIECE)
+    if done < 1.0 and anywhere:
+        return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+    if iterations > most:
+        return Sigma("out of reach", at, done, float("nan"), iterations, "that is too far away for one step")
+    if done < 1.0:
+        return _end_of_line(at, done, iterations)
+    if at.margin() <= ROUNDING:
         return Sigma("singular", at, 1.0, 0.0, iterations, "phi_z is singular there")
     return Sigma("converged", at, 1.0, 0.0, iterations)
 
 
-def _is_singular(at: Kinematics, margin: float) -> bool:
-    return at.margin() <= margin
-
-
-def _same_branch(before: Kinematics, after: Kinematics) -> bool:
-    """Whether det phi_z keeps its sign: between branches there is a singular configuration."""
-    if before.phi_z.shape[0] != before.phi_z.shape[1]:
-        return True
-    return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
-
-
 def _end_of_line(at: Kinematics, done: float, iterations: int) -> Sigma:
     miss = float("nan")  # not looked for
-    if _is_singular(at, 1e-3):
+    if at.margin() <= 1e-3:
         return Sigma("singular", at, done, miss, iterations, "phi_z is singular on the way")
     return Sigma("out of reach", at, done, miss, iterations, "the loops cannot be kept closed on the way")
 
@@ -188,9 +208,9 @@ def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done
         nearest = _least_squares(start.moved(spread), w, tolerance)
         miss = float(np.abs(nearest.phi - w).max(initial=0.0))
         least = min(least, miss)
-        flat = _is_singular(nearest, 1e-6)
+        flat = nearest.margin() <= 1e-6
         if miss <= tolerance and not flat:
-            if _same_branch(at, nearest):
+            if same_branch(at, nearest):
                 return Sigma("converged", nearest, done, 0.0, iterations)
             other = True
         singular = singular or (flat and miss <= NEARLY * tolerance)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.extended import Task
+from ckc_pin.kinematics.continuation import follow_many
+from ckc_pin.kinematics.extended import Task
 from ckc_pin.mechanism.many import ManyPoses, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
@@ -127,25 +128,21 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
     arrived : (count,) array of bool
         Where False the branch ends on the way; the node is the last one that was reached.
     """
-    count, free = len(change), len(task.extended.free)
-    at, done, piece = start[np.arange(count)], np.zeros(count), np.ones(count)
-    active = np.arange(count)
-    while len(active):
+    free, tree = len(task.extended.free), task.extended.mechanism.tree
+    at = start[np.arange(len(change))]
+
+    def advance(active: IntArray, done: Array, part: Array) -> BoolArray:
         here = at[active]
-        part = np.minimum(piece[active], 1.0 - done[active])
         right = np.hstack([np.zeros((len(active), free)), part[:, None] * change[active]])
         step = _solve(here.J[:, task.every], right)
-        near = np.abs(step / task.extended.mechanism.tree.reach).max(axis=1) <= MAX_STEP
-        guess = integrate(task.extended.mechanism.tree, here.q_tree, np.where(near[:, None], step, 0.0))
-        told = start.told[active] + (done[active] + part)[:, None] * change[active]
-        trial, solved = solve(task, guess, told)
+        near = np.abs(step / tree.reach).max(axis=1) <= MAX_STEP
+        guess = integrate(tree, here.q_tree, np.where(near[:, None], step, 0.0))
+        trial, solved = solve(task, guess, start.told[active] + (done + part)[:, None] * change[active])
         good = solved & near & (trial.det * here.det > 0)
         at.put(active[good], trial[good])
-        done[active[good]] += part[good]
-        done[active[good & (part < piece[active])]] = 1.0
-        piece[active] *= np.where(good, 2.0, 0.5)
-        active = active[(done[active] < 1.0) & (piece[active] >= shortest)]
-    return at, done >= 1.0
+        return good
+
+    return at, follow_many(len(change), advance, shortest) == 1.0
 
 
 def solutions(task: Task, told: Array, most: int) -> Array:

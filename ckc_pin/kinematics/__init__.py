@@ -1,0 +1,7 @@
+"""Configurations of a mechanism: sigma, assembly, continuation, branches, charts, and points as the tool."""
+
+from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.point import Point
+from ckc_pin.kinematics.sigma import Sigma, newton, predict, sigma
+
+__all__ = ["Point", "Sigma", "load", "newton", "predict", "sigma"]

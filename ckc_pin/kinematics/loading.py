@@ -1,0 +1,71 @@
+"""Mechanisms by shipped name or by path, assembled."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from threading import Lock
+
+from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.mechanism.toml import by_coordinate, convert, read_toml
+
+__all__ = ["build", "load"]
+
+MOST_KEPT = 32  # of the mechanisms built
+
+_built: dict[tuple[str, str, Path | None], Mechanism] = {}  # never handed out, only copied
+_building = Lock()
+
+
+def load(name: str | Path | GeneratorSpec) -> Mechanism:
+    """Load a mechanism by shipped name or path.
+
+    Parameters
+    ----------
+    name : str, Path or GeneratorSpec
+        For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
+        usual number of links.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, malformed, or has an unknown key.
+    MechanismError
+        A mechanism that cannot exist as described.
+    """
+    return build(*texts_of(name))
+
+
+def build(text: str, sources: Sources) -> Mechanism:
+    """Build a mechanism from the text of its file; the text is kept among its sources.
+
+    One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
+    many a run.
+    """
+    sources.texts[MECHANISM_FILE] = text
+    key = (text, sources.name, sources.folder)
+    built = _built.get(key)
+    if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
+        twin = deepcopy(built)
+        twin.sources = sources
+        return twin
+    mechanism = _build(text, sources)
+    built = deepcopy(mechanism)
+    built.tree.rest()
+    with _building:
+        _built[key] = built
+        while len(_built) > MOST_KEPT:
+            _built.pop(next(iter(_built)))
+    return mechanism
+
+
+def _build(text: str, sources: Sources) -> Mechanism:
+    data = read_toml(text, sources.name)
+    by_coordinate(data, "q_guess")
+    spec = convert(data, MechanismSpec, sources.name)
+    return assembled(spec, sources)
