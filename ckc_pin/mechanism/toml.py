@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,14 +11,14 @@ from typing import Any, TypeVar
 import msgspec
 
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.explain import explain, place_name
+from ckc_pin.mechanism.faults import Fault, faults, numbers
 
 __all__ = ["by_coordinate", "convert", "read_text", "read_toml"]
 
 T = TypeVar("T")
 
 MAX_BYTES = 16 * 2**20  # no mechanism, scene or URDF that a person wrote is larger
-INTEGERS = range(-(2**63), 2**63)  # TOML's
+MOST_SAID = 5  # of the faults of one file
 DEEPEST = 50  # tables and lists inside each other; tomllib reads dotted keys to any depth, what follows recurses
 
 
@@ -86,30 +85,29 @@ def convert(data: Any, kind: type[T], source: str, at: str = "") -> T:
     Raises
     ------
     InputError
-        An unknown key (the valid ones are listed), a wrong type, a missing value, or a number that is
-        not finite (TOML knows nan and inf).
+        Unknown keys (the valid ones are listed), wrong types, missing values, and numbers that are not finite (TOML
+        knows nan and inf), all of them in one message.
     """
+    found: list[Fault] = []
     try:
         converted = msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{source}: {explain(str(error), data, kind, at)}") from None
-    for steps, value in _numbers((), data):
-        if isinstance(value, int) and value not in INTEGERS:
-            raise InputError(f"{source}: {place_name(steps, at)}: an integer of more than 64 bits; write it as 1e20")
-        if not math.isfinite(value):
-            raise InputError(f"{source}: {place_name(steps, at)} = {value}: a finite number is needed")
+        found = [*faults(data, kind)]
+        if not found:
+            raise InputError(f"{source}: {at and f'{at}: '}{error}") from None  # keys that are no strings
+    named = {fault.steps for fault in found}
+    found += [fault for fault in numbers(data) if fault.steps not in named]
+    if found:
+        raise InputError(f"{source}: {_all_of([fault.sentence(at) for fault in found])}")
     return converted
 
 
-def _numbers(steps: tuple[str | int, ...], value: Any) -> Iterator[tuple[tuple[str | int, ...], int | float]]:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _numbers((*steps, key), inner)
-    elif isinstance(value, list | tuple):
-        for index, inner in enumerate(value):
-            yield from _numbers((*steps, index), inner)
-    elif isinstance(value, int | float):
-        yield steps, value
+def _all_of(sentences: list[str]) -> str:
+    """Write several sentences in one line, numbered."""
+    if len(sentences) == 1:
+        return sentences[0]
+    said = " ".join(f"({k}) {sentence}" for k, sentence in enumerate(sentences[:MOST_SAID], 1))
+    return said + (f" and {len(sentences) - MOST_SAID} more" if len(sentences) > MOST_SAID else "")
 
 
 def by_coordinate(data: dict[str, Any], *path: str) -> None:

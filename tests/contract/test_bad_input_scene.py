@@ -10,7 +10,7 @@ from tests.contract.helpers.bad import Bad, expect
 
 RUN = ("run", "bar/swing.scene.toml")
 NAMED = "bar/swing.scene.toml: "
-GREATER = "a number greater than 0 is needed"
+GREATER = "greater than 0"
 FINITE = "a finite number is needed"
 
 
@@ -27,8 +27,8 @@ def _file(what: str, old: str, new: str, *says: str) -> Bad:
 
 
 SCENE = [
-    _value("t_end=0", f"{NAMED}t_end = 0: {GREATER}"),
-    _value("t_end=-1", f"{NAMED}t_end = -1: {GREATER}"),
+    _value("t_end=0", f"{NAMED}t_end = 0: ", GREATER),
+    _value("t_end=-1", f"{NAMED}t_end = -1: ", GREATER),
     _value("t_end=nan", "t_end = nan", GREATER),
     _value("t_end=inf", f"t_end = inf: {FINITE}"),
     _value("t_end=soon", "t_end = 'soon': a number is needed, not a string"),
@@ -36,42 +36,42 @@ SCENE = [
     _value("t_end=2020-01-01", "t_end: a number is needed, not a date"),
     _value("formulation=ode", "formulation = 'ode'; valid: 'dae', 'reduced', 'spf'"),
     _value("formulation=3", "formulation = 3: a string is needed, not an integer"),
-    _value("epsilon=0", f"epsilon = 0: {GREATER}"),
-    _value("epsilon=-1e-3", f"epsilon = -0.001: {GREATER}"),
+    _value("epsilon=0", "epsilon = 0: ", GREATER),
+    _value("epsilon=-1e-3", "epsilon = -0.001: ", GREATER),
     _value("coriolis_velocity=rhoo", "coriolis_velocity = 'rhoo'; valid: 'actual', 'rho'"),
     _value("mechanism=nothing", "no mechanism 'nothing'", "five_bar"),
     _value("mechanism=nothing.toml", "bar/nothing.toml: no such mechanism file"),
     _value("mechanism=3", "mechanism = 3: a string or a table is needed"),
     _value('mechanism={generator="x"}', "mechanism.generator = 'x'; valid: 'n_four_bar'"),
-    _value('mechanism={generator="n_four_bar", N=1000000000}', "mechanism.N = 1000000000: an integer of at most"),
+    _value('mechanism={generator="n_four_bar", N=1000000000}', "mechanism.N = 1000000000: ", "at most 160"),
     _file("no mechanism", 'mechanism = "mechanism.toml"', "", "the key 'mechanism' is missing"),
     _file("no formulation", 'formulation = "dae"', "", "'formulation' is missing; valid: 'dae', 'reduced', 'spf'"),
     _file("malformed", "t_end = 2.0", "t_end = ", "malformed TOML", "line "),
     _file("nested without end", "t_end = 2.0", f"t_end = {'[' * 10000}", "malformed TOML: nested too deeply"),
-    _file("nan in the file", "rtol = 1e-8", "max_step = nan", f"solver.max_step = nan: {GREATER}"),
-    _file("a number of 400 digits", "t_end = 2.0", f"t_end = 1{'0' * 400}", "t_end", "out of range"),
+    _file("nan in the file", "rtol = 1e-8", "max_step = nan", "solver.max_step = nan: ", GREATER),
+    _file("a number of 400 digits", "t_end = 2.0", f"t_end = 1{'0' * 400}", f"{NAMED}t_end: ", "64 bits"),
 ]
 
 SOLVER = [
-    _value("solver.rtol=0", f"{NAMED}solver.rtol = 0: a number of at least 2.3e-14 is needed"),
+    _value("solver.rtol=0", f"{NAMED}solver.rtol = 0: ", "at least 2.3e-14 and less than 1"),
     _value("solver.rtol=-1e-8", "solver.rtol = -1e-08: a number of at least"),
     _value("solver.rtol=nan", "solver.rtol = nan"),
-    _value("solver.rtol=inf", "solver.rtol = inf: a number less than 1 is needed"),
+    _value("solver.rtol=inf", "solver.rtol = inf: ", "less than 1"),
     _value("solver.rtol=1e-300", "solver.rtol = 1e-300: a number of at least 2.3e-14"),
     _value("solver.rtol=high", "solver.rtol = 'high': a number is needed, not a string"),
-    _value("solver.atol=0", f"solver.atol = 0: {GREATER}"),
+    _value("solver.atol=0", "solver.atol = 0: ", GREATER),
     _value("solver.method=RK4", "solver.method = 'RK4'; valid: 'DOP853', 'RK45', 'Radau', 'auto'"),
     _value("solver.method=BDF", "solver.method = 'BDF'; valid: 'DOP853', 'RK45', 'Radau', 'auto'"),
     _value("solver.backend=native", "solver: unknown key 'backend'; valid: method, rtol"),
     _value("spf_coordinates=y", "spf_coordinates = 'y'; valid: 'w', 'z'"),
     _value("solver.projection=yes", "solver.projection = 'yes': true or false is needed, not a string"),
-    _value("solver.max_rhs=0", "solver.max_rhs = 0: an integer of at least 1 is needed"),
+    _value("solver.max_rhs=0", "solver.max_rhs = 0: ", "greater than 0"),
     _value("solver.max_rhs=1.5", "solver.max_rhs = 1.5: an integer is needed, not a number"),
-    _value("solver.max_wall_s=0", f"solver.max_wall_s = 0: {GREATER}"),
-    _value("solver.max_step=0", f"solver.max_step = 0: {GREATER}"),
+    _value("solver.max_wall_s=0", "solver.max_wall_s = 0: ", GREATER),
+    _value("solver.max_step=0", "solver.max_step = 0: ", GREATER),
     _value("solver.min_step=-1", "solver.min_step = -1: a number of at least 0 is needed"),
     _value("solver={min_step=1.0, max_step=0.1}", "solver: min_step = 1 is above max_step = 0.1"),
-    _value("solver.output_dt=0", f"solver.output_dt = 0: {GREATER}"),
+    _value("solver.output_dt=0", "solver.output_dt = 0: ", GREATER),
     _value("solver.output_dt=1e-300", "solver.output_dt = 1e-300 gives more than 1000000 output instants in 2 s"),
 ]
 

@@ -13,14 +13,14 @@ from ckc_pin.mechanism.tree import MOST
 from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
 
-TOO_MANY = f"an integer of at most {MAX_N} is needed"
+TOO_MANY = f"at most {MAX_N}"
 RUN = ("run", "n_four_bar", "--set")
 SCENE = (
     'mechanism = {generator = "n_four_bar", N = 3}\nformulation = "reduced"\nt_end = 0.1\n[initial.q]\ntheta_0 = 1.0\n'
 )
 
 CASES = [
-    Bad("none", [*RUN, "mechanism.N=0"], ["mechanism.N = 0: an integer of at least 1 is needed"]),
+    Bad("none", [*RUN, "mechanism.N=0"], ["mechanism.N = 0: ", "at least 1"]),
     Bad("a thousand million", [*RUN, "mechanism.N=1000000000"], ["mechanism.N = ", TOO_MANY]),
     Bad("one too many", [*RUN, f"mechanism.N={MAX_N + 1}"], ["mechanism.N = ", TOO_MANY]),
     Bad("half a square", [*RUN, "mechanism.N=2.5"], ["mechanism.N", "integer"]),

@@ -1,0 +1,108 @@
+"""What is wrong with a file, as data: every place, what was found there, what would be right."""
+
+from __future__ import annotations
+
+import random
+import tomllib
+from typing import Any, get_args
+
+import msgspec
+import pytest
+
+from ckc_pin import InputError
+from ckc_pin.formats.importing.robot_yaml import RobotYaml
+from ckc_pin.mechanism.faults import faults
+from ckc_pin.mechanism.library import library
+from ckc_pin.mechanism.spec import FrameSpec, LoopType, MechanismSpec
+from ckc_pin.mechanism.toml import convert
+from ckc_pin.simulation.scene import SceneSpec
+from tests.contract.test_mutations import mutated
+
+
+def shipped(file: str) -> Any:
+    return tomllib.loads((library() / file).read_text(encoding="utf-8"))
+
+
+def test_all_faults_of_a_file_are_found() -> None:
+    data = shipped("five_bar/tracking.scene.toml")
+    data |= {"t_end": -1, "formulation": "ode", "event": [{"of": "v"}, {"coordinat": "theta_1"}]}
+    data["controller"] |= {"K_D": [[1.0, "a"], [0.0, 1.0]], "sample_time": True}
+    del data["mechanism"]
+    found = {(fault.steps, fault.what): fault for fault in faults(data, SceneSpec)}
+    assert set(found) == {
+        (("t_end",), "value"),
+        (("formulation",), "value"),
+        ((), "missing key"),
+        (("event", 0, "of"), "value"),
+        (("event", 1), "unknown key"),
+        (("controller", "K_D", 0, 1), "value"),
+        (("controller", "sample_time"), "value"),
+    }
+    assert found[("formulation",), "value"].choices == ("dae", "reduced", "spf")
+    assert found[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop")
+    assert found[("event", 1), "unknown key"].near == "coordinate"
+    assert found[(), "missing key"].found == "mechanism"
+    assert found[("controller", "K_D", 0, 1), "value"].found == "a"
+
+
+def test_one_message_names_all_places_and_counts_what_it_leaves_out() -> None:
+    data = {"name": "", "gravity": 3, "tree": [{"root": "loose"}], "loop": [{"type": "x"}], "urdf": float("nan")}
+    with pytest.raises(InputError) as refused:
+        convert(data, MechanismSpec, "m.toml")
+    said = str(refused.value)
+    assert said.startswith("m.toml: (1) name = ''")
+    for place in ("(2) urdf", "(3) tree[0]", "'file'", "(4) tree[0].root", "'fixed'", "(5) gravity = 3"):
+        assert place in said
+    assert said.endswith(" and 4 more")  # of the loop: its type, name, frame_a and frame_b
+
+
+def test_a_key_that_was_meant_is_not_missing_as_well() -> None:
+    (fault,) = faults({"lnk": "tip"}, FrameSpec)
+    assert (fault.what, fault.found, fault.near) == ("unknown key", "lnk", "link")
+
+
+def test_choices_are_those_of_the_type() -> None:
+    (fault,) = faults("hing", LoopType)
+    assert fault.choices == tuple(sorted(get_args(LoopType)))
+
+
+def test_entries_wrong_in_one_way_are_told_once() -> None:
+    found = [fault.steps for fault in faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
+    assert found == [("gravity", 0)]
+
+
+def test_keys_that_are_no_strings() -> None:
+    with pytest.raises(InputError, match=r"robot.yaml: .*str"):
+        convert({1: "a"}, RobotYaml, "robot.yaml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [(SceneSpec, "five_bar/tracking.scene.toml"), (SceneSpec, "delta/circle.scene.toml"),
+     (MechanismSpec, "five_bar/mechanism.toml"), (MechanismSpec, "two_ur5/mechanism.toml"),
+     (MechanismSpec, "flyball/mechanism.toml")],
+)  # fmt: skip
+def test_there_is_a_fault_exactly_where_data_do_not_fit(kind: Any, file: str) -> None:
+    r, given, refused = random.Random(5), shipped(file), 0
+    if "q_guess" in given:
+        given["q_guess"] = {key: value for key, value in given["q_guess"].items() if not isinstance(value, dict)}
+    for _ in range(400):
+        data = mutated(r, mutated(r, given))
+        try:
+            msgspec.convert(data, kind)
+            fits = True
+        except msgspec.ValidationError:
+            fits = False
+        found = [*faults(data, kind)]
+        assert fits == (not found), data
+        refused += not fits
+        for fault in found:
+            assert _at(data, fault.steps) is fault.found or fault.what != "value"
+            assert fault.needed or fault.choices or fault.what == "missing key"
+    assert 50 < refused < 400
+
+
+def _at(data: Any, steps: tuple[Any, ...]) -> Any:
+    for step in steps:
+        data = data[step]
+    return data
