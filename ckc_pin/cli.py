@@ -178,8 +178,8 @@ def run(
     with ExitStack() as stack:
         view = stack.enter_context(_view(scene, speed, port, open_browser)) if meshcat else None
         with _progress_bar(scene.name) as progress:
-            watch = None if view is None else view.watch
-            finished = ckc_pin.simulate(scene, progress=progress, watch=watch, profile=profile)
+            on_output = None if view is None else view.on_output
+            finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
         code = _report(finished, out, profile, as_json)
         if view is not None and finished.status != "interrupted":
             with suppress(KeyboardInterrupt):

@@ -45,7 +45,7 @@ def main() -> int:
         fail(f"--out {out}: {error}")
     console = Console(highlight=False)
     console.print(table(runs))
-    lines = ["Files:", *(f"  {shown(path)}" for path in files), f"Watch: {watch(out / 'tracking')}"]
+    lines = ["Files:", *(f"  {shown(path)}" for path in files), f"Watch: {playback(out / 'tracking')}"]
     console.print(*lines, sep="\n", markup=False, soft_wrap=True)
     for run in runs:
         if run.status != "done":
@@ -129,7 +129,7 @@ def shown(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def watch(folder: Path) -> str:
+def playback(folder: Path) -> str:
     """The command that plays a case, the SPF on the reduced model."""
     return f"{shown(Path(sys.executable).parent / 'ckc')} play {shown(folder / 'reduced')} {shown(folder / 'spf')}"
 

@@ -15,7 +15,7 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Newton", "Sigma", "Verdict", "move", "newton", "predict", "sigma"]
@@ -88,7 +88,7 @@ def sigma(mechanism: Mechanism, q: Array, start: Kinematics | None = None, w: Ar
         The loops hold a free root in part: its place is no function of numbers q.
     """
     if mechanism.splits_root:
-        raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     start = start or mechanism.assembled
     if mechanism.tree.flat:
         step = q - start.q_tree[mechanism.tree.place[mechanism.partition.q]]

@@ -14,9 +14,9 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["HELD_IN_PART", "Mechanism"]
+__all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
-HELD_IN_PART = (
+CONSTRAINED_IN_PART = (
     "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
     '(at = "assembled"), runs as a DAE (formulation = "dae"), and has no controller'
 )
@@ -152,7 +152,7 @@ class Mechanism:
                 f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
             )
         if self.splits_root:
-            self.warnings.append(HELD_IN_PART)
+            self.warnings.append(CONSTRAINED_IN_PART)
         self.independent = tuple(names)
         self.dependent = tuple(self.coordinates[k] for k in z)
         self.partition = Partition(at, z)

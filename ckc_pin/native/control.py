@@ -97,14 +97,14 @@ def _spline(table: Table) -> dict[str, Any]:
 
 
 def _point(path: PointPath) -> dict[str, Any] | None:
-    """Return a point's path: the rows of Psi, which of them are told what, and configurations along it."""
+    """Return a point's path: the rows of Psi, which of them are prescribed, and configurations along it."""
     point, place = path.point, _desired(path.place)
     extended, mechanism = point.extended, point.mechanism
     if place is None:
         return None
-    told = extended.fixing - extended.place[0]
+    prescribed = extended.fixing - extended.place[0]
     psi = np.concatenate([extended.free, extended.fixing])
-    axis = np.array([-1] * len(extended.free) + [int(k) if k < 3 else -1 for k in told])
+    axis = np.array([-1] * len(extended.free) + [int(k) if k < 3 else -1 for k in prescribed])
     kept = path.start.phi[len(extended.loops) :]
     level = np.concatenate([np.zeros(len(extended.free)), kept])
     return {

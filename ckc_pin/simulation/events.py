@@ -1,6 +1,6 @@
 """Events: something along a run crosses a value, located inside the step that crosses it.
 
-A crossing is a change of sign of (what is watched - value). A run that starts on the value has not crossed
+A crossing is a change of sign of (function - value). A run that starts on the value has not crossed
 it; touching the value and turning back is no crossing; reaching it at the very end of a run is one.
 """
 
@@ -18,7 +18,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.loop_terms import event_call
 from ckc_pin.simulation.scene import EventSpec
 
-__all__ = ["Event", "Watched", "watched"]
+__all__ = ["Event", "EventFunction", "event_functions"]
 
 FLOOR = 1e-12  # rad, m, rad/s, m/s: what a coordinate or a rate is on the value within
 OF = {"q": 0, "q_dot": 1, "sigma_min_phi_z": 2, "sigma_min_J": 3, "function": 4}  # as the loop numbers them
@@ -62,8 +62,8 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Watched:
-    """One function that the loop watches, and what a crossing of it is called.
+class EventFunction:
+    """One function whose sign changes the loop looks for, and what a crossing of it is called.
 
     Attributes
     ----------
@@ -86,15 +86,15 @@ class Watched:
         return {"t": t, **self.label, "direction": direction, "stop": self.stop}
 
 
-def watched(specs: Sequence[EventSpec], own: Sequence[Event], mechanism: Mechanism) -> list[Watched]:
-    """Return what is watched: the events of a scene, then those given in Python.
+def event_functions(specs: Sequence[EventSpec], own: Sequence[Event], mechanism: Mechanism) -> list[EventFunction]:
+    """Return the event functions: the events of a scene, then those given in Python.
 
     Raises
     ------
     InputError
         An unknown coordinate, one without limits, a margin that this mechanism does not have, no `Event`.
     """
-    found: list[Watched] = []
+    found: list[EventFunction] = []
     for k, spec in enumerate(specs):
         found += _of_scene(spec, mechanism, f"event[{k}]")
     for k, event in enumerate(own):
@@ -103,11 +103,11 @@ def watched(specs: Sequence[EventSpec], own: Sequence[Event], mechanism: Mechani
         name = event.name or getattr(event.function, "__name__", "event")
         label = {"name": name, "of": "function", "coordinate": None, "value": 0.0}
         call = event_call(event.function, name, mechanism)
-        found.append(Watched(label, (OF["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)))
+        found.append(EventFunction(label, (OF["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)))
     return found
 
 
-def _of_scene(spec: EventSpec, mechanism: Mechanism, where: str) -> list[Watched]:
+def _of_scene(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
     if spec.coordinate is not None:
         mechanism.tree.indices((spec.coordinate,), f"{where}.coordinate")
     if spec.of == "limit":
@@ -118,11 +118,11 @@ def _of_scene(spec: EventSpec, mechanism: Mechanism, where: str) -> list[Watched
     says = spec.of if name is None else name if spec.of == "q" else f"{name}'s rate"
     label = {"name": f"{says} = {value:g}", "of": spec.of, "coordinate": name, "value": value}
     k = 0 if name is None else mechanism.tree.index[name]
-    return [Watched(label, (OF[spec.of], k, value, 1.0, spec.direction, spec.stop, FLOOR, None))]
+    return [EventFunction(label, (OF[spec.of], k, value, 1.0, spec.direction, spec.stop, FLOOR, None))]
 
 
-def _limits(spec: EventSpec, mechanism: Mechanism, where: str) -> list[Watched]:
-    """Watch how far beyond its limits a coordinate is: rising is leaving, falling is coming back."""
+def _limits(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
+    """Return how far beyond its limits a coordinate is: rising is leaving, falling is coming back."""
     tree = mechanism.tree
     lower, upper = tree.limits()
     limited = [name for k, name in enumerate(tree.coordinates) if np.isfinite(lower[k]) or np.isfinite(upper[k])]
@@ -136,5 +136,7 @@ def _limits(spec: EventSpec, mechanism: Mechanism, where: str) -> list[Watched]:
         for side, limit, outwards in (("lower", float(lower[k]), -1.0), ("upper", float(upper[k]), 1.0)):
             if np.isfinite(limit):
                 label = {"name": f"{name} at its {side} limit", "of": "limit", "coordinate": name, "value": limit}
-                found.append(Watched(label, (OF["q"], k, limit, outwards, spec.direction, spec.stop, FLOOR, None)))
+                found.append(
+                    EventFunction(label, (OF["q"], k, limit, outwards, spec.direction, spec.stop, FLOOR, None))
+                )
     return found

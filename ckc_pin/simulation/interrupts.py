@@ -21,7 +21,7 @@ class Interrupts:
         self._forget()
 
     def _forget(self) -> None:
-        self._told = 0
+        self._interrupted = 0
         self._saving = False
         self._meanwhile: list[int] = []
 
@@ -47,8 +47,8 @@ class Interrupts:
         if self._saving:
             self._meanwhile.append(number)
             return
-        self._told += 1
-        if self._told != 2:
+        self._interrupted += 1
+        if self._interrupted != 2:
             raise _interrupt(number)
 
 

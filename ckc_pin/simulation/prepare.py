@@ -21,12 +21,12 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
-from ckc_pin.mechanism.mechanism import HELD_IN_PART, Mechanism
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
-from ckc_pin.simulation.events import Event, Watched, watched
+from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene, SceneSpec
@@ -81,7 +81,7 @@ class Prepared:
     mechanism : Mechanism
     controller : Controller or None
         What acts, beside a u that is held.
-    events : list of Watched
+    events : list of EventFunction
     instants : (m,) array
         Output instants, s; empty where the caller steps.
     start : Start
@@ -93,7 +93,7 @@ class Prepared:
     scene: Scene
     mechanism: Mechanism
     controller: Controller | None
-    events: list[Watched]
+    events: list[EventFunction]
     instants: Array
     start: Start
     texts: dict[str, str]
@@ -130,7 +130,7 @@ def prepare(
     free : bool
         No controller at all: the caller says what acts.
     profile : bool
-        Book which terms are evaluated.
+        Count which terms are evaluated.
 
     Raises
     ------
@@ -153,8 +153,8 @@ def prepare(
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
-        raise InputError(f"{mechanism.name}: {HELD_IN_PART}")
-    watching = watched(scene.spec.event, events, mechanism)
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
+    functions = event_functions(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
@@ -165,10 +165,10 @@ def prepare(
         _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
-        [event.row for event in watching],
+        [event.row for event in functions],
     )
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, watching, instants, start, texts, loop)
+    return Prepared(scene, mechanism, controller, functions, instants, start, texts, loop)
 
 
 def _output_instants(scene: Scene) -> Array:

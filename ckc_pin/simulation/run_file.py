@@ -144,8 +144,8 @@ def _arrays(path: Path) -> dict[str, Any]:
         allowed = {f"{name}.npy" for name in (*ARRAYS, *OPTIONAL, *OTHERS)}
         needed = {f"{name}.npy" for name in (*ARRAYS, *OTHERS)}
         if len(set(names)) != len(names) or not needed <= set(names) <= allowed:
-            held = ", ".join(name.removesuffix(".npy") for name in names[:20])
-            raise InputError(f"{path}: not a run file: it holds {held or 'nothing'}")
+            arrays = ", ".join(name.removesuffix(".npy") for name in names[:20])
+            raise InputError(f"{path}: not a run file: it holds {arrays or 'nothing'}")
         total = 0
         for entry in entries:
             size = _declared(path, archive, entry)

@@ -21,10 +21,10 @@ from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
-__all__ = ["Progress", "Watch", "run_prepared", "simulate"]
+__all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
-Watch = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
+OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
 SCALARS = ("t", "energy", "lyapunov", "max_phi", "max_phi_dot")
 
@@ -36,7 +36,7 @@ def simulate(
     controller: Controller | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
-    watch: Watch | None = None,
+    on_output: OnOutput | None = None,
     profile: bool = False,
 ) -> Run:
     """Run a scene.
@@ -50,13 +50,13 @@ def simulate(
     controller : Controller, optional
         Takes the place of the scene's, its sample time and delay included; `Sampled` gives it its own.
     events : sequence of Event, optional
-        Functions of the state to watch, beside the scene's events.
+        Event functions of the state, beside the scene's events.
     progress : callable, optional
         Called as progress(t, t_end), every 0.05 s or so.
-    watch : callable, optional
-        Called as watch(t, q_tree) for each output instant, q_tree by coordinate, shape (n,).
+    on_output : callable, optional
+        Called as on_output(t, q_tree) for each output instant, q_tree by coordinate, shape (n,).
     profile : bool
-        Book the terms evaluated in `Run.profile`.
+        Count the terms evaluated in `Run.profile`.
 
     Returns
     -------
@@ -74,13 +74,13 @@ def simulate(
         scene = load_scene(scene, changes)
     elif changes:
         raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
-    run = run_prepared(prepare(scene, controller, events, profile=profile), progress, watch)
+    run = run_prepared(prepare(scene, controller, events, profile=profile), progress, on_output)
     if controller is not None:
         run.scene.pop("controller", None)  # the caller's took its place
     return run
 
 
-def run_prepared(ready: Prepared, progress: Progress | None = None, watch: Watch | None = None) -> Run:
+def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run what was prepared, from its start; errors are those of `simulate`."""
     scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
     times = ready.instants
@@ -93,7 +93,7 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, watch: Watch
         )
     ready.begin()
     loop.record(times, rows)
-    status, message, filled = _drive(ready, rows, progress, watch)
+    status, message, filled = _drive(ready, rows, progress, on_output)
     parts = _parts(ready, rows[:filled])
     lyapunov = parts.pop("lyapunov")
     run = Run(
@@ -117,7 +117,9 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, watch: Watch
     return run
 
 
-def _drive(ready: Prepared, rows: Array, progress: Progress | None, watch: Watch | None) -> tuple[Status, str, int]:
+def _drive(
+    ready: Prepared, rows: Array, progress: Progress | None, on_output: OnOutput | None
+) -> tuple[Status, str, int]:
     """Advance to the end; say how it ended and how many rows there are."""
     loop, solver, t_end = ready.loop, ready.scene.spec.solver, ready.scene.spec.t_end
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
@@ -126,9 +128,9 @@ def _drive(ready: Prepared, rows: Array, progress: Progress | None, watch: Watch
         while True:
             stop = Stop(*loop.advance(t_end, True, PAUSE, deadline - perf_counter()))
             filled = stop.filled
-            if watch is not None:
+            if on_output is not None:
                 for row in rows[shown:filled]:
-                    watch(float(row[0]), row[1 : 1 + n].copy())  # theirs, to change as they like
+                    on_output(float(row[0]), row[1 : 1 + n].copy())  # theirs, to change as they like
                 shown = filled
             if progress is not None:
                 progress(loop.t, t_end)

@@ -84,7 +84,7 @@ class Simulator:
     changes : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     events : sequence of Event, optional
-        Functions of the state to watch, beside the scene's events.
+        Event functions of the state, beside the scene's events.
 
     Attributes
     ----------
@@ -205,14 +205,14 @@ class Simulator:
         NumericalError
             The numerics stopped within the step; `state` is the last one that was reached.
         """
-        held = self._none if u is None else require_u(u, self.mechanism, "u")
-        return self._alone("step", lambda: self._step(held, dt))
+        applied = self._none if u is None else require_u(u, self.mechanism, "u")
+        return self._alone("step", lambda: self._step(applied, dt))
 
-    def _step(self, held: Array, dt: float) -> State:
+    def _step(self, u: Array, dt: float) -> State:
         until = self._state.t + self._require_dt(dt)
         loop = self._loop
-        if not loop.hold(held):
-            raise InputError(f"u is not finite: {held.tolist()}")
+        if not loop.hold(u):
+            raise InputError(f"u is not finite: {u.tolist()}")
         try:
             while (stop := loop.advance(until, False, PAUSE, math.inf))[0] == "pause":
                 pass
@@ -239,8 +239,8 @@ class Simulator:
                 self._at_work = False
 
     def _present(self) -> State:
-        told = self._loop.state()
-        return self._state if told is None else State(self.mechanism, *told)
+        reached = self._loop.state()
+        return self._state if reached is None else State(self.mechanism, *reached)
 
     def _start(self, state: State) -> Start:
         theirs = state._mechanism

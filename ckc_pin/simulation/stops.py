@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.simulation.events import Watched
+from ckc_pin.simulation.events import EventFunction
 from ckc_pin.simulation.scene import SolverSpec
 
 __all__ = ["PAUSE", "Stop", "explain", "why_not_q"]
@@ -34,7 +34,9 @@ class Stop(NamedTuple):
     filled: int
 
 
-def explain(stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, events: list[Watched]) -> NumericalError:
+def explain(
+    stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, events: list[EventFunction]
+) -> NumericalError:
     """Return the error that a stop is, with the configuration where that matters."""
     why, says, u, sigma_min, margin, q_tree, q, z = loop.trouble()
     where = mechanism.tree.named(mechanism.tree.to_coordinates(q_tree))

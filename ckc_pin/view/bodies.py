@@ -75,10 +75,10 @@ def draw_bodies(
     shapes = [shape for shape in visuals(mechanism) if shape.joint or look is not GHOST]
     colours = [BASE, *(LINKS[k % len(LINKS)] for k in range(mechanism.tree.model.njoints - 1))]
     own = {shape.joint: shape.colour for shape in reversed(shapes) if shape.joint}
-    told_apart = None not in own.values() and len(set(own.values())) == len(own)  # by the URDF's own colours
+    distinct = None not in own.values() and len(set(own.values())) == len(own)  # by the URDF's own colours
     drawn = set()
     for k, shape in enumerate(shapes):
-        colour = shape.colour if shape.colour and (told_apart or not shape.joint) else colours[shape.joint]
+        colour = shape.colour if shape.colour and (distinct or not shape.joint) else colours[shape.joint]
         path = f"{body_path(mechanism, root, shape.joint)}/link:{safe(shape.link)}/{k}"
         command = _shape(shape, path, look.of(colour), folder)
         if command is not None:

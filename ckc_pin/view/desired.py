@@ -15,11 +15,11 @@ from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Poses", "Wanted", "desired_along", "desired_poses"]
+__all__ = ["DesiredPath", "Poses", "desired_along", "desired_poses"]
 
 
 @dataclass(frozen=True)
-class Wanted:
+class DesiredPath:
     """q_d along a run.
 
     Attributes
@@ -34,7 +34,7 @@ class Wanted:
     q_dot: Array
 
 
-def desired_along(run: Run) -> Wanted | None:
+def desired_along(run: Run) -> DesiredPath | None:
     """Return q_d and its rate at the run's output instants, or None where the scene has no controller.
 
     Raises
@@ -47,11 +47,11 @@ def desired_along(run: Run) -> Wanted | None:
     spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
     if isinstance(spec, SetPointSpec):
         q_d = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
-        return Wanted("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
+        return DesiredPath("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
     sources = Sources(run.scene_name, None, run.texts)
     desired: Desired = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
     sampled = np.array([desired(float(t))[:2] for t in run.t])
-    return Wanted("tracking", sampled[:, 0], sampled[:, 1])
+    return DesiredPath("tracking", sampled[:, 0], sampled[:, 1])
 
 
 @dataclass(frozen=True)

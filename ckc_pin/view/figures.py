@@ -138,7 +138,7 @@ def _write(figure: Figure, path: Path) -> Path:
 
 def _set_point(group: Group) -> Figure:
     """Fig. 3: a the configurations, b torques, c errors, d velocities."""
-    figure, axes = _sheet(group, ["configurations", _efforts_title(group), "errors", "velocities"])
+    figure, axes = _panels(group, ["configurations", _efforts_title(group), "errors", "velocities"])
     panels.linkage(axes[0], group)
     panels.efforts(axes[1], group)
     panels.errors(axes[2], group)
@@ -154,7 +154,7 @@ def _tracking(group: Group) -> Figure:
     space = "configuration space" if len(group.independent) > 1 else "phase plane"
     if len(group.independent) > 2:
         space += f", 2 of its {len(group.independent)} dimensions"
-    figure, axes = _sheet(group, [space, _efforts_title(group), "coordinates", "velocities"])
+    figure, axes = _panels(group, [space, _efforts_title(group), "coordinates", "velocities"])
     panels.configuration_space(axes[0], group)
     panels.efforts(axes[1], group)
     panels.coordinates(axes[2], group, group.independent)
@@ -167,7 +167,7 @@ def _tracking(group: Group) -> Figure:
 def _motion(group: Group) -> Figure:
     """Without control: coordinates, rates, energy drift, closure residual."""
     names = group.runs[0].coordinates if len(group.runs[0].coordinates) <= LEGEND_MAX else group.independent
-    figure, axes = _sheet(group, ["coordinates", "velocities", "energy drift", "closure residual"])
+    figure, axes = _panels(group, ["coordinates", "velocities", "energy drift", "closure residual"])
     panels.coordinates(axes[0], group, names)
     panels.rates(axes[1], group, names)
     drift = max(float(np.abs(run.energy - run.energy[0]).max()) for run in group.runs)
@@ -183,7 +183,7 @@ def _checks(group: Group) -> Figure:
     """What tells whether to trust a run: residual, loop forces, energy, Lyapunov function."""
     monitored = any(run.lyapunov is not None for run in group.runs)
     titles = ["closure residual", "loop forces", "energy"] + ["Lyapunov function"] * monitored
-    figure, axes = _sheet(group, titles)
+    figure, axes = _panels(group, titles)
     _residual(axes[0], group)
     panels.loop_forces(axes[1], group)
     panels.scalar(axes[2], group, lambda run: run.energy, "$E$, J")
@@ -198,7 +198,7 @@ def _snapshots(group: Group) -> Figure:
     """Poses at equal times; of a motion without control, which has no checks, the loop forces too."""
     which = f", {group.labels[0]}" if len(group.runs) > 1 else ""
     forces = ["loop forces"] * (group.kind == "motion")
-    figure, axes = _sheet(group, [f"snapshots{which}", *forces], (7.2 + 5.0 * len(forces), 5.4))
+    figure, axes = _panels(group, [f"snapshots{which}", *forces], (7.2 + 5.0 * len(forces), 5.4))
     figure.colorbar(panels.snapshots(axes[0], group), ax=axes[0], label="t, s", shrink=0.85)
     if forces:
         panels.loop_forces(axes[1], group)
@@ -212,7 +212,7 @@ _LAYOUTS = {"set_point": _set_point, "tracking": _tracking, "own": _tracking, "m
 # --- parts ---------------------------------------------------------------------------------------
 
 
-def _sheet(group: Group, titles: Sequence[str], size: tuple[float, float] | None = None) -> tuple[Figure, list[Any]]:
+def _panels(group: Group, titles: Sequence[str], size: tuple[float, float] | None = None) -> tuple[Figure, list[Any]]:
     from matplotlib.figure import Figure
 
     rows, columns = (2, 2) if len(titles) == 4 else (1, len(titles))

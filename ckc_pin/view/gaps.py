@@ -28,14 +28,14 @@ def gaps(mechanism: Mechanism, q_tree: Array) -> dict[str, Array]:
         for group in mechanism.closure.groups:
             if isinstance(group, Component):
                 ways = pose.e[group.direction]
-                held = group.phi(pose)[:, None] * ways
+                offset = group.phi(pose)[:, None] * ways
             elif isinstance(group, Distance):
                 r = pose.r[group.pair]
                 lengths = np.linalg.norm(r, axis=1, keepdims=True)
-                held = r * (1.0 - group.length[:, None] / np.maximum(lengths, 1e-300))
+                offset = r * (1.0 - group.length[:, None] / np.maximum(lengths, 1e-300))
             else:
                 continue
-            for row, way in zip(group.out, held, strict=True):
+            for row, way in zip(group.out, offset, strict=True):
                 found[mechanism.closure.names[row][0]][k] += way
     return found
 

@@ -95,8 +95,8 @@ class LiveView:
         self._thread = Thread(target=self._draw, name="ckc_pin live view", daemon=True)
         self._thread.start()
 
-    def watch(self, t: float, q_tree: Array) -> None:
-        """Take an output instant: `simulate`'s watch. Costs next to nothing, whatever the viewers do."""
+    def on_output(self, t: float, q_tree: Array) -> None:
+        """Take an output instant: `simulate`'s output callback. Costs next to nothing, whatever the viewers do."""
         self._began = self._began or perf_counter()
         self._frames.append((t, q_tree))
 

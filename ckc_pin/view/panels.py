@@ -14,7 +14,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
-from ckc_pin.view.desired import Wanted
+from ckc_pin.view.desired import DesiredPath
 from ckc_pin.view.labels import plain, run_labels, symbol, units
 from ckc_pin.view.skeleton import Motion, placements, sticks, viewpoint
 
@@ -37,12 +37,12 @@ class Group:
     kind : "set_point", "tracking", "own" (a controller that is not the scene's) or "motion"
     runs : list of Run
         In drawing order.
-    wanted : list of Wanted or None
+    wanted : list of DesiredPath or None
     """
 
     kind: str
     runs: list[Run]
-    wanted: list[Wanted | None]
+    wanted: list[DesiredPath | None]
 
     @property
     def mechanism(self) -> Mechanism:
@@ -85,9 +85,9 @@ class Group:
         return min(end, 2.0 * settled) or end
 
     @cached_property
-    def desired(self) -> list[tuple[Run, Wanted]]:
+    def desired(self) -> list[tuple[Run, DesiredPath]]:
         """What was wanted, once where several runs want the same, as long as the longest of them."""
-        found: dict[str, tuple[Run, Wanted]] = {}
+        found: dict[str, tuple[Run, DesiredPath]] = {}
         for run, wanted in sorted(zip(self.runs, self.wanted, strict=True), key=lambda pair: -pair[0].t[-1]):
             if wanted is not None:
                 controller = run.scene["controller"]
@@ -153,7 +153,7 @@ def loop_forces(ax: Any, group: Group) -> None:
     mechanism = group.mechanism
     metres = mechanism.closure.in_metres(mechanism.tree)
     loops = [loop for loop, _ in mechanism.closure.names]
-    holding = list(dict.fromkeys(loop for loop, held in zip(loops, metres, strict=True) if held))
+    holding = list(dict.fromkeys(loop for loop, counted in zip(loops, metres, strict=True) if counted))
     colours = style.colours(holding)
     for run, line in zip(group.runs, group.lines, strict=True):
         for loop, forces in run.loop_forces().items():
@@ -181,7 +181,7 @@ def _curves(ax: Any, group: Group, names: Sequence[str], values: Callable[[Run],
             ax.plot(run.t, column, color=group.colours[name], **line)
 
 
-def _dots(ax: Any, group: Group, names: Sequence[str], values: Callable[[Wanted], Array]) -> None:
+def _dots(ax: Any, group: Group, names: Sequence[str], values: Callable[[DesiredPath], Array]) -> None:
     for run, wanted in group.desired:
         rows = np.unique(np.linspace(0, len(run.t) - 1, DOTS).astype(int))
         for name, column in zip(run.independent, values(wanted).T, strict=True):

@@ -167,7 +167,7 @@ def _forget(sent: asyncio.Future[None]) -> None:
         sent.result()
 
 
-class _Guarded(RequestHandler):
+class _OwnOnly(RequestHandler):
     """Answers only requests that were meant for this server."""
 
     def initialize(self, server: ViewServer, **rest: Any) -> None:
@@ -194,12 +194,12 @@ class _Guarded(RequestHandler):
             super().log_exception(*error)
 
 
-class _Nothing(_Guarded):
+class _Nothing(_OwnOnly):
     def get(self) -> None:
         raise HTTPError(404)
 
 
-class _File(_Guarded):
+class _File(_OwnOnly):
     def initialize(self, server: ViewServer, kind: str = "", content: bytes | str = "", **rest: Any) -> None:
         super().initialize(server)
         self.kind, self.content = kind, content
@@ -209,7 +209,7 @@ class _File(_Guarded):
         self.write(self.content)
 
 
-class _Viewer(_Guarded, WebSocketHandler):
+class _Viewer(_OwnOnly, WebSocketHandler):
     """The page at ``/``, and the WebSocket that the page opens at the same place."""
 
     def initialize(self, server: ViewServer, page: str = "", **rest: Any) -> None:

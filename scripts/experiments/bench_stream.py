@@ -56,7 +56,7 @@ def measure(name: str) -> tuple[float, float, str]:
             viewer.stdout.readline()
             time.sleep(0.5)
         spent = time.process_time()
-        run = ckc_pin.simulate(scene, watch=None if view is None else view.watch)
+        run = ckc_pin.simulate(scene, on_output=None if view is None else view.on_output)
         spent = time.process_time() - spent
     frames = "-"
     if viewer is not None:

@@ -26,7 +26,7 @@ def test_many_configurations_are_each_one_of_them(name):
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta", "three_rrr", "stewart"])
-def test_told_rows_are_the_coordinates_and_the_place(name):
+def test_prescribed_rows_are_the_coordinates_and_the_place(name):
     mechanism = load(name)
     point = next(iter(mechanism.points))
     extended = extend(mechanism, point)

@@ -142,13 +142,13 @@ def test_a_simulation_is_seen_while_it_computes_and_played_back_after(look_at):
         visit = look_at(view.server.url, until="viewer.scene_tree.children.world?.children.live")
         shown = []
 
-        def watch(t: float, q_tree: np.ndarray) -> None:
-            view.watch(t, q_tree)
+        def on_output(t: float, q_tree: np.ndarray) -> None:
+            view.on_output(t, q_tree)
             if t in (0.4, 1.2):
                 visit.until(f"document.getElementById('said').textContent === 't = {t:.2f} of 2 s'")
                 shown.append(np.array(visit.tree()["/world/live/joint:theta_2"]["matrix"][12:15]))
 
-        run = ckc_pin.simulate(scene, {}, watch=watch)
+        run = ckc_pin.simulate(scene, {}, on_output=on_output)
         for t, where in zip((0.4, 1.2), shown, strict=True):
             np.testing.assert_allclose(where, elbow(run, "theta_1")[run.at(t)], atol=1e-6)
         view.stop()

@@ -101,7 +101,7 @@ def test_the_second_interrupt_is_let_pass_and_the_third_is_not(interrupts: Inter
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_what_is_held_is_finished_first(interrupts: Interrupts) -> None:
+def test_what_is_deferred_for_is_finished_first(interrupts: Interrupts) -> None:
     done = []
 
     def save() -> None:
@@ -135,7 +135,7 @@ def say(what):
         print(what, file=sys.stderr, flush=True)
         return True
 
-def watched(scene, **options):
+def signalled(scene, **options):
     return simulate(scene, **{**options, "progress": lambda t, t_end: t > 0.2 and say("under way")})
 
 def slow(handle):
@@ -143,7 +143,7 @@ def slow(handle):
         time.sleep(1.0)
     fsync(handle)
 
-ckc_pin.simulate, os.fsync = watched, slow
+ckc_pin.simulate, os.fsync = signalled, slow
 ckc_pin.cli.main()
 """
 

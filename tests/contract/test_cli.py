@@ -251,7 +251,7 @@ def test_profile_does_not_disturb_json() -> None:
         (OSError(28, "No space left on device", "disk"), 2, "disk: No space left on device"),
     ],
 )
-def test_what_happens_to_a_command_is_told_in_one_line(
+def test_what_happens_to_a_command_is_said_in_one_line(
     error: BaseException, code: int, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:

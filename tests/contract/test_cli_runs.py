@@ -85,9 +85,9 @@ def test_an_event_that_stops_is_the_last_instant(crossings: tuple[list[float], l
 def test_a_torque_limit_clips_tau_and_u(run: Callable[..., Run]) -> None:
     free = run("five_bar/tracking", t_end=0.3)
     assert np.abs(free.tau).max() > 6
-    held = run("five_bar/tracking", t_end=0.3, controller__torque_limit=5.0)
-    assert np.abs(held.tau).max() == 5.0
-    assert np.array_equal(held.u, held.tau), "the actuators are the independent joints"
+    limited = run("five_bar/tracking", t_end=0.3, controller__torque_limit=5.0)
+    assert np.abs(limited.tau).max() == 5.0
+    assert np.array_equal(limited.u, limited.tau), "the actuators are the independent joints"
     one = run("five_bar/tracking", t_end=0.3, controller__torque_limit={"theta_1": 3.0})
     assert np.abs(one.tau[:, 0]).max() <= 3.0
     assert np.abs(one.tau[:, 1]).max() > 3.0
@@ -170,12 +170,12 @@ def test_a_controller_that_gives_nan_cannot_start() -> None:
 # --- on the way ------------------------------------------------------------------------------------
 
 
-def test_progress_is_told_on_the_way() -> None:
-    told: list[tuple[float, float]] = []
-    simulate("five_bar/swing", {"t_end": 100.0}, progress=lambda t, t_end: told.append((t, t_end)))
-    assert len(told) > 2
-    assert told[-1] == (100.0, 100.0)
-    assert all(before < after for (before, _), (after, _) in pairwise(told))
+def test_progress_is_reported_on_the_way() -> None:
+    reports: list[tuple[float, float]] = []
+    simulate("five_bar/swing", {"t_end": 100.0}, progress=lambda t, t_end: reports.append((t, t_end)))
+    assert len(reports) > 2
+    assert reports[-1] == (100.0, 100.0)
+    assert all(before < after for (before, _), (after, _) in pairwise(reports))
 
 
 @pytest.mark.parametrize(

@@ -170,10 +170,10 @@ def test_margins_and_functions_are_located(formulation: str, motion: Callable[[f
 
 def test_events_do_not_change_the_motion() -> None:
     plain = simulate("five_bar/swing", {"t_end": 0.3})
-    watched = simulate("five_bar/swing", {"t_end": 0.3, "event": [{"coordinate": "theta_2", "value": 0.5}]})
-    assert watched.events
-    assert watched.stats["steps"] == plain.stats["steps"]
-    assert_close(watched.q_tree, plain.q_tree, 1e-12)
+    observed = simulate("five_bar/swing", {"t_end": 0.3, "event": [{"coordinate": "theta_2", "value": 0.5}]})
+    assert observed.events
+    assert observed.stats["steps"] == plain.stats["steps"]
+    assert_close(observed.q_tree, plain.q_tree, 1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -182,9 +182,9 @@ def test_an_event_that_is_far_from_happening_is_not_looked_for(formulation: str)
     changes: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
     plain = simulate("five_bar/swing", changes, profile=True)
     far = [{"coordinate": "theta_2", "value": 50.0}, {"coordinate": "theta_1", "of": "q_dot", "value": 1e3}]
-    watched = simulate("five_bar/swing", {**changes, "event": far}, profile=True)
-    assert watched.events == []
-    assert watched.profile["J"]["calls"] < 1.1 * plain.profile["J"]["calls"]
+    observed = simulate("five_bar/swing", {**changes, "event": far}, profile=True)
+    assert observed.events == []
+    assert observed.profile["J"]["calls"] < 1.1 * plain.profile["J"]["calls"]
 
 
 # --- limits --------------------------------------------------------------------------------------
@@ -236,9 +236,9 @@ def test_limits_that_are_not_there(bar: Path) -> None:
 def test_a_run_that_starts_on_the_value_has_not_crossed_it() -> None:
     """From rest: every rate starts at zero; theta_1 starts at the value, and comes back to it once a swing."""
     start = load_scene("five_bar/swing").spec.initial.q
-    watched = [{"coordinate": c, "of": "q_dot"} for c in ("theta_1", "theta_2")]
+    observed = [{"coordinate": c, "of": "q_dot"} for c in ("theta_1", "theta_2")]
     run = simulate(
-        "five_bar/swing", {"t_end": 0.1, "event": [*watched, {"coordinate": "theta_1", "value": start["theta_1"]}]}
+        "five_bar/swing", {"t_end": 0.1, "event": [*observed, {"coordinate": "theta_1", "value": start["theta_1"]}]}
     )
     assert run.events == []
 

@@ -31,7 +31,7 @@ def test_a_part_of_an_experiment(name: str) -> None:
     assert says in found.stdout
 
 
-def test_an_unknown_experiment_is_told_the_others() -> None:
+def test_an_unknown_experiment_is_answered_with_the_others() -> None:
     found = run("nothing")
     assert found.returncode == 2
     assert all(name in found.stderr for name in EXPERIMENTS)

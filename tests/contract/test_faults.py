@@ -66,7 +66,7 @@ def test_choices_are_those_of_the_type() -> None:
     assert fault.choices == tuple(sorted(get_args(LoopType)))
 
 
-def test_entries_wrong_in_one_way_are_told_once() -> None:
+def test_entries_wrong_in_one_way_are_named_once() -> None:
     found = [fault.steps for fault in faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
     assert found == [("gravity", 0)]
 

@@ -64,7 +64,7 @@ def test_a_robot_that_does_not_close_is_written_all_the_same(folder: Path) -> No
     assert (folder / "far" / "mechanism.toml").is_file()
 
 
-def test_files_that_are_there_are_kept_unless_told(folder: Path) -> None:
+def test_files_that_are_there_are_kept_without_overwrite(folder: Path) -> None:
     ckc("import", "linkage.xml")
     file = folder / "linkage" / "mechanism.toml"
     file.write_text("mine", encoding="utf-8")

@@ -83,12 +83,12 @@ def elbow_of(frame: dict) -> np.ndarray:
     return np.array(placed["matrix"][12:15])
 
 
-def watched(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[dict]]:
+def seen_live(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[dict]]:
     scene = ckc_pin.load_scene(SWING, changes)
     with live_view(scene, None) as view:
         assert view is not None
         thread, seen = beside(view.server.url, viewer)
-        run = ckc_pin.simulate(scene, watch=view.watch)
+        run = ckc_pin.simulate(scene, on_output=view.on_output)
     thread.join(20)
     assert not thread.is_alive()
     return run, seen
@@ -96,7 +96,7 @@ def watched(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[
 
 @pytest.mark.parametrize("viewer", [answering, silent])
 def test_the_run_is_the_same_whoever_looks(viewer, run):
-    assert_same(watched(viewer, {})[0], run(SWING))
+    assert_same(seen_live(viewer, {})[0], run(SWING))
 
 
 def test_a_viewer_that_vanishes_ends_no_run(run, caplog):
@@ -104,12 +104,12 @@ def test_a_viewer_that_vanishes_ends_no_run(run, caplog):
     with live_view(scene, None) as view:
         viewers = [raw_viewer(view.server) for _ in range(3)]
 
-        def watch(t: float, q_tree: np.ndarray) -> None:
-            view.watch(t, q_tree)
+        def on_output(t: float, q_tree: np.ndarray) -> None:
+            view.on_output(t, q_tree)
             if t > 1.0 and viewers:
                 vanish(viewers.pop())
 
-        seen = ckc_pin.simulate(scene, watch=watch)
+        seen = ckc_pin.simulate(scene, on_output=on_output)
     assert not viewers
     assert not caplog.records
     assert_same(seen, run(SWING))
@@ -122,7 +122,7 @@ def assert_same(seen: ckc_pin.Run, alone: ckc_pin.Run) -> None:
 
 
 def test_frames_show_the_run_in_order_up_to_its_end():
-    run, frames = watched(answering, {})
+    run, frames = seen_live(answering, {})
     times = [time_of(frame) for frame in frames]
     assert times == sorted(set(times))
     assert times[-1] == 2.0
@@ -135,7 +135,7 @@ def test_frames_show_the_run_in_order_up_to_its_end():
 
 
 def test_a_viewer_that_does_not_answer_gets_one_frame_and_the_last():
-    _, frames = watched(silent, {})
+    _, frames = seen_live(silent, {})
     assert len(frames) <= 2
     assert time_of(frames[-1]) == 2.0
 
@@ -144,7 +144,7 @@ def test_only_the_newest_instant_is_kept():
     view = LiveView(ckc_pin.load_scene(SWING), None)
     try:
         for k in range(10_000):
-            view.watch(1e-4 * k, view.mechanism.q_tree)
+            view.on_output(1e-4 * k, view.mechanism.q_tree)
         assert len(view._frames) <= 1
         assert view._last is None or len(view._last) == 2
     finally:
@@ -159,7 +159,7 @@ def test_speed_says_which_instants_are_due(monkeypatch):
     try:
         view.stop()  # its thread; what follows is done by hand
         for k in range(5):
-            view.watch(0.1 * k, view.mechanism.q_tree)
+            view.on_output(0.1 * k, view.mechanism.q_tree)
         assert view._due()[0] == 0.0
         assert view._due() is None
         clock[0] = 100.5  # half a second is a quarter of a second of the motion: 0.1 is dropped
@@ -178,7 +178,7 @@ def test_the_view_waits_for_the_slower_speed_and_not_longer(monkeypatch, run):
     for speed, expected in ((0.5, [3.0]), (None, [])):
         with live_view(ckc_pin.load_scene(SWING), speed) as view:
             clock[0] = 100.0
-            view.watch(0.0, view.mechanism.q_tree)
+            view.on_output(0.0, view.mechanism.q_tree)
             clock[0] = 101.0
             view.finish(run(SWING), stay=False)
         assert waited == expected
@@ -233,7 +233,7 @@ def test_options_that_cannot_be(words, says):
     assert says in found.err
 
 
-def test_a_stop_in_a_run_is_told_as_without_a_view():
+def test_a_stop_in_a_run_is_the_same_as_without_a_view():
     found = ckc("run", SWING, "--set", "solver.max_rhs=40", "--meshcat", "--json")
     assert (found.code, found.json["status"]) == (3, "stopped")
 

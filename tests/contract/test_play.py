@@ -61,7 +61,7 @@ def serve() -> Iterator[Server]:
         server.stop()
 
 
-def watch(server: ViewServer, count: int, **headers: str) -> list[dict]:
+def messages_to(server: ViewServer, count: int, **headers: str) -> list[dict]:
     """What a viewer that connects now is told in its first messages."""
 
     async def listen() -> list[bytes]:
@@ -134,7 +134,7 @@ def test_page_and_viewer_are_served(serve, swing):
 
 def test_elbows_of_the_animation_agree_with_forward_kinematics(serve, tracking):
     server = serve(tracking)
-    moved = tracks(watch(server, len(server.stage.messages())))
+    moved = tracks(messages_to(server, len(server.stage.messages())))
     for proximal, distal, foot, column in (("theta_1", "theta_2", 0.0, 0), ("theta_3", "theta_4", BASE, 2)):
         times, elbow, _ = moved[f"/world/1: reduced/joint:{distal}"]
         rows = np.searchsorted(tracking.t, times - 1e-4)
@@ -149,7 +149,7 @@ def test_elbows_of_the_animation_agree_with_forward_kinematics(serve, tracking):
 
 def test_loop_frames_meet_and_follow_the_traced_point(serve, tracking):
     server = serve(tracking)
-    drawing = watch(server, len(server.stage.messages()))
+    drawing = messages_to(server, len(server.stage.messages()))
     drawn, moved = objects(drawing), tracks(drawing)
     root = "/world/1: reduced"
     ends = {}
@@ -167,7 +167,7 @@ def test_loop_frames_meet_and_follow_the_traced_point(serve, tracking):
     np.testing.assert_allclose(ends["A"], path[np.searchsorted(tracking.t, times - 1e-4)], atol=1e-6)
 
 
-def test_links_have_their_shapes_and_are_told_apart_by_colour(tracking):
+def test_links_have_their_shapes_and_differ_by_colour(tracking):
     drawn = objects(scene([tracking]))
     root = "/world/1: reduced/joint:theta_1/link:link_1"
     shapes = {path: obj["geometries"][0] for path, obj in drawn.items() if path.startswith(root)}
@@ -208,7 +208,7 @@ def test_the_spf_lies_translucent_on_the_reduced_model_whatever_the_order(serve,
     with urlopen(server.url) as answer:
         page = answer.read().decode()
     assert "<p>reduced</p><p>translucent: SPF, ε = 10⁻⁴</p><p>gray: desired</p>" in page
-    opacity = opacities(watch(server, len(server.stage.messages())))
+    opacity = opacities(messages_to(server, len(server.stage.messages())))
     assert {x for path, x in opacity.items() if path.startswith("/world/2: SPF")} == {0.4}
 
 
@@ -384,16 +384,16 @@ def test_names_from_files_are_text_to_the_page(tmp_path):
 def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing):
     server = serve(swing)
     count = len(server.stage.messages())
-    first = watch(server, count)
+    first = messages_to(server, count)
     server.send(commands.set_transform("/world", 2 * np.eye(4)))
-    second = watch(server, count)
+    second = messages_to(server, count)
     assert [c["path"] for c in second] == [c["path"] for c in first]
     np.testing.assert_array_equal(placed(second), 2 * np.eye(4))
     assert second[-1]["type"] == "set_animation"
     assert objects(second) == objects(first)
 
 
-def test_a_viewer_that_is_there_is_told_at_once(serve, swing):
+def test_a_viewer_that_is_there_gets_it_at_once(serve, swing):
     server = serve(swing)
 
     async def listen() -> dict:
@@ -436,10 +436,10 @@ def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
 def test_websockets_of_other_pages_are_refused(serve, swing):
     server = serve(swing)
     count = len(server.stage.messages())
-    assert len(watch(server, count, Origin=f"http://localhost:{server.port}")) == count
+    assert len(messages_to(server, count, Origin=f"http://localhost:{server.port}")) == count
     for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
         with pytest.raises(HTTPClientError) as refused:
-            watch(server, 1, **headers)
+            messages_to(server, 1, **headers)
         assert refused.value.code == 403
 
 
@@ -469,7 +469,7 @@ def test_bad_input(swing):
 def test_nothing_is_left_after_stop(swing):
     threads, files = threading.enumerate(), len(os.listdir("/dev/fd"))
     server = play(swing, block=False)
-    watch(server, 3)
+    messages_to(server, 3)
     server.stop()
     server.stop()  # again is no harm
     assert threading.enumerate() == threads
@@ -489,7 +489,7 @@ def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
     while server.viewers and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not server.viewers
-    assert len(watch(server, 3)) == 3
+    assert len(messages_to(server, 3)) == 3
     server.stop()
     gc.collect()  # asyncio complains about forgotten errors only now
     assert not caplog.records

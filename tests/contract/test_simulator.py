@@ -169,21 +169,21 @@ def test_a_u_that_stays_costs_hardly_more_than_the_run(formulation: str) -> None
 @pytest.mark.parametrize("dt", [1e-3, 7e-3])
 def test_a_u_that_changes_now_and_then(formulation: str, dt: float) -> None:
     """Against SciPy on the equations in NumPy, from change to change: what reached beyond a change is made again."""
-    held, random = [0.0, 0.0], np.random.default_rng(5)
+    u, random = [0.0, 0.0], np.random.default_rng(5)
     simulator = Simulator("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-9})
     q = simulator.mechanism.partition.q
     problem: Any = as_ivp("five_bar/swing", {"formulation": formulation})
 
     def force(t: float, terms: Terms) -> Array:
         u_tree = np.zeros(4)
-        u_tree[q] = held
+        u_tree[q] = u
         return u_tree
 
     problem.force, y, t = force, problem.y0, 0.0
     for steps in (1, 1, 2, 13, 3, 40, 1, 7):
-        held[:] = random.uniform(-0.5, 0.5, 2)
+        u[:] = random.uniform(-0.5, 0.5, 2)
         for _ in range(steps):
-            state = simulator.step(held, dt)
+            state = simulator.step(u, dt)
         y = solve_ivp(problem.f, (t, t + steps * dt), y, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
         t += steps * dt
         assert state.t == pytest.approx(t, abs=1e-12)
@@ -317,8 +317,8 @@ def test_a_bad_step_is_refused_and_moves_nothing(u: Any, dt: Any, says: str) -> 
 
 def test_limits_of_torque_hold() -> None:
     free = Simulator("five_bar/tracking", {"formulation": "reduced"})
-    held = Simulator("five_bar/tracking", {"formulation": "reduced", "controller.torque_limit": 2.0})
-    assert_same(held.step([9.0, -9.0], 0.01), free.step([2.0, -2.0], 0.01), 1e-13)
+    limited = Simulator("five_bar/tracking", {"formulation": "reduced", "controller.torque_limit": 2.0})
+    assert_same(limited.step([9.0, -9.0], 0.01), free.step([2.0, -2.0], 0.01), 1e-13)
 
 
 # --- events --------------------------------------------------------------------------------------

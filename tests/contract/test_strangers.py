@@ -162,15 +162,15 @@ def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
     assert simulator.step(None, 1e-3).t > 0
 
 
-def test_what_a_watcher_does_to_its_array_is_its_own_affair() -> None:
+def test_what_an_output_callback_does_to_its_array_is_its_own_affair() -> None:
     """It was a view of what the run records."""
     changes = {"t_end": 0.02}
 
     def spoil(t: float, q_tree: Any) -> None:
         q_tree[:] = np.nan
 
-    watched = simulate("five_bar/swing", changes, watch=spoil)
-    assert np.array_equal(watched.q_tree, simulate("five_bar/swing", changes).q_tree)
+    spoilt = simulate("five_bar/swing", changes, on_output=spoil)
+    assert np.array_equal(spoilt.q_tree, simulate("five_bar/swing", changes).q_tree)
 
 
 def test_a_state_cannot_be_changed() -> None:

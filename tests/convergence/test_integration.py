@@ -51,8 +51,8 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
 
     ends = steps_of(ready.loop, ready.begin, T_END)
     starts = np.concatenate([[0.0], ends[:-1]])
-    told = ends - starts > SHORTEST
-    within = np.sort(np.concatenate([(starts + x * (ends - starts))[told] for x in (0.25, 0.5, 0.75)]))
+    long_enough = ends - starts > SHORTEST
+    within = np.sort(np.concatenate([(starts + x * (ends - starts))[long_enough] for x in (0.25, 0.5, 0.75)]))
     found = []
     for times in (ends, within):
         rows = np.empty((len(times) + 1, ready.loop.width))

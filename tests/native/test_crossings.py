@@ -69,7 +69,7 @@ def test_nothing_of_the_native_core_is_left_when_python_ends():
 
 
 @pytest.mark.parametrize("N", [3, 9, 30, 120])
-def test_the_least_singular_value_that_is_watched_is_that_of_j(N):
+def test_the_least_singular_value_that_is_monitored_is_that_of_j(N):
     """Of chains whose J is decomposed whole and of longer ones, against NumPy's and differences of NumPy's."""
     ready = started("n_four_bar", {"mechanism.N": N})
     mechanism = ready.mechanism

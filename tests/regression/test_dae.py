@@ -63,16 +63,16 @@ def test_ida_against_an_integration_in_numpy() -> None:
 # --- Baumgarte --------------------------------------------------------------------------------------
 
 
-def test_what_drifts_is_held_by_baumgarte_and_closed_by_projection(run: Callable[..., Run]) -> None:
+def test_what_drifts_is_damped_by_baumgarte_and_closed_by_projection(run: Callable[..., Run]) -> None:
     def swing(**solver: object) -> Run:
         return run("five_bar/swing", formulation="dae", t_end=5.0, solver__rtol=1e-6, **solver)
 
     free, projected = swing(solver__projection=False), swing()
-    held = swing(solver__projection=False, solver__baumgarte=[50.0, 50.0])
+    damped = swing(solver__projection=False, solver__baumgarte=[50.0, 50.0])
     drift = np.abs(free.phi).max(axis=1)
     assert drift[-100:].max() > 3 * drift[:100].max() > 0  # it grows
-    assert free.max_phi > 50 * held.max_phi
-    assert held.max_phi > 1e3 * projected.max_phi  # what is off decays, while every step adds to it
+    assert free.max_phi > 50 * damped.max_phi
+    assert damped.max_phi > 1e3 * projected.max_phi  # what is off decays, while every step adds to it
     assert projected.max_phi <= 1e-12
 
 

@@ -91,13 +91,13 @@ def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
 
 
-def _comment(text: str, first: str = "# ", following: str = "# ") -> list[str]:
+def _comment(text: str, first: str = "# ", rest: str = "# ") -> list[str]:
     """Return a text as comment lines; control characters, which could end a comment, become spaces."""
     lines, line = [], ""
     for word in re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", text).split():
-        if line and len(line) + len(word) + len(following) > WIDTH:
+        if line and len(line) + len(word) + len(rest) > WIDTH:
             lines.append(line)
             line = ""
         line = f"{line} {word}" if line else word
     lines += [line] if line else []
-    return [f"{following if k else first}{line}" for k, line in enumerate(lines)]
+    return [f"{rest if k else first}{line}" for k, line in enumerate(lines)]
