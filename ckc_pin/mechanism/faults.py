@@ -24,7 +24,7 @@ NEAR = 0.7  # how alike a key and the one that was meant are, of 1
 INTEGERS = range(-(2**63), 2**63)  # TOML's
 TOO_LARGE = "an integer of at most 64 bits, or a number such as 1e20,"
 ALSO = {"an integer": ["a number"]}  # what else a value of some kind may stand for
-BOUNDS = {"ge": "of at least", "gt": "greater than", "le": "of at most", "lt": "less than"}
+BOUNDS = {"ge": "at least", "gt": "greater than", "le": "at most", "lt": "less than"}
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -236,7 +236,7 @@ def _bounded(kind: Any) -> str:
         words += f" of {len(get_args(kind))}"
     for meta in get_args(kind)[1:] if get_origin(kind) is Annotated else ():
         bounds = [f"{text} {getattr(meta, name):g}" for name, text in BOUNDS.items() if getattr(meta, name) is not None]
-        words += f" {' and '.join(bounds)}" if bounds else ""
+        words += f"{' of' if bounds[0].startswith('at') else ''} {' and '.join(bounds)}" if bounds else ""
         words += " that is not empty" if meta.min_length else ""
     return words
 

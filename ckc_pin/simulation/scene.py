@@ -56,7 +56,7 @@ class SolverSpec(_Spec, frozen=True):
     atol: Positive | None = None
     max_step: Positive | None = None
     min_step: NonNegative = 0.0
-    max_rhs: Annotated[int, msgspec.Meta(gt=0, le=2**62)] | None = None
+    max_rhs: Annotated[int, msgspec.Meta(ge=1, le=2**62)] | None = None
     max_wall_s: Positive | None = None
     output_dt: Positive | None = None
     projection: bool = True

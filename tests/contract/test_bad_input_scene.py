@@ -65,7 +65,7 @@ SOLVER = [
     _value("solver.backend=native", "solver: unknown key 'backend'; valid: method, rtol"),
     _value("spf_coordinates=y", "spf_coordinates = 'y'; valid: 'w', 'z'"),
     _value("solver.projection=yes", "solver.projection = 'yes': true or false is needed, not a string"),
-    _value("solver.max_rhs=0", "solver.max_rhs = 0: ", "greater than 0"),
+    _value("solver.max_rhs=0", "solver.max_rhs = 0: ", "of at least 1"),
     _value("solver.max_rhs=1.5", "solver.max_rhs = 1.5: an integer is needed, not a number"),
     _value("solver.max_wall_s=0", "solver.max_wall_s = 0: ", GREATER),
     _value("solver.max_step=0", "solver.max_step = 0: ", GREATER),
