@@ -1,4 +1,4 @@
-"""The mechanism file, `mechanism.toml`, as a typed structure. What each key means: README, "your own mechanism"."""
+"""The mechanism file, `mechanism.toml`, as a typed structure. What each key means: docs/reference.md."""
 
 from __future__ import annotations
 
