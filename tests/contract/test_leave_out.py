@@ -40,7 +40,7 @@ def _modules(code: str, *words: str) -> tuple[set[str], str]:
 def test_importing_loads_no_scipy_no_command_line_and_no_pictures() -> None:
     modules, _ = _modules(f"import ckc_pin; {LIST}")
     assert "pinocchio" in modules
-    assert not modules & (VIEW | {"typer", "scipy", "ckc_pin.simulation"})
+    assert not modules & (VIEW | {"click", "scipy", "ckc_pin.simulation"})
 
 
 def test_what_is_loaded_later_is_there() -> None:
@@ -53,7 +53,7 @@ def test_terms_need_no_scipy() -> None:
     modules, _ = _modules(
         'import ckc_pin; ckc_pin.terms(ckc_pin.load("five_bar"), {"theta_1": -1.2, "theta_3": -1.9}).C; ' + LIST
     )
-    assert not modules & (VIEW | {"typer", "scipy"})
+    assert not modules & (VIEW | {"click", "scipy"})
 
 
 def test_a_run_in_json_loads_no_pictures() -> None:

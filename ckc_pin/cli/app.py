@@ -1,0 +1,115 @@
+"""The `ckc` command: finds the module of a command, calls it, and turns errors and signals into exit codes."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from importlib import import_module
+from typing import NoReturn
+
+import click
+
+from ckc_pin.cli.exits import DONE, STOPPED, WRONG_INPUT, interrupted, interrupts
+from ckc_pin.cli.output import errors, print_json
+from ckc_pin.errors import CkcError, NumericalError
+
+__all__ = ["ckc", "main"]
+
+BEGIN = """Dynamics and control of closed kinematic chains.
+
+\b
+Begin with
+  ckc list                                     what is shipped
+  ckc check five_bar                           freedoms, partition, assembled configuration
+  ckc run five_bar/tracking --out runs/first   simulate; run.npz and figures go to the folder
+  ckc play runs/first                          watch it in the browser
+  ckc COMMAND --help                           what a command does, with examples
+"""
+
+COMMANDS = {
+    "list": "look:list_",
+    "check": "look:check",
+    "terms": "look:terms",
+    "run": "run:run",
+    "plot": "view:plot",
+    "play": "view:play",
+    "map": "map:map_",
+    "import": "exchange:import_",
+    "export": "exchange:export",
+}  # in the order of the help; module:function in this folder
+
+
+class _Commands(click.Group):
+    """A group that imports the module of a command when the command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names, in the order of the help."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command; None where there is none of that name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, function = COMMANDS[cmd_name].partition(":")
+        command: click.Command = getattr(import_module(f"ckc_pin.cli.{module}"), function)
+        return command
+
+
+@click.group(
+    "ckc",
+    cls=_Commands,
+    help=BEGIN,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+)
+@click.pass_context
+def ckc(context: click.Context) -> None:
+    """Say where to begin when no command is given."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+def main() -> NoReturn:
+    """Entry point of the `ckc` command."""
+    as_json = "--json" in sys.argv
+    interrupts.install()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no error
+    code = DONE
+    try:
+        with ckc.make_context("ckc", sys.argv[1:]) as context:
+            ckc.invoke(context)
+        sys.stdout.flush()
+    except click.exceptions.Exit as exit_:
+        code = exit_.exit_code
+    except click.ClickException as error:
+        _fail(_usage(error), WRONG_INPUT, as_json)
+    except NumericalError as error:
+        _fail(str(error), STOPPED, as_json, status="stopped")
+    except CkcError as error:
+        _fail(str(error), WRONG_INPUT, as_json)
+    except KeyboardInterrupt as stop:
+        _fail(f"by {str(stop) or 'Ctrl-C'}", interrupted(str(stop)), as_json, status="interrupted")
+    except BrokenPipeError:  # the reader went away; nothing is wrong
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT, as_json)
+    sys.exit(code)
+
+
+def _usage(error: click.ClickException) -> str:
+    """Say what was wrong with the command line, and what would be right."""
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    path = "ckc" if context is None else context.command_path
+    command = None if context is None else context.command
+    choices = f"Commands: {', '.join(COMMANDS)}" if command is ckc else f"See {path} --help"
+    what = error.format_message()
+    return f"{path}: {what if what.endswith(('.', '?')) else f'{what}.'} {choices}"
+
+
+def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoReturn:
+    errors().print(f"{status}: {message}")
+    if as_json:
+        print_json({"status": status, "message": message})
+    sys.exit(code)

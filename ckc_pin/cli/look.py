@@ -1,0 +1,61 @@
+"""What is there, before anything moves: list, check, terms."""
+
+from __future__ import annotations
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.simulation.arguments import read_table
+from ckc_pin.simulation.report import check_plain, check_table, terms_plain, terms_table
+
+__all__ = ["check", "list_", "terms"]
+
+
+@click.command("list", epilog=options.examples("ckc list"))
+@options.as_json
+def list_(as_json: bool) -> None:
+    """Shipped mechanisms and scenes, a line each."""
+    from ckc_pin.simulation.scene import catalogue
+
+    entries = catalogue()
+    if as_json:
+        print_json({"mechanisms": [{"name": n, "about": about, "scenes": scenes} for n, about, scenes in entries]})
+        return
+    for name, about, scenes in entries:
+        print(f"{name:<22} {about}")
+        for scene, says in scenes.items():
+            print(f"  {name + '/' + scene:<30} {says}")
+
+
+@click.command(epilog=options.examples("ckc check five_bar", "ckc check five_bar_as_printed/tracking"))
+@click.argument("what", metavar="MECHANISM|SCENE", help="A mechanism or a scene.")
+@click.option("--branches", is_flag=True, help="List the assembly branches too.")
+@options.as_json
+def check(what: str, branches: bool, as_json: bool) -> None:
+    """Freedoms, rank, redundant rows, partition. For a scene also whether its trajectory stays in the workspace."""
+    found = ckc_pin.check(what, branches=branches)
+    if as_json:
+        for warning in found.warnings:
+            errors().print(f"warning: {warning}")
+        print_json(check_plain(found))
+    else:
+        print_table(check_table(found))
+
+
+@click.command(
+    epilog=options.examples('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'')
+)
+@options.mechanism
+@click.option("--q", metavar="JSON", required=True, help="Table of coordinates.")
+@click.option("--v", metavar="JSON", default="{}", help="Table of rates; absent: at rest.")
+@options.as_json
+def terms(mechanism: str, q: str, v: str, as_json: bool) -> None:
+    """All terms at one state. Independent coordinates alone: sigma closes the loops, v_tree = rho q_dot."""
+    loaded = ckc_pin.load(mechanism)
+    found = ckc_pin.terms(loaded, read_table("--q", q), read_table("--v", v))
+    if as_json:
+        print_json(terms_plain(found))
+    else:
+        print_table(terms_table(found))

@@ -1,0 +1,127 @@
+"""Simulate a scene: run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+from ckc_pin.cli.exits import DONE, STOPPED, interrupted, interrupts
+from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table, watched
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import alone_in, write_whole
+from ckc_pin.simulation.arguments import read_changes
+from ckc_pin.simulation.report import profile_table, run_table
+
+__all__ = ["run"]
+
+
+@click.command(
+    epilog=options.examples(
+        "ckc run five_bar/tracking --out runs/spf",
+        "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
+        "ckc run five_bar/tracking --meshcat --speed 1",
+    )
+)
+@click.argument("what", metavar="SCENE", help="A scene, or a mechanism for its default scene.")
+@options.changes
+@click.option("--out", metavar="DIR", type=Path, help="Folder for run.npz, figures and the scene as resolved.")
+@click.option("--profile", is_flag=True, help="Print which terms were evaluated, how often.")
+@click.option("--meshcat", is_flag=True, help="Show it in the browser while it computes.")
+@click.option("--speed", type=float, help="With --meshcat: 1 is real time; absent: as it is computed.")
+@options.port
+@options.open_browser
+@options.as_json
+def run(
+    what: str,
+    changes: tuple[str, ...],
+    out: Path | None,
+    profile: bool,
+    meshcat: bool,
+    speed: float | None,
+    port: int,
+    open_browser: bool,
+    as_json: bool,
+) -> None:
+    """Simulate a scene."""
+    _check_view_options(meshcat, speed, port, open_browser)
+    scene = ckc_pin.load_scene(what, read_changes("--set", changes))
+    if scene.spec.controller is not None:
+        for warning in ckc_pin.check(scene).warnings:
+            errors().print(f"warning: {warning}")
+    if out is not None:
+        make_folder(out)
+    with ExitStack() as stack:
+        view = stack.enter_context(_view(scene, speed, port, open_browser)) if meshcat else None
+        with ProgressBar(scene.name) as progress:
+            on_output = None if view is None else view.on_output
+            finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
+        code = _report(finished, out, profile, as_json)
+        if view is not None and finished.status != "interrupted":
+            with suppress(KeyboardInterrupt):
+                view.finish(finished, stay=watched())
+    if code != DONE:
+        raise click.exceptions.Exit(code)
+
+
+def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: bool) -> int:
+    """Write and print a run; return the exit code."""
+    stop = _write(finished, out) if out is not None else None
+    if profile:
+        errors().print(profile_table(finished))
+    if as_json:
+        print_json(finished.summary())
+    else:
+        print_table(run_table(finished))
+        if out is not None:
+            print(f"written to {out}")
+    sys.stdout.flush()  # a view may keep the command alive
+    if finished.status != "done":
+        errors().print(finished.message)
+        return STOPPED if finished.status == "stopped" else interrupted(finished.message)
+    return DONE if stop is None else interrupted(str(stop))
+
+
+def _check_view_options(meshcat: bool, speed: float | None, port: int, open_browser: bool) -> None:
+    given = [name for name, x in (("--speed", speed), ("--port", port), ("--open", open_browser)) if x]
+    if given and not meshcat:
+        raise InputError(f"{given[0]} goes with --meshcat; give both")
+    if speed is not None:
+        options.check_speed(speed)
+
+
+def _view(scene: ckc_pin.Scene, speed: float | None, port: int, open_browser: bool) -> Any:
+    from ckc_pin.view.live import live_view
+
+    return live_view(scene, speed, port, open_browser)
+
+
+def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
+    """Save a run, whatever signals come, then draw its figures; return what interrupted that."""
+    try:
+        with ExitStack() as stack:
+            with interrupts.held():
+                stack.enter_context(alone_in(out))
+                finished.save(out / "run.npz")
+                write_whole(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")
+            _draw(finished, out)
+    except KeyboardInterrupt as stop:
+        by = f" by {stop}" if str(stop) else ""
+        errors().print(f"no figures: interrupted{by}; the run is saved")
+        return stop
+    return None
+
+
+def _draw(finished: ckc_pin.Run, out: Path) -> None:
+    try:
+        from ckc_pin.view.figures import plot as plot_runs
+
+        plot_runs([finished], out)
+    except InputError as error:  # matplotlib is an extra; the run itself is saved
+        errors().print(f"no figures: {error}")

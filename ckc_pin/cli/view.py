@@ -1,0 +1,57 @@
+"""Look at runs: plot, play."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+
+__all__ = ["play", "plot"]
+
+
+@click.command(epilog=options.examples("ckc plot runs/reduced runs/spf --out figures"))
+@options.runs
+@click.option("--out", type=Path, default=".", help="Folder for the figures.")
+def plot(runs: tuple[Path, ...], out: Path) -> None:
+    """Figures of one or several runs, PNG and SVG."""
+    from ckc_pin.view.figures import plot as plot_runs
+
+    for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg")):
+        print(path)
+
+
+@click.command(
+    epilog=options.examples(
+        "ckc play runs/spf",
+        "ckc play runs/reduced runs/spf --speed 0.5 --gap 1000",
+        "ckc play runs/spf --html spf.html",
+    )
+)
+@options.runs
+@click.option("--html", metavar="FILE", type=Path, help="Write one file that plays from disk instead.")
+@click.option("--speed", type=float, default=1.0, help="Playback speed, 1 is real time.")
+@click.option("--gap", type=float, default=0.0, help="Draw the gaps of the loops so many times larger.")
+@click.option("--meshes", metavar="FOLDER", type=Path, help="The mechanism's folder, for its mesh files.")
+@options.port
+@options.open_browser
+def play(
+    runs: tuple[Path, ...],
+    html: Path | None,
+    speed: float,
+    gap: float,
+    meshes: Path | None,
+    port: int,
+    open_browser: bool,
+) -> None:
+    """Watch runs in the browser, on this machine only. Several runs lie on each other."""
+    options.check_speed(speed)
+    loaded = [ckc_pin.Run.load(path) for path in runs]
+    if html is None:
+        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, port=port, open_browser=open_browser)
+        return
+    from ckc_pin.view.player import save_html
+
+    print(f"written: {save_html(loaded, html, speed=speed, gap=gap, meshes=meshes)}")
