@@ -35,6 +35,7 @@ COMMANDS = {
     "plot": "view:plot",
     "play": "view:play",
     "map": "map:map_",
+    "report": "report:report",
     "import": "exchange:import_",
     "export": "exchange:export",
 }  # in the order of the help; module:function in this folder

@@ -1,0 +1,231 @@
+"""Every setting of a scene against its reference, within a budget of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from ckc_pin.analysis.precision import mujoco
+from ckc_pin.analysis.precision.advice import Advice, advise
+from ckc_pin.analysis.precision.motion import Motion, Row, apart, move, on_span
+from ckc_pin.analysis.precision.reference import Reference, find_reference
+from ckc_pin.analysis.precision.settings import Setting, changed, off_manifold, settings
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene import Scene, load_scene
+
+__all__ = ["BUDGET", "WorkPrecision", "work_precision"]
+
+BUDGET = 20.0  # s
+REFERENCE, PEER = 0.35, 0.15  # parts of the budget
+RUNS = 40  # of the longest ones would use up the budget
+CLEAR = 10.0  # an error that many times the reference's uncertainty is told from it
+
+Progress = Callable[[float], None]  # the part that is done
+
+
+@dataclass
+class WorkPrecision:
+    """A scene's settings compared.
+
+    Attributes
+    ----------
+    scene : str
+    status : "done", "stopped" or "interrupted"
+        "stopped" where no reference could be confirmed.
+    message : str
+    reference : Reference or None
+    rows : list of Row
+    advice : list of Advice
+    notes : list of str
+        What was left out, and why.
+    model_difference : float or None
+        Of a start with phi = w other than 0: how far the reduced model's motion, from w = 0, is from the SPF's.
+    seconds : float
+        What it took.
+    """
+
+    scene: str
+    status: Literal["done", "stopped", "interrupted"] = "done"
+    message: str = ""
+    reference: Reference | None = None
+    rows: list[Row] = field(default_factory=list)
+    advice: list[Advice] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    model_difference: float | None = None
+    seconds: float = 0.0
+
+
+def work_precision(
+    scene: Scene | str | Path,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    budget: float = BUDGET,
+    mjcf: str = "",
+    progress: Progress | None = None,
+) -> WorkPrecision:
+    """Compare formulations, methods and tolerances on a scene.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, its shipped name or its path.
+    changes : mapping, optional
+        Values by dotted key.
+    budget : float
+        What it may take, s.
+    mjcf : str
+        The mechanism as MuJoCo's model, to put that program beside; empty: without it.
+    progress : callable, optional
+        Called as progress(part), from 0 to 1.
+
+    Returns
+    -------
+    WorkPrecision
+        A signal ends it with status "interrupted" and the rows up to there.
+
+    Raises
+    ------
+    InputError, MechanismError
+        The scene cannot be run as written.
+    NumericalError
+        Its start is singular.
+    """
+    if not (np.isfinite(budget) and budget > 0):
+        raise InputError(f"budget = {budget:g}: a number of seconds above zero is needed")
+    if not isinstance(scene, Scene):
+        scene = load_scene(scene, changes)
+    elif changes:
+        raise InputError("work_precision: changes go with the name of a scene; a Scene is complete")
+    ready, found = prepare(scene), WorkPrecision(scene.name)
+    began = perf_counter()
+    try:
+        _compare(found, scene, ready.mechanism, budget, mjcf, progress or (lambda part: None))
+    except KeyboardInterrupt as stop:
+        by = f" by {stop}" if str(stop) else ""
+        found.status, found.message = "interrupted", f"interrupted{by} after {len(found.rows)} settings"
+    if found.reference is not None:
+        found.advice = advise(found.rows, found.reference.accuracy)
+    found.seconds = perf_counter() - began
+    return found
+
+
+def _compare(
+    found: WorkPrecision, scene: Scene, mechanism: Mechanism, budget: float, mjcf: str, progress: Progress
+) -> None:
+    began = perf_counter()
+    reference = find_reference(scene, mechanism, REFERENCE * budget)
+    if isinstance(reference, str):
+        found.status, found.message = "stopped", reference
+        return
+    found.reference = reference
+    progress(REFERENCE)
+    if off_manifold(scene):
+        _without_w(found, scene, mechanism, reference)
+    missing = mujoco.missing(scene) if mjcf else ""
+    peer = PEER * budget if mjcf and not missing else 0.0
+    part = (1 - REFERENCE) * (1 - peer / budget)
+    _ours(found, scene, mechanism, began + budget - peer, budget / RUNS, lambda x: progress(REFERENCE + part * x))
+    if missing:
+        found.notes.append(f"MuJoCo is not beside it: {missing}")
+    elif mjcf:
+        deadline = max(began + budget, perf_counter() + peer)
+        _peer(found, mujoco.rows(scene, mechanism, mjcf, reference.t_end, deadline), mechanism)
+    progress(1.0)
+
+
+def _ours(
+    found: WorkPrecision, scene: Scene, mechanism: Mechanism, deadline: float, limit: float, progress: Progress
+) -> None:
+    """Run all settings; what used up its time at one tolerance is not tried with a tighter one."""
+    assert found.reference is not None
+    span, every = on_span(scene, found.reference.t_end), list(settings(scene))
+    spent: dict[tuple[str, str], tuple[str, str]] = {}
+    for k, setting in enumerate(every):
+        progress(k / len(every))
+        left = deadline - perf_counter()
+        if setting.family in spent:
+            motion = _none(mechanism, *spent[setting.family])
+        elif left <= 0:
+            motion = _none(mechanism, "not tried", "the budget was used up before; give a larger one")
+        else:
+            limited = {**setting.changes(scene), **span, "solver.max_wall_s": min(limit, max(left, 0.01))}
+            motion, _ = move(changed(scene, limited), min(limit, left))
+            if motion.status == "refused":
+                spent[setting.family] = ("refused", motion.reason)
+            elif "max_wall_s" in motion.reason:
+                spent[setting.family] = "not tried", f"at rtol {setting.rtol:.0e} it took more than {limit:.2g} s"
+        found.rows.append(_judged(found.reference, mechanism, motion, setting, setting.changes(scene)))
+    late = sum("budget" in row.reason for row in found.rows)
+    if late:
+        found.notes.append(f"{late} settings were not tried: the budget was used up before")
+
+
+def _peer(found: WorkPrecision, rows: Iterable[tuple[str, float, Motion]] | str, mechanism: Mechanism) -> None:
+    if isinstance(rows, str):
+        found.notes.append(f"MuJoCo is not beside it: {rows}")
+        return
+    assert found.reference is not None
+    for method, dt, motion in rows:
+        found.rows.append(_judged(found.reference, mechanism, motion, (method, dt), {}))
+
+
+def _judged(
+    reference: Reference,
+    mechanism: Mechanism,
+    motion: Motion,
+    setting: Setting | tuple[str, float],
+    changes: dict[str, Any],
+) -> Row:
+    """Return the row of a motion; one that is not whole has no error."""
+    whole = motion.status == "done" and len(motion.q_tree) == len(reference.t)
+    finite = whole and bool(np.isfinite(motion.q_tree).all() and np.isfinite(motion.v_tree).all())
+    status, reason = motion.status, motion.reason
+    if motion.status == "done" and not finite:
+        status, reason = "failed", "its motion is not finite"
+    off = apart(mechanism.tree, motion, reference.motion) if finite else None
+    error = None if off is None else float(off.scaled.max())
+    ours = setting if isinstance(setting, Setting) else None
+    return Row(
+        program="ckc_pin" if ours else "MuJoCo",
+        formulation=ours.formulation if ours else None,
+        method=ours.method if ours else setting[0],  # type: ignore[index]
+        rtol=ours.rtol if ours else None,
+        dt=None if ours else setting[1],  # type: ignore[index]
+        changes={key: x for key, x in changes.items() if x is not None},
+        status=status,
+        reason=reason,
+        error=error,
+        error_q=None if off is None else float(off.q.max()),
+        error_v=None if off is None else float(off.v.max()),
+        told=None if error is None else error > CLEAR * reference.accuracy,
+        rhs=motion.rhs,
+        steps=motion.steps,
+        used=motion.used,
+        wall_s=motion.wall_s,
+        setup_s=motion.setup_s,
+    )
+
+
+def _none(mechanism: Mechanism, status: str, reason: str) -> Motion:
+    none = np.empty((0, mechanism.n))
+    return Motion(status, reason, none, none)
+
+
+def _without_w(found: WorkPrecision, scene: Scene, mechanism: Mechanism, reference: Reference) -> None:
+    """Tell how far the motion with w = 0 is from the SPF's: a difference of models, which is in no row's error."""
+    changes = {**on_span(scene, reference.t_end), "initial.w": None, "formulation": "reduced", "solver.rtol": 1e-10}
+    motion, _ = move(changed(scene, changes), 1.0, once=True)
+    found.notes.append("the scene starts off phi = 0, where only the SPF can: compared with the SPF's own flow")
+    if motion.status == "done":
+        found.model_difference = float(apart(mechanism.tree, motion, reference.motion).scaled.max())
+        found.notes.append(
+            f"the reduced model and the DAE, which start from the same q and q_dot with w = 0, are up to "
+            f"{found.model_difference:.1e} away from that: a difference of models, no error"
+        )

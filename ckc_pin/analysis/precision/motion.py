@@ -1,0 +1,159 @@
+"""A scene's motion under one setting, timed, and how far two motions are apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.errors import CkcError
+from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.simulate import run_prepared
+
+__all__ = ["INSTANTS", "Apart", "Motion", "Row", "apart", "move", "on_span", "without_place"]
+
+INSTANTS = 20  # at which motions are compared, the end among them
+REPEATS, ENOUGH = 20, 0.05  # runs and s: repeated up to whichever comes first
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a setting made of a scene.
+
+    Attributes
+    ----------
+    status : "done", "stopped", "refused", "failed" or "not tried"
+    reason : str
+        Where it is not "done".
+    q_tree, v_tree : (m, n) arrays
+        By coordinate, at the first m of the instants.
+    wall_s : float or None
+        Least time of its repeats, without `setup_s`.
+    setup_s : float or None
+        Time of loading and assembling, s.
+    rhs, steps : int or None
+    used : str
+        The method that made the steps.
+    """
+
+    status: str
+    reason: str
+    q_tree: Array
+    v_tree: Array
+    wall_s: float | None = None
+    setup_s: float | None = None
+    rhs: int | None = None
+    steps: int | None = None
+    used: str = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the comparison: a setting, what it cost, how far off it is.
+
+    Attributes
+    ----------
+    program : "ckc_pin" or "MuJoCo"
+    formulation : str or None
+        "dae", "reduced", "spf, w" (eq. 17's coordinates) or "spf, z" (eq. 8 as printed).
+    method : str
+    rtol, dt : float or None
+        The tolerance, or the step, s.
+    changes : dict
+        The setting as values of the scene by dotted key.
+    status, reason, rhs, steps, used, wall_s, setup_s
+        As in `Motion`.
+    error_q, error_v : float or None
+        Largest error of q_tree and v_tree over the instants, rad or m and per s.
+    error : float or None
+        The larger of both, each relative to its largest value where that is above 1.
+    told : bool or None
+        Whether the error is well above the reference's own uncertainty.
+    """
+
+    program: str
+    formulation: str | None
+    method: str
+    rtol: float | None
+    dt: float | None
+    changes: Mapping[str, Any]
+    status: str
+    reason: str
+    error: float | None
+    error_q: float | None
+    error_v: float | None
+    told: bool | None
+    rhs: int | None
+    steps: int | None
+    used: str
+    wall_s: float | None
+    setup_s: float | None
+
+
+@dataclass(frozen=True)
+class Apart:
+    """How far two motions are apart at each of the instants that both have: (m,) arrays."""
+
+    q: Array
+    v: Array
+    scaled: Array
+
+
+def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
+    """Compare two motions of one mechanism; the second one's size is the scale."""
+    m = min(len(motion.q_tree), len(other.q_tree))
+    q, theirs = motion.q_tree[:m], other.q_tree[:m]
+    if tree.flat:
+        difference = q - theirs
+    else:  # a rotation vector jumps where it has turned by pi
+        from_numbers = tree.from_coordinates
+        rows = [tree.difference(from_numbers(b), from_numbers(a)) for a, b in zip(q, theirs, strict=True)]
+        difference = np.reshape(rows, (m, tree.n))
+    error_q, error_v = (np.abs(x).max(axis=1, initial=0.0) for x in (difference, motion.v_tree[:m] - other.v_tree[:m]))
+    scales = (max(1.0, float(np.abs(x).max(initial=0.0))) for x in (other.q_tree, other.v_tree))
+    scaled = np.maximum(*(error / scale for error, scale in zip((error_q, error_v), scales, strict=True)))
+    return Apart(error_q, error_v, scaled)
+
+
+def on_span(scene: Scene, t_end: float) -> dict[str, Any]:
+    """Return the changes that make all runs of a scene comparable: one span, its instants, no event that ends it."""
+    events = [{**event, "stop": False} for event in scene.plain().get("event", [])]
+    return {"t_end": t_end, "solver.output_dt": t_end / INSTANTS, **({"event": events} if events else {})}
+
+
+def move(scene: Scene, limit: float, *, once: bool = False) -> tuple[Motion, Run | None]:
+    """Run a scene, each run for no more than a limit in s; short runs are repeated, the fastest counts.
+
+    KeyboardInterrupt: a signal stopped a run.
+    """
+    began, walls = perf_counter(), list[float]()
+    try:
+        ready = prepare(scene)
+        setup = perf_counter() - began
+        while True:
+            run = run_prepared(ready)
+            if run.status == "interrupted":  # the comparison is, not only this run
+                raise KeyboardInterrupt(*(["SIGTERM"] if "SIGTERM" in run.message else []))
+            walls.append(float(run.stats["wall_s"]))
+            if once or run.status != "done" or len(walls) >= REPEATS or sum(walls) > min(ENOUGH, limit):
+                break
+    except CkcError as error:
+        none = np.empty((0, 0))
+        return Motion("refused", str(error), none, none), None
+    stats = run.stats
+    reason = "" if run.status == "done" else without_place(run.message)
+    return Motion(
+        run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["rhs"], stats["steps"], stats["method"]
+    ), run
+
+
+def without_place(message: str) -> str:
+    """Shorten a message by its configuration, which may be a line of 81 coordinates."""
+    return re.sub(r" near [^:]*:", ":", message)

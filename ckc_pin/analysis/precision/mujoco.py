@@ -1,0 +1,204 @@
+"""MuJoCo on the same motion: loops as soft constraints, fixed steps, from a model's text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from time import perf_counter
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.analysis.precision.motion import INSTANTS, Motion
+from ckc_pin.analysis.precision.settings import off_manifold
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.scene import Scene
+
+__all__ = ["missing", "rows"]
+
+SAME = 1e-6  # relative: how well mass matrix and bias agree where both programs have one mechanism
+COARSEST, STEPS = 1e-2, 9  # of the span or of 2 s, and how many halves
+INTEGRATORS = ("implicitfast", "RK4")
+STIFFNESSES = ("default", "solref 2 dt")  # as MuJoCo has them, and as stiff as its manual lets them be
+TRIAL, REPEATS = 50, 3
+UNUSED = ("AUTORESET", "CONTACT", "LIMIT", "FRICTIONLOSS", "SENSOR")  # a run that blew up is not to start again
+
+
+def missing(scene: Scene) -> str:
+    """Say why MuJoCo cannot run a scene; empty where it can."""
+    if scene.spec.controller is not None:
+        return "the scene's controller needs D, C and h of the reduced model, which it does not give"
+    if off_manifold(scene):
+        return "the scene starts with its loops open, phi = w, which has no meaning there"
+    return ""
+
+
+def rows(
+    scene: Scene, mechanism: Mechanism, mjcf: str, t_end: float, deadline: float
+) -> Iterator[tuple[str, float, Motion]] | str:
+    """Return (method, step in s, motion) from coarse to fine steps; a sentence where it has another mechanism.
+
+    Parameters
+    ----------
+    scene : Scene
+    mechanism : Mechanism
+    mjcf : str
+    t_end : float
+        s.
+    deadline : float
+        By `perf_counter`; what would end later is not tried.
+    """
+    import mujoco
+
+    mujoco.set_mju_user_warning(_silent)  # by default they go to a file in the current folder
+    try:
+        model = mujoco.MjModel.from_xml_string(_bare(mjcf))
+    except ValueError as error:
+        return f"it refuses the model: {' '.join(str(error).split())}"
+    start = find_start(mechanism, scene)
+    state = start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+    joints, data = _Joints(mechanism, model), mujoco.MjData(model)
+    off = _difference(mechanism, joints, model, data, state)
+    if not off <= SAME:
+        return f"its mass matrix or its forces at the start differ by {off:.1e}"
+    return _steps(model, data, joints, state, mechanism.n, t_end, deadline)
+
+
+def _steps(
+    model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], n: int, t_end: float, deadline: float
+) -> Iterator[tuple[str, float, Motion]]:
+    import mujoco
+
+    for unused in UNUSED:
+        model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
+    solref, solimp = model.eq_solref.copy(), model.eq_solimp.copy()
+    none, between, slow = np.empty((0, n)), t_end / INSTANTS, set[str]()
+    for k, (integrator, stiffness) in product(range(STEPS), product(INTEGRATORS, STIFFNESSES)):
+        many = max(1, round(between / (COARSEST * min(2.0, t_end) / 2**k)))
+        method, dt = f"{integrator}, {stiffness}", between / many
+        model.opt.timestep = dt
+        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+        model.eq_solref[:], model.eq_solimp[:] = solref, solimp
+        if stiffness != "default":
+            model.eq_solref[:], model.eq_solimp[:] = [2 * dt, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+        foreseen = np.inf if method in slow else _foreseen(model, data, joints, state, many)
+        if foreseen > deadline - perf_counter():
+            slow.add(method)
+            yield method, dt, Motion("not tried", "the budget was used up before; give a larger one", none, none)
+            continue
+        yield method, dt, _run(model, data, joints, state, many)
+
+
+def _foreseen(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int) -> float:
+    import mujoco
+
+    _reset(model, data, joints, state)
+    trial = min(TRIAL, many * INSTANTS)
+    began = perf_counter()
+    mujoco.mj_step(model, data, nstep=trial)
+    return (perf_counter() - began) / trial * many * INSTANTS
+
+
+def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int) -> Motion:
+    """Step from instant to instant; reading the states out is not timed."""
+    import mujoco
+
+    walls: list[float] = []
+    while len(walls) < REPEATS and sum(walls) < 1.0:
+        _reset(model, data, joints, state)
+        states, wall = [joints.state(data)], 0.0
+        for _ in range(INSTANTS):
+            began = perf_counter()
+            mujoco.mj_step(model, data, nstep=many)
+            wall += perf_counter() - began
+            states.append(joints.state(data))
+        walls.append(wall)
+    q_tree, v_tree = (np.array(each) for each in zip(*states, strict=True))
+    return Motion("done", "", q_tree, v_tree, min(walls), None, None, many * INSTANTS, "fixed step")
+
+
+def _reset(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array]) -> None:
+    import mujoco
+
+    mujoco.mj_resetData(model, data)
+    joints.put(data, *state)
+
+
+def _difference(mechanism: Mechanism, joints: _Joints, model: Any, data: Any, state: tuple[Array, Array]) -> float:
+    """How far D', and without a free root also the bias, are from Pinocchio's at the start, relative."""
+    import mujoco
+
+    tree, (q_tree, v_tree) = mechanism.tree, state
+    to = joints.put(data, q_tree, v_tree)
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    ours = tree.evaluate(pin.crba, q_tree)
+    ours = np.triu(ours) + np.triu(ours, 1).T
+    off = float(np.abs(to.T @ mass @ to - ours).max() / np.abs(ours).max())
+    if tree.flat:
+        bias = tree.evaluate(pin.nonLinearEffects, q_tree, v_tree)
+        off = max(off, float(np.abs(to.T @ data.qfrc_bias - bias).max() / max(float(np.abs(bias).max()), 1e-12)))
+    return off
+
+
+class _Joints:
+    """Pinocchio's states in MuJoCo's order and back."""
+
+    def __init__(self, mechanism: Mechanism, model: Any) -> None:
+        self._tree = mechanism.tree
+        names = list(mechanism.tree.model.names)
+        self._there = {k: model.joint(names[k]) for k in range(1, len(names))}
+
+    def put(self, data: Any, q_tree: Array, v_tree: Array) -> Array:
+        """Set a state; return the map from Pinocchio's velocities to MuJoCo's, shape (n, n)."""
+        tree = self._tree
+        pin.forwardKinematics(tree.model, tree.data, q_tree)
+        to = np.zeros((len(data.qvel), tree.n))
+        for k, there in self._there.items():
+            joint, at, v_at = tree.model.joints[k], int(there.qposadr[0]), int(there.dofadr[0])
+            if joint.nv == 1:
+                data.qpos[at] = q_tree[joint.idx_q]
+                to[v_at, joint.idx_v] = 1.0
+                continue
+            placement = tree.data.oMi[k]
+            x, y, z, w = pin.Quaternion(placement.rotation).coeffs()
+            data.qpos[at : at + 7] = [*placement.translation, w, x, y, z]
+            to[v_at : v_at + 3, joint.idx_v : joint.idx_v + 3] = placement.rotation
+            to[v_at + 3 : v_at + 6, joint.idx_v + 3 : joint.idx_v + 6] = np.eye(3)
+        data.qvel[:] = to @ v_tree
+        return to
+
+    def state(self, data: Any) -> tuple[Array, Array]:
+        """Return q_tree and v_tree by coordinate."""
+        tree = self._tree
+        q_tree, v_tree = tree.neutral(), np.zeros(tree.n)
+        for k, there in self._there.items():
+            joint, at, v_at = tree.model.joints[k], int(there.qposadr[0]), int(there.dofadr[0])
+            if joint.nv == 1:
+                q_tree[joint.idx_q], v_tree[joint.idx_v] = data.qpos[at], data.qvel[v_at]
+                continue
+            w, x, y, z = data.qpos[at + 3 : at + 7]
+            rotation = pin.Quaternion(float(w), float(x), float(y), float(z)).matrix()
+            placed = tree.model.jointPlacements[k].actInv(pin.SE3(rotation, np.array(data.qpos[at : at + 3])))
+            q_tree[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(placed)
+            v_tree[joint.idx_v : joint.idx_v + 3] = rotation.T @ data.qvel[v_at : v_at + 3]
+            v_tree[joint.idx_v + 3 : joint.idx_v + 6] = data.qvel[v_at + 3 : v_at + 6]
+        return tree.to_coordinates(q_tree), v_tree
+
+
+def _bare(mjcf: str) -> str:
+    """Take the shapes out: nothing collides, and placing them takes time."""
+    root = ElementTree.fromstring(mjcf)
+    for body in root.iter():
+        for shape in body.findall("geom"):
+            body.remove(shape)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _silent(message: str) -> None:
+    """Pass over a warning: a run that became unstable is told by its numbers."""

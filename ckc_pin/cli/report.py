@@ -1,0 +1,134 @@
+"""Work against precision of scenes of one's own: report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
+from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import alone_in, write_whole
+from ckc_pin.simulation.arguments import read_changes
+from ckc_pin.simulation.prepare import prepare
+
+if TYPE_CHECKING:
+    from ckc_pin.analysis.precision import WorkPrecision
+
+__all__ = ["report"]
+
+LONG = 10.0  # s: what may take longer is told before
+
+
+@click.command(
+    epilog=options.examples(
+        "ckc report five_bar/swing",
+        "ckc report mine/drop.scene.toml --out reports/drop --budget 60",
+        "ckc report five_bar/swing five_bar/tracking --json",
+    )
+)
+@click.argument(
+    "scenes", metavar="SCENE...", nargs=-1, required=True, help="Scenes, or mechanisms for their default scenes."
+)
+@options.changes
+@click.option("--budget", type=float, default=20.0, help="What each scene may take, s.")
+@click.option("--out", metavar="DIR", type=Path, help="Folder for report.md, rows.csv and the figures.")
+@options.as_json
+def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
+    """Error against run time of your own scenes. Formulations, methods and tolerances, and which of them to take."""
+    from ckc_pin.analysis.precision import precision_plain, work_precision
+
+    if not 0 < budget < float("inf"):
+        raise InputError(f"--budget {budget:g}: a number of seconds above zero is needed")
+    loaded = [ckc_pin.load_scene(name, read_changes("--set", changes)) for name in scenes]
+    mechanisms = [prepare(scene).mechanism for scene in loaded]  # what is wrong with one is told before the first
+    if out is not None:
+        make_folder(out)
+    if budget * len(loaded) > LONG:
+        many = f", {budget:g} s for each of {len(loaded)} scenes" if len(loaded) > 1 else ""
+        errors().print(f"this may take {budget * len(loaded):g} s{many}; --budget SECONDS changes that")
+    every: list[WorkPrecision] = []
+    for scene, mechanism in zip(loaded, mechanisms, strict=True):
+        mjcf, note = _mjcf(mechanism)
+        with ProgressBar(scene.name, "{task.percentage:.0f} %") as bar:
+            progress = None if bar is None else lambda part, bar=bar: bar(part, 1.0)
+            found = work_precision(scene, budget=budget, mjcf=mjcf, progress=progress)
+        found.notes += note
+        every.append(found)
+        if not as_json:
+            _print(found)
+        if found.status == "interrupted":
+            break
+    plain = [precision_plain(found) for found in every]
+    last = every[-1]
+    stopped = [found for found in every if found.status == "stopped"]
+    status = last.status if last.status == "interrupted" else "stopped" if stopped else "done"
+    message = last.message if last.status == "interrupted" else "; ".join(f"{x.scene}: {x.message}" for x in stopped)
+    written = [] if out is None else _write(every, plain, out)
+    if as_json:
+        print_json({"status": status, "message": message, "scenes": plain, "written": [str(path) for path in written]})
+    else:
+        for path in written:
+            print(f"written: {path}")
+    if status != "done":
+        errors().print(message)
+        raise click.exceptions.Exit(STOPPED if status == "stopped" else interrupted(message))
+
+
+def _print(found: WorkPrecision) -> None:
+    from ckc_pin.analysis.precision import precision_lines, precision_table
+
+    print(f"{found.scene}: {found.message or f'{len(found.rows)} settings in {found.seconds:.1f} s'}")
+    if found.reference is not None:
+        print_table(precision_table(found))
+    for line in precision_lines(found):
+        print(line)
+
+
+def _mjcf(mechanism: ckc_pin.Mechanism) -> tuple[str, list[str]]:
+    """Return the mechanism as MuJoCo's model, or why there is none, and what moves otherwise there."""
+    from ckc_pin.formats import exporting
+
+    if find_spec("mujoco") is None:
+        return "", ["MuJoCo is not beside it: not installed (pip install 'ckc_pin[peers]')"]
+    try:
+        found = exporting.export(mechanism, "mjcf")
+    except InputError as error:
+        return "", [f"MuJoCo is not beside it: {error}"]
+    return found.text, [f"in MuJoCo: {difference}" for difference in found.differs]
+
+
+def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], out: Path) -> list[Path]:
+    """Write page, rows and figures, whatever signals come."""
+    from ckc_pin.analysis.precision import precision_csv, precision_markdown
+
+    written, figures = list[Path](), dict[int, str]()
+    with interrupts.held(), ExitStack() as stack:
+        stack.enter_context(alone_in(out))
+        for k, (found, data) in enumerate(zip(every, plain, strict=True)):
+            if found.reference is None:
+                continue
+            stem = "work_precision" if len(every) == 1 else f"work_precision_{k + 1}_{_as_file(found.scene)}"
+            try:
+                from ckc_pin.view.precision_figure import save_precision
+
+                written += save_precision(data, out, stem)
+                figures[k] = f"{stem}.png"
+            except InputError as error:  # matplotlib is an extra
+                errors().print(f"no figure: {error}")
+        for name, text in (("report.md", precision_markdown(every, figures)), ("rows.csv", precision_csv(every))):
+            write_whole(out / name, text)
+            written.insert(0, out / name)
+    return written
+
+
+def _as_file(scene: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", scene.removesuffix(".scene.toml")).strip("_.")[-60:]
