@@ -61,7 +61,8 @@ def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out
         with ProgressBar(scene.name, "{task.percentage:.0f} %") as bar:
             progress = None if bar is None else lambda part, bar=bar: bar(part, 1.0)
             found = work_precision(scene, budget=budget, mjcf=mjcf, progress=progress)
-        found.notes += note
+        if not mjcf or any(row.program == "MuJoCo" for row in found.rows):
+            found.notes += note
         every.append(found)
         if not as_json:
             _print(found)

@@ -11,6 +11,7 @@ from ckc_pin.analysis.precision.motion import Row
 __all__ = ["TARGETS", "Advice", "advise", "fastest"]
 
 TARGETS = (1e-3, 1e-6, 1e-9)
+CHANCE = 0.1  # of a time
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,21 @@ def advise(rows: Sequence[Row], accuracy: float) -> list[Advice]:
 
 
 def fastest(rows: Sequence[Row], target: float, accuracy: float, program: str) -> Row | None:
-    """Return the row that took the least time of those whose error, the reference's added, is within a target."""
-    good = [row for row in rows if row.program == program and row.error is not None and row.error + accuracy <= target]
-    return min(good, key=lambda row: row.wall_s or 0.0, default=None)
+    """Return the row that took the least time of those whose error, the reference's added, is within a target.
+
+    Times that close are a matter of chance: of rows that take as long, "auto" is preferred.
+    """
+    good = [
+        (row.wall_s, row)
+        for row in rows
+        if row.program == program
+        and row.error is not None
+        and row.wall_s is not None
+        and row.error + accuracy <= target
+    ]
+    least = min((wall_s for wall_s, _ in good), default=0.0)
+    same = [(row.method != "auto", wall_s, row) for wall_s, row in good if wall_s <= (1 + CHANCE) * least]
+    return min(same, key=lambda each: each[:2])[2] if same else None
 
 
 def _options(changes: Mapping[str, Any]) -> list[str]:

@@ -25,6 +25,7 @@ __all__ = ["BUDGET", "WorkPrecision", "work_precision"]
 BUDGET = 20.0  # s
 REFERENCE, PEER = 0.35, 0.15  # parts of the budget
 RUNS = 40  # of the longest ones would use up the budget
+LATE = "not tried", "the budget was used up before; give a larger one"
 CLEAR = 10.0  # an error that many times the reference's uncertainty is told from it
 
 Progress = Callable[[float], None]  # the part that is done
@@ -136,7 +137,7 @@ def _compare(
         found.notes.append(f"MuJoCo is not beside it: {missing}")
     elif mjcf:
         deadline = max(began + budget, perf_counter() + peer)
-        _peer(found, mujoco.rows(scene, mechanism, mjcf, reference.t_end, deadline), mechanism)
+        _peer(found, mujoco.rows(scene, mechanism, mjcf, reference.t, deadline), mechanism)
     progress(1.0)
 
 
@@ -145,7 +146,7 @@ def _ours(
 ) -> None:
     """Run all settings; what used up its time at one tolerance is not tried with a tighter one."""
     assert found.reference is not None
-    span, every = on_span(scene, found.reference.t_end), list(settings(scene))
+    span, every = on_span(scene, found.reference.t_end, found.reference.dt), list(settings(scene))
     spent: dict[tuple[str, str], tuple[str, str]] = {}
     for k, setting in enumerate(every):
         progress(k / len(every))
@@ -153,16 +154,18 @@ def _ours(
         if setting.family in spent:
             motion = _none(mechanism, *spent[setting.family])
         elif left <= 0:
-            motion = _none(mechanism, "not tried", "the budget was used up before; give a larger one")
+            motion = _none(mechanism, *LATE)
         else:
             limited = {**setting.changes(scene), **span, "solver.max_wall_s": min(limit, max(left, 0.01))}
             motion, _ = move(changed(scene, limited), min(limit, left))
             if motion.status == "refused":
                 spent[setting.family] = ("refused", motion.reason)
+            elif "max_wall_s" in motion.reason and left < limit:  # too late, not too slow
+                motion = _none(mechanism, *LATE)
             elif "max_wall_s" in motion.reason:
                 spent[setting.family] = "not tried", f"at rtol {setting.rtol:.0e} it took more than {limit:.2g} s"
         found.rows.append(_judged(found.reference, mechanism, motion, setting, setting.changes(scene)))
-    late = sum("budget" in row.reason for row in found.rows)
+    late = sum((row.status, row.reason) == LATE for row in found.rows)
     if late:
         found.notes.append(f"{late} settings were not tried: the budget was used up before")
 
@@ -220,7 +223,12 @@ def _none(mechanism: Mechanism, status: str, reason: str) -> Motion:
 
 def _without_w(found: WorkPrecision, scene: Scene, mechanism: Mechanism, reference: Reference) -> None:
     """Tell how far the motion with w = 0 is from the SPF's: a difference of models, which is in no row's error."""
-    changes = {**on_span(scene, reference.t_end), "initial.w": None, "formulation": "reduced", "solver.rtol": 1e-10}
+    changes = {
+        **on_span(scene, reference.t_end, reference.dt),
+        "initial.w": None,
+        "formulation": "reduced",
+        "solver.rtol": 1e-10,
+    }
     motion, _ = move(changed(scene, changes), 1.0, once=True)
     found.notes.append("the scene starts off phi = 0, where only the SPF can: compared with the SPF's own flow")
     if motion.status == "done":

@@ -122,10 +122,10 @@ def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
     return Apart(error_q, error_v, scaled)
 
 
-def on_span(scene: Scene, t_end: float) -> dict[str, Any]:
+def on_span(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
     """Return the changes that make all runs of a scene comparable: one span, its instants, no event that ends it."""
     events = [{**event, "stop": False} for event in scene.plain().get("event", [])]
-    return {"t_end": t_end, "solver.output_dt": t_end / INSTANTS, **({"event": events} if events else {})}
+    return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
 
 
 def move(scene: Scene, limit: float, *, once: bool = False) -> tuple[Motion, Run | None]:

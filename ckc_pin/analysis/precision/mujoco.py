@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import INSTANTS, Motion
+from ckc_pin.analysis.precision.motion import Motion
 from ckc_pin.analysis.precision.settings import off_manifold
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -38,7 +38,7 @@ def missing(scene: Scene) -> str:
 
 
 def rows(
-    scene: Scene, mechanism: Mechanism, mjcf: str, t_end: float, deadline: float
+    scene: Scene, mechanism: Mechanism, mjcf: str, t: Array, deadline: float
 ) -> Iterator[tuple[str, float, Motion]] | str:
     """Return (method, step in s, motion) from coarse to fine steps; a sentence where it has another mechanism.
 
@@ -47,8 +47,8 @@ def rows(
     scene : Scene
     mechanism : Mechanism
     mjcf : str
-    t_end : float
-        s.
+    t : (m,) array
+        Instants, evenly spaced, s.
     deadline : float
         By `perf_counter`; what would end later is not tried.
     """
@@ -65,45 +65,45 @@ def rows(
     off = _difference(mechanism, joints, model, data, state)
     if not off <= SAME:
         return f"its mass matrix or its forces at the start differ by {off:.1e}"
-    return _steps(model, data, joints, state, mechanism.n, t_end, deadline)
+    return _steps(model, data, joints, state, mechanism.n, t, deadline)
 
 
 def _steps(
-    model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], n: int, t_end: float, deadline: float
+    model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], n: int, t: Array, deadline: float
 ) -> Iterator[tuple[str, float, Motion]]:
     import mujoco
 
     for unused in UNUSED:
         model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
     solref, solimp = model.eq_solref.copy(), model.eq_solimp.copy()
-    none, between, slow = np.empty((0, n)), t_end / INSTANTS, set[str]()
+    none, between, instants, slow = np.empty((0, n)), float(t[1]), len(t) - 1, set[str]()
     for k, (integrator, stiffness) in product(range(STEPS), product(INTEGRATORS, STIFFNESSES)):
-        many = max(1, round(between / (COARSEST * min(2.0, t_end) / 2**k)))
+        many = max(1, round(between / (COARSEST * min(2.0, float(t[-1])) / 2**k)))
         method, dt = f"{integrator}, {stiffness}", between / many
         model.opt.timestep = dt
         model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
         model.eq_solref[:], model.eq_solimp[:] = solref, solimp
         if stiffness != "default":
             model.eq_solref[:], model.eq_solimp[:] = [2 * dt, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
-        foreseen = np.inf if method in slow else _foreseen(model, data, joints, state, many)
+        foreseen = np.inf if method in slow else _foreseen(model, data, joints, state, many * instants)
         if foreseen > deadline - perf_counter():
             slow.add(method)
             yield method, dt, Motion("not tried", "the budget was used up before; give a larger one", none, none)
             continue
-        yield method, dt, _run(model, data, joints, state, many)
+        yield method, dt, _run(model, data, joints, state, many, instants)
 
 
-def _foreseen(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int) -> float:
+def _foreseen(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], steps: int) -> float:
     import mujoco
 
     _reset(model, data, joints, state)
-    trial = min(TRIAL, many * INSTANTS)
+    trial = min(TRIAL, steps)
     began = perf_counter()
     mujoco.mj_step(model, data, nstep=trial)
-    return (perf_counter() - began) / trial * many * INSTANTS
+    return (perf_counter() - began) / trial * steps
 
 
-def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int) -> Motion:
+def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int, instants: int) -> Motion:
     """Step from instant to instant; reading the states out is not timed."""
     import mujoco
 
@@ -111,14 +111,14 @@ def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], man
     while len(walls) < REPEATS and sum(walls) < 1.0:
         _reset(model, data, joints, state)
         states, wall = [joints.state(data)], 0.0
-        for _ in range(INSTANTS):
+        for _ in range(instants):
             began = perf_counter()
             mujoco.mj_step(model, data, nstep=many)
             wall += perf_counter() - began
             states.append(joints.state(data))
         walls.append(wall)
     q_tree, v_tree = (np.array(each) for each in zip(*states, strict=True))
-    return Motion("done", "", q_tree, v_tree, min(walls), None, None, many * INSTANTS, "fixed step")
+    return Motion("done", "", q_tree, v_tree, min(walls), None, None, many * instants, "fixed step")
 
 
 def _reset(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array]) -> None:

@@ -57,12 +57,22 @@ class Reference:
         """How far it goes, s."""
         return float(self.t[-1])
 
+    @property
+    def dt(self) -> float:
+        """Between its instants, s."""
+        return float(self.t[1])
+
 
 @dataclass(frozen=True)
 class _Tight:
-    name: str
+    formulation: str
+    method: str
     motion: Motion
     run: Run
+
+    @property
+    def name(self) -> str:
+        return f"{self.formulation}, {self.method}"
 
 
 def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Reference | str:
@@ -93,13 +103,13 @@ def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Refere
         if left <= 0 or (best and best[0] == INSTANTS and best[1] <= GOOD):
             break
         motion, run = move(_tight(scene, formulation, method, t_end, min(left, seconds / 3)), left, once=True)
-        name = f"{formulation}, {method}"
         if motion.status != "done":
-            failures.append(f"{name}: {motion.reason}")
+            failures.append(f"{formulation}, {method}: {motion.reason}")
         if run is None:
             continue
-        found.append(_Tight(name, motion, run))
-        best = max((_agreed(mechanism, *pair) for pair in combinations(found, 2)), key=_rank, default=None)
+        found.append(_Tight(formulation, method, motion, run))
+        others = (pair for pair in combinations(found, 2) if _independent(*pair))
+        best = max((_agreed(mechanism, *pair) for pair in others), key=_rank, default=None)
     if best is None or best[0] == 0:
         why = "; ".join(failures) or f"two runs at rtol {TIGHT:.0e} are more than {CONFIRMED:.0e} apart from the start"
         return f"no reference could be confirmed: {why}"
@@ -119,6 +129,12 @@ def confirm(mechanism: Mechanism, one: Motion, other: Motion) -> tuple[int, floa
     return max(0, min(many - 1, INSTANTS)), max(float(scaled[:many].max(initial=0.0)), LEAST)
 
 
+def _independent(one: _Tight, other: _Tight) -> bool:
+    """Whether two runs can confirm each other: "auto" may have taken the very steps of a method that is named."""
+    used = ({name for name, steps in each.run.stats["steps_by_method"].items() if steps} for each in (one, other))
+    return one.formulation != other.formulation or set.isdisjoint(*used)
+
+
 def _agreed(mechanism: Mechanism, one: _Tight, other: _Tight) -> tuple[int, float, _Tight, _Tight]:
     return (*confirm(mechanism, one.motion, other.motion), one, other)
 
@@ -130,7 +146,9 @@ def _rank(found: tuple[int, float, _Tight, _Tight]) -> tuple[int, float]:
 def _tight(scene: Scene, formulation: str, method: str, t_end: float, limit: float, **more: Any) -> Scene:
     loosened = dict.fromkeys(f"solver.{key}" for key in ("atol", "baumgarte", "projection", "max_rhs", "min_step"))
     values = {"solver.method": method, "solver.rtol": TIGHT, "solver.max_wall_s": max(limit, 0.05)}
-    return changed(scene, {**loosened, **on_span(scene, t_end), **FORMULATIONS[formulation], **values, **more})
+    return changed(
+        scene, {**loosened, **on_span(scene, t_end, t_end / INSTANTS), **FORMULATIONS[formulation], **values, **more}
+    )
 
 
 def _end(scene: Scene, seconds: float) -> tuple[float, str]:

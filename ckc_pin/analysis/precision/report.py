@@ -20,7 +20,7 @@ __all__ = ["precision_csv", "precision_lines", "precision_markdown", "precision_
 
 COLUMNS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 ERROR = (
-    "Errors are the largest of q_tree and v_tree at {instants} instants, in SI units, relative to the largest value "
+    "Errors are the largest of q_tree and v_tree at up to {instants} instants, in SI units, relative to the largest value "
     "where that is above 1."
 )
 TIMES = "least time, ms, to an error"
@@ -85,7 +85,7 @@ def precision_markdown(every: Sequence[WorkPrecision], figures: Mapping[int, str
             "",
             f"### {TIMES.capitalize()}",
             "",
-            *_rows(head, ((name, *cells) for name, cells in _families(found))),
+            *_rows(head, ((name, *cells) for name, cells, _ in _families(found))),
         ]
         head = ("setting", "error", "right-hand sides", "time, ms", "status")
         lines += ["", "### All settings", "", *_rows(head, (_line(row) for row in found.rows))]
@@ -125,7 +125,7 @@ def _families(found: WorkPrecision) -> Iterator[tuple[str, list[str], str]]:
         cells = ["" if row is None or row.wall_s is None else f"{1e3 * row.wall_s:.3g}" for row in best]
         counts = [row.rhs for row in own if row.rhs and row.status == "done"]
         failed = [row for row in own if row.status in ("refused", "stopped", "failed")]
-        said = f"{len(failed)} of {len(own)} {failed[0].status}: {failed[0].reason}" if failed else ""
+        said = f"{len(failed)} of {len(own)} {_outcome(failed[0])}" if failed else ""
         yield family, [*cells, f"{min(counts)} ... {max(counts)}" if counts else ""], said
 
 
@@ -141,7 +141,11 @@ def _line(row: Row) -> tuple[str, ...]:
     at = "" if row.told in (True, None) else " (not told)"
     error = "" if row.error is None else f"{row.error:.1e}{at}"
     wall = "" if row.wall_s is None else f"{1e3 * row.wall_s:.3g}"
-    return _setting(row), error, str(row.rhs or ""), wall, f"{row.status}: {row.reason}" if row.reason else row.status
+    return _setting(row), error, str(row.rhs or ""), wall, _outcome(row)
+
+
+def _outcome(row: Row) -> str:
+    return row.reason if row.reason.startswith(row.status) else f"{row.status}: {row.reason}".removesuffix(": ")
 
 
 def _sentence(advice: Advice, mark: str = "") -> str:
