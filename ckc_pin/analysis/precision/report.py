@@ -20,8 +20,8 @@ __all__ = ["precision_csv", "precision_lines", "precision_markdown", "precision_
 
 COLUMNS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 ERROR = (
-    "Errors are the largest of q_tree and v_tree at up to {instants} instants, in SI units, relative to the largest value "
-    "where that is above 1."
+    "Errors are the largest of q_tree and v_tree at up to {instants} instants, in SI units, relative to the largest "
+    "value where that is above 1."
 )
 TIMES = "least time, ms, to an error"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from ckc_pin.simulation.scene import Scene, make_scene, with_changes
@@ -58,12 +59,12 @@ def _no_projection(scene: Scene) -> dict[str, Any]:
 
 
 def settings(scene: Scene) -> Iterator[Setting]:
-    """All settings, from loose to tight, so that a budget that is used up leaves out the tight ones of all."""
+    """All settings, from loose to tight: first of "auto", so that a budget that is used up leaves out the others'."""
     formulations = [name for name in FORMULATIONS if name.startswith("spf") or not off_manifold(scene)]
-    for rtol in EVERY:
-        for method, tolerances in METHODS.items():
-            if rtol in tolerances:
-                yield from (Setting(formulation, method, rtol) for formulation in formulations)
+    for methods in (["auto"], [name for name in METHODS if name != "auto"]):
+        for rtol, method, formulation in product(EVERY, methods, formulations):
+            if rtol in METHODS[method]:
+                yield Setting(formulation, method, rtol)
 
 
 def off_manifold(scene: Scene) -> bool:
