@@ -1,1 +1,1 @@
-"""What a mechanism can do and where it fails: singularities, curves of them, maps, certificates of controllers."""
+"""What a mechanism can do and where it fails: singularities, maps, certificates; what each setting of a run costs."""

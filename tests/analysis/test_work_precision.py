@@ -227,6 +227,19 @@ def test_a_scenes_own_atol_goes_with_its_rtol() -> None:
         assert setting.changes(scene)["solver.atol"] == pytest.approx(setting.rtol / 100)
 
 
+def test_what_only_a_dae_has_is_to_be_taken_out(found: WorkPrecision) -> None:
+    """A scene with Baumgarte's stabilization: no other formulation takes that key."""
+    scene = load_scene(
+        "five_bar/swing", {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0]}
+    )
+    for setting in settings(scene):
+        taken_out = [key for key, x in setting.changes(scene).items() if x is None]
+        assert taken_out == ([] if setting.formulation == "dae" else ["solver.baumgarte"])
+    row = replace(found.rows[0], changes={"formulation": "reduced", "solver.baumgarte": None}, error=1e-5, wall_s=1e-9)
+    advice = advise([row], 1e-12)[0]
+    assert (advice.options, advice.removed) == (["formulation=reduced"], ["solver.baumgarte"])
+
+
 def test_a_sampled_controller_is_compared_too() -> None:
     found = work_precision("five_bar/set_point", {"t_end": 0.2, "controller.sample_time": 0.02}, budget=BUDGET)
     assert reference_of(found).t_end == 0.2

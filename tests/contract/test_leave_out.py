@@ -63,6 +63,15 @@ def test_a_run_in_json_loads_no_pictures() -> None:
     assert not modules & (VIEW | {"PIL", "tornado", "zmq", "scipy", "rich.console"})
 
 
+def test_a_command_loads_no_other_one() -> None:
+    modules, _ = _modules(RUN, "run", "five_bar/swing", "--set", "t_end=0.01", "--json")
+    shared = {"app", "exits", "options", "output"}
+    assert {name for name in modules if name.startswith("ckc_pin.cli.")} == {
+        f"ckc_pin.cli.{x}" for x in {*shared, "run"}
+    }
+    assert not {name for name in modules if name.startswith(("ckc_pin.formats", "ckc_pin.analysis", "ckc_pin.view"))}
+
+
 def test_checking_loads_no_pictures() -> None:
     modules, out = _modules(RUN, "check", "five_bar", "--json")
     assert json.loads(out)["d"] == 2

@@ -24,7 +24,7 @@ SECTION = {"scene", "status", "message", "reference", "model_difference", "rows"
 REFERENCE = {"of", "confirmed_by", "rtol", "accuracy", "t_end", "t", "q_tree", "v_tree"}
 ROW = """program formulation method rtol dt changes status reason error error_q error_v told rhs steps used wall_s
          setup_s"""
-ADVICE = {"target", "set", "reason", "wall_s", "error", "mujoco"}
+ADVICE = {"target", "set", "remove", "reason", "wall_s", "error", "mujoco"}
 
 
 @pytest.fixture

@@ -39,6 +39,11 @@ class Advice:
         """The setting as options of `ckc run`."""
         return [] if self.row is None else _options(self.row.changes)
 
+    @property
+    def removed(self) -> list[str]:
+        """Keys to take out of the scene, which no option can."""
+        return [] if self.row is None else [key for key, x in self.row.changes.items() if x is None]
+
 
 def advise(rows: Sequence[Row], accuracy: float) -> list[Advice]:
     """Find the fastest row for each target; what the reference cannot tell is not advised."""

@@ -201,7 +201,7 @@ def _judged(
         method=ours.method if ours else setting[0],  # type: ignore[index]
         rtol=ours.rtol if ours else None,
         dt=None if ours else setting[1],  # type: ignore[index]
-        changes={key: x for key, x in changes.items() if x is not None},
+        changes=changes,
         status=status,
         reason=reason,
         error=error,

@@ -67,7 +67,7 @@ class Row:
     rtol, dt : float or None
         The tolerance, or the step, s.
     changes : dict
-        The setting as values of the scene by dotted key.
+        The setting as values of the scene by dotted key; None: the key is to be taken out.
     status, reason, rhs, steps, used, wall_s, setup_s
         As in `Motion`.
     error_q, error_v : float or None

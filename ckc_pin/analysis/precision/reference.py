@@ -17,7 +17,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["Reference", "confirm", "find_reference"]
+__all__ = ["TIGHT", "Reference", "confirm", "find_reference", "said"]
 
 TIGHT = 1e-13
 GOOD = 1e-10  # no other pair is tried where two agree to that
@@ -91,9 +91,9 @@ def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Refere
     On the manifold all formulations are one flow; off it, with phi = w, only the SPF's two coordinates are.
     """
     deadline, notes = perf_counter() + seconds, list[str]()
-    t_end, said = _end(scene, seconds)
-    if said:
-        notes.append(said)
+    t_end, event = _end(scene, seconds)
+    if event:
+        notes.append(event)
     found: list[_Tight] = []
     best: tuple[int, float, _Tight, _Tight] | None = None
     failures: list[str] = []
@@ -116,7 +116,7 @@ def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Refere
     last, accuracy, one, other = best
     t = one.run.t[: last + 1]
     if last < INSTANTS:
-        notes.append(_why_not_further(t, accuracy, failures))
+        notes.append(_why_not_further(t, failures))
     motion = Motion("done", "", one.motion.q_tree[: last + 1], one.motion.v_tree[: last + 1])
     return Reference(motion, t, accuracy, one.name, other.name, tuple(notes))
 
@@ -165,15 +165,16 @@ def _end(scene: Scene, seconds: float) -> tuple[float, str]:
     return met[-1]["t"], f"compared up to the event that ends it, at t = {met[-1]['t']:.6g} s: {met[-1]['name']}"
 
 
-def _why_not_further(t: Array, accuracy: float, failures: list[str]) -> str:
+def _why_not_further(t: Array, failures: list[str]) -> str:
     why = "; ".join(failures) or (
         f"later, runs at rtol {TIGHT:.0e} are more than {CONFIRMED:.0e} apart: the motion forgets what it comes from, "
         "and no setting is right there"
     )
-    return f"compared up to t = {t[-1]:.6g} s, as far as the reference is confirmed ({why})"
+    more = "; a larger budget gets further" if "max_wall_s" in why else ""
+    return f"compared up to t = {t[-1]:.6g} s, as far as the reference is confirmed ({why}){more}"
 
 
-def every(reference: Reference) -> Iterator[str]:
+def said(reference: Reference) -> Iterator[str]:
     """Yield what there is to say of a reference, a sentence each."""
     yield (
         f"reference: {reference.of} at rtol {TIGHT:.0e}, confirmed by {reference.by} to {reference.accuracy:.1e} "

@@ -41,7 +41,7 @@ def precision_plain(found: WorkPrecision) -> dict[str, Any]:
         "model_difference": found.model_difference,
         "rows": [asdict(row) for row in found.rows],
         "advice": [
-            {"target": a.target, "set": a.options, "reason": a.reason,
+            {"target": a.target, "set": a.options, "remove": a.removed, "reason": a.reason,
              "wall_s": a.row.wall_s if a.row else None, "error": a.row.error if a.row else None,
              "mujoco": {"method": a.peer.method, "dt": a.peer.dt, "wall_s": a.peer.wall_s} if a.peer else None}
             for a in found.advice
@@ -106,7 +106,7 @@ def precision_csv(every: Sequence[WorkPrecision]) -> str:
 
 def _notes(found: WorkPrecision) -> Iterator[str]:
     if found.reference is not None:
-        yield from references.every(found.reference)
+        yield from references.said(found.reference)
         below = sum(row.told is False for row in found.rows)
         if below:
             yield f"{below} settings are at or below the reference's own uncertainty: not told apart from it"
@@ -155,6 +155,8 @@ def _sentence(advice: Advice, mark: str = "") -> str:
         row = advice.row
         options = " ".join(f"--set {option}" for option in advice.options)
         said = f"{mark}{options}{mark} ({1e3 * (row.wall_s or 0.0):.3g} ms, error {row.error:.1e})"
+    if advice.removed:
+        said += f"; take {', '.join(advice.removed)} out of the scene"
     if advice.peer is not None:
         peer = advice.peer
         said += f"; MuJoCo takes {1e3 * (peer.wall_s or 0.0):.3g} ms ({peer.method}, dt {peer.dt:.2g} s)"
