@@ -14,7 +14,7 @@ from ckc_pin.simulation.report import to_json
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-__all__ = ["ProgressBar", "errors", "make_folder", "print_json", "print_table", "watched"]
+__all__ = ["ProgressBar", "errors", "make_folder", "on_terminal", "print_json", "print_table"]
 
 
 @cache
@@ -25,7 +25,7 @@ def errors() -> Console:
     return Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
-def watched() -> bool:
+def on_terminal() -> bool:
     """Whether somebody is looking on."""
     return sys.stderr.isatty() and errors().is_terminal
 
@@ -63,7 +63,7 @@ class ProgressBar:
 
     def __enter__(self) -> Any:
         """Show the bar."""
-        if not watched():
+        if not on_terminal():
             return None
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 

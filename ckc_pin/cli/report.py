@@ -112,7 +112,7 @@ def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], o
     from ckc_pin.analysis.precision import precision_csv, precision_markdown
 
     written, figures = list[Path](), dict[int, str]()
-    with interrupts.held(), ExitStack() as stack:
+    with interrupts.deferred(), ExitStack() as stack:
         stack.enter_context(alone_in(out))
         for k, (found, data) in enumerate(zip(every, plain, strict=True)):
             if found.reference is None:

@@ -13,7 +13,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted, interrupts
-from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table, watched
+from ckc_pin.cli.output import ProgressBar, errors, make_folder, on_terminal, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
@@ -65,7 +65,7 @@ def run(
         code = _report(finished, out, profile, as_json)
         if view is not None and finished.status != "interrupted":
             with suppress(KeyboardInterrupt):
-                view.finish(finished, stay=watched())
+                view.finish(finished, stay=on_terminal())
     if code != DONE:
         raise click.exceptions.Exit(code)
 
@@ -106,7 +106,7 @@ def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
     """Save a run, whatever signals come, then draw its figures; return what interrupted that."""
     try:
         with ExitStack() as stack:
-            with interrupts.held():
+            with interrupts.deferred():
                 stack.enter_context(alone_in(out))
                 finished.save(out / "run.npz")
                 write_whole(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")

@@ -33,7 +33,7 @@ class Interrupts:
                 signal.signal(number, self._handle)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def deferred(self) -> Iterator[None]:
         """Finish what is inside; a signal that comes meanwhile raises afterwards."""
         self._saving = True
         try:

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, as_ivp, load, load_scene, simulate
-from ckc_pin.analysis.precision import Row, WorkPrecision, precision_plain, work_precision
+from ckc_pin.analysis.precision import PrecisionRow, WorkPrecision, precision_plain, work_precision
 from ckc_pin.analysis.precision.advice import advise
 from ckc_pin.analysis.precision.motion import INSTANTS, Motion
 from ckc_pin.analysis.precision.reference import Reference, confirm, find_reference
@@ -52,7 +52,7 @@ def of_scene(scene: str | Path, changes: dict[str, Any] | None = None, seconds: 
     return reference
 
 
-def again(scene: str | Path, row: Row, t_end: float) -> Any:
+def again(scene: str | Path, row: PrecisionRow, t_end: float) -> Any:
     return simulate(scene, {**row.changes, "t_end": t_end, "solver.output_dt": t_end / INSTANTS})
 
 
@@ -189,7 +189,7 @@ def test_tighter_tolerances_err_less(found: WorkPrecision) -> None:
 def test_what_the_reference_cannot_tell_is_said(found: WorkPrecision) -> None:
     accuracy = reference_of(found).accuracy
     for row in found.rows:
-        assert row.told == (None if row.error is None else row.error > 10 * accuracy)
+        assert row.resolved == (None if row.error is None else row.error > 10 * accuracy)
 
 
 def test_eq_17s_spf_is_the_reduced_model_on_the_manifold(found: WorkPrecision) -> None:
@@ -308,7 +308,7 @@ def test_mujoco_is_left_out_where_it_cannot() -> None:
     assert any(note.startswith("MuJoCo is not beside it: the scene's controller") for note in found.notes)
 
 
-def test_another_mechanism_in_mujoco_is_told(table: Path) -> None:
+def test_another_mechanism_in_mujoco_is_named(table: Path) -> None:
     heavier = export(load(table / "mechanism.toml"), "mjcf").text.replace('mass="2.5"', 'mass="2.6"')
     found = work_precision(table, {"t_end": 0.05}, budget=1.0, mjcf=heavier)
     assert {row.program for row in found.rows} == {"ckc_pin"}

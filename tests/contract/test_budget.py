@@ -105,7 +105,7 @@ def test_what_is_deferred_for_is_finished_first(interrupts: Interrupts) -> None:
     done = []
 
     def save() -> None:
-        with interrupts.held():
+        with interrupts.deferred():
             for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
                 signal.raise_signal(number)
                 done.append(number)

@@ -22,7 +22,7 @@ from tests.contract.helpers.command import ckc
 PLAIN = {"status", "message", "scenes", "written"}
 SECTION = {"scene", "status", "message", "reference", "model_difference", "rows", "advice", "notes", "seconds"}
 REFERENCE = {"of", "confirmed_by", "rtol", "accuracy", "t_end", "t", "q_tree", "v_tree"}
-ROW = """program formulation method rtol dt changes status reason error error_q error_v told rhs steps used wall_s
+ROW = """program formulation method rtol dt changes status reason error error_q error_v resolved rhs steps used wall_s
          setup_s"""
 ADVICE = {"target", "set", "remove", "reason", "wall_s", "error", "mujoco"}
 
@@ -110,7 +110,7 @@ def test_one_scene_has_one_figure(table: Path, no_mujoco: None) -> None:
     assert {path.name for path in Path("out").iterdir()} == {"report.md", "rows.csv", "work_precision.png"}
 
 
-def test_what_takes_long_is_told_before(table: Path, no_mujoco: None) -> None:
+def test_what_takes_long_is_announced(table: Path, no_mujoco: None) -> None:
     quick = ckc("report", "table", "--set", "t_end=0.01", "--budget", "10")
     assert quick.err == ""
     several = ckc("report", "table", "table", "--set", "t_end=0.01", "--budget", "5.5")
@@ -157,7 +157,7 @@ def test_no_reference_is_a_stop_and_the_other_scenes_are_kept(table: Path, no_mu
         (["table", "broken"], "theta"),
     ],
 )
-def test_what_is_wrong_is_told_before_anything_is_run(
+def test_what_is_wrong_is_said_before_anything_is_run(
     words: list[str], says: str, table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def never(*_: Any, **__: Any) -> None:
@@ -181,14 +181,14 @@ from ckc_pin.analysis.precision import compute
 signal.signal(signal.SIGINT, signal.default_int_handler)
 judged, made = compute._judged, []
 
-def told(*arguments):
+def announced(*arguments):
     row = judged(*arguments)
     made.append(row)
     if len(made) == 10:
         print("under way", file=sys.stderr, flush=True)
     return row
 
-compute._judged = told
+compute._judged = announced
 ckc_pin.cli.main()
 """
 

@@ -2,7 +2,7 @@
 
 from ckc_pin.analysis.precision.advice import TARGETS, Advice
 from ckc_pin.analysis.precision.compute import BUDGET, WorkPrecision, work_precision
-from ckc_pin.analysis.precision.motion import Row
+from ckc_pin.analysis.precision.motion import PrecisionRow
 from ckc_pin.analysis.precision.reference import Reference
 from ckc_pin.analysis.precision.report import (
     precision_csv,
@@ -16,8 +16,8 @@ __all__ = [
     "BUDGET",
     "TARGETS",
     "Advice",
+    "PrecisionRow",
     "Reference",
-    "Row",
     "WorkPrecision",
     "precision_csv",
     "precision_lines",

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ckc_pin.analysis.precision.motion import Row
+from ckc_pin.analysis.precision.motion import PrecisionRow
 
 __all__ = ["TARGETS", "Advice", "advise", "fastest"]
 
@@ -21,18 +21,18 @@ class Advice:
     Attributes
     ----------
     target : float
-    row : Row or None
+    row : PrecisionRow or None
         The fastest setting that met it.
     reason : str
         Why there is none.
-    peer : Row or None
+    peer : PrecisionRow or None
         The fastest of MuJoCo's that met it.
     """
 
     target: float
-    row: Row | None
+    row: PrecisionRow | None
     reason: str
-    peer: Row | None
+    peer: PrecisionRow | None
 
     @property
     def options(self) -> list[str]:
@@ -45,7 +45,7 @@ class Advice:
         return [] if self.row is None else [key for key, x in self.row.changes.items() if x is None]
 
 
-def advise(rows: Sequence[Row], accuracy: float) -> list[Advice]:
+def advise(rows: Sequence[PrecisionRow], accuracy: float) -> list[Advice]:
     """Find the fastest row for each target; what the reference cannot tell is not advised."""
     found = []
     for target in TARGETS:
@@ -59,7 +59,7 @@ def advise(rows: Sequence[Row], accuracy: float) -> list[Advice]:
     return found
 
 
-def fastest(rows: Sequence[Row], target: float, accuracy: float, program: str) -> Row | None:
+def fastest(rows: Sequence[PrecisionRow], target: float, accuracy: float, program: str) -> PrecisionRow | None:
     """Return the row that took the least time of those whose error, the reference's added, is within a target.
 
     Times that close are a matter of chance: of rows that take as long, "auto" is preferred.

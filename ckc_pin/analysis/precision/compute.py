@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin.analysis.precision import mujoco
 from ckc_pin.analysis.precision.advice import Advice, advise
-from ckc_pin.analysis.precision.motion import Motion, Row, apart, move, on_span
+from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move, on_span
 from ckc_pin.analysis.precision.reference import Reference, find_reference
 from ckc_pin.analysis.precision.settings import Setting, changed, off_manifold, settings
 from ckc_pin.errors import InputError
@@ -42,7 +42,7 @@ class WorkPrecision:
         "stopped" where no reference could be confirmed.
     message : str
     reference : Reference or None
-    rows : list of Row
+    rows : list of PrecisionRow
     advice : list of Advice
     notes : list of str
         What was left out, and why.
@@ -56,7 +56,7 @@ class WorkPrecision:
     status: Literal["done", "stopped", "interrupted"] = "done"
     message: str = ""
     reference: Reference | None = None
-    rows: list[Row] = field(default_factory=list)
+    rows: list[PrecisionRow] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     model_difference: float | None = None
@@ -185,7 +185,7 @@ def _judged(
     motion: Motion,
     setting: Setting | tuple[str, float],
     changes: dict[str, Any],
-) -> Row:
+) -> PrecisionRow:
     """Return the row of a motion; one that is not whole has no error."""
     whole = motion.status == "done" and len(motion.q_tree) == len(reference.t)
     finite = whole and bool(np.isfinite(motion.q_tree).all() and np.isfinite(motion.v_tree).all())
@@ -195,7 +195,7 @@ def _judged(
     off = apart(mechanism.tree, motion, reference.motion) if finite else None
     error = None if off is None else float(off.scaled.max())
     ours = setting if isinstance(setting, Setting) else None
-    return Row(
+    return PrecisionRow(
         program="ckc_pin" if ours else "MuJoCo",
         formulation=ours.formulation if ours else None,
         method=ours.method if ours else setting[0],  # type: ignore[index]
@@ -207,7 +207,7 @@ def _judged(
         error=error,
         error_q=None if off is None else float(off.q.max()),
         error_v=None if off is None else float(off.v.max()),
-        told=None if error is None else error > CLEAR * reference.accuracy,
+        resolved=None if error is None else error > CLEAR * reference.accuracy,
         rhs=motion.rhs,
         steps=motion.steps,
         used=motion.used,

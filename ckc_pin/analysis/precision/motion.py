@@ -17,7 +17,7 @@ from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.simulate import run_prepared
 
-__all__ = ["INSTANTS", "Apart", "Motion", "Row", "apart", "move", "on_span", "without_place"]
+__all__ = ["INSTANTS", "Apart", "Motion", "PrecisionRow", "apart", "move", "on_span", "without_place"]
 
 INSTANTS = 20  # at which motions are compared, the end among them
 REPEATS, ENOUGH = 20, 0.05  # runs and s: repeated up to whichever comes first
@@ -55,7 +55,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Row:
+class PrecisionRow:
     """A line of the comparison: a setting, what it cost, how far off it is.
 
     Attributes
@@ -74,7 +74,7 @@ class Row:
         Largest error of q_tree and v_tree over the instants, rad or m and per s.
     error : float or None
         The larger of both, each relative to its largest value where that is above 1.
-    told : bool or None
+    resolved : bool or None
         Whether the error is well above the reference's own uncertainty.
     """
 
@@ -89,7 +89,7 @@ class Row:
     error: float | None
     error_q: float | None
     error_v: float | None
-    told: bool | None
+    resolved: bool | None
     rhs: int | None
     steps: int | None
     used: str

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ckc_pin.analysis.precision import reference as references
 from ckc_pin.analysis.precision.advice import Advice, fastest
 from ckc_pin.analysis.precision.compute import WorkPrecision
-from ckc_pin.analysis.precision.motion import INSTANTS, Row
+from ckc_pin.analysis.precision.motion import INSTANTS, PrecisionRow
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -94,7 +94,7 @@ def precision_markdown(every: Sequence[WorkPrecision], figures: Mapping[int, str
 
 def precision_csv(every: Sequence[WorkPrecision]) -> str:
     """Return all rows of comparisons as CSV; what there is not is empty."""
-    names = [field.name for field in fields(Row) if field.name != "changes"]
+    names = [field.name for field in fields(PrecisionRow) if field.name != "changes"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["scene", *names])
@@ -107,7 +107,7 @@ def precision_csv(every: Sequence[WorkPrecision]) -> str:
 def _notes(found: WorkPrecision) -> Iterator[str]:
     if found.reference is not None:
         yield from references.said(found.reference)
-        below = sum(row.told is False for row in found.rows)
+        below = sum(row.resolved is False for row in found.rows)
         if below:
             yield f"{below} settings are at or below the reference's own uncertainty: not told apart from it"
         for name, _, failed in _families(found):
@@ -129,22 +129,22 @@ def _families(found: WorkPrecision) -> Iterator[tuple[str, list[str], str]]:
         yield family, [*cells, f"{min(counts)} ... {max(counts)}" if counts else ""], said
 
 
-def _family(row: Row) -> str:
+def _family(row: PrecisionRow) -> str:
     return f"{row.formulation}, {row.method}" if row.formulation else f"{row.program}, {row.method}"
 
 
-def _setting(row: Row) -> str:
+def _setting(row: PrecisionRow) -> str:
     return f"{_family(row)}, " + (f"rtol {row.rtol:.0e}" if row.rtol is not None else f"dt {row.dt:.3g} s")
 
 
-def _line(row: Row) -> tuple[str, ...]:
-    at = "" if row.told in (True, None) else " (not told)"
+def _line(row: PrecisionRow) -> tuple[str, ...]:
+    at = "" if row.resolved in (True, None) else " (not resolved)"
     error = "" if row.error is None else f"{row.error:.1e}{at}"
     wall = "" if row.wall_s is None else f"{1e3 * row.wall_s:.3g}"
     return _setting(row), error, str(row.rhs or ""), wall, _outcome(row)
 
 
-def _outcome(row: Row) -> str:
+def _outcome(row: PrecisionRow) -> str:
     return row.reason if row.reason.startswith(row.status) else f"{row.status}: {row.reason}".removesuffix(": ")
 
 

@@ -45,7 +45,7 @@ MODULES: dict[str, tuple[str, str]] = {
     "yourdfpy": ("import yourdfpy", "visual meshes"),
     "sksundae": ("import sksundae", "SUNDIALS, for `ckc report`"),
     "mujoco": ("import mujoco", "checking what `ckc export` writes"),
-    "typer": ("import typer, rich", "the command line; a run from Python needs none"),
+    "click": ("import click, rich", "the command line; a run from Python needs none"),
     "scipy.integrate": ("import scipy.integrate", "a second opinion by SciPy's solvers"),
 }
 
