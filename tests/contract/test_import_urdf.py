@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ckc_pin.formats.importing import Draft, read
-from ckc_pin.formats.importing.orientation import euler, from_rpy, from_x_and_y, from_z, to_rpy
+from ckc_pin.formats.orientation import euler, from_rpy, from_x_and_y, from_z, to_rpy
 from tests.conftest import assert_close
 
 BODY = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'

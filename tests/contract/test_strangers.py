@@ -17,7 +17,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
-from ckc_pin.formats.importing.mjcf_inertia import _uniform
+from ckc_pin.formats.mjcf.inertia import _uniform
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.whole_file import UNFINISHED, written_whole
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.exporting.mjcf_loops import in_one_plane
+from ckc_pin.formats.mjcf.writer_loops import in_one_plane
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import checked_direction, number
-from ckc_pin.formats.importing.mjcf_document import Attributes, Child, Document
-from ckc_pin.formats.importing.orientation import from_axis_angle
-from ckc_pin.formats.importing.urdf_out import UNLIMITED, JointLimits
+from ckc_pin.formats.draft import checked_direction, number
+from ckc_pin.formats.mjcf.document import Attributes, Child, Document
+from ckc_pin.formats.orientation import from_axis_angle
+from ckc_pin.formats.urdf.elements import UNLIMITED, JointLimits
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["MjcfJoint", "is_free_root"]

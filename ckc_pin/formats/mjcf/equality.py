@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import frame, number, unique, vector
-from ckc_pin.formats.importing.mjcf_document import Attributes, Document
-from ckc_pin.formats.importing.mjcf_tree import MjcfTree, Placed
+from ckc_pin.formats.draft import frame, number, unique, vector
+from ckc_pin.formats.mjcf.document import Attributes, Document
+from ckc_pin.formats.mjcf.tree import MjcfTree, Placed
 from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec
 
 __all__ = ["Equalities"]

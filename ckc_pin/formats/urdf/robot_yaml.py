@@ -14,8 +14,8 @@ from xml.etree.ElementTree import Element, SubElement
 import msgspec
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.importing.draft import Draft, some, unique
-from ckc_pin.formats.importing.urdf_in import Names
+from ckc_pin.formats.draft import Draft, some, unique
+from ckc_pin.formats.urdf.names import Names
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.toml import convert
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ckc_pin.errors import MechanismError
-from ckc_pin.formats.importing.draft import Draft
+from ckc_pin.formats.draft import Draft
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import choose_dependent, rank_of
 

@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing import orientation
-from ckc_pin.formats.importing.draft import checked_direction
+from ckc_pin.formats import orientation
+from ckc_pin.formats.draft import checked_direction
 from ckc_pin.mechanism.strict_xml import MAX_DEPTH, strict_xml
 from ckc_pin.mechanism.toml import read_text
 from ckc_pin.mechanism.tree import Array

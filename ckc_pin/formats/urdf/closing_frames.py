@@ -10,9 +10,9 @@ import re
 from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
-from ckc_pin.formats.importing.draft import Draft
-from ckc_pin.formats.importing.proposal import propose
-from ckc_pin.formats.importing.urdf_in import Names
+from ckc_pin.formats.draft import Draft
+from ckc_pin.formats.urdf.names import Names
+from ckc_pin.formats.urdf.proposal import propose
 from ckc_pin.mechanism.spec import LoopSpec
 
 __all__ = ["take_closing_frames"]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ckc_pin.formats.importing.draft import Draft, vector
+from ckc_pin.formats.draft import Draft, vector
 from ckc_pin.kinematics.assembly import assemble
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame

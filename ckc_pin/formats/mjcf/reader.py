@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import Draft, safe_name, vector
-from ckc_pin.formats.importing.mjcf_document import Document
-from ckc_pin.formats.importing.mjcf_equality import Equalities
-from ckc_pin.formats.importing.mjcf_tree import MjcfTree
+from ckc_pin.formats.draft import Draft, safe_name, vector
+from ckc_pin.formats.mjcf.document import Document
+from ckc_pin.formats.mjcf.equality import Equalities
+from ckc_pin.formats.mjcf.tree import MjcfTree
 
 __all__ = ["read_mjcf"]
 

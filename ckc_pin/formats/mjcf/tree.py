@@ -15,11 +15,11 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import number, some, unique, vector
-from ckc_pin.formats.importing.mjcf_document import MAIN, Attributes, Child, Document
-from ckc_pin.formats.importing.mjcf_inertia import Geom, bounded, declared, from_geoms
-from ckc_pin.formats.importing.mjcf_joints import MjcfJoint, is_free_root
-from ckc_pin.formats.importing.urdf_out import UNLIMITED, Body, JointLimits, add_joint, add_link
+from ckc_pin.formats.draft import number, some, unique, vector
+from ckc_pin.formats.mjcf.document import MAIN, Attributes, Child, Document
+from ckc_pin.formats.mjcf.inertia import Geom, bounded, declared, from_geoms
+from ckc_pin.formats.mjcf.joints import MjcfJoint, is_free_root
+from ckc_pin.formats.urdf.elements import UNLIMITED, Body, JointLimits, add_joint, add_link
 from ckc_pin.mechanism.spec import SpringSpec
 from ckc_pin.mechanism.tree import Array
 

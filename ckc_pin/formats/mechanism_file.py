@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from ckc_pin.formats.importing.draft import Draft
+from ckc_pin.formats.draft import Draft
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.sources import write_texts
 

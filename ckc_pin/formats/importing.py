@@ -9,11 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import Draft
-from ckc_pin.formats.importing.mjcf import read_mjcf
-from ckc_pin.formats.importing.partition import settle_independent
-from ckc_pin.formats.importing.urdf_reader import read_urdf, urdf_beside
-from ckc_pin.formats.importing.write import mechanism_text, write
+from ckc_pin.formats.draft import Draft
+from ckc_pin.formats.mechanism_file import mechanism_text, write
+from ckc_pin.formats.mjcf.reader import read_mjcf
+from ckc_pin.formats.partition import settle_independent
+from ckc_pin.formats.urdf.reader import read_urdf, urdf_beside
 from ckc_pin.mechanism.strict_xml import strict_xml
 from ckc_pin.mechanism.toml import read_text
 

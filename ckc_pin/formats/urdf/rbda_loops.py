@@ -14,8 +14,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.importing.draft import Draft, checked_direction, frame, number, unique, vector
-from ckc_pin.formats.importing.urdf_in import Names, origin_of, three
+from ckc_pin.formats.draft import Draft, checked_direction, frame, number, unique, vector
+from ckc_pin.formats.urdf.names import Names, origin_of, three
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, LoopType
 
 __all__ = ["take_loops"]

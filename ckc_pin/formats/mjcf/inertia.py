@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.draft import checked_direction
-from ckc_pin.formats.importing.mjcf_document import Attributes, Document
-from ckc_pin.formats.importing.orientation import from_z
-from ckc_pin.formats.importing.urdf_out import Body, add_shape, numbers
+from ckc_pin.formats.draft import checked_direction
+from ckc_pin.formats.mjcf.document import Attributes, Document
+from ckc_pin.formats.orientation import from_z
+from ckc_pin.formats.urdf.elements import Body, add_shape, numbers
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Geom", "bounded", "declared", "from_geoms"]

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.importing.orientation import to_rpy
+from ckc_pin.formats.orientation import to_rpy
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism

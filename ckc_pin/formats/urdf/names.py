@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.importing.orientation import from_rpy
+from ckc_pin.formats.orientation import from_rpy
 
 __all__ = ["Names", "origin_of", "three"]
 

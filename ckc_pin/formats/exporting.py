@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.exporting.mjcf import mjcf
+from ckc_pin.formats.mjcf.writer import mjcf
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import write_texts
 

@@ -1,0 +1,1 @@
+"""MuJoCo's models: read through MuJoCo's own compiler, and written for it."""
