@@ -18,7 +18,16 @@ from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.spec import CouplingSpec, Frame, FrameSpec, LoopSpec, MechanismSpec, SpringSpec, Vector3
+from ckc_pin.mechanism.spec import (
+    CouplingSpec,
+    ForceSpec,
+    Frame,
+    FrameSpec,
+    LoopSpec,
+    MechanismSpec,
+    SpringSpec,
+    Vector3,
+)
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, UrdfTree, merge
 
@@ -42,7 +51,7 @@ class Draft:
         What it was made from, for the head of the file.
     robot : Element
         The tree as a URDF's <robot>.
-    loops, couplings, springs : list of (spec, comment)
+    loops, couplings, springs, forces : list of (spec, comment)
     independent, actuated : list of str, or None
         None leaves it to the program.
     why_independent : str
@@ -61,6 +70,7 @@ class Draft:
     loops: Noted[LoopSpec] = field(default_factory=list)
     couplings: Noted[CouplingSpec] = field(default_factory=list)
     springs: Noted[SpringSpec] = field(default_factory=list)
+    forces: Noted[ForceSpec] = field(default_factory=list)
     independent: list[str] | None = None
     actuated: list[str] | None = None
     why_independent: str = ""
@@ -91,6 +101,7 @@ class Draft:
             loop=[spec for spec, _ in self.loops],
             coupling=[spec for spec, _ in self.couplings],
             spring=[spec for spec, _ in self.springs],
+            force=[spec for spec, _ in self.forces],
         )
 
     def tree(self) -> tuple[Tree, Frames, UrdfTree]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,13 @@ def mechanism_text(draft: Draft) -> str:
         lines += _list("actuated", draft.actuated)
     if draft.q_guess:
         lines += ["", "[q_guess]", *(f"{_key(k)} = {_value(v)}" for k, v in draft.q_guess.items())]
-    for table, noted in (("loop", draft.loops), ("coupling", draft.couplings), ("spring", draft.springs)):
+    tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
+        "loop": draft.loops,
+        "coupling": draft.couplings,
+        "spring": draft.springs,
+        "force": draft.forces,
+    }
+    for table, noted in tables.items():
         for entry, comment in noted:
             lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
     return "\n".join(lines) + "\n"

@@ -130,6 +130,11 @@ def urdf(content: str, **others: str) -> dict[str, str]:
 
 
 BODY = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
+FREE_BELOW = "<body><body name='c'><freejoint/><geom size='.1'/></body></body>"
+MESH, MESH_ASSET = "<body><joint/><geom type='mesh' mesh='m'/></body>", "<asset><mesh file='m.stl'/></asset>"
+FINE = "<asset><mesh builtin='sphere' params='1000000'/></asset>"
+BAD_MODEL = "<mujoco><worldbody><body pos='0 up'/></worldbody></mujoco>"
+SUBMODEL = "<asset><model file='n.xml'/></asset>"
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><mujoco>&b;</mujoco>'
 X, R = ["import", "m.xml"], ["import", "r.urdf"]
 LOOP = '<loop name="l" type="{}"><predecessor link="{}"/><successor link="base"/>{}</loop>'
@@ -148,51 +153,53 @@ CASES = [
         "a yaml alone", ["import", "robot.yaml"], ["one URDF beside it is needed; found none"], files={"robot.yaml": ""}
     ),
     Bad("a folder that cannot be made", [*X, "--out", "m.xml/x"], ["m.xml/x: cannot be written"], files=mjcf(BODY)),
-    # MJCF
-    Bad("global coordinates", X, ["coordinate='global'"], files=mjcf("", "<compiler coordinate='global'/>")),
-    Bad("unknown unit", X, ["angle='gon' is not degree or radian"], files=mjcf("", "<compiler angle='gon'/>")),
-    Bad("bad sequence", X, ["eulerseq='xyq'"], files=mjcf("", "<compiler eulerseq='xyq'/>")),
-    Bad(
-        "unknown class",
-        X,
-        ["<joint> 'j'", "no default class 'k'"],
-        files=mjcf("<body><joint name='j' class='k'/></body>"),
-    ),
-    Bad("class without name", X, ["nested <default> has no class"], files=mjcf("", "<default><default/></default>")),
-    Bad("unknown joint type", X, ["type='screw' is not one of"], files=mjcf("<body><joint type='screw'/></body>")),
-    Bad(
-        "two of one name",
-        X,
-        ["two joints have this name"],
-        files=mjcf("<body><joint name='j'/><joint name='j'/></body>"),
-    ),
-    Bad("two bodies of one name", X, ["two bodies are called 'b'"], files=mjcf(BODY + "<body name='b'/>")),
-    Bad("a word for a number", X, ["pos='0 0 up'", "not a list of numbers"], files=mjcf("<body pos='0 0 up'/>")),
-    Bad("not a number", X, ["pos='0 0 nan'", "3 finite numbers"], files=mjcf("<body pos='0 0 nan'/>")),
-    Bad("too few numbers", X, ["quat='1 0'", "4 finite numbers"], files=mjcf("<body quat='1 0'/>")),
-    Bad("no rotation", X, ["quat is zero"], files=mjcf("<body quat='0 0 0 0'/>")),
-    Bad("no axis", X, ["axis", "all three are zero"], files=mjcf("<body><joint axis='0 0 0'/></body>")),
-    Bad("no size", X, ["<geom> 'g'", "size=''"], files=mjcf("<body><geom name='g' type='box'/></body>")),
+    # MJCF: what MuJoCo's compiler refuses, with the element's name
+    Bad("global coordinates", X, ["<compiler>", "coordinate"], files=mjcf("", "<compiler coordinate='global'/>")),
+    Bad("unknown unit", X, ["<compiler>", "'gon'"], files=mjcf("", "<compiler angle='gon'/>")),
+    Bad("bad sequence", X, ["euler sequence"], files=mjcf("<body euler='1 2 3'/>", "<compiler eulerseq='xyq'/>")),
+    Bad("unknown class", X, ["<joint> 'j'", "class name 'k'"], files=mjcf("<body><joint name='j' class='k'/></body>")),
+    Bad("class without name", X, ["<default>", "empty class"], files=mjcf("", "<default><default/></default>")),
+    Bad("unknown joint type", X, ["<joint>", "'screw'"], files=mjcf("<body><joint type='screw'/></body>")),
+    Bad("unknown element", X, ["<jiont> 'j'", "unrecognized"], files=mjcf("<body><jiont name='j'/></body>")),
+    Bad("two of one name", X, ["<joint> 'j'"], files=mjcf("<body><joint name='j'/><joint name='j'/></body>")),
+    Bad("two bodies of one name", X, ["<body> 'b'", "repeated"], files=mjcf(BODY + "<body name='b'/>")),
+    Bad("a word for a number", X, ["pos='0 0 up'", "bad format"], files=mjcf("<body pos='0 0 up'/>")),
+    Bad("not a number", X, ["<body> 'b'", "pos='0 0 nan'"], files=mjcf("<body name='b' pos='0 0 nan'/>")),
+    Bad("a number too large", X, ["stiffness='1e200'"], files=mjcf("<body><joint stiffness='1e200'/></body>")),
+    Bad("too few numbers", X, ["quat='1 0'", "enough data"], files=mjcf("<body quat='1 0'/>")),
+    Bad("no rotation", X, ["quat='0 0 0 0'", "zero"], files=mjcf("<body quat='0 0 0 0'/>")),
+    Bad("no axis", X, ["<joint> 'j'", "axis"], files=mjcf("<body><joint name='j' axis='0 0 0'/></body>")),
+    Bad("no size", X, ["<geom> 'g'", "size"], files=mjcf("<body><geom name='g' type='box'/></body>")),
     Bad("negative size", X, ["size='-1'", "positive"], files=mjcf("<body><geom size='-1'/></body>")),
-    Bad(
-        "a free joint below", X, ["a free joint is the only one"], files=mjcf("<body><body><freejoint/></body></body>")
-    ),
-    Bad("replicas", X, ["<replicate> is not read", "mj_saveLastXML"], files=mjcf("<replicate count='9'/>")),
+    Bad("no mass", X, ["<body> 'b'", "mass and inertia"], files=mjcf("<body name='b'><joint/></body>")),
+    Bad("a free joint below", X, ["<body> 'c'", "free joint"], files=mjcf(FREE_BELOW)),
+    Bad("no such body", X, ["body1='q'", "there are b"], files=mjcf(BODY, "<equality><weld body1='q'/></equality>")),
+    Bad("no such site", X, ["site1='q'"], files=mjcf(BODY, "<equality><weld site1='q' site2='q'/></equality>")),
+    Bad("nothing to connect", X, ["<connect>", "body1"], files=mjcf(BODY, "<equality><connect/></equality>")),
+    Bad("no anchor", X, ["<connect>", "anchor"], files=mjcf(BODY, "<equality><connect body1='b'/></equality>")),
+    Bad("no such joint", X, ["'q'", "there are j"], files=mjcf(BODY, "<equality><joint joint1='q'/></equality>")),
+    Bad("a motor on nothing", X, ["'q'", "there are j"], files=mjcf(BODY, "<actuator><motor joint='q'/></actuator>")),
+    Bad("neither true nor false", X, ["active='yes'"], files=mjcf(BODY, "<equality><weld active='yes'/></equality>")),
+    Bad("bad solid", X, ["<mesh> 'm'", "m.stl"], files=mjcf(MESH, MESH_ASSET) | {"m.stl": "version of a pointer"}),
+    # MJCF: what MuJoCo does not get to see
     Bad("an include from outside", X, ["include file='../x'"], files=mjcf("<include file='../x'/>")),
     Bad("an include of itself", X, ["'m.xml' is included twice"], files=mjcf("<include file='m.xml'/>")),
     Bad("an include of nothing", X, ["n.xml: no such MuJoCo model"], files=mjcf("<include file='n.xml'/>")),
-    Bad("no such body", X, ["body1: no body 'q'"], files=mjcf(BODY, "<equality><weld body1='q'/></equality>")),
-    Bad("no such site", X, ["no site 'q'"], files=mjcf(BODY, "<equality><weld site1='q' site2='q'/></equality>")),
-    Bad("nothing to connect", X, ["needs body1"], files=mjcf(BODY, "<equality><connect/></equality>")),
-    Bad("no anchor", X, ["anchor=''"], files=mjcf(BODY, "<equality><connect body1='b'/></equality>")),
+    Bad("a model from outside", X, ["model file='../x'"], files=mjcf("", "<asset><model file='../x'/></asset>")),
+    Bad("a model of itself", X, ["cannot contain itself"], files=mjcf("", "<asset><model file='m.xml'/></asset>")),
     Bad(
-        "no such joint",
+        "a bad model",
         X,
-        ["no hinge or slide 'q'; there are j"],
-        files=mjcf(BODY, "<equality><joint joint1='q'/></equality>"),
+        ["n.xml: <body>", "'0 up'"],
+        files=mjcf("", SUBMODEL) | mjcf("<body pos='0 up'/>", "", "n.xml"),
     ),
-    Bad("a motor on nothing", X, ["no joint 'q'"], files=mjcf(BODY, "<actuator><motor joint='q'/></actuator>")),
-    Bad("neither true nor false", X, ["active='yes'"], files=mjcf(BODY, "<equality><weld active='yes'/></equality>")),
+    Bad("too many", X, ["1000000 bodies", "2000"], files=mjcf(f"<replicate count='1000000'>{BODY}</replicate>")),
+    Bad(
+        "a fine mesh",
+        X,
+        ["params='1000000'"],
+        files=mjcf("", FINE),
+    ),
     # URDF
     Bad("a xacro", R, ["a xacro", "expand it first"], files=urdf('<link name="${x}"/>')),
     Bad("two roots", R, ["roots found: 'base', 'lost'"], files=urdf('<link name="lost"/>')),

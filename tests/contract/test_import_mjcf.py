@@ -1,117 +1,86 @@
-"""`ckc import` of MuJoCo models, against what MuJoCo itself makes of them (test_import_data/make_reference.py)."""
+"""`ckc import` of MuJoCo models, against MuJoCo itself: the same bodies, masses, forces and loops at random states."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from ckc_pin.formats.importing import Draft, read
-from ckc_pin.mechanism.pose import Pose
 from tests.conftest import assert_close
+from tests.contract.helpers.models import TWO_ARMS, model, said, write_workshop
+from tests.contract.helpers.mujoco_twin import Twin
 
-DATA = Path(__file__).parent / "test_import_data"
-REFERENCE = json.loads((DATA / "reference.json").read_text(encoding="utf-8"))["poses"]
+MACHINE = Path(__file__).parent / "test_import_data" / "machine.xml"
 EXACT = 1e-12
-
-
-def model(tmp_path: Path, bodies: str, rest: str = "", name: str = "thing.xml") -> Draft:
-    """Import a MuJoCo model of these bodies."""
-    path = tmp_path / name
-    path.write_text(f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody>{rest}</mujoco>", "utf-8")
-    return read(path)
-
-
-def said(notes: list[str], *fragments: str) -> bool:
-    """Whether one note holds all fragments."""
-    return any(all(fragment in note for fragment in fragments) for note in notes)
+SAME = 1e-10
 
 
 # --- the same machine in MuJoCo and here ----------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module", params=["machine", "workshop"])
+def twin(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Twin:
+    """A machine with every kind of orientation, solid and joint; one of replicas, attached models and meshes."""
+    return Twin(MACHINE if request.param == "machine" else write_workshop(tmp_path_factory.mktemp("workshop")))
+
+
 @pytest.fixture(scope="module")
 def machine() -> Draft:
-    return read(DATA / "machine.xml")
+    return read(MACHINE)
 
 
-def coordinates(joints: dict[str, list[float]]) -> dict[str, float]:
-    """MuJoCo's numbers by our coordinates."""
-    found: dict[str, float] = {}
-    for name, values in joints.items():
-        labels = {1: [name], 3: [f"{name}_{a}" for a in "xyz"]}.get(len(values)) or [
-            f"{name}.{a}" for a in ("x", "y", "z", "rx", "ry", "rz")
-        ]
-        found |= dict(zip(labels, values, strict=True))
-    return found
+def states(twin: Twin) -> list[tuple[Any, Any]]:
+    """The reference pose and random ones farther and farther away."""
+    random = np.random.default_rng(7)
+    start = np.array([twin.draft.q_guess.get(label, 0.0) for label in twin.tree.coordinates])
+    n = twin.tree.n
+    return [(start + random.uniform(-far, far, n), random.normal(size=n)) for far in (0.0, 0.3, 0.6, 0.9, 1.2)]
 
 
-@pytest.mark.parametrize("reference", REFERENCE, ids=["reference", "near", "far", "farther"])
-def test_bodies_are_where_mujoco_has_them(machine: Draft, reference: dict[str, Any]) -> None:
-    """Mass, centre of mass and inertia of every body in world axes: geometry, joints, refs and solids are right."""
-    tree, frames, _ = machine.tree()
-    named = coordinates(reference["joints"])
-    q_tree = tree.from_coordinates(np.array([named[label] for label in tree.coordinates]))
-    placement, _ = tree.kinematics(q_tree)
-    for name, theirs in reference["bodies"].items():
-        inertial = machine.robot.find(f"link[@name='{name}']/inertial")
-        assert inertial is not None, name
-        assert_close(float(inertial.find("mass").get("value")), theirs["mass"], EXACT)
-        at = frames.find(name, name)
-        joint = pin.SE3(placement[at.joint, :9].reshape(3, 3).T, placement[at.joint, 9:])
-        link = joint * pin.SE3(at.rotation, at.translation)
-        centre = np.array([float(x) for x in inertial.find("origin").get("xyz").split()])
-        assert_close(link.act(centre), theirs["centre"], EXACT)
-        entry = {key: float(inertial.find("inertia").get(key)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")}
-        inertia = np.array(
-            [
-                [entry["ixx"], entry["ixy"], entry["ixz"]],
-                [entry["ixy"], entry["iyy"], entry["iyz"]],
-                [entry["ixz"], entry["iyz"], entry["izz"]],
-            ]
-        )
-        assert_close(link.rotation @ inertia @ link.rotation.T, theirs["inertia"], EXACT, relative=True)
+def test_the_mass_matrix_is_mujocos(twin: Twin) -> None:
+    for values, v in states(twin):
+        q_tree, to = twin.put(values, v)
+        ours, theirs = twin.mass_matrices(q_tree, to)
+        assert_close(ours, theirs, SAME * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("reference", REFERENCE, ids=["reference", "near", "far", "farther"])
-def test_loops_miss_by_what_mujoco_says(machine: Draft, reference: dict[str, Any]) -> None:
+def test_bodies_are_where_mujoco_has_them(twin: Twin) -> None:
+    """Mass, centre of mass and inertia of every body in the world's axes: geometry, joints, refs and solids."""
+    for values, v in states(twin):
+        q_tree, _ = twin.put(values, v)
+        bodies = twin.bodies(q_tree)
+        assert len(bodies) == twin.model.nbody - 1
+        for ours, theirs in bodies.values():
+            for mine, other in zip(ours, theirs, strict=True):
+                assert_close(mine, other, SAME * np.abs(other).max())
+
+
+def test_springs_and_dampers_pull_as_mujocos(twin: Twin) -> None:
+    """Those of joints, of tendons between two sites, and what actuators add to a joint's damping."""
+    for values, v in states(twin):
+        q_tree, to = twin.put(values, v)
+        ours, theirs = twin.passive_forces(q_tree, v, to)
+        assert np.abs(theirs).max() > 0.1
+        assert_close(ours, theirs, SAME * np.abs(theirs).max())
+
+
+def test_loops_miss_by_what_mujoco_says(twin: Twin) -> None:
     """The distance, and for a weld the angle, by which each equality constraint is not met anywhere."""
-    tree, frames, _ = machine.tree()
-    named = coordinates(reference["joints"])
-    q_tree = tree.from_coordinates(np.array([named[label] for label in tree.coordinates]))
-    placement, _ = tree.kinematics(q_tree)
-    compared = set()
-    for loop, _ in machine.loops:
-        ends = []
-        for frame in (loop.frame_a, loop.frame_b):
-            f = frames.find(frame, loop.name)
-            joint = pin.SE3(placement[f.joint, :9].reshape(3, 3).T, placement[f.joint, 9:])
-            ends.append(joint * pin.SE3(f.rotation, f.translation))
-        ours = [np.linalg.norm(ends[0].translation - ends[1].translation)]
-        if loop.type == "weld":
-            ours.append(np.linalg.norm(pin.log3(ends[0].rotation.T @ ends[1].rotation)))
-        assert_close(ours, reference["misses"][loop.name], 1e-7)  # arccos near 0 loses half the digits
-        compared.add(loop.name)
-    for coupling, _ in machine.couplings:
-        name = {"elbow": "geared", "swing": "held"}[coupling.joint]
-        ours = named[coupling.joint] - coupling.ratio * named[coupling.other] - coupling.offset
-        assert_close(ours, reference["misses"][name], EXACT)
-        compared.add(name)
-    assert compared == set(reference["misses"])
+    for values, v in states(twin):
+        q_tree, _ = twin.put(values, v)
+        ours, theirs = twin.misses(q_tree), twin.their_misses()
+        assert set(ours) == set(theirs)
+        assert_close([ours[name] for name in theirs], list(theirs.values()), SAME)
 
 
-def test_the_reference_pose_is_the_guess(machine: Draft) -> None:
+def test_the_reference_pose_is_the_guess(twin: Twin) -> None:
     """Refs and the free body's pose; the coordinates keep MuJoCo's numbers."""
-    expected = coordinates(REFERENCE[0]["joints"])
-    for label, value in expected.items():
-        assert_close(machine.q_guess.get(label, 0.0), value, 1e-9)
-    assert set(machine.q_guess) <= set(expected)
+    twin.put(np.array([twin.draft.q_guess.get(label, 0.0) for label in twin.tree.coordinates]), np.zeros(twin.tree.n))
+    assert_close(twin.data.qpos, twin.model.qpos0, SAME)
 
 
 def test_what_else_the_machine_says(machine: Draft) -> None:
@@ -127,15 +96,19 @@ def test_what_else_the_machine_says(machine: Draft) -> None:
     assert said(machine.guessed, "ball joint ball is three hinges, ball_x, ball_y, ball_z", "90 degrees")
 
 
-# --- loops ----------------------------------------------------------------------------------------------------------
+def test_what_else_the_workshop_says(tmp_path: Path) -> None:
+    """Replicas and attached models under the names that MuJoCo gives them; what has no counterpart by name."""
+    draft = read(write_workshop(tmp_path))
+    assert draft.actuated == ["left_knee", "right_knee"]
+    hip = draft.robot.find("joint[@name='right_hip']/limit")
+    assert (hip.get("lower"), hip.get("upper")) == ("-1.2", "1.4")
+    assert [spec.frame_b.link for spec, _ in draft.springs if spec.joint is None] == ["arm_1", "arm_2", "hub"]
+    assert said(draft.left_out, "armature", "left_hip 0.02, left_knee 0.11, right_hip 0.02, right_knee 0.11")
+    assert said(draft.left_out, "dry friction", "spin, swing_0, swing_1, swing_2")
+    assert said(draft.left_out, "gears", "left_knee, right_knee")
 
-TWO_ARMS = """
-<body name="left"><joint name="a" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
-  <body name="rod" pos="1 0 .5"><joint name="b" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
-    <site name="s1" pos="1 0 -.5"/><site name="s2" pos="1 .1 -.5"/></body></body>
-<body name="right" pos="2 0 -1"><joint name="c" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
-  <site name="t1" pos="0 0 1"/><site name="t2" pos="0 .1 1"/><site name="t3" pos="0 .2 1"/></body>
-"""
+
+# --- loops ----------------------------------------------------------------------------------------------------------
 
 
 def test_two_connects_of_one_pair_are_a_hinge(tmp_path: Path) -> None:
@@ -166,13 +139,17 @@ def test_two_connects_at_different_distances_stay_points(tmp_path: Path) -> None
 
 def test_what_is_not_active_or_not_linear_or_not_known_is_said(tmp_path: Path) -> None:
     equality = """<equality><connect name="off" site1="s1" site2="t1" active="false"/>
-      <joint name="cam" joint1="a" joint2="b" polycoef="0 1 0.5 0 0"/><tendon name="cable" tendon1="x"/></equality>"""
+      <joint name="cam" joint1="a" joint2="b" polycoef="0 1 0.5 0 0"/><tendon name="cable" tendon1="x"/></equality>
+      <tendon><spatial name="x" limited="true" range="0 3"><site site="s1"/><site site="t1"/><site site="t2"/></spatial>
+      </tendon><contact><exclude body1="left" body2="right"/></contact>"""
     draft = model(tmp_path, TWO_ARMS, equality + "<keyframe><key qpos='0 0 0'/></keyframe>")
     assert not draft.loops
     assert not draft.couplings
     assert said(draft.left_out, "off", "not active")
     assert said(draft.left_out, "joints a and b", "not linear")
     assert said(draft.left_out, "<tendon> cable")
+    assert said(draft.left_out, "a limit of tendon x")
+    assert said(draft.left_out, "contact pairs")
     assert said(draft.left_out, "key frames")
 
 
@@ -207,6 +184,25 @@ def test_three_slides_and_a_ball_are_a_free_root(tmp_path: Path) -> None:
     assert said(draft.guessed, "three slides and the ball of body trunk")
 
 
+def test_free_joints_start_where_the_file_says(tmp_path: Path) -> None:
+    """The three slides' refs too, and the key frame that `ckc export` writes."""
+    bodies = root().replace("type='slide'", "type='slide' ref='0.3'")
+    keys = "<key name='assembled' qpos='.5 .3 .3 .8 0 0 .6'/><key name='other' qpos='0 0 0 1 0 0 0'/>"
+    draft = model(tmp_path, bodies, f"<keyframe>{keys}</keyframe>")
+    angle = 2 * math.atan2(0.6, 0.8)
+    assert_close([draft.q_guess[f"root.{x}"] for x in ("x", "z", "rz")], [0.2, 1.0, angle], 1e-12)
+    assert said(draft.left_out, "key frames")
+
+
+def test_a_ball_starts_where_the_key_frame_says(tmp_path: Path) -> None:
+    ball = "<body name='b'><joint name='turn' type='ball'/><geom type='box' size='.1 .2 .3'/></body>"
+    key = "<keyframe><key name='assembled' qpos='.5 .5 -.1 .7'/></keyframe>"
+    draft = model(tmp_path, ball, key)
+    twin = Twin(tmp_path / "thing.xml")
+    twin.put(np.array([draft.q_guess[f"turn_{axis}"] for axis in "xyz"]), np.zeros(3))
+    assert_close(twin.data.qpos, twin.model.key_qpos[0] / np.linalg.norm(twin.model.key_qpos[0]), 1e-12)
+
+
 @pytest.mark.parametrize("ball", ["damping='0.1'", "pos='0 0 0.2'", "armature='0.01'"])
 def test_slides_and_a_ball_with_more_to_them_stay(tmp_path: Path, ball: str) -> None:
     assert model(tmp_path, root(ball=ball)).mechanism().coordinates == ("x", "y", "z", "turn_x", "turn_y", "turn_z")
@@ -216,79 +212,3 @@ def test_slides_that_are_used_stay(tmp_path: Path) -> None:
     draft = model(tmp_path, root(), "<actuator><motor joint='z'/></actuator>")
     assert draft.mechanism().coordinates[2] == "z"
     assert draft.actuated == ["z"]
-
-
-# --- masses, springs, names -----------------------------------------------------------------------------------------
-
-
-def test_masses_that_only_a_mesh_knows_are_said(tmp_path: Path) -> None:
-    geoms = "<geom type='mesh' mesh='hull_shape'/><geom type='sphere' size='.1' mass='2'/>"
-    draft = model(tmp_path, f"<body name='hull'><joint name='j'/>{geoms}</body>")
-    assert said(draft.left_out, "hull (mesh hull_shape)", "<inertial>")
-    assert draft.robot.find("link[@name='hull']/inertial/mass").get("value") == "2.0"
-
-
-@pytest.mark.parametrize(("rule", "mass"), [("auto", 3.0), ("true", 2.0), ("false", 3.0)])
-def test_which_mass_counts(tmp_path: Path, rule: str, mass: float) -> None:
-    path = tmp_path / "m.xml"
-    path.write_text(
-        f"<mujoco><compiler inertiafromgeom='{rule}'/><worldbody><body name='b'><joint name='j'/>"
-        "<inertial pos='0 0 0' mass='3' diaginertia='1 1 1'/><geom size='.1' mass='2'/></body></worldbody></mujoco>"
-    )
-    assert float(read(path).robot.find("link[@name='b']/inertial/mass").get("value")) == mass
-
-
-def test_the_total_mass_and_the_groups_that_count(tmp_path: Path) -> None:
-    path = tmp_path / "m.xml"
-    path.write_text(
-        "<mujoco><compiler settotalmass='12' inertiagrouprange='0 2'/><worldbody>"
-        "<body name='a'><joint name='j'/><geom size='.1' mass='1'/><geom size='.3' mass='50' group='3'/></body>"
-        "<body name='b'><joint name='k'/><geom size='.1' mass='2'/></body></worldbody></mujoco>"
-    )
-    masses = [float(m.get("value")) for m in read(path).robot.iterfind("link/inertial/mass")]
-    assert_close(masses, [4.0, 8.0], EXACT)
-
-
-def test_springs_armature_and_friction(tmp_path: Path) -> None:
-    joint = "<joint name='j' stiffness='30' springref='0.2' armature='0.01' frictionloss='0.5' damping='1'/>"
-    draft = model(tmp_path, f"<body name='b'>{joint}<geom size='.1'/></body>")
-    ((spring, _),) = draft.springs
-    assert (spring.joint, spring.stiffness, spring.rest, spring.damping) == ("j", 30.0, 0.2, 0.0)
-    assert draft.robot.find("joint[@name='j']/dynamics").attrib == {"damping": "1.0", "friction": "0.5"}
-    assert said(draft.left_out, "armature", "j 0.01")
-
-
-def test_bodies_and_joints_without_names_get_some(tmp_path: Path) -> None:
-    inner = "<body name='body_1'><joint/><joint type='slide'/><geom size='.1'/></body>"
-    mechanism = model(tmp_path, f"<body><joint/><geom size='.1'/>{inner}</body>").mechanism()
-    assert mechanism.coordinates == ("body_1_2_hinge", "body_1_hinge", "body_1_slide")
-
-
-def test_an_included_file_is_part_of_the_model(tmp_path: Path) -> None:
-    (tmp_path / "arm.xml").write_text(
-        "<mujocoinclude><body name='arm'><joint name='j'/><geom size='.1'/></body></mujocoinclude>"
-    )
-    assert model(tmp_path, "<include file='arm.xml'/>").mechanism().coordinates == ("j",)
-
-
-def test_gravity_switched_off(tmp_path: Path) -> None:
-    body = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
-    assert model(tmp_path, body, "<option><flag gravity='disable'/></option>").gravity == (0.0, 0.0, 0.0)
-
-
-def test_solids_are_drawn_and_the_urdf_is_one(tmp_path: Path) -> None:
-    body = "<body name='b'><joint name='j'/><geom type='capsule' size='.1 .2'/><geom type='box' size='1 2 3'/></body>"
-    draft = model(tmp_path, body)
-    shapes = [e.tag for e in ElementTree.fromstring(draft.urdf()).iterfind("link[@name='b']/visual/geometry/*")]
-    assert shapes == ["cylinder", "sphere", "sphere", "box"]
-
-
-def test_motors_are_part_of_q(tmp_path: Path) -> None:
-    """An independent set with every actuated joint, not the program's own choice."""
-    rest = "<equality><connect site1='s1' site2='t1'/></equality><actuator><motor joint='c'/></actuator>"
-    draft = model(tmp_path, TWO_ARMS, rest)
-    assert draft.independent == ["c"]
-    mechanism = draft.mechanism()
-    assert mechanism.independent == mechanism.actuated == ("c",)
-    pose = Pose(mechanism.tree, mechanism.closure.anchors, mechanism.q_tree)
-    assert_close(mechanism.closure.phi(pose), 0.0, 1e-12)

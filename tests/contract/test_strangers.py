@@ -17,7 +17,6 @@ import pytest
 
 import ckc_pin
 from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
-from ckc_pin.formats.mjcf.inertia import _uniform
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.whole_file import UNFINISHED, written_whole
 
@@ -72,13 +71,6 @@ def test_a_start_a_thousand_turns_away_is_found_without_the_way() -> None:
     """Newton's method went there step by step, whatever the number."""
     far = 2 * np.pi * 10**5 + load("four_bar").assembled.q_tree[0]
     assert sigma(load("four_bar"), np.array([far])).iterations < 6000
-
-
-def test_a_capsule_without_volume_is_a_rod() -> None:
-    """Its two parts were weighed by volumes that are zero beside each other."""
-    volume, per_mass = _uniform("capsule", [1e-300, 0.5])
-    assert volume == 0.0
-    assert per_mass == pytest.approx([1 / 12, 1 / 12, 0.0])
 
 
 # --- threads -----------------------------------------------------------------------------------------

@@ -1,222 +1,217 @@
-"""A MuJoCo model's XML made plain: includes expanded, default classes applied, the compiler's settings read."""
+"""A MuJoCo model's XML before MuJoCo sees it: parsed strictly, its paths and sizes checked, reduced to what moves.
+
+MuJoCo's compiler opens any file that a model names, and allocates what it asks for. So included and attached models
+are read here, a mesh becomes a token for a path that was checked, and what neither moves nor weighs (textures,
+cameras, sensors, contacts) is taken out; what would change the motion is named.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element
-
-import numpy as np
-import pinocchio as pin
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats import orientation
-from ckc_pin.formats.draft import checked_direction
-from ckc_pin.mechanism.strict_xml import MAX_DEPTH, strict_xml
+from ckc_pin.formats.mjcf.files import Files, expand
+from ckc_pin.mechanism.strict_xml import strict_xml
 from ckc_pin.mechanism.toml import read_text
-from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Attributes", "Child", "Document"]
+__all__ = ["ASSEMBLED", "LARGEST", "Document"]
 
-MAIN = "main"
+ASSEMBLED = "assembled"  # the key frame that `ckc export` writes
 LARGEST = 1e100  # squares of what is larger overflow
-IN_BODIES = ("joint", "freejoint", "inertial", "geom", "site", "body", "frame", "camera", "light", "plugin")
+MAX_BODIES, MAX_ELEMENTS = 2000, 20_000  # after <replicate> and <attach>; MuJoCo takes seconds for that many
+MAX_PARAMETER = 1000  # of a built-in mesh, whose vertices are as many as its parameters say
 
-
-@dataclass(frozen=True)
-class Attributes:
-    """An element's attributes with its defaults, and where it stands for messages."""
-
-    values: dict[str, str]
-    where: str
-
-    def get(self, key: str, default: str = "") -> str:
-        """Return the text of an attribute."""
-        return self.values.get(key, default)
-
-    def __contains__(self, key: str) -> bool:
-        """Whether the attribute is given, here or in a default class."""
-        return key in self.values
-
-    def numbers(self, key: str, default: str = "", least: int = 0) -> list[float]:
-        """Return the finite numbers of an attribute, `least` of them or more."""
-        text = self.values.get(key, default)
-        try:
-            found = [float(word) for word in text.split()]
-        except ValueError:
-            raise InputError(f"{self.where}: {key}={text!r} is not a list of numbers") from None
-        if len(found) < least or not all(abs(x) < LARGEST for x in found):
-            raise InputError(f"{self.where}: {key}={text!r}: {least} finite numbers are needed")
-        return found
-
-    def number(self, key: str, default: float = 0.0) -> float:
-        """Return the first number of an attribute."""
-        return self.numbers(key, repr(default), 1)[0]
-
-    def point(self, key: str) -> Array:
-        """Return three numbers, zeros when absent."""
-        return np.array(self.numbers(key, "0 0 0", 3)[:3])
-
-    def flag(self, key: str, default: str) -> str:
-        """Return true, false or auto."""
-        text = self.values.get(key, default)
-        if text not in ("true", "false", "auto"):
-            raise InputError(f"{self.where}: {key}={text!r} is not true, false or auto")
-        return text
-
-
-@dataclass(frozen=True)
-class Child:
-    """A child of a body: its attributes, and the pose of the <frame> elements around it."""
-
-    element: Element
-    frame: pin.SE3
-    childclass: str
+KEY_FRAMES = "key frames; one of them may be a better [q_guess]"
+SAID = {
+    "contact": "contact pairs and exclusions: there is no contact here",
+    "deformable": "deformable bodies",
+    "extension": "plugins",
+}
+SILENT = ("custom", "sensor", "size", "statistic", "visual")  # sections that do not move anything
+IMMATERIAL = ("camera", "light", "texture", "material", "skin", "hfield", "lengthrange")
+UNREAD = ("composite", "flexcomp", "plugin")  # in bodies
+EQUALITIES = ("connect", "weld", "joint", "tendon")
+FOLDERS = ("assetdir", "meshdir", "texturedir", "strippath")
+FUSION = ("fusestatic", "discardvisual")  # would take names away
+WORDS = {  # attributes whose text may look like a number
+    *("name", "class", "childclass", "dclass", "model", "prefix", "file", "mesh", "hfield", "content_type", "target"),
+    *(f"{of}{k}" for of in ("body", "geom", "joint", "site", "tendon") for k in ("", "1", "2")),
+    *("jointinparent", "refsite", "sidesite", "cranksite", "slidersite"),
+}
 
 
 @dataclass
 class Document:
-    """A model ready to be walked through.
+    """A model and what it consists of.
 
     Attributes
     ----------
     source : str
+        What messages call it.
     root : Element
         <mujoco>, no <include> left.
-    compiler, option, flag : Attributes
+    files : Files
+        Of the model and of all that it attaches.
+    models : dict of str to Document
+        Models to attach, by token.
     left_out : list of str
-        What was met and not understood.
+        What would change the motion and was taken out.
     """
 
     source: str
     root: Element
-    compiler: Attributes = field(init=False)
-    option: Attributes = field(init=False)
-    flag: Attributes = field(init=False)
+    files: Files
+    models: dict[str, Document] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._classes: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
-        for section in self.root.findall("default"):
-            self._add_class(section, None)
-        self.compiler = self._merged("compiler")
-        self.option = self._merged("option")
-        self.flag = self._merged("option/flag")
-        if self.compiler.get("coordinate", "local") != "local":
-            raise InputError(f"{self.source}: coordinate='global' went out of MJCF; save it with an older MuJoCo first")
-        unit = self.compiler.get("angle", "degree")
-        if unit not in ("degree", "radian"):
-            raise InputError(f"{self.compiler.where}: angle={unit!r} is not degree or radian")
-        self.radians = 1.0 if unit == "radian" else math.pi / 180.0
-        self.eulerseq = self.compiler.get("eulerseq", "xyz")
-        if len(self.eulerseq) != 3 or set(self.eulerseq.lower()) - set("xyz"):
-            raise InputError(f"{self.compiler.where}: eulerseq={self.eulerseq!r} is not three of x, y, z, X, Y, Z")
 
     @classmethod
     def read(cls, text: str, path: Path) -> Document:
-        """Parse a model and the files that it includes.
+        """Parse a model and the files that it includes and attaches.
 
         Raises
         ------
         InputError
-            Malformed XML, an include outside the model's folder or one that comes twice, a bad setting.
+            Malformed XML, a file outside the model's folder or one that comes twice, a number that is none, more
+            bodies than can be computed with.
         """
-        root = strict_xml(text, str(path))
+        document = cls._read(text, path.absolute(), str(path), Files(path.absolute().parent.resolve()), ())
+        bodies, elements = document._size()
+        if bodies > MAX_BODIES or elements > MAX_ELEMENTS:
+            raise InputError(
+                f"{path}: {bodies} bodies and {elements} elements after <replicate> and <attach>; "
+                f"{MAX_BODIES} and {MAX_ELEMENTS} are accepted"
+            )
+        return document
+
+    def text(self) -> str:
+        """Return the XML for MuJoCo, a tag a line."""
+        return tostring(self.root, encoding="unicode")
+
+    def opened_at(self, line: int) -> Element | None:
+        """Return the element whose tag opens on a line of `text`."""
+        lines = self.text().split("\n")
+        opening = [number for number, content in enumerate(lines, 1) if not content.lstrip().startswith("</")]
+        return dict(zip(opening, self.root.iter(), strict=True)).get(line)
+
+    @classmethod
+    def _read(cls, text: str, path: Path, source: str, files: Files, above: tuple[Path, ...]) -> Document:
+        root = strict_xml(text, source)
         if root.tag != "mujoco":
-            raise InputError(f"{path}: the root element is <{root.tag}>, a MuJoCo model's is <mujoco>")
-        _expand(root, path.absolute().parent, {path.resolve()}, str(path), 0)
-        return cls(str(path), root)
+            raise InputError(f"{source}: the root element is <{root.tag}>, a MuJoCo model's is <mujoco>")
+        expand(root, path.parent, files, {path.resolve()}, source)
+        for element in root.iter():
+            element.text = element.tail = None
+            _check_numbers(element, source)
+        document = cls(source, root, files)
+        document._reduce_sections(keep_key=not above)
+        document._reduce_elements()
+        document._take_meshes(path.parent)
+        document._take_models(path.parent, (*above, path.resolve()))
+        indent(root)
+        return document
 
-    def attributes(self, element: Element, childclass: str = MAIN, name: str = "") -> Attributes:
-        """Return an element's attributes over those of its class."""
-        where = f"{self.source}: <{element.tag}> {name or element.get('name', '')!r}"
-        chosen = element.get("class") or childclass
-        if chosen not in self._classes:
-            known = ", ".join(self._classes)
-            raise InputError(f"{where}: no default class {chosen!r}; there are {known}")
-        return Attributes({**self._classes[chosen].get(element.tag, {}), **element.attrib}, where)
+    def _reduce_sections(self, keep_key: bool) -> None:
+        """Take out sections that move nothing, and name those that would have."""
+        for section in list(self.root):
+            if section.tag in SAID and len(section):
+                self._leave_out(SAID[section.tag])
+            if section.tag in SAID or section.tag in SILENT:
+                self.root.remove(section)
+        for keyframe in self.root.findall("keyframe"):
+            for key in keyframe.findall("key"):
+                if not keep_key or key.get("name") != ASSEMBLED:
+                    self._leave_out(KEY_FRAMES)
+                    keyframe.remove(key)
+        for equality in self.root.findall("equality"):
+            for element in [e for e in equality if e.tag not in EQUALITIES]:
+                self._leave_out(f"equality <{element.tag}> {element.get('name', '')}".rstrip())
+                equality.remove(element)
 
-    def children(self, body: Element, childclass: str) -> Iterator[Child]:
-        """Walk over a body's children in their order, <frame> elements dissolved."""
-        yield from self._children(body, pin.SE3.Identity(), childclass)
+    def _reduce_elements(self) -> None:
+        """Take out what is only looked at, and what bodies consist of that is not rigid."""
+        for parent in list(self.root.iter()):
+            parent.attrib.pop("material", None)
+            for element in list(parent):
+                if element.tag in IMMATERIAL:
+                    parent.remove(element)
+                elif element.tag in UNREAD and parent.tag != "actuator":
+                    self._leave_out(f"<{element.tag}> {element.get('name', '')}".rstrip() + " (not read)")
+                    parent.remove(element)
+        for element in self.root.iterfind("actuator/plugin"):  # what it moves is read, not how
+            element.tag = "general"
+            for key in ("plugin", "instance"):
+                element.attrib.pop(key, None)
+            for child in list(element):
+                element.remove(child)
 
-    def _children(self, parent: Element, pose: pin.SE3, childclass: str) -> Iterator[Child]:
-        for element in parent:
-            if element.tag == "frame":
-                inner = pose * self.pose(self.attributes(element, childclass))
-                yield from self._children(element, inner, element.get("childclass", childclass))
-            elif element.tag in ("replicate", "attach"):
-                raise InputError(
-                    f"{self.source}: <{element.tag}> is not read; have MuJoCo write the model out as compiled "
-                    "(mj_saveLastXML) and import that"
-                )
-            elif element.tag in IN_BODIES:
-                yield Child(element, pose, childclass)
-            else:
-                self.left_out.append(f"<{element.tag}> {element.get('name', '')}".rstrip())
+    def _take_meshes(self, folder: Path) -> None:
+        """Put tokens in place of meshes' files, and settle what the compiler does with names and muscles."""
+        meshdir, strip = "", False
+        for compiler in self.root.findall("compiler"):
+            meshdir = compiler.get("meshdir", compiler.get("assetdir", meshdir))
+            strip = compiler.get("strippath", str(strip)).lower() == "true"
+            for setting in (*FOLDERS, *FUSION):
+                compiler.attrib.pop(setting, None)
+        SubElement(SubElement(self.root, "compiler"), "lengthrange", mode="none")
+        for mesh in self.root.iterfind("asset/mesh"):
+            if "builtin" in mesh.attrib and any(x > MAX_PARAMETER for x in _numbers(mesh.get("params", ""))):
+                where = f"{self.source}: mesh {mesh.get('name', '')!r}"
+                raise InputError(f"{where}: params={mesh.get('params')!r}: at most {MAX_PARAMETER} are accepted")
+            if "file" in mesh.attrib:
+                file = Path(mesh.attrib["file"])
+                mesh.attrib.setdefault("name", file.stem)
+                mesh.set("file", self.files.mesh(folder / meshdir / (file.name if strip else file)))
 
-    def pose(self, a: Attributes) -> pin.SE3:
-        """Return the pose that an element's pos and orientation say."""
-        return pin.SE3(self.rotation(a), a.point("pos"))
+    def _take_models(self, folder: Path, above: tuple[Path, ...]) -> None:
+        """Read the models that are attached, and put tokens in place of their files."""
+        for asset in self.root.iterfind("asset/model"):
+            file = asset.get("file", "")
+            where = f"{self.source}: <model file={file!r}>"
+            path = self.files.inside(folder, file, where)
+            if path in above:
+                raise InputError(f"{where}: a model cannot contain itself")
+            model = Document._read(read_text(path, "MuJoCo model"), path, file, self.files, above)
+            asset.attrib.setdefault("name", model.root.get("model", "MuJoCo Model"))
+            asset.set("file", self.files.model())
+            self.models[asset.attrib["file"]] = model
+            for said in model.left_out:
+                self._leave_out(said)
 
-    def rotation(self, a: Attributes) -> Array:
-        """Return an element's orientation, in whichever of the five ways it is given."""
-        if "axisangle" in a:
-            *axis, angle = a.numbers("axisangle", least=4)[:4]
-            return orientation.from_axis_angle(checked_direction(axis, a.where), angle * self.radians)
-        if "xyaxes" in a:
-            x, y = np.array(a.numbers("xyaxes", least=6)[:6]).reshape(2, 3)
-            checked_direction(np.cross(x, y), f"{a.where}: xyaxes, their cross product")
-            return orientation.from_x_and_y(x, y)
-        if "zaxis" in a:
-            return orientation.from_z(checked_direction(a.point("zaxis"), f"{a.where}: zaxis"))
-        if "euler" in a:
-            return orientation.euler([x * self.radians for x in a.point("euler")], self.eulerseq)
-        quaternion = a.numbers("quat", "1 0 0 0", 4)[:4]
-        if not any(quaternion):
-            raise InputError(f"{a.where}: quat is zero")
-        return orientation.from_quaternion(quaternion)
+    def _leave_out(self, what: str) -> None:
+        if what not in self.left_out:
+            self.left_out.append(what)
 
-    def _add_class(self, element: Element, parent: str | None) -> None:
-        """Take in one <default>: what its parent says, then what it says, then its own children."""
-        name = element.get("class", MAIN if parent is None else "")
-        if not name:
-            raise InputError(f"{self.source}: a nested <default> has no class")
-        own = self._classes.setdefault(name, {})
-        for tag, values in self._classes[parent].items() if parent else ():
-            own[tag] = dict(values)
-        for child in element:
-            if child.tag != "default":
-                own.setdefault(child.tag, {}).update(child.attrib)
-        for child in element.findall("default"):
-            self._add_class(child, name)
+    def _size(self) -> tuple[int, int]:
+        """Bodies and elements, each as often as it is replicated and attached."""
+        sizes = {a.get("name"): self.models[a.attrib["file"]]._size() for a in self.root.iterfind("asset/model")}
 
-    def _merged(self, path: str) -> Attributes:
-        values: dict[str, str] = {}
-        for element in self.root.findall(path):
-            values.update(element.attrib)
-        return Attributes(values, f"{self.source}: <{path}>")
+        def count(element: Element) -> tuple[int, int]:
+            bodies, elements = sizes.get(element.get("model"), (0, 0)) if element.tag == "attach" else (0, 0)
+            for child in element:
+                more = count(child)
+                bodies, elements = bodies + more[0], elements + more[1]
+            times = 1
+            if element.tag == "replicate":
+                times = int(max([1.0, *_numbers(element.get("count", "1"))]))
+            return times * (bodies + (element.tag == "body")), times * (elements + 1)
+
+        return count(self.root)
 
 
-def _expand(element: Element, folder: Path, seen: set[Path], source: str, depth: int) -> None:
-    """Put included files in place of <include>, each at most once and none from outside the folder."""
-    if depth > MAX_DEPTH:
-        raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
-    position = 0
-    while position < len(element):
-        child = element[position]
-        if child.tag != "include":
-            _expand(child, folder, seen, source, depth + 1)
-            position += 1
-            continue
-        file = child.get("file", "")
-        path = (folder / file).resolve()
-        if not file or not path.is_relative_to(folder.resolve()):
-            raise InputError(f"{source}: <include file={file!r}>: a file in the model's own folder is needed")
-        if path in seen:
-            raise InputError(f"{source}: {file!r} is included twice")
-        seen.add(path)
-        included = strict_xml(read_text(path, "MuJoCo model"), file)
-        element[position : position + 1] = list(included)
+def _numbers(text: str) -> list[float]:
+    """Return the numbers of a text, none if one of its words is none."""
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return []
+
+
+def _check_numbers(element: Element, source: str) -> None:
+    for key, text in element.attrib.items():
+        values = [] if key in WORDS else _numbers(text)
+        if not all(math.isfinite(x) and abs(x) < LARGEST for x in values):
+            where = f"{source}: <{element.tag}> {element.get('name', '')!r}"
+            raise InputError(f"{where}: {key}={text!r}: finite numbers below {LARGEST:g} are needed")

@@ -1,20 +1,21 @@
-"""MuJoCo's equality constraints to loops and couplings, through the reference pose."""
+"""MuJoCo's equality constraints to loops and couplings; anchors and relative poses are as its compiler has them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import frame, number, unique, vector
-from ckc_pin.formats.mjcf.document import Attributes, Document
+from ckc_pin.formats.mjcf.compiled import Compiled
+from ckc_pin.formats.mjcf.tendons import Tendon, Tendons
 from ckc_pin.formats.mjcf.tree import MjcfTree, Placed
+from ckc_pin.formats.orientation import from_quaternion
 from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec
+from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Equalities"]
 
@@ -37,93 +38,123 @@ class Equalities:
 
     Parameters
     ----------
-    document : Document
+    compiled : Compiled
     tree : MjcfTree
-        With every body, site and joint.
+    tendons : Tendons
 
     Attributes
     ----------
     loops, couplings : list of (spec, comment)
-    left_out, guessed : list of str
+    left_out : list of str
     """
 
-    def __init__(self, document: Document, tree: MjcfTree) -> None:
-        self.document = document
-        self.tree = tree
+    def __init__(self, compiled: Compiled, tree: MjcfTree, tendons: Tendons) -> None:
+        self.compiled, self.tree, self.tendons = compiled, tree, tendons
         self.loops: list[tuple[LoopSpec, str]] = []
         self.couplings: list[tuple[CouplingSpec, str]] = []
         self.left_out: list[str] = []
-        self.guessed: list[str] = []
+        model, kinds = compiled.model, compiled.mujoco.mjtEq
+        named = {int(kinds.mjEQ_CONNECT): "connect", int(kinds.mjEQ_WELD): "weld", int(kinds.mjEQ_JOINT): "joint"}
         closures: list[_Closure] = []
-        for element in (e for section in document.root.findall("equality") for e in section):
-            a = document.attributes(element)
-            name = element.get("name", "")
-            if document.attributes(element).flag("active", "true") == "false":
-                self.left_out.append(f"<{element.tag}> {name}, which is not active".replace("  ", " "))
-            elif element.tag in ("connect", "weld"):
-                closures.append(self._closure(element, a))
-            elif element.tag == "joint":
-                self._coupling(a)
+        for k in range(model.neq):
+            kind = named.get(int(model.eq_type[k]), "tendon")
+            name = compiled.name("eq", k)
+            if not model.eq_active0[k]:
+                self.left_out.append(f"<{kind}> {name}, which is not active".replace("  ", " "))
+            elif kind in ("connect", "weld"):
+                closures.append(self._closure(k, kind, name))
+            elif kind == "joint":
+                self._coupling(k)
             else:
-                self.left_out.append(f"equality <{element.tag}> {name}".rstrip())
+                self._length(k, name)
         for pair in self._by_pair(closures):
             self._add_loops(pair)
 
-    def _closure(self, element: Element, a: Attributes) -> _Closure:
+    def _closure(self, k: int, kind: str, name: str) -> _Closure:
         """Place the two frames that a connect or a weld brings together."""
-        if "site1" in a and "site2" in a:
-            first, second = (self._find(self.tree.sites, a, key, "site") for key in ("site1", "site2"))
-            comment = f"{element.tag} of sites {a.get('site1')} and {a.get('site2')}"
-            ends = (a.get("site1"), a.get("site2"))
-        elif "body1" in a:
-            one = self._find(self.tree.bodies, a, "body1", "body")
-            two = self._find(self.tree.bodies, a, "body2", "body") if a.get("body2") else self.tree.bodies["world"]
-            first, second, said = self._bodies(element.tag, a, one, two)
-            ends = (a.get("body1"), a.get("body2", "world"))
-            comment = f"{element.tag} of bodies {ends[0]} and {ends[1]}{said}"
+        model, data = self.compiled.model, self.compiled.model.eq_data[k]
+        ends = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
+        if int(model.eq_objtype[k]) == self.compiled.mujoco.mjtObj.mjOBJ_SITE:
+            first, second = (self.tree.site(end) for end in ends)
+            called = [self.compiled.name("site", end) for end in ends]
+            comment = f"{kind} of sites {called[0]} and {called[1]}"
         else:
-            raise InputError(f"{a.where}: needs body1, or site1 and site2")
-        soft = element.tag == "weld" and a.number("torquescale", 1.0) == 0
-        kind = "point" if element.tag == "connect" or soft else "weld"
-        return _Closure(element.get("name") or f"{ends[0]}_{ends[1]}", kind, first, second, comment)
+            one, two = (self.tree.bodies[max(end, 0)] for end in ends)
+            called = [self.compiled.bodies[max(end, 0)] for end in ends]
+            comment = f"{kind} of bodies {called[0]} and {called[1]}"
+            if kind == "connect":
+                first, second = one.at(_shift(data[0:3])), two.at(_shift(data[3:6]))
+                comment += ", its second point from the reference pose"
+            else:
+                first, second = (
+                    one.at(pin.SE3(from_quaternion(data[6:10]), data[3:6].copy())),
+                    two.at(_shift(data[0:3])),
+                )
+        soft = kind == "weld" and data[10] == 0
+        meant = "point" if kind == "connect" or soft else "weld"
+        return _Closure(name or f"{called[0]}_{called[1]}", meant, first, second, comment)
 
-    def _bodies(self, tag: str, a: Attributes, one: Placed, two: Placed) -> tuple[Placed, Placed, str]:
-        """Frames on two bodies; what the file does not say is what it is in the reference pose."""
-        if tag == "connect":
-            first = one.at(pin.SE3(np.eye(3), np.array(a.numbers("anchor", "", 3)[:3])))
-            there = pin.SE3(np.eye(3), two.reference.actInv(first.reference.translation))
-            return first, two.at(there), ", its second point from the reference pose"
-        anchor = two.at(pin.SE3(np.eye(3), a.point("anchor")))
-        *xyz, w, x, y, z = a.numbers("relpose", "0 1 0 0 0 0 0", 7)[:7]
-        if any((w, x, y, z)):
-            turn = pin.Quaternion(np.array([x, y, z, w])).normalized().matrix()
-            return one.at(pin.SE3(turn, np.array(xyz))), anchor, ""
-        return one.at(one.reference.actInv(anchor.reference)), anchor, ", as they are in the reference pose"
-
-    def _coupling(self, a: Attributes) -> None:
+    def _coupling(self, k: int) -> None:
         """Read joint1 - ref1 = c0 + c1 (joint2 - ref2) + higher powers."""
-        joint = self._joint(a, "joint1")
-        polynomial = (a.numbers("polycoef", "0 1 0 0 0") + [0.0] * 5)[:5] if "polycoef" in a else [0, 1, 0, 0, 0]
-        other = self._joint(a, "joint2") if a.get("joint2") else None
-        if other is not None and any(polynomial[2:]):
+        model, names = self.compiled.model, self.compiled.joints
+        joint, other = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        polynomial = [float(x) for x in model.eq_data[k, :5]]
+        if any(j >= 0 and j not in self.tree.ref for j in (joint, other)):
+            self.left_out.append(f"equality of joint {names[joint]}, which has more than one freedom or is part of one")
+        elif other < 0:
+            self._hold(joint, self.tree.ref[joint] + polynomial[0])
+        elif any(polynomial[2:]):
             self.left_out.append(
-                f"equality of joints {joint} and {other}: its polynomial {polynomial} is not linear; "
+                f"equality of joints {names[joint]} and {names[other]}: its polynomial {polynomial} is not linear; "
                 "a [[coupling]] at one angle may stand in"
             )
-            return
+        else:
+            ratio = polynomial[1]
+            offset = self.tree.ref[joint] + polynomial[0] - ratio * self.tree.ref[other]
+            self._couple(joint, other, ratio, offset, "joint equality")
+
+    def _hold(self, joint: int, value: float) -> None:
+        """Hold a joint at a value, with a coupling to any other."""
+        names = self.compiled.joints
+        other = next((j for j in self.tree.ref if j != joint), None)
         if other is None:
-            value = self.tree.ref[joint] + polynomial[0]
-            other = next((name for name in self.tree.ref if name != joint), None)
-            if other is None:
-                self.left_out.append(f"joint {joint} is held at {value:g}, and there is no other joint: make it fixed")
-                return
-            spec = CouplingSpec(joint=joint, other=other, ratio=0.0, offset=number(value))
-            self.couplings.append((spec, f"holds {joint} at a value; a ratio of 0 makes {other} count for nothing"))
+            self.left_out.append(f"joint {names[joint]} is held at {value:g}, and there is no other joint: fix it")
             return
-        ratio = polynomial[1]
-        offset = self.tree.ref[joint] + polynomial[0] - ratio * self.tree.ref[other]
-        spec = CouplingSpec(joint=joint, other=other, ratio=number(ratio), offset=number(offset))
-        self.couplings.append((spec, "joint equality"))
+        said = f"holds {names[joint]} at a value; a ratio of 0 makes {names[other]} count for nothing"
+        self._couple(joint, other, 0.0, value, said)
+
+    def _couple(self, joint: int, other: int, ratio: float, offset: float, comment: str) -> None:
+        names = self.compiled.joints
+        spec = CouplingSpec(joint=names[joint], other=names[other], ratio=number(ratio), offset=number(offset))
+        self.couplings.append((spec, comment))
+
+    def _length(self, k: int, name: str) -> None:
+        """Read a tendon kept at its length: between two sites a distance, over two joints a coupling."""
+        model = self.compiled.model
+        tendon = self.tendons.all[int(model.eq_obj1id[k])]
+        kept = not model.eq_data[k, 1:5].any() or model.eq_obj2id[k] < 0
+        length = float(model.tendon_length0[tendon.number] + model.eq_data[k, 0])
+        called = name or tendon.name
+        if kept and tendon.ends is not None and length > 0:
+            ends = [_point(self.tree.site(site)) for site in tendon.ends]
+            spec = LoopSpec(
+                name=unique(called, [spec.name for spec, _ in self.loops]),
+                type="distance",
+                frame_a=ends[0],
+                frame_b=ends[1],
+                length=number(length),
+            )
+            self.loops.append((spec, f"tendon {tendon.name}, kept at its length".replace("  ", " ")))
+        elif kept and self._is_gear(tendon):
+            (joint, of_joint), (other, of_other) = tendon.joints
+            offset = length / of_joint
+            self._couple(joint, other, -of_other / of_joint, offset, f"tendon {tendon.name}, kept at its length")
+        else:
+            self.left_out.append(f"equality <tendon> {called}".rstrip())
+
+    def _is_gear(self, tendon: Tendon) -> bool:
+        joints = tendon.joints
+        return len(joints) == 2 and joints[0][1] != 0 and all(joint in self.tree.ref for joint, _ in joints)
 
     def _by_pair(self, closures: list[_Closure]) -> Iterator[list[_Closure]]:
         """Group what closes the same two links, in the order of the file."""
@@ -167,18 +198,11 @@ class Equalities:
                 spec = LoopSpec(name=name, type="point", frame_a=ends[0], frame_b=ends[1])
             self.loops.append((spec, closure.comment))
 
-    def _find(self, known: dict[str, Placed], a: Attributes, key: str, what: str) -> Placed:
-        if a.get(key) not in known:
-            raise InputError(f"{a.where}: {key}: no {what} {a.get(key)!r}; there are {', '.join(known) or 'none'}")
-        return known[a.get(key)]
 
-    def _joint(self, a: Attributes, key: str) -> str:
-        if a.get(key) not in self.tree.ref:
-            known = ", ".join(self.tree.ref) or "none"
-            raise InputError(f"{a.where}: {key}: no hinge or slide {a.get(key)!r}; there are {known}")
-        return a.get(key)
+def _shift(translation: Array) -> pin.SE3:
+    return pin.SE3(np.eye(3), translation.copy())
 
 
 def _point(placed: Placed) -> Frame:
     """Return a frame at a point, along the link's axes."""
-    return frame(placed.link, pin.SE3(np.eye(3), placed.pose.translation))
+    return frame(placed.link, _shift(placed.pose.translation))

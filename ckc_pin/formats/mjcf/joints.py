@@ -1,4 +1,4 @@
-"""A MuJoCo joint's place, axis, value in the reference pose, and range."""
+"""A joint as MuJoCo compiled it: its place, axis, value in the reference pose, range, and what acts on it."""
 
 from __future__ import annotations
 
@@ -8,59 +8,96 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.errors import InputError
-from ckc_pin.formats.draft import checked_direction, number
-from ckc_pin.formats.mjcf.document import Attributes, Child, Document
+from ckc_pin.formats.draft import number
+from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.orientation import from_axis_angle
 from ckc_pin.formats.urdf.elements import UNLIMITED, JointLimits
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["MjcfJoint", "is_free_root"]
+__all__ = ["Joint", "is_free_root"]
 
-TYPES = ("hinge", "slide", "ball", "free")
+KINDS = ("free", "ball", "slide", "hinge")
 
 
 @dataclass(frozen=True)
-class MjcfJoint:
+class Joint:
     """A joint of a body, in the body's frame.
 
     Attributes
     ----------
+    number : int
+        MuJoCo's.
     name : str
-        Empty when the file has none.
     kind : str
         hinge, slide, ball or free.
+    at_qpos : int
+        Where its values begin in qpos.
     at, axis : (3,) arrays
         The point that it turns about; its direction, of length 1.
     ref : float
         Its value in the reference pose, rad or m.
-    attributes : Attributes
+    limits : JointLimits
+    stiffness, rest, damping, friction, armature : float
+        Damping and armature with those of the actuators on it.
+    is_nonlinear : bool
+        Whether stiffness or damping have terms of higher order.
     """
 
+    number: int
     name: str
     kind: str
+    at_qpos: int
     at: Array
     axis: Array
     ref: float
-    attributes: Attributes
+    limits: JointLimits
+    stiffness: float
+    rest: float
+    damping: float
+    friction: float
+    armature: float
+    is_nonlinear: bool
 
     @classmethod
-    def read(cls, child: Child, body: str, document: Document) -> MjcfJoint:
-        """Read a <joint> or <freejoint>."""
-        element = child.element
-        a = document.attributes(element, child.childclass, element.get("name", f"of {body}"))
-        kind = "free" if element.tag == "freejoint" else a.get("type", "hinge")
-        if kind not in TYPES:
-            raise InputError(f"{a.where}: type={kind!r} is not one of {', '.join(TYPES)}")
-        axis = checked_direction(a.numbers("axis", "0 0 1", 3)[:3], f"{a.where}: axis")
-        axis = child.frame.rotation @ axis / np.linalg.norm(axis)
-        at = np.zeros(3) if kind == "free" else child.frame.act(a.point("pos"))
-        unit = {"hinge": document.radians, "slide": 1.0}.get(kind, 0.0)
-        return cls(element.get("name", ""), kind, at, axis, a.number("ref") * unit, a)
+    def read(cls, compiled: Compiled, at: int) -> Joint:
+        """Read a joint by its number."""
+        model, kind = compiled.model, KINDS[compiled.model.jnt_type[at]]
+        dof, qpos = int(model.jnt_dofadr[at]), int(model.jnt_qposadr[at])
+        damping, armature = float(model.dof_damping[dof]), float(model.dof_armature[dof])
+        through = (compiled.mujoco.mjtTrn.mjTRN_JOINT, compiled.mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        for k in range(model.nactuator):
+            if int(model.actuator_trntype[k]) in through and model.actuator_trnid[k, 0] == at:
+                gear = float(model.actuator_gear[k, 0])
+                damping += gear**2 * float(model.actuator_damping[k])
+                armature += gear**2 * float(model.actuator_armature[k])
+        return cls(
+            number=at,
+            name=compiled.joints[at],
+            kind=kind,
+            at_qpos=qpos,
+            at=np.zeros(3) if kind == "free" else model.jnt_pos[at].copy(),
+            axis=model.jnt_axis[at].copy(),
+            ref=float(model.qpos0[qpos]) if kind in ("hinge", "slide") else 0.0,
+            limits=_limits(compiled, at),
+            stiffness=float(model.jnt_stiffness[at]),
+            rest=float(model.qpos_spring[qpos]),
+            damping=damping,
+            friction=float(model.dof_frictionloss[dof]),
+            armature=armature,
+            is_nonlinear=bool(model.jnt_stiffnesspoly[at].any() or model.dof_dampingpoly[dof].any()),
+        )
 
-    def unit(self, document: Document) -> float:
-        """Return what the file's numbers of this joint are multiplied by, for radians and metres."""
-        return document.radians if self.kind == "hinge" else 1.0
+    @property
+    def acting(self) -> list[str]:
+        """What acts on the joint, by MuJoCo's words."""
+        acting = {
+            "damping": self.damping,
+            "stiffness": self.stiffness,
+            "frictionloss": self.friction,
+            "armature": self.armature,
+            "range": self.limits.upper is not None,
+        }
+        return [key for key, value in acting.items() if value]
 
     def turned(self, value: float) -> pin.SE3:
         """Displacement that a value of the joint stands for."""
@@ -68,22 +105,21 @@ class MjcfJoint:
             return pin.SE3(np.eye(3), value * self.axis)
         return pin.SE3(from_axis_angle(self.axis, value) if value else np.eye(3), np.zeros(3))
 
-    def limits(self, document: Document) -> JointLimits:
-        """Return the range, where there is one."""
-        a = self.attributes
-        autolimits = document.compiler.flag("autolimits", "true") == "true"
-        limited = a.flag("limited", "auto")
-        if limited == "false" or (limited == "auto" and not (autolimits and "range" in a)):
-            return UNLIMITED
-        lower, upper = (number(x * self.unit(document)) for x in a.numbers("range", "0 0", 2)[:2])
-        return JointLimits(lower, upper, max(map(abs, a.numbers("actuatorfrcrange", "0 0", 2))))
 
-
-def is_free_root(joints: Sequence[MjcfJoint]) -> bool:
+def is_free_root(joints: Sequence[Joint]) -> bool:
     """Whether three slides and a ball are a free joint: across each other, about the body's origin, nothing acting."""
     if [joint.kind for joint in joints] != ["slide", "slide", "slide", "ball"] or joints[3].at.any():
         return False
-    if any(j.attributes.number(key) for j in joints for key in ("stiffness", "damping", "armature", "frictionloss")):
+    if any(set(joint.acting) - {"range"} for joint in joints):
         return False
     axes = np.array([joint.axis for joint in joints[:3]])
     return bool(np.abs(axes @ axes.T - np.eye(3)).max() < 1e-12)
+
+
+def _limits(compiled: Compiled, at: int) -> JointLimits:
+    model = compiled.model
+    if not model.jnt_limited[at]:
+        return UNLIMITED
+    lower, upper = (number(float(x)) for x in model.jnt_range[at])
+    effort = float(np.abs(model.jnt_actfrcrange[at]).max()) if model.jnt_actfrclimited[at] else 0.0
+    return JointLimits(lower, upper, effort)

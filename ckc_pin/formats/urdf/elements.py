@@ -6,14 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element, SubElement
 
-import numpy as np
 import pinocchio as pin
 
 from ckc_pin.formats.draft import number
 from ckc_pin.formats.orientation import to_rpy
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["UNLIMITED", "Body", "JointLimits", "add_joint", "add_link", "add_shape"]
+__all__ = ["UNLIMITED", "Body", "JointLimits", "add_inertial", "add_joint", "add_link", "add_shape", "numbers"]
 
 
 @dataclass
@@ -23,19 +22,6 @@ class Body:
     mass: float
     centre: Array
     inertia: Array
-
-    def __add__(self, other: Body) -> Body:
-        """Two bodies as one."""
-        mass = self.mass + other.mass
-        if mass == 0:
-            return Body(0.0, np.zeros(3), self.inertia + other.inertia)
-        centre = (self.mass * self.centre + other.mass * other.centre) / mass
-        return Body(mass, centre, self.about(centre) + other.about(centre))
-
-    def about(self, point: Array) -> Array:
-        """Inertia about another point, by Steiner."""
-        r = self.centre - point
-        return self.inertia + self.mass * (r @ r * np.eye(3) - np.outer(r, r))
 
     def moved(self, pose: pin.SE3) -> Body:
         """Return the body seen from the frame that `pose` is given in."""
@@ -54,16 +40,19 @@ class JointLimits:
 UNLIMITED = JointLimits()
 
 
-def add_link(robot: Element, name: str, body: Body | None = None) -> Element:
-    """Add a link; one without a body has no mass."""
-    link = SubElement(robot, "link", name=name)
-    if body is not None and (body.mass or body.inertia.any()):
+def add_link(robot: Element, name: str) -> Element:
+    """Add a link, so far without mass."""
+    return SubElement(robot, "link", name=name)
+
+
+def add_inertial(link: Element, body: Body) -> None:
+    """Give a link a body; one without mass and inertia says nothing."""
+    if body.mass or body.inertia.any():
         inertial = SubElement(link, "inertial")
         SubElement(inertial, "origin", xyz=numbers(body.centre), rpy="0 0 0")
         SubElement(inertial, "mass", value=repr(float(body.mass)))
         pairs = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
         SubElement(inertial, "inertia", {key: repr(float(body.inertia[at])) for key, at in pairs.items()})
-    return link
 
 
 def add_joint(

@@ -1,0 +1,196 @@
+"""What of a MuJoCo model's bodies comes along: masses, meshes, springs, motors, names; and what is named instead."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import pytest
+
+from ckc_pin.errors import InputError
+from ckc_pin.formats.importing import read
+from ckc_pin.mechanism.pose import Pose
+from tests.conftest import assert_close
+from tests.contract.helpers.models import TWO_ARMS, model, said, tetrahedron
+
+EXACT = 1e-12
+
+
+# --- masses, springs, names -----------------------------------------------------------------------------------------
+
+
+HULL = "<asset><mesh name='hull_shape' file='{}'/></asset>"
+
+
+def test_masses_that_only_a_mesh_knows_are_said(tmp_path: Path) -> None:
+    geoms = "<geom type='mesh' mesh='hull_shape'/><geom type='sphere' size='.1' mass='2'/>"
+    draft = model(tmp_path, f"<body name='hull'><joint name='j'/>{geoms}</body>", HULL.format("hull.stl"))
+    assert said(draft.left_out, "hull (mesh hull_shape)", "<inertial>")
+    assert draft.robot.find("link[@name='hull']/inertial/mass").get("value") == "2.0"
+
+
+def test_a_body_of_a_mesh_that_is_not_there_has_no_mass(tmp_path: Path) -> None:
+    body = "<body name='hull'><joint name='j'/><geom type='mesh' mesh='hull_shape'/></body>"
+    draft = model(tmp_path, body, HULL.format("hull.stl"))
+    assert said(draft.left_out, "hull (mesh hull_shape)", "<inertial>")
+    assert draft.robot.find("link[@name='hull']/inertial") is None
+
+
+def test_meshes_weigh_as_in_mujoco(tmp_path: Path) -> None:
+    (tmp_path / "hull.stl").write_bytes(tetrahedron())
+    body = "<body name='hull'><joint name='j'/><geom type='mesh' mesh='hull_shape' density='6'/></body>"
+    draft = model(tmp_path, body, HULL.format("hull.stl"))
+    assert not draft.left_out[1:]
+    assert_close(float(draft.robot.find("link[@name='hull']/inertial/mass").get("value")), 6 / 6, 1e-6)
+
+
+@pytest.mark.parametrize("file", ["hull.stl", "damaged.stl", "../outside.stl"])
+def test_meshes_that_weigh_nothing_are_not_opened(tmp_path: Path, file: str) -> None:
+    """The body's mass is declared, or the shape has none."""
+    (tmp_path / "damaged.stl").write_text("version of a pointer", encoding="utf-8")
+    declared = "<inertial pos='0 0 0' mass='3' diaginertia='1 1 1'/><geom type='mesh' mesh='hull_shape'/>"
+    shown = "<geom type='mesh' mesh='hull_shape' mass='0'/><geom size='.1' mass='2'/>"
+    bodies = f"<body name='a'><joint/>{declared}</body><body name='b'><joint/>{shown}</body>"
+    draft = model(tmp_path, bodies, HULL.format(file))
+    assert [float(m.get("value")) for m in draft.robot.iterfind("link/inertial/mass")] == [3.0, 2.0]
+    assert draft.left_out == ["2 shapes that are no box, cylinder or sphere: not drawn"]
+
+
+def test_meshes_outside_the_folder_are_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "hull.stl").write_bytes(tetrahedron())
+    (tmp_path / "inside" / "link.stl").symlink_to(tmp_path / "hull.stl")
+    body = "<body name='hull'><joint/><geom type='mesh' mesh='hull_shape'/><geom size='.1' mass='2'/></body>"
+    for file in ("../hull.stl", "link.stl", str(tmp_path / "hull.stl")):
+        assert said(model(tmp_path / "inside", body, HULL.format(file)).left_out, "hull (mesh hull_shape)")
+
+
+def test_textures_and_other_looks_are_not_opened(tmp_path: Path) -> None:
+    looks = "<asset><texture name='t' type='2d' file='/etc/hostname'/><material name='m' texture='t'/></asset>"
+    draft = model(tmp_path, "<body name='b'><joint name='j'/><geom size='.1' material='m'/></body>", looks)
+    assert draft.left_out == []
+
+
+@pytest.mark.parametrize(("rule", "mass"), [("auto", 3.0), ("true", 2.0), ("false", 3.0)])
+def test_which_mass_counts(tmp_path: Path, rule: str, mass: float) -> None:
+    path = tmp_path / "m.xml"
+    path.write_text(
+        f"<mujoco><compiler inertiafromgeom='{rule}'/><worldbody><body name='b'><joint name='j'/>"
+        "<inertial pos='0 0 0' mass='3' diaginertia='1 1 1'/><geom size='.1' mass='2'/></body></worldbody></mujoco>"
+    )
+    assert float(read(path).robot.find("link[@name='b']/inertial/mass").get("value")) == mass
+
+
+def test_the_total_mass_and_the_groups_that_count(tmp_path: Path) -> None:
+    path = tmp_path / "m.xml"
+    path.write_text(
+        "<mujoco><compiler settotalmass='12' inertiagrouprange='0 2'/><worldbody>"
+        "<body name='a'><joint name='j'/><geom size='.1' mass='1'/><geom size='.3' mass='50' group='3'/></body>"
+        "<body name='b'><joint name='k'/><geom size='.1' mass='2'/></body></worldbody></mujoco>"
+    )
+    masses = [float(m.get("value")) for m in read(path).robot.iterfind("link/inertial/mass")]
+    assert_close(masses, [4.0, 8.0], EXACT)
+
+
+def test_springs_armature_and_friction(tmp_path: Path) -> None:
+    joint = "<joint name='j' stiffness='30' springref='0.2' armature='0.01' frictionloss='0.5' damping='1'/>"
+    draft = model(tmp_path, f"<body name='b'>{joint}<geom size='.1'/></body>")
+    ((spring, _),) = draft.springs
+    assert (spring.joint, spring.stiffness, spring.rest, spring.damping) == ("j", 30.0, 0.2, 0.0)
+    assert draft.robot.find("joint[@name='j']/dynamics").attrib == {"damping": "1.0", "friction": "0.5"}
+    assert said(draft.left_out, "armature", "j 0.01")
+    assert said(draft.left_out, "dry friction", "j")
+
+
+def test_what_joints_and_tendons_have_beyond_springs_is_said(tmp_path: Path) -> None:
+    bodies = TWO_ARMS.replace('<joint name="a"', '<joint name="a" stiffness="1 2"')
+    floating = "<body name='f' gravcomp='1'><joint name='free' type='free' damping='2'/><geom size='.1'/></body>"
+    ends = '<site site="s1"/><site site="t1"/>'
+    tendons = f"""<spatial name="band" stiffness="3" springlength="0 1">{ends}</spatial>
+      <spatial name="rope" stiffness="3" armature="0.1">{ends}<site site="t2"/></spatial>"""
+    draft = model(tmp_path, bodies + floating, f"<tendon>{tendons}</tendon>")
+    assert said(draft.left_out, "quadratic", "joint a")
+    assert said(draft.left_out, "damping of free joint free")
+    assert said(draft.left_out, "gravity compensation", "f")
+    assert said(draft.left_out, "stiffness or damping of tendon band")
+    assert said(draft.left_out, "armature and stiffness or damping of tendon rope")
+    assert len(draft.springs) == 1
+
+
+def test_motors_and_constant_forces(tmp_path: Path) -> None:
+    """A motor whose control is the force leaves nothing out; a force that takes no control is one of the mechanism."""
+    actuators = """<motor joint="a"/><position joint="b" kp="9"/><motor site="s1"/>
+      <general joint="c" gear="2" gainprm="0" biastype="affine" biasprm="1.5 0 0"/>"""
+    draft = model(tmp_path, TWO_ARMS, f"<actuator>{actuators}</actuator>")
+    assert draft.actuated == ["a", "b"]
+    assert [(spec.joint, spec.value) for spec, _ in draft.forces] == [("c", 3.0)]
+    assert said(draft.left_out, "gears", ": b")
+    assert said(draft.left_out, "actuator on site s1")
+    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "thing.xml"))
+    data = mujoco.MjData(whole)
+    mujoco.mj_forward(whole, data)
+    assert data.joint("c").qfrc_actuator[0] == 3.0
+
+
+def test_muscles_and_plugins_move_joints(tmp_path: Path) -> None:
+    """No length of a muscle is computed, no plugin is loaded."""
+    rest = "<extension><plugin plugin='mujoco.pid'/></extension>"
+    rest += "<actuator><muscle joint='a'/><plugin joint='b' plugin='mujoco.pid'/></actuator>"
+    draft = model(tmp_path, TWO_ARMS, rest)
+    assert draft.actuated == ["a", "b"]
+    assert said(draft.left_out, "plugins")
+
+
+def test_what_mujoco_warns_of_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not to a file in the current folder, nor to standard error."""
+    monkeypatch.chdir(tmp_path)
+    draft = model(tmp_path, "<body name='b'><joint name='j' armature='-1'/><geom size='.1'/></body>")
+    assert said(draft.guessed, "MuJoCo says", "singular")
+    assert [path.name for path in tmp_path.iterdir()] == ["thing.xml"]
+
+
+def test_without_mujoco_or_with_an_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mujoco, "__version__", "3.3.0")
+    with pytest.raises(InputError, match=r"MuJoCo 4 or later is needed, 3.3.0 is installed: pip install --upgrade"):
+        model(tmp_path, "")
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"thing.xml: reading MuJoCo's models needs MuJoCo: pip install 'ckc_pin\[muj"):
+        model(tmp_path, "")
+
+
+def test_bodies_and_joints_without_names_get_some(tmp_path: Path) -> None:
+    inner = "<body name='body_1'><joint/><joint type='slide'/><geom size='.1'/></body>"
+    mechanism = model(tmp_path, f"<body><joint/><geom size='.1'/>{inner}</body>").mechanism()
+    assert mechanism.coordinates == ("body_1_2_hinge", "body_1_hinge", "body_1_slide")
+
+
+def test_an_included_file_is_part_of_the_model(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        "<mujocoinclude><body name='arm'><joint name='j'/><geom size='.1'/></body></mujocoinclude>"
+    )
+    assert model(tmp_path, "<include file='arm.xml'/>").mechanism().coordinates == ("j",)
+
+
+def test_gravity_switched_off(tmp_path: Path) -> None:
+    body = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
+    assert model(tmp_path, body, "<option><flag gravity='disable'/></option>").gravity == (0.0, 0.0, 0.0)
+
+
+def test_solids_are_drawn_and_the_urdf_is_one(tmp_path: Path) -> None:
+    body = "<body name='b'><joint name='j'/><geom type='capsule' size='.1 .2'/><geom type='box' size='1 2 3'/></body>"
+    draft = model(tmp_path, body)
+    shapes = [e.tag for e in ElementTree.fromstring(draft.urdf()).iterfind("link[@name='b']/visual/geometry/*")]
+    assert shapes == ["cylinder", "sphere", "sphere", "box"]
+
+
+def test_motors_are_part_of_q(tmp_path: Path) -> None:
+    """An independent set with every actuated joint, not the program's own choice."""
+    rest = "<equality><connect site1='s1' site2='t1'/></equality><actuator><motor joint='c'/></actuator>"
+    draft = model(tmp_path, TWO_ARMS, rest)
+    assert draft.independent == ["c"]
+    mechanism = draft.mechanism()
+    assert mechanism.independent == mechanism.actuated == ("c",)
+    pose = Pose(mechanism.tree, mechanism.closure.anchors, mechanism.q_tree)
+    assert_close(mechanism.closure.phi(pose), 0.0, 1e-12)
