@@ -6,17 +6,19 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
 from ckc_pin.formats.draft import Draft
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.sources import write_texts
+from ckc_pin.mechanism.spec import LoopType
 
 __all__ = ["mechanism_text", "write"]
 
 WIDTH = 116
+LOOP_TYPES = get_args(LoopType)
 
 
 def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
@@ -62,7 +64,24 @@ def mechanism_text(draft: Draft) -> str:
     for table, noted in tables.items():
         for entry, comment in noted:
             lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
+    if not draft.loops:
+        lines += ["", *_example(draft)]
     return "\n".join(lines) + "\n"
+
+
+def _example(draft: Draft) -> Iterator[str]:
+    """Yield a loop to fill in, commented out, between links that nothing hangs on."""
+    names = [link.get("name", "") for link in draft.robot.findall("link")]
+    parents = {parent.get("link") for parent in draft.robot.iterfind("joint/parent")}
+    ends = [name for name in names if name not in parents]
+    other = ends[-2] if len(ends) > 1 else names[0]
+    yield from _comment(f"No loop is closed. A table like this one closes one; type is one of {', '.join(LOOP_TYPES)}:")
+    yield "# [[loop]]"
+    table = {"name": "closed", "type": "hinge"}
+    yield from (f"# {key} = {_value(value)}" for key, value in table.items())
+    for key, end in (("frame_a", ends[-1]), ("frame_b", other)):
+        yield f"# {key} = {{link = {_value(end)}, xyz = [0.0, 0.0, 0.0], rpy = [0.0, 0.0, 0.0]}}"
+    yield from (f"# axis_{end} = [0.0, 0.0, 1.0]" for end in "ab")
 
 
 def _entries(spec: msgspec.Struct) -> Iterator[str]:

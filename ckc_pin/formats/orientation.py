@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["euler", "from_axis_angle", "from_quaternion", "from_rpy", "from_x_and_y", "from_z", "to_rpy"]
+__all__ = ["from_axis_angle", "from_quaternion", "from_rpy", "to_rpy"]
 
 
 def from_quaternion(quaternion: Sequence[float]) -> Array:
@@ -30,35 +30,10 @@ def from_axis_angle(axis: Array, angle: float) -> Array:
     return from_quaternion([math.cos(half), *(math.sin(half) * axis / np.linalg.norm(axis))])
 
 
-def from_x_and_y(x: Array, y: Array) -> Array:
-    """Rotation whose x axis is along x, its y axis in the plane of x and y."""
-    e1 = x / np.linalg.norm(x)
-    e2 = y - e1 * (e1 @ y)
-    e2 = e2 / np.linalg.norm(e2)
-    return np.column_stack([e1, e2, np.cross(e1, e2)])
-
-
-def from_z(z: Array) -> Array:
-    """Smallest rotation that takes (0, 0, 1) to the direction z."""
-    axis = np.array([-z[1], z[0], 0.0])  # the cross product of (0, 0, 1) and z
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-10 * np.linalg.norm(z):
-        axis = np.array([1.0, 0.0, 0.0])
-    return from_axis_angle(axis, math.atan2(sine, z[2]))
-
-
-def euler(angles: Sequence[float], sequence: str) -> Array:
-    """Rotation of three turns: about axes that turn along (xyz), or that stay (XYZ)."""
-    rotation = np.eye(3)
-    for angle, letter in zip(angles, sequence, strict=True):
-        turn = from_axis_angle(np.eye(3)["xyz".index(letter.lower())], angle)
-        rotation = rotation @ turn if letter.islower() else turn @ rotation
-    return rotation
-
-
 def from_rpy(rpy: Sequence[float]) -> Array:
     """Rotation of a URDF's roll, pitch and yaw."""
-    return euler(rpy, "XYZ")
+    x, y, z = (from_axis_angle(axis, angle) for axis, angle in zip(np.eye(3), rpy, strict=True))
+    return z @ y @ x
 
 
 def to_rpy(rotation: Array) -> tuple[float, float, float]:

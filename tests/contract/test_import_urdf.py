@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ckc_pin.formats.importing import Draft, read
-from ckc_pin.formats.orientation import euler, from_rpy, from_x_and_y, from_z, to_rpy
+from ckc_pin import load
+from ckc_pin.formats.importing import Draft, mechanism_text, read
+from ckc_pin.formats.orientation import from_rpy, to_rpy
 from tests.conftest import assert_close
 
 BODY = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -309,11 +311,30 @@ def test_what_a_urdf_cannot_say_is_said(tmp_path: Path) -> None:
     assert said(draft.left_out, "1 mesh files", "package://x/a.stl")
 
 
+def test_a_urdf_without_loops_says_how_to_declare_one(tmp_path: Path) -> None:
+    """In a note, with the ways that a file may say it itself, and as a table to fill in, which does close the loop."""
+    plain = imported(tmp_path, FOUR_BAR)
+    assert said(plain.guessed, "no loops", "[[loop]]", "frame_a", "<loop>", "robot.yaml", "closing_NAME_1")
+    text = mechanism_text(plain)
+    head, _, table = text.partition("# [[loop]]\n")
+    filled = "[[loop]]\n" + re.sub("^# ?", "", table, flags=re.MULTILINE)
+    for end, at, xyz in (("a", "rocker", "[1, 0, 0]"), ("b", "coupler", "[1, 0.5, 0]")):
+        zero = f'frame_{end} = {{link = "{at}", xyz = [0.0, 0.0, 0.0]'
+        assert zero in filled
+        filled = filled.replace(zero, zero.replace("[0.0, 0.0, 0.0]", xyz))
+    for name, content in (("mechanism.toml", head + filled), ("thing.urdf", plain.urdf())):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    mechanism = load(tmp_path)
+    assert (mechanism.closure.rows, mechanism.rank, mechanism.d) == (5, 2, 1)
+    closed = imported(tmp_path, FOUR_BAR + PIN.format(type="revolute", axis=""))
+    assert not said(closed.guessed, "no loops")
+    assert "# [[loop]]" not in mechanism_text(closed)
+
+
 # --- rotations ------------------------------------------------------------------------------------------------------
 
 angle = st.floats(-math.pi, math.pi)
 near_the_pole = st.sampled_from([math.pi / 2, -math.pi / 2, math.pi / 2 - 1e-9, 1e-4 - math.pi / 2, math.pi / 2 - 5e-4])
-direction = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
 
 
 @given(angle, angle | near_the_pole, angle)
@@ -321,31 +342,3 @@ def test_roll_pitch_yaw_are_exact_at_the_poles_too(roll: float, pitch: float, ya
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
     assert_close(from_rpy([roll, pitch, yaw]), rotation, 1e-14)
     assert_close(from_rpy(to_rpy(rotation)), rotation, 1e-14)
-
-
-@given(st.tuples(angle, angle, angle), st.permutations("xyz"), st.booleans())
-def test_euler_sequences(angles: tuple[float, ...], letters: list[str], fixed: bool) -> None:
-    sequence = "".join(letters)
-    scipys = sequence if fixed else sequence.upper()  # scipy has the capitals the other way round
-    rotation = Rotation.from_euler(scipys, angles).as_matrix()
-    assert_close(euler(angles, sequence.upper() if fixed else sequence), rotation, 1e-14)
-
-
-@given(direction)
-def test_the_smallest_rotation_to_a_direction(z: tuple[float, ...]) -> None:
-    rotation = from_z(np.array(z))
-    along = np.array(z) / np.linalg.norm(z)
-    assert_close(rotation[:, 2], along, 1e-9)
-    assert_close(rotation.T @ rotation, np.eye(3), 1e-14)
-    assert_close(np.trace(rotation), 1 + 2 * along[2], 1e-9)  # the angle is that between z and the direction
-
-
-@given(direction, direction)
-def test_a_frame_from_two_axes(x: tuple[float, ...], y: tuple[float, ...]) -> None:
-    normal = np.cross(x, y)
-    if np.linalg.norm(normal) < 1e-2:
-        return
-    rotation = from_x_and_y(np.array(x), np.array(y))
-    assert_close(rotation.T @ rotation, np.eye(3), 1e-12)
-    assert_close(rotation[:, 0], np.array(x) / np.linalg.norm(x), 1e-14)
-    assert_close(rotation[:, 2], normal / np.linalg.norm(normal), 1e-9)

@@ -18,6 +18,12 @@ from ckc_pin.mechanism.urdf import parse
 __all__ = ["read_urdf", "urdf_beside"]
 
 BESIDE = "robot.yaml"
+NO_LOOPS = (
+    "no loops, since the URDF declares none: to close one, write a table [[loop]] with name, type, frame_a and "
+    "frame_b, such as the one at the end of mechanism.toml. Import itself finds <loop> in a URDF (generalized_rbda), "
+    "closed_loop in a robot.yaml beside it (example-parallel-robots), and pairs of links closing_NAME_1, "
+    "closing_NAME_2 (onshape-to-robot)"
+)
 
 
 def read_urdf(text: str, path: Path) -> Draft:
@@ -55,6 +61,8 @@ def read_urdf(text: str, path: Path) -> Draft:
         base = next(name for name in names.links if name not in names.above)
         draft.guessed.append(f'{base} stands fixed in the world; for a free base write [[tree]] with root = "free"')
     draft.guessed.append("gravity is along -z, the file has none")
+    if not draft.loops:
+        draft.guessed.append(NO_LOOPS)
     meshes = [mesh.get("filename", "") for mesh in robot.iter("mesh")]
     if meshes:
         draft.left_out.append(f"{len(meshes)} mesh files, such as {meshes[0]}: not copied to where the URDF is now")
