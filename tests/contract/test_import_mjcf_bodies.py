@@ -63,7 +63,8 @@ def test_meshes_outside_the_folder_are_not_opened(tmp_path: Path) -> None:
     (tmp_path / "hull.stl").write_bytes(tetrahedron())
     (tmp_path / "inside" / "link.stl").symlink_to(tmp_path / "hull.stl")
     body = "<body name='hull'><joint/><geom type='mesh' mesh='hull_shape'/><geom size='.1' mass='2'/></body>"
-    for file in ("../hull.stl", "link.stl", str(tmp_path / "hull.stl")):
+    (tmp_path / "inside" / "circle.stl").symlink_to("circle.stl")
+    for file in ("../hull.stl", "link.stl", str(tmp_path / "hull.stl"), "circle.stl", "x" * 300 + ".stl"):
         assert said(model(tmp_path / "inside", body, HULL.format(file)).left_out, "hull (mesh hull_shape)")
 
 
@@ -137,7 +138,7 @@ def test_motors_and_constant_forces(tmp_path: Path) -> None:
 def test_muscles_and_plugins_move_joints(tmp_path: Path) -> None:
     """No length of a muscle is computed, no plugin is loaded."""
     rest = "<extension><plugin plugin='mujoco.pid'/></extension>"
-    rest += "<actuator><muscle joint='a'/><plugin joint='b' plugin='mujoco.pid'/></actuator>"
+    rest += "<actuator><muscle joint='a'/><plugin joint='b' plugin='mujoco.pid' actdim='1'/></actuator>"
     draft = model(tmp_path, TWO_ARMS, rest)
     assert draft.actuated == ["a", "b"]
     assert said(draft.left_out, "plugins")
@@ -173,9 +174,12 @@ def test_an_included_file_is_part_of_the_model(tmp_path: Path) -> None:
     assert model(tmp_path, "<include file='arm.xml'/>").mechanism().coordinates == ("j",)
 
 
-def test_gravity_switched_off(tmp_path: Path) -> None:
+def test_what_is_switched_off(tmp_path: Path) -> None:
     body = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
-    assert model(tmp_path, body, "<option><flag gravity='disable'/></option>").gravity == (0.0, 0.0, 0.0)
+    flags = "gravity='disable' spring='disable' equality='disable' contact='disable'"
+    draft = model(tmp_path, body, f"<option><flag {flags}/></option>")
+    assert draft.gravity == (0.0, 0.0, 0.0)
+    assert draft.left_out == [f"that the model switches its {what} off" for what in ("springs", "equality constraints")]
 
 
 def test_solids_are_drawn_and_the_urdf_is_one(tmp_path: Path) -> None:

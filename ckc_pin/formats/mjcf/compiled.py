@@ -226,7 +226,8 @@ def _choices(document: Document, element: Element, message: str) -> str:
         return ""
     path = "tendon/*" if keys[0] == "tendon" else f"worldbody//{keys[0]}"
     names = [name for found in document.root.iterfind(path) if (name := found.get("name"))]
-    return f"; there are {some(names) or 'none'}"
+    unread = [said.removesuffix(" (not read)") for said in document.left_out if said.endswith("(not read)")]
+    return f"; there are {some(names) or 'none'}" + (f"; not read: {some(unread)}" if unread else "")
 
 
 def _line(text: str) -> str:

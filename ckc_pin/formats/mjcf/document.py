@@ -21,7 +21,7 @@ __all__ = ["ASSEMBLED", "LARGEST", "Document"]
 
 ASSEMBLED = "assembled"  # the key frame that `ckc export` writes
 LARGEST = 1e100  # squares of what is larger overflow
-MAX_BODIES, MAX_ELEMENTS = 2000, 20_000  # after <replicate> and <attach>; MuJoCo takes seconds for that many
+MAX_BODIES, MAX_ELEMENTS = 1000, 20_000  # after <replicate> and <attach>; MuJoCo takes seconds for that many
 MAX_PARAMETER = 1000  # of a built-in mesh, whose vertices are as many as its parameters say
 
 KEY_FRAMES = "key frames; one of them may be a better [q_guess]"
@@ -34,6 +34,10 @@ SILENT = ("custom", "sensor", "size", "statistic", "visual")  # sections that do
 IMMATERIAL = ("camera", "light", "texture", "material", "skin", "hfield", "lengthrange")
 UNREAD = ("composite", "flexcomp", "plugin")  # in bodies
 EQUALITIES = ("connect", "weld", "joint", "tendon")
+TRANSMISSION = (
+    *("name", "gear", "joint", "jointinparent", "tendon", "site", "refsite", "body"),
+    *("cranksite", "slidersite", "cranklength"),
+)
 FOLDERS = ("assetdir", "meshdir", "texturedir", "strippath")
 FUSION = ("fusestatic", "discardvisual")  # would take names away
 WORDS = {  # attributes whose text may look like a number
@@ -142,8 +146,8 @@ class Document:
                     parent.remove(element)
         for element in self.root.iterfind("actuator/plugin"):  # what it moves is read, not how
             element.tag = "general"
-            for key in ("plugin", "instance"):
-                element.attrib.pop(key, None)
+            for key in set(element.attrib) - set(TRANSMISSION):
+                element.attrib.pop(key)
             for child in list(element):
                 element.remove(child)
 
@@ -155,7 +159,7 @@ class Document:
             strip = compiler.get("strippath", str(strip)).lower() == "true"
             for setting in (*FOLDERS, *FUSION):
                 compiler.attrib.pop(setting, None)
-        SubElement(SubElement(self.root, "compiler"), "lengthrange", mode="none")
+        SubElement(SubElement(self.root, "compiler", usethread="false"), "lengthrange", mode="none")
         for mesh in self.root.iterfind("asset/mesh"):
             if "builtin" in mesh.attrib and any(x > MAX_PARAMETER for x in _numbers(mesh.get("params", ""))):
                 where = f"{self.source}: mesh {mesh.get('name', '')!r}"

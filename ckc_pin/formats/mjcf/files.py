@@ -51,31 +51,39 @@ class Files:
         InputError
             It is not under the model's folder.
         """
-        path = (folder / file).resolve()
-        if not file or not path.is_relative_to(self.home):
+        path = _resolved(folder / file)
+        if not file or path is None or not path.is_relative_to(self.home):
             raise InputError(f"{where}: a file in the model's own folder is needed")
         return path
 
     def content(self, token: str) -> bytes | None:
-        """Return what is in a mesh file; None where it is not there, or not under the model's folder.
+        """Return what is in a mesh file; None where it cannot be read, or is not under the model's folder.
 
         Raises
         ------
         InputError
-            It is too large, or cannot be read.
+            It is too large.
         """
-        path = self.paths[token].resolve()
+        path = _resolved(self.paths[token])
+        if path is None or not path.is_relative_to(self.home):
+            return None
         try:
             status = path.stat()
-            if not S_ISREG(status.st_mode) or not path.is_relative_to(self.home):
+            if not S_ISREG(status.st_mode):
                 return None
             if status.st_size > MAX_MESH:
                 raise InputError(f"{path}: more than {MAX_MESH // 2**20} MiB, too large for a mesh")
             return path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
+        except OSError:
             return None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _resolved(path: Path) -> Path | None:
+    """Return where a path leads; None where its links go round in a circle."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):
+        return None
 
 
 def expand(element: Element, folder: Path, files: Files, seen: set[Path], source: str, depth: int = 0) -> None:

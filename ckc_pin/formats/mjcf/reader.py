@@ -41,9 +41,8 @@ def read_mjcf(text: str, path: Path) -> Draft:
     actuators = Actuators(compiled, tree)
     name = safe_name(path, document.root.get("model", ""))
     tree.robot.set("name", name)
-    flags = compiled.mujoco.mjtDisableBit
-    weightless = bool(model.opt.disableflags & flags.mjDSBL_GRAVITY)
     medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
+    off = _switched_off(compiled)
     return Draft(
         name,
         f"{path.name}, a MuJoCo model",
@@ -53,7 +52,7 @@ def read_mjcf(text: str, path: Path) -> Draft:
         springs=tree.springs + springs,
         forces=actuators.forces,
         actuated=actuators.joints or None,
-        gravity=vector((0.0, 0.0, 0.0) if weightless else model.opt.gravity),
+        gravity=vector((0.0, 0.0, 0.0) if "gravity" in off else model.opt.gravity),
         q_guess=tree.q_guess,
         guessed=tree.guessed + [f"MuJoCo says: {said}" for said in compiled.warnings],
         left_out=[
@@ -63,5 +62,18 @@ def read_mjcf(text: str, path: Path) -> Draft:
             *actuators.left_out,
             *document.left_out,
             *(["forces of the medium (wind, density, viscosity)"] if medium else []),
+            *(f"that the model switches its {what} off" for what in off if what != "gravity"),
         ],
     )
+
+
+def _switched_off(compiled: Compiled) -> list[str]:
+    """Return what flags of the model switch off that would act here."""
+    bits = compiled.mujoco.mjtDisableBit
+    flags = {
+        "gravity": bits.mjDSBL_GRAVITY,
+        "springs": bits.mjDSBL_SPRING,
+        "dampers": bits.mjDSBL_DAMPER,
+        "equality constraints": bits.mjDSBL_EQUALITY | bits.mjDSBL_CONSTRAINT,
+    }
+    return [what for what, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]
