@@ -109,6 +109,8 @@ class Draft:
         text, urdf = merge([TreeText(self.urdf(), self.urdf_file)])
         try:
             tree = Tree(pin.buildModelFromXML(text))
+        except MechanismError as error:
+            raise MechanismError(f"{self.name}: {error}") from None
         except (ValueError, RuntimeError) as error:
             raise MechanismError(f"{self.name}: Pinocchio cannot build this tree: {error}") from None
         return tree, Frames(tree.model), urdf

@@ -58,6 +58,13 @@ def test_meshes_that_weigh_nothing_are_not_opened(tmp_path: Path, file: str) -> 
     assert draft.left_out == ["2 shapes that are no box, cylinder or sphere: not drawn"]
 
 
+def test_a_shape_that_a_plugin_makes_has_no_mass_here(tmp_path: Path) -> None:
+    asset = "<asset><mesh name='gear'><plugin plugin='mujoco.sdf.gear'/></mesh></asset>"
+    body = "<body name='wheel'><joint/><geom type='sdf' mesh='gear'><plugin plugin='mujoco.sdf.gear'/></geom></body>"
+    draft = model(tmp_path, body, asset)
+    assert said(draft.left_out, "wheel (mesh gear)", "<inertial>")
+
+
 def test_meshes_outside_the_folder_are_not_opened(tmp_path: Path) -> None:
     (tmp_path / "inside").mkdir()
     (tmp_path / "hull.stl").write_bytes(tetrahedron())

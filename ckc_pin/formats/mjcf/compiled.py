@@ -69,14 +69,16 @@ class Compiled:
         found = cls(_mujoco(document.source), document.source)
         with found._listening():
             spec = found._parsed(document)
-            spec.assets, feathers = found._shapes_that_weigh(spec, document)
+            spec.assets, missing = found._shapes_that_weigh(spec, document)
             try:
                 found.model = spec.compile()
             except (ValueError, RuntimeError) as error:
                 raise _refused(document, error) from None
-        found.weightless = {body.id for body in feathers}
         found._check_numbers()
         found._name()
+        for body, shapes, is_weightless in missing:
+            found.unweighed += [f"{found.bodies[body.id]} (mesh {shape})" for shape in shapes]
+            found.weightless |= {body.id} if is_weightless else set()
         return found
 
     def name(self, kind: str, number: int) -> str:
@@ -98,30 +100,30 @@ class Compiled:
     def _shapes_that_weigh(self, spec: Any, document: Document) -> tuple[dict[str, bytes], list[Any]]:
         """Take out meshes that no mass comes from, and those that are not there.
 
-        Returns the files of the others, and the bodies that have no mass now.
+        Returns the files of the others, and for each body what is missing and whether it has no mass now.
         """
         files = {mesh.name: mesh.file for mesh in spec.meshes}
         assets: dict[str, bytes] = {}
-        feathers = []
+        lacking = []
         for body in spec.bodies:
-            missing = False
+            missing: list[str] = []
             for geom in list(body.geoms):
                 geom.contype = geom.conaffinity = 0  # MuJoCo needs no convex hull then
                 if not geom.meshname and geom.type != self.mujoco.mjtGeom.mjGEOM_HFIELD:
                     continue
                 token = files.get(geom.meshname, "")
                 if self._weighs(geom, body):
-                    content = document.files.content(token) if token else b""
-                    if content is not None:
-                        assets |= {token: content} if token else {}
+                    if token and token not in assets and (content := document.files.content(token)) is not None:
+                        assets[token] = content
+                    if not token or token in assets:
                         continue
-                    missing = True
-                    self.unweighed.append(f"{body.name or 'a body'} (mesh {geom.name or geom.meshname})")
+                    missing.append(geom.name or geom.meshname)
                 self.undrawn += 1
                 spec.delete(geom)
-            if missing and not any(self._weighs(geom, body) for geom in body.geoms):
+            is_weightless = bool(missing) and not any(self._weighs(geom, body) for geom in body.geoms)
+            if is_weightless:
                 body.explicitinertial, body.mass, body.inertia = True, FEATHER, np.full(3, FEATHER)
-                feathers.append(body)
+            lacking += [(body, missing, is_weightless)] if missing else []
         for site in spec.sites:
             if site.meshname:
                 site.meshname, site.type = "", self.mujoco.mjtGeom.mjGEOM_SPHERE
@@ -129,7 +131,7 @@ class Compiled:
         for mesh in list(spec.meshes):
             if mesh.name not in needed:
                 spec.delete(mesh)
-        return assets, feathers
+        return assets, lacking
 
     def _weighs(self, geom: Any, body: Any) -> bool:
         """Whether a body has mass from a shape: the rules of MuJoCo's compiler."""

@@ -141,6 +141,9 @@ class Document:
             for element in list(parent):
                 if element.tag in IMMATERIAL:
                     parent.remove(element)
+                elif element.tag == "plugin" and parent.tag == "mesh":
+                    parent.set("file", "")  # as if it were not there
+                    parent.remove(element)
                 elif element.tag in UNREAD and parent.tag != "actuator":
                     self._leave_out(f"<{element.tag}> {element.get('name', '')}".rstrip() + " (not read)")
                     parent.remove(element)
