@@ -25,6 +25,7 @@ from ckc_pin.mechanism.spec import (
     FrameSpec,
     LoopSpec,
     MechanismSpec,
+    PointSpec,
     SpringSpec,
     Vector3,
 )
@@ -51,7 +52,7 @@ class Draft:
         What it was made from, for the head of the file.
     robot : Element
         The tree as a URDF's <robot>.
-    loops, couplings, springs, forces : list of (spec, comment)
+    loops, couplings, springs, forces, points : list of (spec, comment)
     independent, actuated : list of str, or None
         None leaves it to the program.
     why_independent : str
@@ -71,6 +72,7 @@ class Draft:
     couplings: Noted[CouplingSpec] = field(default_factory=list)
     springs: Noted[SpringSpec] = field(default_factory=list)
     forces: Noted[ForceSpec] = field(default_factory=list)
+    points: Noted[PointSpec] = field(default_factory=list)
     independent: list[str] | None = None
     actuated: list[str] | None = None
     why_independent: str = ""
@@ -102,6 +104,7 @@ class Draft:
             coupling=[spec for spec, _ in self.couplings],
             spring=[spec for spec, _ in self.springs],
             force=[spec for spec, _ in self.forces],
+            point=[spec for spec, _ in self.points],
         )
 
     def tree(self) -> tuple[Tree, Frames, UrdfTree]:

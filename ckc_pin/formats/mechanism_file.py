@@ -60,6 +60,7 @@ def mechanism_text(draft: Draft) -> str:
         "coupling": draft.couplings,
         "spring": draft.springs,
         "force": draft.forces,
+        "point": draft.points,
     }
     for table, noted in tables.items():
         for entry, comment in noted:

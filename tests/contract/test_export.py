@@ -191,13 +191,17 @@ def there_and_back(
 
 
 def test_it_comes_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
-    """Coordinates, freedoms, what is driven, gravity, the assembled configuration."""
+    """Coordinates, freedoms, what is driven, gravity, the assembled configuration, points."""
     here, back = there_and_back
     assert back.coordinates == here.coordinates
     assert (back.n, back.rank, back.d) == (here.n, here.rank, here.d)
     assert set(back.actuated) == set(here.actuated)
     assert_same(back.tree.model.gravity.linear, here.tree.model.gravity.linear)
     assert np.abs(back.tree.difference(here.q_tree, back.q_tree)).max() < 1e-8
+    for q_tree, _ in states(here):
+        ours, theirs = (mechanism.point_positions(q_tree) for mechanism in there_and_back)
+        assert set(ours) == set(theirs)
+        assert all(np.abs(theirs[name] - ours[name]).max() < 1e-12 * max(1.0, here.size) for name in ours)
 
 
 def test_its_dynamics_come_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:

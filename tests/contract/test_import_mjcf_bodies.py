@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 import pytest
 
 from ckc_pin.errors import InputError
@@ -14,6 +15,7 @@ from ckc_pin.formats.importing import read
 from ckc_pin.mechanism.pose import Pose
 from tests.conftest import assert_close
 from tests.contract.helpers.models import TWO_ARMS, model, said, tetrahedron
+from tests.contract.helpers.mujoco_twin import Twin
 
 EXACT = 1e-12
 
@@ -187,6 +189,20 @@ def test_what_is_switched_off(tmp_path: Path) -> None:
     draft = model(tmp_path, body, f"<option><flag {flags}/></option>")
     assert draft.gravity == (0.0, 0.0, 0.0)
     assert draft.left_out == [f"that the model switches its {what} off" for what in ("springs", "equality constraints")]
+
+
+def test_sites_that_nothing_is_on_are_points(tmp_path: Path) -> None:
+    """Where MuJoCo has them; not those of a loop, a tendon or a motor."""
+    rest = """<equality><connect site1="s1" site2="t1"/></equality><actuator><motor site="t3"/></actuator>
+      <tendon><spatial damping="1"><site site="s1"/><site site="side"/></spatial></tendon>"""
+    bodies = TWO_ARMS.replace('<site name="s1"', '<site name="side"/><site name="s1"')
+    draft = model(tmp_path, bodies, rest)
+    assert [spec.name for spec, _ in draft.points] == ["s2", "t2"]
+    twin = Twin(tmp_path / "thing.xml")
+    q_tree, _ = twin.put(np.array([0.3, -0.4, 0.7]), np.zeros(3))
+    twin.misses(q_tree)
+    for spec, _ in draft.points:
+        assert_close(twin.pose(spec.frame).translation, twin.data.site(spec.name).xpos, EXACT)
 
 
 def test_solids_are_drawn_and_the_urdf_is_one(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from ckc_pin.formats.mjcf.actuators import Actuators, moved_joints
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.document import Document
 from ckc_pin.formats.mjcf.equality import Equalities
+from ckc_pin.formats.mjcf.points import free_sites
 from ckc_pin.formats.mjcf.tendons import Tendons
 from ckc_pin.formats.mjcf.tree import MjcfTree
 
@@ -51,6 +52,7 @@ def read_mjcf(text: str, path: Path) -> Draft:
         couplings=equalities.couplings,
         springs=tree.springs + springs,
         forces=actuators.forces,
+        points=free_sites(compiled, tree),
         actuated=actuators.joints or None,
         gravity=vector((0.0, 0.0, 0.0) if "gravity" in off else model.opt.gravity),
         q_guess=tree.q_guess,
