@@ -35,8 +35,8 @@ class Curve:
     look: Mapping[str, Any]
 
 
-def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -> list[str]:
-    """Draw one work; return the files, PNG and SVG.
+def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -> str:
+    """Draw one work; return the file's name.
 
     Parameters
     ----------
@@ -64,13 +64,11 @@ def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -
     )
     figure.suptitle(work.says)
     _name(figure, axes)
-    return [save(figure, folder, f"{work.key}.{kind}") for kind in ("png", "svg")]
+    return save(figure, folder, f"{work.key}.png")
 
 
-def draw_main(
-    works: Sequence[Work], rows: Mapping[str, Sequence[Row]], others: Sequence[str], folder: Path
-) -> list[str]:
-    """Draw error against time of a few works side by side, by program; return the files."""
+def draw_main(works: Sequence[Work], rows: Mapping[str, Sequence[Row]], others: Sequence[str], folder: Path) -> str:
+    """Draw error against time of a few works side by side, by program; return the file's name."""
     chosen = [work for key in MAIN for work in works if work.key == key][:3] or list(works[:3])
     figure, axes = chart(columns=len(chosen), size=(5.6, 4.6))
     for ax, work in zip(axes, chosen, strict=True):
@@ -78,7 +76,7 @@ def draw_main(
         time, error = ("time, s", lambda row: row.wall_s), ("largest error, rad or m", lambda row: row.error_max)
         _panel(ax, curves, time, error, work.says)
     _name(figure, axes)
-    return [save(figure, folder, f"report.{kind}") for kind in ("png", "svg")]
+    return save(figure, folder, "report.png")
 
 
 def _programs(rows: Sequence[Row], others: Sequence[str]) -> Iterator[Curve]:

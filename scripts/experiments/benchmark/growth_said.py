@@ -104,7 +104,7 @@ def _tolerances(measured: Mapping[str, Sequence[Row]]) -> Iterator[str]:
             )
 
 
-def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], folder: Path) -> list[str]:
+def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], folder: Path) -> str:
     """Draw right-hand sides' times along each family, and runs' right-hand sides against the tolerance."""
     figure, axes = chart(columns=(len(FAMILIES) + 1) // 2, rows=2, size=(6.2, 4.2))
     for ax, family in zip(axes, FAMILIES, strict=False):
@@ -131,4 +131,4 @@ def draw_growth(rows: Sequence[Growth], measured: Mapping[str, Sequence[Row]], f
         whole_decades(ax)
         if ax.lines:
             ax.legend(fontsize=7.5)
-    return [save(figure, folder, f"growth.{kind}") for kind in ("png", "svg")]
+    return save(figure, folder, "growth.png")

@@ -19,7 +19,7 @@ from scripts.experiments.benchmark.figure import draw, draw_main
 from scripts.experiments.benchmark.growth import Growth
 from scripts.experiments.benchmark.growth_said import draw_growth
 from scripts.experiments.benchmark.left_out import LeftOut
-from scripts.experiments.benchmark.page import Measured, PeerNote, markdown, web
+from scripts.experiments.benchmark.page import Measured, PeerNote, markdown
 from scripts.experiments.benchmark.peers import Peer, peers
 from scripts.experiments.benchmark.reference import Reference, reference
 from scripts.experiments.benchmark.row import Motion, Row, judged
@@ -41,7 +41,7 @@ class Report:
     Attributes
     ----------
     files : list of Path
-        The page in two forms, the tables, the figures.
+        The page, the tables, the figures.
     rows : dict of str to list of Row
         By work.
     """
@@ -84,10 +84,9 @@ def report(out: Path, *, quick: bool = False, progress: Progress | None = None) 
     grown, left = _grown(out, quick, tell), _left_out(out, works, quick, tell)
     figures = _figures(works, found.rows, [peer.name for peer in others], grown, out)
     text = markdown(Measured(works, unmade, BUDGET, found.rows, references, notes, left, grown, quick))
-    for name, content in (("report.md", text), ("report.html", web(text, out))):
-        (out / name).write_text(content, encoding="utf-8")
+    (out / "report.md").write_text(text, encoding="utf-8")
     tables = ("report.csv", "growth.csv", "left_out.csv")
-    found.files = [out / name for name in ("report.html", "report.md", *tables, *figures)]
+    found.files = [out / name for name in ("report.md", *tables, *figures)]
     return found
 
 
@@ -109,8 +108,8 @@ def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
 def _figures(
     works: list[Work], rows: dict[str, list[Row]], others: list[str], grown: list[Growth], out: Path
 ) -> list[str]:
-    figures = [*draw_main(works, rows, others, out), *draw_growth(grown, rows, out)]
-    return [*figures, *(name for work in works for name in draw(work, rows[work.key], others, out))]
+    figures = [draw_main(works, rows, others, out), draw_growth(grown, rows, out)]
+    return [*figures, *(draw(work, rows[work.key], others, out) for work in works)]
 
 
 class _Measured:

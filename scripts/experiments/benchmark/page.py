@@ -1,13 +1,9 @@
-"""The report as one page, in Markdown and in HTML that opens without anything else."""
+"""The report as one page, in Markdown."""
 
 from __future__ import annotations
 
-import base64
-import html
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from scripts.experiments.benchmark.advice import advice
 from scripts.experiments.benchmark.goals import BY_HAND, PACKAGED, goals_table
@@ -23,14 +19,7 @@ from scripts.experiments.benchmark.table import machine, versions
 from scripts.experiments.benchmark.work import Budget, Work
 from scripts.experiments.markdown import escaped, table
 
-__all__ = ["Measured", "PeerNote", "markdown", "web"]
-
-STYLE = (
-    "body{font:16px/1.5 sans-serif;color:#111;background:#fff;max-width:72rem;margin:2rem auto;padding:0 1rem}"
-    "table{border-collapse:collapse;font-size:.85rem;display:block;overflow-x:auto}"
-    "td,th{border-bottom:1px solid #ddd;padding:.25rem .6rem;text-align:left}img{max-width:100%}"
-    "h2{margin-top:2.5rem;border-top:1px solid #ddd;padding-top:1rem}"
-)
+__all__ = ["Measured", "PeerNote", "markdown"]
 
 
 @dataclass(frozen=True)
@@ -163,18 +152,3 @@ def _best(rows: Sequence[Row]) -> list[str]:
                 )
     header = ["accuracy", "program", "setting", "ms", "error", "at the end", "closure", "energy drift"]
     return table([*header, "right-hand sides", "steps"], cells)
-
-
-def web(text: str, folder: Path) -> str:
-    """Return the Markdown page as HTML, its figures inside."""
-    from markdown_it import MarkdownIt
-
-    body = MarkdownIt("commonmark").enable("table").render(text)
-
-    def inside(match: re.Match[str]) -> str:
-        image = base64.b64encode((folder / html.unescape(match[1])).read_bytes()).decode()
-        return f'src="data:image/png;base64,{image}"'
-
-    body = re.sub(r'src="([^":]+\.png)"', inside, body)
-    head = f'<meta charset="utf-8"><title>ckc_pin: error against run time</title><style>{STYLE}</style>'
-    return f'<!doctype html><html lang="en">{head}{body}</html>'
