@@ -37,7 +37,6 @@ __all__ = [
 EPSILONS = (1e-1, 1e-2, 1e-3, 1e-4)
 TAUS = np.linspace(0.0, 12.0, 121)
 SCENE = "five_bar/tracking"
-COMMAND = "./scripts/experiment tikhonov"
 DEEP = 40.0  # fast time after which the layer is over: exp(-40) is 4e-18
 
 
@@ -213,7 +212,6 @@ def _layer_claim(layer: Layer, figures: Path) -> Claim:
         key="boundary-layer",
         where="section II-A, eqs. 10 to 12",
         says="in fast time z - h follows dy/dτ = -φ_z⁻¹(q, y + h) φ(q, y + h), which decays exponentially",
-        command=COMMAND,
         found=(
             f"Along eq. 12 φ = w(0) exp(-τ) exactly, and |y| ≤ {layer.factor:.3f} |y(0)| exp(-τ). The SPF's y leaves "
             f"the solution of eq. 12 by {', '.join(f'{m:.1e}' for m in layer.misses)} rad at ε = "
@@ -245,7 +243,6 @@ def _eigenvalue_claim(problem: Problem, figures: Path) -> Claim:
         key="eq-13",
         where="section II-A, eq. 13",
         says="Re λ{∇_y g(t, x, y + h, 0)} ≤ Re λ{∇_y φ_z⁻¹ φ} ≤ c ≤ 0, hence exponential stability",
-        command=COMMAND,
         found=(
             f"At y = 0 the gradient of g = -φ_z⁻¹ φ is -I in every non-singular configuration: along {SCENE} its "
             f"eigenvalues are -1 to {miss:.1g}. The second term as printed lacks g's minus sign, its eigenvalues are "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 __all__ = ["Claim", "Verdict"]
@@ -22,11 +22,11 @@ class Claim:
         Where the paper says it, e.g. "section II-A, eq. 13".
     says : str
         What it says, in a sentence.
-    command : str
-        What a reader runs to see it.
     found : str
         What was measured, with its numbers.
     verdict : Verdict
+    commands : tuple of str
+        What else a reader can run to see it; ``./scripts/experiment paper KEY`` always shows it.
     figures : tuple of str
         File names in the page's folder of figures.
     table : (header, rows) or None
@@ -36,8 +36,8 @@ class Claim:
     key: str
     where: str
     says: str
-    command: str
     found: str
     verdict: Verdict
+    commands: tuple[str, ...] = ()
     figures: tuple[str, ...] = ()
-    table: tuple[tuple[str, ...], tuple[tuple[str, ...], ...]] | None = field(default=None)
+    table: tuple[tuple[str, ...], tuple[tuple[str, ...], ...]] | None = None

@@ -84,7 +84,6 @@ def claims(figures: Path) -> list[Claim]:
             key="epsilon-irrelevant",
             where="section III-B: ε = 1e-3 'based on trial and error in order to give satisfactory accuracy'",
             says="the accuracy of the SPF in the paper's experiments, which start on φ = 0, depends on ε",
-            command="./scripts/experiment tikhonov",
             found=(
                 "It does not. From w(0) = 0, q̇(0) ≠ 0, eq. 8 as printed (Radau) differs from the DAE at t = "
                 f"{T_END:g} s by at most {largest} for ε = {PRINTED[0]:g} ... {PRINTED[-1]:.0e} at rtol {tolerances}: "

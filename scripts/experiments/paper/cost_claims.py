@@ -44,7 +44,6 @@ def claims(figures: Path) -> list[Claim]:
                 "a nonlinear solver will have to be employed at each step for the reduced model, while the SPF "
                 "does not involve this cost"
             ),
-            command="./scripts/experiment paper --only cost",
             found=" ".join(sentences).strip(),
             verdict=("holds" if saved else "holds with a condition") if literal else "does not hold",
             figures=(_draw(found, figures),),

@@ -140,7 +140,6 @@ def _psi_claim(checks: dict[str, PsiCheck]) -> Claim:
         key="implicit-function",
         where="section II, eqs. 3 to 5",
         says="The map sigma exists where the Jacobian Psi_{q'} is non-singular, and rho = -Psi_{q'}^-1 Psi_q.",
-        command="./scripts/experiment paper --only implicit-function",
         found="With the last rows of Psi selecting q, |det Psi_{q'}| = |det phi_z| at every configuration tried, on "
         "the closure and off it, so that Psi_{q'} is non-singular exactly where phi_z is; rho by eq. 5 and the "
         "program's rho from phi_z alone agree. At solved singular configurations det Psi_{q'} vanishes and the matrix "
@@ -163,7 +162,6 @@ def _domain_claim() -> Claim:
         key="spf-domain",
         where="section II-A",
         says="The domain of validity of the SPF may be shown to be a superset of the non-singular workspace V'.",
-        command="./scripts/experiment paper --only spf-domain",
         found=f"As the set where eq. 8 is defined: yes. It needs a regular phi_z(q, z) and no phi = 0: at "
         f"{len(beyond.sigma_min)} random (q, z) whose q no closed configuration has, sigma_min(phi_z) is "
         f"{beyond.sigma_min.min():.2g} m or more and eq. 8 starts. As a domain where it stands for the mechanism: no. "

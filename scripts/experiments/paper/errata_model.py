@@ -118,7 +118,7 @@ def closure_angles() -> Erratum:
         agreement=float(np.abs(at.phi).max()),
         unit="m",
         measured=f"|phi| of `{FIVE_BAR}` at its hanging equilibrium: eq. 27 as printed, and the program's",
-        command="ckc check five_bar",
+        commands=("ckc check five_bar",),
     )
 
 
@@ -137,7 +137,7 @@ def table_rows() -> Erratum:
         unit="m",
         measured="how far eq. 21 asks the elbows beyond the reach l2 + l4: "
         f"{printed:.4f} of {reach:.4f} as printed, {loop:.4f} of {loop_reach:.4f} otherwise",
-        command="ckc check five_bar_as_printed/tracking",
+        commands=("ckc check five_bar_as_printed/tracking",),
     )
 
 
@@ -172,7 +172,7 @@ def lost_freedoms() -> Erratum:
         agreement=max(point.sigma_min_phi_z for point in points),
         unit="m",
         measured=f"at {len(points)} singular configurations: least sigma_min(J), largest sigma_min(phi_z)",
-        command="./scripts/experiment paper --only singular-freedoms",
+        commands=("./scripts/experiment paper singular-freedoms",),
     )
 
 

@@ -95,7 +95,7 @@ def coriolis_arguments() -> Erratum:
         unit="kg m²/s",
         measured=f"largest difference of the two at w = {W.tolist()} m and at w = 0, q_dot = {Q_DOT.tolist()} rad/s, "
         f"epsilon = {EPSILON:g}",
-        command="./scripts/experiment tikhonov",
+        commands=("./scripts/experiment paper tikhonov-velocity",),
     )
 
 

@@ -26,8 +26,8 @@ class Erratum:
         Of both.
     measured : str
         What was compared with what.
-    command : str
-        Another command that shows it; empty: only ``./scripts/experiment errata KEY``.
+    commands : tuple of str
+        What else a reader can run to see it; ``./scripts/experiment errata KEY`` always shows it.
     """
 
     key: str
@@ -38,4 +38,4 @@ class Erratum:
     agreement: float
     unit: str
     measured: str
-    command: str = ""
+    commands: tuple[str, ...] = ()

@@ -154,7 +154,7 @@ def _appendix() -> Claim:
         key="appendix",
         where="appendix, eqs. 23 to 26, Table I",
         says="The terms of the open chains.",
-        command='ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',
+        commands=('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',),
         found=f"Pinocchio's terms of the shipped URDFs against the printed equations at {STATES} random states: D' and "
         "h' are the same; C' v' is once eq. 25's squares are dropped (see the errata: coriolis-power, coriolis-skew, "
         "closure-angles and table-rows). Both readings of Table I are shipped.",
@@ -173,7 +173,6 @@ def _equilibrium(run: Run) -> Claim:
         key="initial-equilibrium",
         where="section III-B, Fig. 3a",
         says="The initial configuration happens to be a stable equilibrium for the system.",
-        command="./scripts/experiment paper --only initial-equilibrium",
         found=f"The one shipped for both scenes is: (theta_1 ... theta_4) = ({angles}), |h| = {h:.0e} N m there, "
         f"eigenvalues of dh/dq {stiffness[0]:.4f} and {stiffness[1]:.4f} N m/rad. The numbers are not in the paper.",
         verdict="holds" if h < 1e-10 and stiffness[0] > 0 else "does not hold",
@@ -190,7 +189,7 @@ def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
         where="section III-B, Fig. 3",
         says="The controller stabilizes the system at the desired configuration, and the SPF follows the reduced model "
         "closely throughout.",
-        command="./scripts/demo",
+        commands=("./scripts/demo",),
         found=f"From a consistent start they are one system. Eq. 8 as printed (epsilon = {spf.scene['epsilon']:g}) and "
         f"the reduced model differ by {q:.0e} rad and {u:.0e} N m at most over the run, the integrations' errors. The "
         f"error at {spf.t[-1]:g} s is {error:.0e} rad. The target of Fig. 3a is not in the text; chosen here: both "
@@ -207,7 +206,7 @@ def _figure_4(runs: list[Run], drawn: list[str]) -> Claim:
         where="section III-C, Fig. 4",
         says="Although the system starts from a completely different configuration, the controller makes the desired "
         "trajectory convergent; its q-space picture is a closed ellipse.",
-        command="./scripts/demo",
+        commands=("./scripts/demo",),
         found="Reproduced over one and a half cycles. Eq. 8 as printed "
         f"(epsilon = {runs[1].scene['epsilon']:g}) and the reduced model differ by {q:.0e} rad and {u:.0e} N m at "
         "most. For the error at the end see tracking-error-law.",
@@ -231,7 +230,7 @@ def _torques(cases: dict[str, list[Run]]) -> Claim:
         where="sections III-B and III-C",
         says=f"The gains keep the control within {FIRST:g} N m at first, in tracking within {LATER:g} N m in steady "
         "state.",
-        command="./scripts/demo",
+        commands=("./scripts/demo",),
         found="They do, with the gains of eqs. 20 and 22 and the set-point target chosen here.",
         verdict="holds" if good else "does not hold",
         table=(
@@ -252,7 +251,6 @@ def _law(laws: list[Law]) -> Claim:
         key="tracking-error-law",
         where="section III-C, Figs. 4c and 4d",
         says="The controller is effective: tracking converges as the figures show.",
-        command="./scripts/experiment paper --only tracking-error-law",
         found="It does, but the error says nothing about the model: r of eq. 17 dies out fast and "
         f"q_tilde_dot = -q_tilde is left, whatever the plant. At t = {AT} s the error is {ratios.min():.4f} to "
         f"{ratios.max():.4f} times e^-t of the initial one; without gravity, or with all masses and inertias doubled, "

@@ -44,7 +44,6 @@ ROWS: dict[str, dict[str, Any]] = {
     "equilibrium, K_P = 1 I": {"controller.K_P": 1.0},
     "equilibrium, K_P = 0.5 I": LOW_GAIN,
 }
-COMMAND = "./scripts/experiment paper --only"
 
 
 def claims(figures: Path) -> list[Claim]:
@@ -72,7 +71,6 @@ def _lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
         key="set-point-lyapunov",
         where="section II-B, after eq. 15",
         says="Along eq. 14's closed loop the Lyapunov function's rate is -q_dot^T K_V q_dot, so it never grows.",
-        command=f"{COMMAND} set-point-lyapunov",
         found=(
             f"In every formulation V_L falls from {records[rows[0][0]].value[0]:.2f} J to rounding: its largest "
             f"increase between output instants is {worst:.1e} J. A spline's derivative of the recorded function agrees "
@@ -99,7 +97,6 @@ def _gradient_claim(case: Case, figures: Path) -> Claim:
         key="set-point-gradient-bound",
         where="section II-B, before eq. 15",
         says="The gradient of h is bounded by M_1, and K_P may be chosen with k_pi > M_1.",
-        command=f"{COMMAND} set-point-gradient-bound",
         found=(
             f"dh/dq by the chain rule through sigma agrees with differences of h at {used} random configurations to "
             f"{error:.1e}, and is symmetric to {asymmetry:.1e}. On |s| >= s_min it has a bound, but that grows as "
@@ -139,7 +136,6 @@ def _gain_claim(
         key="set-point-gain-condition",
         where="section II-B",
         says="With K_P above M_1 the candidate is a Lyapunov function, and q_d is asymptotically stable.",
-        command=f"{COMMAND} set-point-gain-condition",
         found=(
             f"The scene starts at V_L = {own.level:.3g} J. Not decided for the whole of it: {own.reason}. "
             f"Up to V_L = {own.safe_level:.3g} J the argument holds, and the run is below that from "
@@ -169,7 +165,7 @@ def _uniqueness_claim(certificates: dict[str, tuple[Case, Certificate]]) -> Clai
         key="set-point-unique",
         where="section II-B, eq. 15",
         says="The condition on K_P is sufficient for q = q_d to be the only solution of eq. 15.",
-        command=f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60; {COMMAND} set-point-unique",
+        commands=(f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60",),
         found=(
             "With the sign of its left side put right (see the errata): "
             f"Newton from points all over the sublevel set finds {'q_d alone' if unique else 'more than q_d'} where "

@@ -116,7 +116,6 @@ def _type_1(found: dict[str, list[Locus]], figure: str) -> Claim:
         where="section III-A, Fig. 2",
         says="In the Type 1 singularity theta_1 and theta_3 get locked on to particular values, links 2 and 4 "
         "degenerate into a pendulum; it is a single point of the chosen coordinates.",
-        command="./scripts/experiment paper --only singular-type-1",
         found=f"`{FIVE_BAR}`: the solver finds {len(ours)} such points, (theta_1, theta_3) = {at}: elbows coincident "
         f"above and below the base. Along the traced curve through each, links 2 and 4 turn by {turn:.4f} rad, back "
         f"to the start, while theta_1 and theta_3 move by {spread:.0e} rad at most. `{PRINTED}`: it finds "
@@ -146,7 +145,6 @@ def _type_2(found: dict[str, list[Locus]], figure: str) -> Claim:
         where="section III-A, Fig. 2",
         says="In the Type 2 singularity links 2 and 4 lock against each other, the mechanism becomes effectively a "
         "4-bar, and theta_1 and theta_3 have a functional relationship represented by a closed curve.",
-        command="./scripts/experiment paper --only singular-type-2",
         found=f"Traced by continuation from solved points: {len(rows)} curves, one on each reading of Table I, on "
         "which the distance of the elbows is l2 + l4. The other side of each is unreachable.",
         verdict="holds" if good and len(rows) == 2 else "does not hold",
@@ -171,7 +169,6 @@ def _freedoms(every: list[tuple[str, Locus]], crossings: Sequence[tuple[str, str
         key="singular-freedoms",
         where="section III-A",
         says="In both these singularities the system ceases to have two DOFs and becomes a single DOF system.",
-        command="./scripts/experiment paper --only singular-freedoms",
         found=f"By the rank of J it keeps two everywhere on all {len(every)} curves of both readings "
         f"(sigma_min(J) >= {min(locus.sigma_min_J for _, locus in every):.3f}); what fails is the chart: phi_z has "
         "rank 1, and the allowed velocities move (theta_1, theta_3) in one direction only. Another pair of coordinates "

@@ -15,18 +15,16 @@ import numpy as np
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.paper import boundary_layer, consistent_start
+from scripts.experiments.paper import boundary_layer
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, difference, end_of, five_bar_problem, vector
-from scripts.experiments.paper.show import run_as_command
 
-__all__ = ["EPSILONS", "Convergence", "claims", "converge", "main"]
+__all__ = ["EPSILONS", "Convergence", "claims", "converge"]
 
 EPSILONS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 T_END = 1.0
 FIRST, SECOND = ("DOP853", 1e-12), ("LSODA", 1e-12)  # two integrations that share neither method nor code
 ORDER_MARGIN = 0.05
-COMMAND = "./scripts/experiment tikhonov"
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,6 @@ def _order_claim(rest: Convergence, moving: Convergence, start: str, figure: str
         key="tikhonov-order",
         where="section II-A, eqs. 9 to 13",
         says="after the boundary layer x - x̄ = O(ε) and z - h(t, x̄) = O(ε)",
-        command=COMMAND,
         found=(
             f"Free motion of the five-bar, {start}, C at ρ q̇ (eq. 8), SPF against DAE at t = {T_END:g} s. Over the "
             f"last two decades of ε the observed orders of (q, q̇) and of z lie between {last.min():.3f} and "
@@ -165,7 +162,6 @@ def _velocity_claim(
         key="tikhonov-velocity",
         where="section II-C, eq. 16, against eq. 8",
         says="the SPF with C(q, q̇, z, ż), as eq. 16 writes it, approximates the DAE to O(ε) too",
-        command=COMMAND,
         found=(
             f"From a moving start it does not: the difference stays at {floor:.2e} down to ε = "
             f"{moving.epsilons[-1]:.0e}. With the actual ż, f of eq. 9 contains 1/ε, which Tikhonov's theorem "
@@ -210,15 +206,3 @@ def _draw(rho: Sequence[Convergence], actual: Sequence[Convergence], figures: Pa
     for ax in axes:
         ax.legend(fontsize=8)
     return save(figure, figures, "tikhonov.png")
-
-
-def main() -> None:
-    """Run the studies of epsilon and print what they found: the ``./scripts/experiment tikhonov`` command."""
-    about = (
-        "Tikhonov's theorem on the five-bar: the SPF's error against epsilon, its boundary layer, consistent starts."
-    )
-    run_as_command("tikhonov", about, [claims, boundary_layer.claims, consistent_start.claims])
-
-
-if __name__ == "__main__":
-    main()

@@ -81,7 +81,6 @@ def _lyapunov_claim(figures: Path) -> Claim:
         where="section II-C, eqs. 18 and 19",
         says="Along the closed loop dV/dt = -q_tilde_dot^T K_D q_tilde_dot - q_tilde^T Lambda^T K_D Lambda q_tilde "
         "- (1/epsilon) w^T M w, with d_1 = d_2 = 1: the desired trajectory is asymptotically stable.",
-        command="./scripts/experiment paper --only tracking-lyapunov",
         found=(
             "From w(0) = 0 a spline's derivative of the recorded function agrees with eq. 19 to "
             f"{max(x.mismatch for x in on):.1e} of its largest value, for the SPF, the reduced model and the DAE "
@@ -121,7 +120,6 @@ def _skew_claim() -> Claim:
         key="tracking-skew",
         where="section II-C, eq. 19",
         says="D_dot - 2 C is skew-symmetric, so that its term in eq. 19 vanishes.",
-        command="./scripts/experiment paper --only tracking-skew",
         found=(
             f"Over {found[LAYERS[0]].states} random states, D_dot by differences of D. On phi = 0 it is, to {on:.1e} "
             "of D_dot's largest entry. Off it D_dot belongs to the perturbed flow, with w / epsilon in z_dot: with C "
@@ -167,7 +165,6 @@ def _gains_claim() -> Claim:
         key="tracking-gains",
         where="section II-C, eqs. 18 and 19",
         says="Eq. 18 is positive and eq. 19 follows for gains with positive definite weights.",
-        command="./scripts/experiment paper --only tracking-gains",
         found=(
             "As quadratic forms in (q_tilde, q_tilde_dot), with D_dot - 2 C skew. Where Lambda^T K_D is symmetric "
             f"eq. 19's last line is -dV_1/dt (to {max(fits):.1e}), otherwise it is off by {min(misfits):.2g} and more: "
@@ -211,7 +208,6 @@ def _deviations_claim(figures: Path) -> Claim:
         where="section III-C",
         says="The SPF exactly follows the desired trajectory, but the more exact reduced model periodically sees some "
         "deviations, which are soon corrected by the controller; the stability result is applicable only for the SPF.",
-        command="./scripts/experiment paper --only tracking-deviations",
         found=(
             f"The two are the same system: after the first period eq. 8, solved tightly, is {largest:.1e} rad from the "
             "reduced model, both converge to the desired trajectory like e^-t, and eq. 19 holds for both (see "
