@@ -1,19 +1,21 @@
-"""Figures: error, closure and energy against time, by program and by formulation."""
+"""Figures: error, closure and energy against time, by program and by formulation; how cost grows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scripts.experiments.benchmark.ours import PROGRAM, of_row
-from scripts.experiments.benchmark.row import Row
-from scripts.experiments.benchmark.sentences import here
-from scripts.experiments.benchmark.work import Work
+import numpy as np
+import pandas as pd
+
+from scripts.experiments.benchmark.analysis import NAMES, Found
+from scripts.experiments.benchmark.growth import FAMILIES, FORMULATIONS, exponent
+from scripts.experiments.benchmark.ours import PROGRAM
 from scripts.experiments.chart import BLACK, COLOURS, chart, save, whole_decades
 
-__all__ = ["MAIN", "draw", "draw_main"]
+__all__ = ["MAIN", "draw", "draw_growth", "draw_main", "front"]
 
 MAIN = ("swing", "andrews", "n_four_bar_16", "n_four_bar_4")  # the first three of them that were measured
 MARKERS = "osD^vPX<>"
@@ -21,100 +23,103 @@ FLOOR = 1e-17  # a number of zero has no logarithm
 APART = 11.0  # points between the labels of two curves
 REACH = 100.0  # points: labels further apart do not meet
 LETTER = 5.0  # points wide
-NAMES = {"dae": "DAE", "reduced": "reduced model", "spf": "SPF eq. 17", "spf, eq. 8": "SPF eq. 8 as printed"}
-
-Number = Callable[[Row], float | None]
+LABELS = {
+    "wall_s": "time, s",
+    "rhs": "right-hand sides",
+    "error_max": "largest error along the run, rad or m",
+    "error_end": "error at the end, rad or m",
+    "closure": "largest |φ|, m or rad",
+    "energy_drift": "largest energy drift / kinetic energy",
+}
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Rows that no other one of the same family beats in both time and error, by falling error, and how they look."""
+    """Runs that no other one of the same family beats in both time and error, by falling error, and how they look."""
 
     name: str
-    rows: tuple[Row, ...]
+    rows: pd.DataFrame
     look: Mapping[str, Any]
 
 
-def draw(work: Work, rows: Sequence[Row], others: Sequence[str], folder: Path) -> str:
-    """Draw one work; return the file's name.
-
-    Parameters
-    ----------
-    work : Work
-    rows : sequence of Row
-    others : sequence of str
-        All other programs of the report, so that each has one look on all figures.
-    folder : Path
-    """
+def draw(found: Found, work: str, folder: Path) -> str:
+    """Draw one work; return the file's name."""
     figure, axes = chart(columns=3, rows=2, size=(5.6, 4.2))
-    programs, formulations = list(_programs(rows, others)), list(_formulations(rows))
-    time = ("time, s", lambda row: row.wall_s)
-    error = ("largest error along the run, rad or m", lambda row: row.error_max)
-    _panel(axes[0], programs, time, error, "programs: error")
-    _panel(axes[1], programs, time, ("largest |φ|, m or rad", lambda row: row.closure), "programs: closure")
-    drift = ("largest energy drift / kinetic energy", lambda row: row.energy_drift)
-    _panel(axes[2], programs, time, drift, "programs: energy")
-    if work.controlled or not axes[2].lines:
+    rows = found.rows[found.rows.work == work]
+    programs, formulations = list(_programs(rows, found.programs)), list(_formulations(rows))
+    _panel(axes[0], programs, "wall_s", "error_max", "programs: error")
+    _panel(axes[1], programs, "wall_s", "closure", "programs: closure")
+    _panel(axes[2], programs, "wall_s", "energy_drift", "programs: energy")
+    if found.works.controlled[work] or not axes[2].lines:
         axes[2].set_axis_off()
         axes[2].text(0.5, 0.5, "energy is not kept here: something acts", ha="center", transform=axes[2].transAxes)
-    _panel(axes[3], formulations, time, error, f"{PROGRAM}: error")
-    _panel(axes[4], formulations, ("right-hand sides", lambda row: row.rhs), error, f"{PROGRAM}: error")
-    _panel(
-        axes[5], formulations, time, ("error at the end, rad or m", lambda row: row.error_end), f"{PROGRAM}: at the end"
-    )
-    figure.suptitle(work.says)
+    _panel(axes[3], formulations, "wall_s", "error_max", f"{PROGRAM}: error")
+    _panel(axes[4], formulations, "rhs", "error_max", f"{PROGRAM}: error")
+    _panel(axes[5], formulations, "wall_s", "error_end", f"{PROGRAM}: at the end")
+    figure.suptitle(found.works.says[work])
     _name(figure, axes)
-    return save(figure, folder, f"{work.key}.png")
+    return save(figure, folder, f"{work}.png")
 
 
-def draw_main(works: Sequence[Work], rows: Mapping[str, Sequence[Row]], others: Sequence[str], folder: Path) -> str:
+def draw_main(found: Found, folder: Path) -> str:
     """Draw error against time of a few works side by side, by program; return the file's name."""
-    chosen = [work for key in MAIN for work in works if work.key == key][:3] or list(works[:3])
+    chosen = [key for key in MAIN if key in found.works.index][:3] or list(found.works.index[:3])
     figure, axes = chart(columns=len(chosen), size=(5.6, 4.6))
     for ax, work in zip(axes, chosen, strict=True):
-        curves = list(_programs(rows[work.key], others))
-        time, error = ("time, s", lambda row: row.wall_s), ("largest error, rad or m", lambda row: row.error_max)
-        _panel(ax, curves, time, error, work.says)
+        curves = list(_programs(found.rows[found.rows.work == work], found.programs))
+        _panel(ax, curves, "wall_s", "error_max", found.works.says[work])
     _name(figure, axes)
     return save(figure, folder, "report.png")
 
 
-def _programs(rows: Sequence[Row], others: Sequence[str]) -> Iterator[Curve]:
+def draw_growth(found: Found, folder: Path) -> str:
+    """Draw right-hand sides' times along each family; return the file's name."""
+    figure, axes = chart(columns=len(FAMILIES), size=(5.6, 4.2))
+    for ax, family in zip(axes, FAMILIES, strict=True):
+        own = found.growth[(found.growth.family == family.key) & found.growth.rhs_s.notna()]
+        for k, formulation in enumerate(FORMULATIONS):
+            points = own[own.formulation == formulation].set_index("x").rhs_s.sort_index()
+            p = exponent(points.to_dict())
+            if p is not None:
+                look = {"color": COLOURS[k], "marker": MARKERS[k + 1], "markersize": 4, "clip_on": False}
+                ax.plot(points.index, 1e6 * points, label=f"{NAMES[formulation]}: ∝ {family.along}^{p:.1f}", **look)
+        ax.set(xscale="log", yscale="log", xlabel=family.along, title=family.says)
+        ax.set_ylabel("one right-hand side, µs")
+        whole_decades(ax)
+        if ax.lines:
+            ax.legend(fontsize=7.5)
+    return save(figure, folder, "growth.png")
+
+
+def _programs(rows: pd.DataFrame, others: Sequence[str]) -> Iterator[Curve]:
     """Each program's best, this one's first."""
-    yield Curve(PROGRAM, _front(here(rows)), {"color": BLACK, "marker": "o", "linewidth": 2.2})
+    yield Curve(PROGRAM, front(rows[rows.program == PROGRAM]), {"color": BLACK, "marker": "o", "linewidth": 2.2})
     for k, name in enumerate(others):
         look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[(k + 1) % len(MARKERS)]}
         line = "--" if k < len(COLOURS) else "-."
-        yield Curve(name, _front([row for row in rows if row.program == name]), {**look, "linestyle": line})
+        yield Curve(name, front(rows[rows.program == name]), {**look, "linestyle": line})
 
 
-def _formulations(rows: Sequence[Row]) -> Iterator[Curve]:
+def _formulations(rows: pd.DataFrame) -> Iterator[Curve]:
     """Each formulation's best."""
     for k, (key, name) in enumerate(NAMES.items()):
-        there = [row for row in here(rows) if of_row(row).formulation == key]
-        yield Curve(name, _front(there), {"color": COLOURS[k], "marker": MARKERS[k]})
+        yield Curve(name, front(rows[rows.formulation == key]), {"color": COLOURS[k], "marker": MARKERS[k]})
 
 
-def _front(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the rows that no other one beats in both time and error."""
-    front: list[Row] = []
-    done = [row for row in rows if row.status == "done" and row.error_max is not None]
-    for row in sorted(done, key=lambda row: (row.wall_s, row.error_max)):
-        if not front or (row.error_max or 0.0) < (front[-1].error_max or 0.0):
-            front.append(row)
-    return tuple(front)
+def front(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs that no other one beats in both time and error, by falling error."""
+    done = rows[(rows.status == "done") & rows.error_max.notna()].sort_values(["wall_s", "error_max"])
+    return done[done.error_max < done.error_max.cummin().shift(fill_value=np.inf)]
 
 
-def _panel(ax: Any, curves: Sequence[Curve], x: tuple[str, Number], y: tuple[str, Number], title: str) -> None:
-    ax.set(xscale="log", yscale="log", xlabel=x[0], ylabel=y[0], title=title)
+def _panel(ax: Any, curves: Sequence[Curve], x: str, y: str, title: str) -> None:
+    ax.set(xscale="log", yscale="log", xlabel=LABELS[x], ylabel=LABELS[y], title=title)
     for curve in curves:
-        points = [(a, max(b, FLOOR)) for row in curve.rows if (a := x[1](row)) and (b := y[1](row)) is not None]
-        if points:
-            ax.plot(
-                *zip(*points, strict=True),
-                **{"markersize": 4.5, "linewidth": 1.4, "clip_on": False, **curve.look},
-                label=curve.name,
-            )
+        points = curve.rows[[x, y]].dropna()
+        points = points[points[x] > 0]
+        if len(points):
+            look = {"markersize": 4.5, "linewidth": 1.4, "clip_on": False, **curve.look}
+            ax.plot(points[x], points[y].clip(lower=FLOOR), label=curve.name, **look)
     whole_decades(ax)
 
 

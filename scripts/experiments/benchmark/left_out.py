@@ -12,10 +12,11 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
-from time import perf_counter
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from timeit import repeat
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ckc_pin.dynamics.formulations import multipliers
@@ -27,7 +28,6 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import Ivp, as_ivp
 from ckc_pin.simulation.scene import Scene, catalogue, load_scene
 from ckc_pin.simulation.simulate import simulate
-from scripts.experiments.benchmark.table import Keyed
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 
@@ -95,12 +95,12 @@ TERMS: dict[str, tuple[str, Probe]] = {
 }
 
 
-class LeftOut(Keyed, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
     """A module or a term, and a scene.
 
     Attributes
     ----------
-    key : str
     scene : str
         Empty for a module's own cost, which is every scene's.
     what : str
@@ -130,28 +130,28 @@ def every_scene() -> list[str]:
     return [f"{name}/{scene}" for name, _, scenes in catalogue() for scene in scenes]
 
 
-def module_costs(key: str, repeats: int = REPEATS) -> Iterator[LeftOut]:
+def module_costs(repeats: int = REPEATS) -> Iterator[LeftOut]:
     """Measure what each module costs where it is switched on after a run: the least of several interpreters."""
     for name, (statement, _) in MODULES.items():
         words = (json.dumps([START, {"t_end": BRIEF}]), statement)
         try:
             found = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
         except CkcError as error:
-            yield LeftOut(key=f"{key}.{name}", scene="", what=name, reason=str(error))
+            yield LeftOut(scene="", what=name, reason=str(error))
             continue
         spent, memory = (min(column) for column in zip(*found, strict=True))
-        yield LeftOut(key=f"{key}.{name}", scene="", what=name, seconds=spent, bytes=max(0, memory))
+        yield LeftOut(scene="", what=name, seconds=spent, bytes=max(0, memory))
 
 
-def modules_of(scene: str, key: str) -> Iterator[LeftOut]:
+def modules_of(scene: str) -> Iterator[LeftOut]:
     """Run a scene's beginning in a fresh interpreter, and see what it has loaded."""
     words = (json.dumps([scene, {"t_end": BRIEF}]), json.dumps(list(MODULES)))
     try:
         loaded = json.loads(_interpreter(LOADED, *words))
     except CkcError as error:
-        yield from (LeftOut(key=f"{key}.{name}", scene=scene, what=name, reason=str(error)) for name in MODULES)
+        yield from (LeftOut(scene=scene, what=name, reason=str(error)) for name in MODULES)
         return
-    yield from (LeftOut(key=f"{key}.{name}", scene=scene, what=name, used=name in loaded) for name in MODULES)
+    yield from (LeftOut(scene=scene, what=name, used=name in loaded) for name in MODULES)
 
 
 def _interpreter(code: str, *words: str) -> str:
@@ -168,25 +168,25 @@ def _interpreter(code: str, *words: str) -> str:
     return done.stdout.splitlines()[-1]
 
 
-def terms_of(scene: str, key: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
+def terms_of(scene: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
     """Measure what each term would cost beside a scene's right-hand side, at states of its motion."""
     try:
         loaded = load_scene(scene, {**(changes or {}), "t_end": BRIEF})
         evaluated, ivp = _evaluated(loaded), as_ivp(loaded)
         states = _motion(ivp)
     except CkcError as error:
-        yield from (LeftOut(key=f"{key}.{what}", scene=scene, what=what, reason=str(error)) for what in TERMS)
+        yield from (LeftOut(scene=scene, what=what, reason=str(error)) for what in TERMS)
         return
     rhs_s = _rhs_seconds(ivp, states)
     for what, (name, probe) in TERMS.items():
-        row = LeftOut(key=f"{key}.{what}", scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
+        row = LeftOut(scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
         if name not in evaluated:
             try:
                 spent, memory = _beside(ivp, states, evaluated, probe)
             except CkcError as error:
-                row = msgspec.structs.replace(row, reason=str(error))
+                row = replace(row, reason=str(error))
             else:
-                row = msgspec.structs.replace(row, seconds=spent, bytes=memory)
+                row = replace(row, seconds=spent, bytes=memory)
         yield row
 
 
@@ -221,33 +221,32 @@ def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
 
 def _rhs_seconds(ivp: Ivp, states: list[tuple[float, Array]]) -> float:
     """Return the mean time of a right-hand side over the states, s, the least of several rounds."""
-    best = np.inf
+
+    def each() -> None:
+        for t, y in states:
+            ivp.f(t, y)
+
     with one_blas_thread():
-        for _ in range(ROUNDS):
-            began = perf_counter()
-            for t, y in states:
-                ivp.f(t, y)
-            best = min(best, (perf_counter() - began) / len(states))
-    return best
+        return min(repeat(each, repeat=ROUNDS, number=1)) / len(states)
 
 
 def _beside(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
     """Return a probe's mean time over the states, s, the least of several rounds, and its memory, bytes."""
-    best = np.inf
+    terms: list[Terms] = []
+
+    def fresh() -> None:
+        terms[:] = [_as_evaluated(ivp, *state, evaluated) for state in states]
+
+    def each() -> None:
+        for before, now in pairwise(terms):
+            probe(now, before)
+
     with one_blas_thread():
-        for _ in range(ROUNDS):
-            spent, before = 0.0, _as_evaluated(ivp, *states[0], evaluated)
-            for t, y in states[1:]:
-                terms = _as_evaluated(ivp, t, y, evaluated)
-                began = perf_counter()
-                probe(terms, before)
-                spent += perf_counter() - began
-                before = terms
-            best = min(best, spent / (len(states) - 1))
-        first, second = (_as_evaluated(ivp, *state, evaluated) for state in states[:2])
+        best = min(repeat(each, fresh, repeat=ROUNDS, number=1)) / (len(states) - 1)
+        fresh()
         tracemalloc.start()
         try:
-            probe(second, first)
+            probe(terms[1], terms[0])
             memory = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()

@@ -1,93 +1,117 @@
-"""The benchmark: runs the studies that have no row yet, then writes tables, figures and page."""
+"""The benchmark: measures what has not been measured yet into tables, then draws figures and fills in the page."""
 
 from __future__ import annotations
 
-import argparse
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-import msgspec
+import pandas as pd
+from joblib import Memory
 
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import load_scene
-from scripts.experiments.benchmark import growth, left_out, ours
-from scripts.experiments.benchmark.figure import draw, draw_main
+from scripts.experiments.benchmark import analysis, growth, left_out, ours
+from scripts.experiments.benchmark.figure import draw, draw_growth, draw_main
 from scripts.experiments.benchmark.growth import Growth
-from scripts.experiments.benchmark.growth_said import draw_growth
 from scripts.experiments.benchmark.left_out import LeftOut
-from scripts.experiments.benchmark.page import Measured, PeerNote, markdown
-from scripts.experiments.benchmark.peers import Peer, peers
+from scripts.experiments.benchmark.peers import peers
 from scripts.experiments.benchmark.reference import Reference, reference
-from scripts.experiments.benchmark.row import Motion, Row, judged
-from scripts.experiments.benchmark.table import Table, digest, key
+from scripts.experiments.benchmark.row import Row, judged
+from scripts.experiments.benchmark.stamp import machine, stamp, versions, work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
+from scripts.experiments.pages import GZIP, render
 
-__all__ = ["Report", "report"]
+__all__ = ["BUDGET", "TABLES", "measure", "report", "rows_of", "save", "write"]
 
 ROOT = Path(__file__).resolve().parents[3]
+CACHE = ROOT / ".cache" / "benchmark"
 BUDGET = Budget(own=1.5, peer=2.0)
+TABLES = ("report", "works", "checks", "growth", "left_out")
 
-Progress = Callable[[str], None]  # what is being measured
-
-
-@dataclass
-class Report:
-    """A report on disk.
-
-    Attributes
-    ----------
-    files : list of Path
-        The page, the tables, the figures.
-    rows : dict of str to list of Row
-        By work.
-    """
-
-    files: list[Path] = field(default_factory=list)
-    rows: dict[str, list[Row]] = field(default_factory=dict)
+Tables = dict[str, pd.DataFrame]
 
 
-def report(out: Path, *, quick: bool = False, progress: Progress | None = None) -> Report:
-    """Measure what has not been measured yet, and write the report.
+def report(out: Path, *, quick: bool = False, anew: bool = True) -> list[Path]:
+    """Measure what has not been measured yet, and write tables, figures and page; return the files.
 
     Parameters
     ----------
     out : Path
-        Folder; a report there is gone on with, as far as its rows still hold.
+        Folder.
     quick : bool
         Fewer motions, methods and tolerances.
-    progress : callable, optional
-        Told what is being measured.
+    anew : bool
+        Whether to measure; otherwise the tables that are in the folder make the page.
 
     Raises
     ------
     InputError
-        The folder cannot be written to, or has another table in it.
+        The folder has no tables to make a page from.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if anew:
+        save(out, *measure(quick, Memory(CACHE, verbose=0)))
+    return write(out)
+
+
+def save(out: Path, tables: Tables, about: dict[str, Any]) -> None:
+    """Write tables, and what is to be said about all of them."""
+    for name, table in tables.items():
+        table.to_csv(out / f"{name}.csv.gz", index=False, float_format="%.6g", lineterminator="\n", compression=GZIP)
+    (out / "about.json").write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write(out: Path) -> list[Path]:
+    """Make figures and page from the tables in a folder; return the files.
+
+    Raises
+    ------
+    InputError
+        There are none.
     """
     try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be made: {error.strerror}") from None
-    tell = progress or (lambda said: None)
-    works, unmade = _at_hand(quick)
-    table, found, references = Table(out / "report.csv", Row), Report(), {}
-    others = peers()
-    for work in works:
-        measured = _Measured(work, table, tell)
-        found.rows[work.key] = [*measured.ours(quick), *(row for peer in others for row in measured.peer(peer, quick))]
-        references[work.key] = measured.reference()
-    table.write([row.key for rows in found.rows.values() for row in rows])
-    notes = [_checked(peer, works) for peer in others]
-    grown, left = _grown(out, quick, tell), _left_out(out, works, quick, tell)
-    figures = _figures(works, found.rows, [peer.name for peer in others], grown, out)
-    text = markdown(Measured(works, unmade, BUDGET, found.rows, references, notes, left, grown, quick))
+        about = json.loads((out / "about.json").read_text(encoding="utf-8"))
+        tables = {name: pd.read_csv(out / f"{name}.csv.gz", keep_default_na=True) for name in TABLES}
+    except FileNotFoundError as error:
+        raise InputError(f"{error.filename}: not there; a page is made from the tables of a benchmark") from None
+    found = analysis.analysed(**tables)
+    figures = [draw_main(found, out), draw_growth(found, out), *(draw(found, work, out) for work in found.works.index)]
+    text = render("report", found=found, about=about, kinds=analysis.KINDS, targets=analysis.TARGETS)
     (out / "report.md").write_text(text, encoding="utf-8")
-    tables = ("report.csv", "growth.csv", "left_out.csv")
-    found.files = [out / name for name in ("report.md", *tables, *figures)]
-    return found
+    return [out / name for name in ("report.md", *(f"{name}.csv.gz" for name in TABLES), *figures)]
+
+
+def measure(quick: bool, memory: Memory) -> tuple[Tables, dict[str, Any]]:
+    """Return all tables, and what is to be said about all of them; what the memory has is not measured again."""
+    works, unmade = _at_hand(quick)
+    others = peers()
+    rows = [row for work in works for row in rows_of(work, quick, memory)]
+    checks = [
+        {"program": peer.name, "version": "" if missing else peer.version(), "packaged": peer.packaged,
+         "work": work.key, "said": f"not compared, {missing}" if missing else peer.check(work)}
+        for peer in others for work in works for missing in [peer.missing(work)]
+    ]  # fmt: skip
+    references = [(work, _reference(work.key)) for work in works]
+    described = [
+        {"work": work.key, "says": work.says, "epsilon": work.epsilon, "controlled": work.controlled,
+         "accuracy": exact.accuracy, "how": exact.how}
+        for work, exact in references
+    ]  # fmt: skip
+    tables: dict[str, Iterable[Any]] = {
+        "report": map(asdict, rows),
+        "works": described,
+        "checks": checks,
+        "growth": map(asdict, _grown(quick, memory)),
+        "left_out": map(asdict, _left_out(works, quick, memory)),
+    }
+    about = {"machine": machine(), "versions": versions(), "budget": asdict(BUDGET), "quick": quick, "unmade": unmade}
+    return {name: pd.DataFrame(table) for name, table in tables.items()}, about
 
 
 def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
@@ -105,122 +129,81 @@ def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
     return works, unmade
 
 
-def _figures(
-    works: list[Work], rows: dict[str, list[Row]], others: list[str], grown: list[Growth], out: Path
-) -> list[str]:
-    figures = [draw_main(works, rows, others, out), draw_growth(grown, rows, out)]
-    return [*figures, *(draw(work, rows[work.key], others, out) for work in works)]
+def rows_of(work: Work, quick: bool, memory: Memory) -> Iterator[Row]:
+    """Measure a work: this program first. What used up its budget at one tolerance is not tried with a tighter one."""
+    run = memory.cache(_run)
+    own = work_stamp(work)
+    spent: dict[str, str] = {}
+    for setting in ours.settings(quick):
+        if setting.family in spent:
+            motion = ours.refused(work, spent[setting.family])
+            yield judged(work, ours.PROGRAM, setting.name, motion, _reference(work.key))
+            continue
+        row = run(own, work.key, ours.PROGRAM, setting.name)
+        if ours.used_up(row):
+            spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
+        yield row
+    for peer in peers():
+        if peer.missing(work) is None:
+            own = work_stamp(work, peer.version())
+            yield from (run(own, work.key, peer.name, setting) for setting in peer.settings(work, quick))
 
 
-class _Measured:
-    """A work's rows, from the table where they are there already."""
-
-    def __init__(self, work: Work, table: Table[Row], progress: Progress) -> None:
-        self.work, self.table, self.progress = work, table, progress
-        self._reference: Reference | None = None
-
-    def reference(self) -> Reference:
-        if self._reference is None:
-            self.progress(f"{self.work.key}: reference")
-            self._reference = reference(self.work)
-        return self._reference
-
-    def ours(self, quick: bool) -> Iterator[Row]:
-        """Rows of this program; what used up its budget at one tolerance is not tried with a tighter one."""
-        spent: dict[str, str] = {}
-        for setting in ours.settings(quick):
-            compute = partial(ours.compute, self.work, setting.changes, BUDGET.own)
-            if setting.family in spent:
-                compute = partial(ours.refused, self.work, spent[setting.family])
-            row = self._row(ours.PROGRAM, "", setting.name, compute)
-            if ours.used_up(row):
-                spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
-            yield row
-
-    def peer(self, peer: Peer, quick: bool) -> Iterator[Row]:
-        """Rows of another program."""
-        if peer.missing(self.work) is not None:
-            return
-        for setting in peer.settings(self.work, quick):
-            yield self._row(peer.name, peer.version(), setting, partial(peer.compute, self.work, setting, BUDGET.peer))
-
-    def _row(self, program: str, version: str, setting: str, compute: Callable[[], Motion]) -> Row:
-        own = key(self.work, program, version, setting)
-        if own not in self.table.rows:
-            self.progress(f"{self.work.key}: {program}, {setting}")
-            self.table.add(judged(own, self.work, program, setting, compute(), self.reference()))
-        return self.table.rows[own]
+def _run(own: str, work: str, program: str, setting: str) -> Row:
+    """Run one work by one program and setting, and judge it; called by name, so that what is kept has plain keys."""
+    _tell(f"{work}: {program}, {setting}")
+    chosen = next(each for each in WORKS if each.key == work)
+    if program == ours.PROGRAM:
+        motion = ours.compute(chosen, ours.setting_of(setting).changes, BUDGET.own)
+    else:
+        motion = next(peer for peer in peers() if peer.name == program).compute(chosen, setting, BUDGET.peer)
+    return judged(chosen, program, setting, motion, _reference(work))
 
 
-def _checked(peer: Peer, works: list[Work]) -> PeerNote:
-    said, version = {}, ""
-    for work in works:
-        missing = peer.missing(work)
-        if missing is None:
-            version = peer.version()
-            said[work.key] = peer.check(work)
-        else:
-            said[work.key] = f"not compared, {missing}"
-    return PeerNote(peer.name, version, peer.packaged, said)
+@cache
+def _reference(work: str) -> Reference:
+    _tell(f"{work}: reference")
+    return reference(next(each for each in WORKS if each.key == work))
 
 
-def _grown(out: Path, quick: bool, progress: Progress) -> list[Growth]:
-    """How cost grows: rows of the table, measured where it has none."""
-    table, found = Table(out / "growth.csv", Growth), []
-    for family, case, formulation in growth.every_case(quick):
-        own = digest("growth", family.key, msgspec.to_builtins(case), formulation)
-        if own not in table.rows:
-            progress(f"growth: {family.says}, {getattr(case, family.along)}, {formulation}")
-            table.add(growth.measure(case, family, formulation, own))
-        found.append(table.rows[own])
-    table.write([row.key for row in found])
-    return found
+def _grown(quick: bool, memory: Memory) -> list[Growth]:
+    run = memory.cache(_grow)
+    return [
+        run(stamp(), family.key, case.N, case.loops, formulation)
+        for family, case, formulation in growth.every_case(quick)
+    ]
 
 
-def _left_out(out: Path, works: list[Work], quick: bool, progress: Progress) -> list[LeftOut]:
-    """What scenes leave out: rows of the table, measured where it has none."""
-    table = Table(out / "left_out.csv", LeftOut)
+def _grow(own: str, family: str, N: int, loops: int, formulation: str) -> Growth:
+    _tell(f"growth: {family}, N = {N}, {loops} loops, {formulation}")
+    return growth.measure(growth.Case(N, loops), next(f for f in growth.FAMILIES if f.key == family), formulation)
+
+
+def _left_out(works: list[Work], quick: bool, memory: Memory) -> list[LeftOut]:
+    """What scenes leave out, beside what each module costs."""
     scenes = list(dict.fromkeys(work.load().name for work in works)) if quick else left_out.every_scene()
-    found: list[LeftOut] = []
-
-    def measured(names: Iterable[str], own: str, said: str, compute: Callable[[str], Iterator[LeftOut]]) -> None:
-        keys = [f"{own}.{name}" for name in names]
-        if not all(k in table.rows for k in keys):
-            progress(f"left out: {said}")
-            table.add(*compute(own))
-        found.extend(table.rows[k] for k in keys)
-
-    repeats = 1 if quick else left_out.REPEATS
-    costs = digest("module costs", repeats)
-    measured(left_out.MODULES, costs, "modules", partial(left_out.module_costs, repeats=repeats))
+    found: list[LeftOut] = memory.cache(_costs)(stamp(), 1 if quick else left_out.REPEATS)
+    of_scene: Callable[[str, str], list[LeftOut]] = memory.cache(_of_scene)
     for name in scenes:
         try:
             scene = load_scene(name)
             content = [scene.plain(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
         except CkcError as error:  # robots that are not installed
-            found.append(LeftOut(key=digest("scene", name), scene=name, what=left_out.MISSING, reason=str(error)))
-            table.add(found[-1])
-            continue
-        measured(left_out.MODULES, digest("modules", *content), name, partial(left_out.modules_of, name))
-        measured(left_out.TERMS, digest("terms", *content), name, partial(left_out.terms_of, name))
-    table.write([row.key for row in found])
+            found.append(LeftOut(scene=name, what=left_out.MISSING, reason=str(error)))
+        else:
+            found += of_scene(stamp(*content), name)
     return found
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Make the report."""
-    parser = argparse.ArgumentParser(prog="benchmark", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer motions, methods and tolerances: minutes")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "report", help="a report there is gone on with")
-    options = parser.parse_args(arguments)
-    try:
-        found = report(options.out, quick=options.quick, progress=lambda said: print(said, file=sys.stderr, flush=True))
-    except CkcError as error:
-        parser.error(str(error))
-    for path in found.files:
-        print(f"written: {path}")
-    return 0
+def _costs(own: str, repeats: int) -> list[LeftOut]:
+    _tell("left out: modules")
+    return list(left_out.module_costs(repeats))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _of_scene(own: str, scene: str) -> list[LeftOut]:
+    _tell(f"left out: {scene}")
+    return [*left_out.modules_of(scene), *left_out.terms_of(scene)]
+
+
+def _tell(said: str) -> None:
+    print(said, file=sys.stderr, flush=True)

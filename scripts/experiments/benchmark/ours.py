@@ -15,7 +15,7 @@ from ckc_pin.simulation.simulate import run_prepared
 from scripts.experiments.benchmark.row import Motion, Row
 from scripts.experiments.benchmark.work import Work
 
-__all__ = ["PROGRAM", "Setting", "compute", "of_row", "refused", "settings", "used_up"]
+__all__ = ["PROGRAM", "Setting", "compute", "refused", "setting_of", "settings", "used_up"]
 
 PROGRAM = "ckc_pin"
 FORMULATIONS: dict[str, dict[str, Any]] = {
@@ -61,9 +61,9 @@ class Setting:
         return {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
 
 
-def of_row(row: Row) -> Setting:
-    """Read a row's setting back."""
-    family, _, rtol = row.setting.rpartition(", rtol ")
+def setting_of(name: str) -> Setting:
+    """Read a setting's name back."""
+    family, _, rtol = name.rpartition(", rtol ")
     formulation, _, method = family.rpartition(", ")
     return Setting(formulation, method, float(rtol))
 

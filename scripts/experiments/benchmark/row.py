@@ -9,7 +9,6 @@ import numpy as np
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.reference import Reference
-from scripts.experiments.benchmark.table import Keyed
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Motion", "Row", "judged"]
@@ -42,7 +41,8 @@ class Motion:
     rhs: int | None = None
 
 
-class Row(Keyed, frozen=True, kw_only=True):
+@dataclass(frozen=True)
+class Row:
     """A line of the table. Errors in rad or m; energy drift in units of the largest kinetic energy."""
 
     work: str
@@ -60,14 +60,13 @@ class Row(Keyed, frozen=True, kw_only=True):
     rhs: int | None
 
 
-def judged(key: str, work: Work, program: str, setting: str, motion: Motion, reference: Reference) -> Row:
+def judged(work: Work, program: str, setting: str, motion: Motion, reference: Reference) -> Row:
     """Measure a motion against the reference: error, closure, energy."""
     whole = motion.status == "done" and len(motion.q_tree) == len(work.instants)
     finite = whole and bool(np.all(np.isfinite(motion.q_tree)))
     errors = np.abs(work.observed(motion.q_tree) - reference.values).max(axis=1) if finite else np.empty(0)
     closure, drift = _held(work, motion) if finite else (None, None)
     return Row(
-        key=key,
         work=work.key,
         program=program,
         setting=setting,
