@@ -1,33 +1,240 @@
-"""``python -m scripts.experiments NAME ...``: run an experiment by name."""
+"""``./scripts/experiment NAME ...``: every experiment, each loaded when it is run."""
 
 from __future__ import annotations
 
-import runpy
 import sys
+from collections.abc import Collection, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
 
-EXPERIMENTS = {
-    "paper": "scripts.experiments.paper.page",
-    "errata": "scripts.experiments.paper.errata",
-    "tikhonov": "scripts.experiments.paper.tikhonov",
-    "stability": "scripts.experiments.stability.suite",
-    "rank_loss": "scripts.experiments.rank_loss",
-    "benchmark": "scripts.experiments.benchmark.make",
-    "fuzz": "scripts.experiments.fuzz.main",
-    "scenes": "scripts.experiments.scenes",
-    "map": "scripts.experiments.bench_map",
-    "stream": "scripts.experiments.bench_stream",
-    "robots": "scripts.experiments.published_robots",
-    "pictures": "scripts.experiments.pictures",
-}
+import typer
+from typer.core import TyperGroup
+
+__all__ = ["app", "main"]
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-def main() -> None:
-    """Hand the rest of the command line to the experiment."""
-    if len(sys.argv) < 2 or sys.argv[1] not in EXPERIMENTS:
-        print(f"usage: ./scripts/experiment NAME ...; NAME is one of {', '.join(EXPERIMENTS)}", file=sys.stderr)
-        sys.exit(2)
-    name = sys.argv.pop(1)
-    runpy.run_module(EXPERIMENTS[name], run_name="__main__", alter_sys=True)
+class Listed(TyperGroup):
+    """Commands, of which a wrong name is told."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] not in self.commands:
+            ctx.fail(f"no experiment {args[0]!r}; there are {', '.join(self.commands)}")
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(
+    cls=Listed,
+    help="Experiments on the package, each with --help.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Keys = Annotated[list[str] | None, typer.Argument(metavar="KEY", show_default=False)]
+
+
+class Formulation(StrEnum):
+    """What rank_loss runs."""
+
+    dae = "dae"
+    reduced = "reduced"
+    spf = "spf"
+
+
+def chosen(given: Sequence[str] | None, known: Collection[str], what: str) -> list[str]:
+    """Return the names that were given; of one that is not known say which there are."""
+    for name in given or ():
+        if name not in known:
+            raise typer.BadParameter(f"no {what} {name!r}; there are {', '.join(known)}")
+    return list(given or ())
+
+
+@app.command()
+def paper(
+    keys: Keys = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default: docs; with KEY out")] = None,
+) -> None:
+    """The paper, statement by statement.
+
+    Writes docs/paper.md with its figures and docs/errata.md; with KEY it prints these entries alone.
+    """
+    from scripts.experiments.paper.contents import KEYS
+
+    names = chosen(keys, KEYS, "entry")
+    from scripts.experiments.paper import page
+
+    if names:
+        figures = (out or Path("out")) / "paper"
+        figures.mkdir(parents=True, exist_ok=True)
+        print(page.entries(page.as_frame(page.collect(names, figures))), end="")
+        return
+    for path in page.write(out or DOCS):
+        print(f"written: {path}")
+
+
+@app.command()
+def errata(keys: Keys = None) -> None:
+    """The paper's errata, each with its number.
+
+    docs/errata.md is written by `paper`.
+    """
+    from scripts.experiments.paper import page
+    from scripts.experiments.paper.errata import ERRATA, find
+
+    print(page.errata_entries(find(chosen(keys, ERRATA, "erratum"))), end="")
+
+
+@app.command()
+def stability(
+    groups: Annotated[list[str] | None, typer.Argument(metavar="GROUP", show_default=False)] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="for page and table")] = DOCS,
+) -> None:
+    """Integrators pushed to where they stop.
+
+    Writes docs/stability.md, or prints some groups; exit 1 where a cell FAILED.
+    """
+    from scripts.experiments.stability import suite
+    from scripts.experiments.stability.page import as_frame, page, satisfied, save
+
+    names = chosen(groups, suite.NAMES, "group")
+    cells, long_runs = suite.measure(names or suite.NAMES)
+    table = as_frame(cells)
+    text = page(table, long_runs)
+    if names:
+        print(text, end="")
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "stability.md").write_text(text, encoding="utf-8")
+        save(table, out / "stability.csv.gz")
+        print(f"written: {out / 'stability.md'}, stability.csv.gz")
+    raise typer.Exit(0 if not cells or satisfied(table) else 1)
+
+
+@app.command("rank_loss")
+def rank_loss(
+    formulation: Formulation = Formulation.dae,
+    quick: Annotated[bool, typer.Option("--quick", help="N = 1, 2, 7 and every third tolerance")] = False,
+) -> None:
+    """Positions where J loses rank, against a closed form.
+
+    Says how many runs are right, stopped or wrong.
+    """
+    from scripts.experiments import rank_loss
+
+    rank_loss.show(formulation.value, quick)
+
+
+@app.command()
+def benchmark(
+    quick: Annotated[bool, typer.Option("--quick", help="fewer motions, methods and tolerances: minutes")] = False,
+    out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "report",
+    page: Annotated[bool, typer.Option("--page", help="measure nothing: page and figures from the tables")] = False,
+) -> None:
+    """Error against run time, beside other programs.
+
+    Writes docs/report, and goes on where it was stopped.
+    """
+    from scripts.experiments.benchmark import make
+
+    for path in make.report(out, quick=quick, anew=not page):
+        print(f"written: {path}")
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+def fuzz(context: typer.Context) -> None:
+    """Random motions, judged by an integration of its own."""
+    from scripts.experiments.fuzz import main as suite
+
+    raise typer.Exit(suite.main(context.args))
+
+
+@app.command()
+def scenes() -> None:
+    """Errors of all shipped scenes, by SciPy.
+
+    In units of their tolerance; exit 1 where one is too far off.
+    """
+    from scripts.experiments import scenes
+
+    raise typer.Exit(scenes.main())
+
+
+@app.command("map")
+def map_(cells: Annotated[int, typer.Option(min=8, help="along each axis")] = 400) -> None:
+    """How long the five-bar's singularity map takes."""
+    from scripts.experiments import bench_map
+
+    bench_map.main(cells)
+
+
+@app.command()
+def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
+    """Right-hand sides per second with viewers and without."""
+    from scripts.experiments import bench_stream
+
+    bench_stream.main(runs)
+
+
+@app.command()
+def bench(
+    only: Annotated[str, typer.Option(metavar="WORDS", help="lines that have these words")] = "",
+) -> None:
+    """Processor times of what a person does with a scene.
+
+    Exit 1 where one misses its bound.
+    """
+    from scripts.experiments import bench
+
+    raise typer.Exit(bench.main(only))
+
+
+@app.command()
+def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the counter, preloaded")]) -> None:
+    """Allocations of the step loop, of which a step makes none.
+
+    Exit 1 where it does; ./scripts/check_native builds the counter and preloads it.
+    """
+    from scripts.experiments import count_allocations
+
+    raise typer.Exit(count_allocations.main(library))
+
+
+@app.command()
+def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="of checkouts")]) -> None:
+    """Import and check of published robots.
+
+    Prints the tables of docs/published_robots.md.
+    """
+    from scripts.experiments import published_robots
+
+    published_robots.main(folder)
+
+
+@app.command()
+def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
+    """The pictures of docs/images, by a browser."""
+    from scripts.experiments import pictures
+
+    pictures.main(chromium)
+
+
+def main() -> NoReturn:
+    """Run the command line: exit 2 where the input is wrong, 3 where the numerics stopped."""
+    try:
+        app(prog_name="./scripts/experiment")
+    except Exception as error:
+        from ckc_pin.errors import CkcError, InputError
+
+        if not isinstance(error, CkcError | OSError):
+            raise
+        print(f"./scripts/experiment: {error}", file=sys.stderr)
+        sys.exit(2 if isinstance(error, InputError | OSError) else 3)
+    sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,20 @@ import sys
 import time
 from contextlib import ExitStack
 
+import pandas as pd
+
 import ckc_pin
 from ckc_pin.view.live import live_view
 
 SCENE = "five_bar/tracking"
 CHANGES = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.output_dt": 1e-3, "t_end": 3.0}
-RUNS = 6
-VIEWERS = {"no view": None, "no viewer": None, "a fast viewer": 0.0, "a slow viewer": 0.5, "a viewer that hangs": -1.0}
+VIEWERS: dict[str, float | None] = {  # s from a frame to its answer
+    "no view": None,
+    "no viewer": None,
+    "a fast viewer": 0.0,
+    "a slow viewer": 0.5,
+    "a viewer that hangs": -1.0,
+}
 
 VIEWER = """
 import asyncio, sys, time
@@ -53,30 +60,28 @@ def measure(name: str) -> tuple[float, float, str]:
         if view is not None and pause is not None:
             command = [sys.executable, "-c", VIEWER, view.server.url.replace("http", "ws"), str(pause)]
             viewer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            assert viewer.stdout is not None
             viewer.stdout.readline()
             time.sleep(0.5)
         spent = time.process_time()
         run = ckc_pin.simulate(scene, on_output=None if view is None else view.on_output)
         spent = time.process_time() - spent
     frames = "-"
-    if viewer is not None:
+    if viewer is not None and pause is not None:
         if pause < 0:
             viewer.kill()
         frames = viewer.communicate()[0].strip() or "-"
     return run.stats["rhs"] / run.stats["wall_s"], run.stats["rhs"] / spent, frames
 
 
-def main() -> int:
+def main(runs: int) -> None:
     """Print a Markdown table."""
     print(f"{SCENE}, {CHANGES}\n")
     print("| viewer | per second of the clock | of the processor | share | frames |\n|---|---|---|---|---|")
-    rounds = [{name: measure(name) for name in VIEWERS} for _ in range(RUNS)]  # in turn: other work falls on all
-    best = {name: [max(one[name][k] for one in rounds) for k in (0, 1)] for name in VIEWERS}
-    for name, (clock, processor) in best.items():
-        share = 100 * processor / best["no view"][1]
-        print(f"| {name} | {clock:,.0f} | {processor:,.0f} | {share:.1f} % | {rounds[-1][name][2]} |", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    columns = ["viewer", "clock", "processor", "frames"]
+    rounds = pd.DataFrame([(name, *measure(name)) for _ in range(runs) for name in VIEWERS], columns=columns)
+    # the viewers in turn: other work falls on all
+    best = rounds.groupby("viewer", sort=False).agg({"clock": "max", "processor": "max", "frames": "last"})
+    best["share"] = 100 * best.processor / best.processor["no view"]
+    for row in best.itertuples():
+        print(f"| {row.Index} | {row.clock:,.0f} | {row.processor:,.0f} | {row.share:.1f} % | {row.frames} |")

@@ -1,13 +1,12 @@
-"""Makes the pictures of docs/images: python scripts/experiments/pictures.py CHROMIUM."""
+"""Makes the pictures of docs/images."""
 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from pathlib import Path
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
@@ -16,14 +15,16 @@ from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
-SIZE = {"width": 720, "height": 540}
+SIZE: ViewportSize = {"width": 720, "height": 540}
 DPI = 100
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.getuid() else ["--no-sandbox"])]
 
 
 def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> None:
     """Playback at a time of the run, without the controls."""
-    with play(runs, block=False) as server:
+    server = play(runs, block=False)
+    assert server is not None  # it does not wait
+    with server:
         page.goto(server.url)
         while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
             time.sleep(0.1)
@@ -33,7 +34,7 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
         page.screenshot(path=path)
 
 
-def main(chromium: str) -> None:
+def main(chromium: Path) -> None:
     """Playback first, then figures."""
     IMAGES.mkdir(parents=True, exist_ok=True)
     tracking = ckc_pin.simulate("five_bar/tracking")
@@ -48,7 +49,3 @@ def main(chromium: str) -> None:
         for name in ("five_bar", "five_bar_as_printed"):
             draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -1,6 +1,6 @@
 """The tables of docs/published_robots.md: `ckc import` and `ckc check` on published robots.
 
-    .venv/bin/python scripts/experiments/published_robots.py FOLDER
+    ./scripts/experiment robots FOLDER
 
 FOLDER holds a checkout of each repository below, under the repository's own name, at the commit named there; robots of
 example-robot-data come from its package (pip install example-robot-data). A robot that is not there stops the script.
@@ -8,7 +8,6 @@ example-robot-data come from its package (pip install example-robot-data). A rob
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -152,8 +151,8 @@ def _line(*cells: str) -> str:
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
-def main() -> None:
-    root = Path(sys.argv[1])
+def main(root: Path) -> None:
+    """Print the tables of all robots under a folder."""
     for origin in ORIGINS:
         print(f"\n## {origin.title} ({origin.commit})\n")
         print(_line("robot", "imported", "closed", "motors", "n", "rows", "rank", "d", "remarks"))
@@ -162,10 +161,6 @@ def main() -> None:
             named = origin.title == "example-robot-data"
             path = resolve(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file
             if not path.is_file():
-                sys.exit(f"{path}: not there")
+                raise FileNotFoundError(f"{path}: not there")
             stem = path.parent.name if path.stem == "robot" else path.stem
             print(row(f"{stem}{'' if path.suffix != '.xml' else ' (MJCF)'}", path), flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,7 +6,6 @@ first top pin is within 1e4 rtol and 1e-4 m after ten seconds, stopped if it say
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 
 from ckc_pin.simulation import simulate
 
-__all__ = ["TOLERANCES", "Crossing", "crossings", "first_top_pin", "main"]
+__all__ = ["TOLERANCES", "Crossing", "crossings", "first_top_pin", "show"]
 
 Verdict = Literal["right", "stopped", "wrong"]
 
@@ -74,22 +73,14 @@ def crossings(loops: Sequence[int], tolerances: Sequence[float], formulation: st
             yield Crossing(N, rtol, run.status, t, error, run.stats["rhs"])
 
 
-def main() -> None:
+def show(formulation: str, quick: bool) -> None:
     """Print the table, and how many runs are right, stopped, wrong."""
-    parser = argparse.ArgumentParser(prog="rank_loss", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--formulation", choices=("dae", "reduced", "spf"), default="dae")
-    parser.add_argument("--quick", action="store_true", help="N = 1, 2, 7 and every third tolerance")
-    options = parser.parse_args()
-    loops, tolerances = (LOOPS[:3], TOLERANCES[::3]) if options.quick else (LOOPS, TOLERANCES)
+    loops, tolerances = (LOOPS[:3], TOLERANCES[::3]) if quick else (LOOPS, TOLERANCES)
     verdicts: Counter[str] = Counter()
     print("|  N |    rtol | verdict |      t | error of B0 |   rhs |")
     print("|---:|--------:|---------|-------:|------------:|------:|")
-    for one in crossings(loops, tolerances, options.formulation):
+    for one in crossings(loops, tolerances, formulation):
         verdicts[one.verdict] += 1
         row = f"| {one.N:2} | {one.rtol:.1e} | {one.verdict:7} | {one.t:6.3f} | {one.error:11.1e} | {one.rhs:5} |"
         print(row, flush=True)
     print(", ".join(f"{verdicts[verdict]} {verdict}" for verdict in ("right", "stopped", "wrong")))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Allocations of the step loop: none a step, so that a stretch of many steps makes as many as one of few."""
 
-import sys
 from ctypes import CDLL, c_long
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,8 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-def main() -> int:
-    counter = CDLL(sys.argv[1]).allocations
+def main(library: Path) -> int:
+    counter = CDLL(str(library)).allocations
     counter.restype = c_long
     bad = 0
     for scene, changes in SCENES:
@@ -53,7 +53,3 @@ def main() -> int:
         print(f"{scene} {changes or ''}: {few} allocations in {short} steps, {many} in {long}")
         bad += many > few or long < 2 * short
     return 1 if bad else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
