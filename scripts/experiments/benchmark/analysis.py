@@ -152,7 +152,7 @@ def compared(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
         fastest(rows[rows.kind == which], ["work"]).set_index(["work", "target"])[["program", "setting", "wall_s"]]
         for which in ("own", kind)
     )
-    both = theirs.join(ours, rsuffix="_own", how="left")
+    both = theirs.join(ours.add_suffix("_own"))
     return both.assign(ratio=both.wall_s / both.wall_s_own).reset_index()
 
 

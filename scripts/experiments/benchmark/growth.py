@@ -22,7 +22,18 @@ from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
 from ckc_pin.simulation.simulate import run_prepared
 
-__all__ = ["FAMILIES", "FORMULATIONS", "Case", "Family", "Growth", "every_case", "exponent", "measure", "motion"]
+__all__ = [
+    "FAMILIES",
+    "FORMULATIONS",
+    "Case",
+    "Family",
+    "Growth",
+    "every_case",
+    "exponent",
+    "measure",
+    "motion",
+    "written",
+]
 
 RTOL, T_END = 1e-10, 0.4  # s: before the row lies flat
 LEAN = 1.2  # rad: squares lean, so that at rest they are no equilibrium
@@ -105,13 +116,13 @@ class Growth:
     reason: str = ""
 
 
-def measure(case: Case, family: Family, formulation: str) -> Growth:
+def measure(case: Case, family: Family, formulation: str, changes: Mapping[str, Any] | None = None) -> Growth:
     """Time a right-hand side of a case, and count those of a run."""
     row = Growth(family.key, formulation, getattr(case, family.along))
-    changes = {**FORMULATIONS[formulation], "solver.method": "DOP853"}
+    every = {**FORMULATIONS[formulation], "solver.method": "DOP853", **(changes or {})}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            ready = prepare(load_scene(_written(case, Path(folder)), changes))
+            ready = prepare(load_scene(written(case, Path(folder)), every))
         ready.begin()
         rhs_s = float(ready.loop.seconds(motion(ready.loop), ROUNDS))
         run = run_prepared(ready)
@@ -122,7 +133,7 @@ def measure(case: Case, family: Family, formulation: str) -> Growth:
     return replace(row, rhs_s=rhs_s, rhs=int(run.stats["rhs"]))
 
 
-def _written(case: Case, folder: Path) -> Path:
+def written(case: Case, folder: Path) -> Path:
     """Write a case as files; return the scene's path."""
     text, sources = generate(GeneratorSpec(generator="n_four_bar", N=case.N))
     head, *loops = text.split("[[loop]]")

@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from timeit import repeat
@@ -38,8 +38,10 @@ REPEATS = 3  # fresh interpreters a module
 STATES, SPACING = 20, 1e-4  # of the motion, how many and s between them
 ROUNDS = 8  # over the states
 
+Modules = Mapping[str, tuple[str, str]]
+
 # Module, what its import statement is, what it is for.
-MODULES: dict[str, tuple[str, str]] = {
+MODULES: Modules = {
     "meshcat": ("import meshcat", "playback in a browser"),
     "matplotlib": ("import matplotlib.figure, matplotlib.backends.backend_agg", "figures"),
     "yourdfpy": ("import yourdfpy", "visual meshes"),
@@ -130,9 +132,9 @@ def every_scene() -> list[str]:
     return [f"{name}/{scene}" for name, _, scenes in catalogue() for scene in scenes]
 
 
-def module_costs(repeats: int = REPEATS) -> Iterator[LeftOut]:
+def module_costs(repeats: int = REPEATS, modules: Modules = MODULES) -> Iterator[LeftOut]:
     """Measure what each module costs where it is switched on after a run: the least of several interpreters."""
-    for name, (statement, _) in MODULES.items():
+    for name, (statement, _) in modules.items():
         words = (json.dumps([START, {"t_end": BRIEF}]), statement)
         try:
             found = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
@@ -143,15 +145,15 @@ def module_costs(repeats: int = REPEATS) -> Iterator[LeftOut]:
         yield LeftOut(scene="", what=name, seconds=spent, bytes=max(0, memory))
 
 
-def modules_of(scene: str) -> Iterator[LeftOut]:
+def modules_of(scene: str, modules: Iterable[str] = MODULES) -> Iterator[LeftOut]:
     """Run a scene's beginning in a fresh interpreter, and see what it has loaded."""
-    words = (json.dumps([scene, {"t_end": BRIEF}]), json.dumps(list(MODULES)))
+    words = (json.dumps([scene, {"t_end": BRIEF}]), json.dumps(list(modules)))
     try:
         loaded = json.loads(_interpreter(LOADED, *words))
     except CkcError as error:
-        yield from (LeftOut(scene=scene, what=name, reason=str(error)) for name in MODULES)
+        yield from (LeftOut(scene=scene, what=name, reason=str(error)) for name in modules)
         return
-    yield from (LeftOut(scene=scene, what=name, used=name in loaded) for name in MODULES)
+    yield from (LeftOut(scene=scene, what=name, used=name in loaded) for name in modules)
 
 
 def _interpreter(code: str, *words: str) -> str:

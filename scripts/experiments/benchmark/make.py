@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
-from functools import cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,14 @@ from scripts.experiments.benchmark import analysis, growth, left_out, ours
 from scripts.experiments.benchmark.figure import draw, draw_growth, draw_main
 from scripts.experiments.benchmark.growth import Growth
 from scripts.experiments.benchmark.left_out import LeftOut
-from scripts.experiments.benchmark.peers import peers
+from scripts.experiments.benchmark.peers import Peer, peers
 from scripts.experiments.benchmark.reference import Reference, reference
 from scripts.experiments.benchmark.row import Row, judged
 from scripts.experiments.benchmark.stamp import machine, stamp, versions, work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
 from scripts.experiments.pages import GZIP, render
 
-__all__ = ["BUDGET", "TABLES", "measure", "report", "rows_of", "save", "write"]
+__all__ = ["BUDGET", "TABLES", "exact_of", "measure", "report", "rows_of", "save", "write"]
 
 ROOT = Path(__file__).resolve().parents[3]
 CACHE = ROOT / ".cache" / "benchmark"
@@ -91,13 +91,13 @@ def measure(quick: bool, memory: Memory) -> tuple[Tables, dict[str, Any]]:
     """Return all tables, and what is to be said about all of them; what the memory has is not measured again."""
     works, unmade = _at_hand(quick)
     others = peers()
-    rows = [row for work in works for row in rows_of(work, quick, memory)]
+    rows = [row for work in works for row in rows_of(work, quick, memory, others)]
     checks = [
         {"program": peer.name, "version": "" if missing else peer.version(), "packaged": peer.packaged,
          "work": work.key, "said": f"not compared, {missing}" if missing else peer.check(work)}
         for peer in others for work in works for missing in [peer.missing(work)]
     ]  # fmt: skip
-    references = [(work, _reference(work.key)) for work in works]
+    references = [(work, exact_of(work, memory)()) for work in works]
     described = [
         {"work": work.key, "says": work.says, "epsilon": work.epsilon, "controlled": work.controlled,
          "accuracy": exact.accuracy, "how": exact.how}
@@ -129,41 +129,47 @@ def _at_hand(quick: bool) -> tuple[list[Work], dict[str, str]]:
     return works, unmade
 
 
-def rows_of(work: Work, quick: bool, memory: Memory) -> Iterator[Row]:
+def rows_of(work: Work, quick: bool, memory: Memory, others: Sequence[Peer], budget: Budget = BUDGET) -> Iterator[Row]:
     """Measure a work: this program first. What used up its budget at one tolerance is not tried with a tighter one."""
-    run = memory.cache(_run)
-    own = work_stamp(work)
+    run = memory.cache(_run, ignore=["work", "peer", "exact"])
+    own, exact = work_stamp(work), exact_of(work, memory)
     spent: dict[str, str] = {}
     for setting in ours.settings(quick):
         if setting.family in spent:
             motion = ours.refused(work, spent[setting.family])
-            yield judged(work, ours.PROGRAM, setting.name, motion, _reference(work.key))
+            yield judged(work, ours.PROGRAM, setting.name, motion, exact())
             continue
-        row = run(own, work.key, ours.PROGRAM, setting.name)
+        row = run(own, ours.PROGRAM, setting.name, budget.own, work, None, exact)
         if ours.used_up(row):
             spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
         yield row
-    for peer in peers():
+    for peer in others:
         if peer.missing(work) is None:
             own = work_stamp(work, peer.version())
-            yield from (run(own, work.key, peer.name, setting) for setting in peer.settings(work, quick))
+            for setting_name in peer.settings(work, quick):
+                yield run(own, peer.name, setting_name, budget.peer, work, peer, exact)
 
 
-def _run(own: str, work: str, program: str, setting: str) -> Row:
-    """Run one work by one program and setting, and judge it; called by name, so that what is kept has plain keys."""
-    _tell(f"{work}: {program}, {setting}")
-    chosen = next(each for each in WORKS if each.key == work)
-    if program == ours.PROGRAM:
-        motion = ours.compute(chosen, ours.setting_of(setting).changes, BUDGET.own)
+def exact_of(work: Work, memory: Memory) -> Callable[[], Reference]:
+    """Return how to get a work's reference, which is kept as well."""
+    return partial(memory.cache(_reference, ignore=["work"]), work_stamp(work), work)
+
+
+def _run(
+    own: str, program: str, setting: str, budget: float, work: Work, peer: Peer | None, exact: Callable[[], Reference]
+) -> Row:
+    """Run one work by one program and setting, and judge it; `own` tells what the rest depends on."""
+    _tell(f"{work.key}: {program}, {setting}")
+    if peer is None:
+        motion = ours.compute(work, ours.setting_of(setting).changes, budget)
     else:
-        motion = next(peer for peer in peers() if peer.name == program).compute(chosen, setting, BUDGET.peer)
-    return judged(chosen, program, setting, motion, _reference(work))
+        motion = peer.compute(work, setting, budget)
+    return judged(work, program, setting, motion, exact())
 
 
-@cache
-def _reference(work: str) -> Reference:
-    _tell(f"{work}: reference")
-    return reference(next(each for each in WORKS if each.key == work))
+def _reference(own: str, work: Work) -> Reference:
+    _tell(f"{work.key}: reference")
+    return reference(work)
 
 
 def _grown(quick: bool, memory: Memory) -> list[Growth]:

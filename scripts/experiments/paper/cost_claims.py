@@ -12,7 +12,7 @@ from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.cost import EPSILONS, METHODS, Cost, Search, cheapest, study
 from scripts.experiments.paper.experiment import Problem
 
-__all__ = ["claims"]
+__all__ = ["claims", "cost_claim"]
 
 SCENES = {"five_bar/swing": 2.0, "five_bar/tracking": 3.0}  # and t_end, s
 PAPER = (1e-3, 1e-4)  # the paper's epsilons
@@ -23,7 +23,13 @@ Found = Mapping[str, Sequence[Cost]]
 
 def claims(figures: Path) -> list[Claim]:
     """Answer what the paper says of the cost of the reduced model against the SPF."""
-    found = {name: study(Problem.of_scene(load_scene(name)), t_end) for name, t_end in SCENES.items()}
+    return [
+        cost_claim({name: study(Problem.of_scene(load_scene(name)), t_end) for name, t_end in SCENES.items()}, figures)
+    ]
+
+
+def cost_claim(found: Found, figures: Path) -> Claim:
+    """Judge costs by scene of `SCENES`."""
     literal = all(
         (cost.count("newton") > 0) == (cost.formulation == "reduced")
         for costs in found.values()
@@ -36,20 +42,18 @@ def claims(figures: Path) -> list[Claim]:
         for epsilon in PAPER
     )
     sentences = [_sigma(found), *(_cheapest(name, costs) for name, costs in found.items()), _unaffordable(found)]
-    return [
-        Claim(
-            key="cost",
-            where="section III-B",
-            says=(
-                "a nonlinear solver will have to be employed at each step for the reduced model, while the SPF "
-                "does not involve this cost"
-            ),
-            found=" ".join(sentences).strip(),
-            verdict=("holds" if saved else "holds with a condition") if literal else "does not hold",
-            figures=(_draw(found, figures),),
-            table=_table(found),
-        )
-    ]
+    return Claim(
+        key="cost",
+        where="section III-B",
+        says=(
+            "a nonlinear solver will have to be employed at each step for the reduced model, while the SPF "
+            "does not involve this cost"
+        ),
+        found=" ".join(sentences).strip(),
+        verdict=("holds" if saved else "holds with a condition") if literal else "does not hold",
+        figures=(_draw(found, figures),),
+        table=_table(found),
+    )
 
 
 def _sigma(found: Found) -> str:

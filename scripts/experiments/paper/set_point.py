@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from scripts.experiments.paper.set_point_experiments import (
 from scripts.experiments.paper.set_point_figures import draw_bounds, draw_lyapunov, draw_set
 from scripts.experiments.paper.solutions import Equilibrium
 
-__all__ = ["claims"]
+__all__ = ["ROWS", "claims", "gain_claim", "gradient_claim", "lyapunov_claim", "uniqueness_claim"]
 
 SAME = 1e-8  # relative: a spline's derivative of the recorded function against the formula
 EXACT = 1e-9  # relative: differences of h against the chain rule
@@ -54,14 +55,15 @@ def claims(figures: Path) -> list[Claim]:
     case, own = next(iter(certificates.values()))
     first_run = next(iter(runs.values()))[0]
     return [
-        _lyapunov_claim({name: record for name, (_, record) in runs.items()}, figures),
-        _gradient_claim(case, figures),
-        _gain_claim(case, own, certificates, first_run, figures),
-        _uniqueness_claim(certificates),
+        lyapunov_claim({name: record for name, (_, record) in runs.items()}, figures),
+        gradient_claim(case, gradient_error(case.mechanism, 60), bounds(case.mechanism), figures),
+        gain_claim(case, own, certificates, first_run, figures),
+        uniqueness_claim(certificates, {name: equilibria_of(case) for name, case in cases.items()}),
     ]
 
 
-def _lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
+def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
+    """Judge records of V_L by formulation."""
     rows = tuple(
         (name, f"{r.largest_increase:.1e}", f"{r.round_off:.1e}", f"{r.mismatch:.1e}") for name, r in records.items()
     )
@@ -82,9 +84,9 @@ def _lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
     )
 
 
-def _gradient_claim(case: Case, figures: Path) -> Claim:
-    error, asymmetry, used = gradient_error(case.mechanism, 60)
-    branches = bounds(case.mechanism)
+def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list[list[Bound]], figures: Path) -> Claim:
+    """Judge bounds on dh/dq by branch, once it is what differences of h say."""
+    error, asymmetry, used = checked
     own, tail = branches[0], branches[0][-2:]
     exponent = np.log(tail[1].norm / tail[0].norm) / np.log(tail[0].margin / tail[1].margin)
     bounded = exponent < 0.1 and error <= EXACT
@@ -115,9 +117,10 @@ def _margin_where(branch: list[Bound], norm: float) -> str:
     return f"{np.exp(np.interp(np.log(norm), m, s)):.2f}"
 
 
-def _gain_claim(
+def gain_claim(
     case: Case, own: Certificate, certificates: dict[str, tuple[Case, Certificate]], run: Run, figures: Path
 ) -> Claim:
+    """Judge what certificates say of the scene's own case, and of others."""
     rows = tuple(
         (
             name,
@@ -152,11 +155,13 @@ def _gain_claim(
     )
 
 
-def _uniqueness_claim(certificates: dict[str, tuple[Case, Certificate]]) -> Claim:
-    solutions = {name: equilibria_of(case) for name, (case, _) in certificates.items()}
+def uniqueness_claim(
+    certificates: dict[str, tuple[Case, Certificate]], solutions: Mapping[str, list[Equilibrium]]
+) -> Claim:
+    """Judge whether eq. 15 has one solution where the gain condition is certified; the last case has a low gain."""
     unique = all(len(solutions[name]) == 1 for name, (_, c) in certificates.items() if c.status == "certified")
     rows = tuple((name, certificates[name][1].status, *_count(found)) for name, found in solutions.items())
-    own_name, low_name = next(iter(rows))[0], next(reversed(ROWS))
+    own_name, low_name = next(iter(rows))[0], next(reversed(certificates))
     end = simulate(SCENE, {**LOW_GAIN, "t_end": 60.0})
     q = np.array([end.q_tree[-1, end.column(name)] for name in end.independent])
     distance = min(float(np.abs(q - x.q).max()) for x in solutions[low_name] if x.kind == "minimum")

@@ -19,7 +19,7 @@ from scripts.experiments.paper import boundary_layer
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, difference, end_of, five_bar_problem, vector
 
-__all__ = ["EPSILONS", "Convergence", "claims", "converge"]
+__all__ = ["EPSILONS", "Convergence", "claims", "converge", "order_claim", "velocity_claim"]
 
 EPSILONS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 T_END = 1.0
@@ -118,10 +118,10 @@ def claims(figures: Path) -> list[Claim]:
     behind = boundary_layer.problem_after_layer(moving, W0)
     corrected = converge(moving, W0, convention="actual", reference=behind)
     figure = _draw(rho, [*actual, corrected], figures)
-    return [_order_claim(*rho, start, figure), _velocity_claim(*actual, corrected, moving, behind, figure)]
+    return [order_claim(*rho, start, figure), velocity_claim(*actual, corrected, moving, behind, figure)]
 
 
-def _order_claim(rest: Convergence, moving: Convergence, start: str, figure: str) -> Claim:
+def order_claim(rest: Convergence, moving: Convergence, start: str, figure: str) -> Claim:
     last = np.concatenate([orders[-2:] for c in (rest, moving) for orders in (c.orders, c.z_orders)])
     resolved = rest.resolved and moving.resolved
     good = bool(np.all(np.abs(last - 1) <= ORDER_MARGIN)) and resolved
@@ -147,7 +147,7 @@ def _order_claim(rest: Convergence, moving: Convergence, start: str, figure: str
     )
 
 
-def _velocity_claim(
+def velocity_claim(
     rest: Convergence, moving: Convergence, corrected: Convergence, before: Problem, behind: Problem, figure: str
 ) -> Claim:
     floor = moving.x[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.tree import Array
@@ -27,9 +29,9 @@ from scripts.experiments.paper.tracking_experiments import (
     off_manifold,
 )
 from scripts.experiments.paper.tracking_figures import draw_deviations, draw_lyapunov
-from scripts.experiments.paper.tracking_identities import claimed_form, printed_form, rate_form, skewness
+from scripts.experiments.paper.tracking_identities import Skewness, claimed_form, printed_form, rate_form, skewness
 
-__all__ = ["claims"]
+__all__ = ["accepted", "claims", "deviations_claim", "gains_claim", "lyapunov_claim", "skew_claim"]
 
 SAME = 1e-7  # relative: a spline's derivative of the recorded function against eq. 19
 SKEW = 1e-8  # relative: differences of D against C
@@ -47,25 +49,38 @@ PERIODIC = 0.9  # share of a deviation's variance that repeats
 STATES = 30
 LAYERS = (1e-3, 1e-4)  # epsilon of runs through the boundary layer; the first is drawn
 
+VELOCITY: dict[CoriolisVelocity, str] = {"rho": "rho q_dot", "actual": "the actual velocity"}
+OffManifold = tuple[float, CoriolisVelocity, bool]  # epsilon, where C takes its velocity, whether it starts moving
+
 
 def claims(figures: Path) -> list[Claim]:
     """Run the experiments on eqs. 16 to 19, write their figures into a folder, return the claims."""
-    return [_lyapunov_claim(figures), _skew_claim(), _gains_claim(), _deviations_claim(figures)]
-
-
-# --- eqs. 18 and 19 along runs -----------------------------------------------------------------------------------
-
-
-def _lyapunov_claim(figures: Path) -> Claim:
     first = {name: lyapunov_along({**how, **START}) for name, how in ON_MANIFOLD.items()}
     later = {name: lyapunov_along({**how, **WHOLE}, SINCE) for name, how in ON_MANIFOLD.items()}
     off = {
         (epsilon, convention, moving): off_manifold(epsilon, convention, moving)
         for epsilon in LAYERS
-        for convention in ("rho", "actual")
+        for convention in VELOCITY
         for moving in (False, True)
     }
-    rows = [(name, "0", "either", *_cells(x)) for name in ON_MANIFOLD for x in (first[name], later[name])]
+    skew = {epsilon: skewness(load("five_bar"), STATES, epsilon) for epsilon in (1e-2, *LAYERS)}
+    apart = deviations({name: x for group in SETTINGS.values() for name, x in group.items()})
+    return [
+        lyapunov_claim(first, later, off, figures),
+        skew_claim(skew),
+        gains_claim(),
+        deviations_claim(*apart, figures),
+    ]
+
+
+# --- eqs. 18 and 19 along runs -----------------------------------------------------------------------------------
+
+
+def lyapunov_claim(
+    first: Mapping[str, Record], later: Mapping[str, Record], off: Mapping[OffManifold, Record], figures: Path
+) -> Claim:
+    """Judge records from w(0) = 0, by formulation, and from off the manifold."""
+    rows = [(name, "0", "either", *_cells(x)) for name in first for x in (first[name], later[name])]
     rows += [
         (f"SPF, eq. 17, ε = {epsilon:g}, {'moving' if moving else 'at rest'}", str(W0), VELOCITY[name], *_cells(x))
         for (epsilon, name, moving), x in off.items()
@@ -75,7 +90,8 @@ def _lyapunov_claim(figures: Path) -> Claim:
     kept = all(x.mismatch <= SAME and x.monotone for x in on) and actual <= SAME
     rising = sum(not x.monotone for x in (*on, *off.values()))
     whole = next(iter(later.values()))
-    drawn = {f"C at {VELOCITY[name]}": off[LAYERS[0], name, True] for name in VELOCITY}
+    layer = next(iter(off))[0]
+    drawn = {f"C at {VELOCITY[name]}": off[layer, name, True] for name in VELOCITY}
     return Claim(
         key="tracking-lyapunov",
         where="section II-C, eqs. 18 and 19",
@@ -90,12 +106,9 @@ def _lyapunov_claim(figures: Path) -> Claim:
             f"value in the boundary layer. V rises in {rising} of {len(on) + len(off)} records."
         ),
         verdict="does not hold" if not kept else "holds" if rho <= SAME else "holds with a condition",
-        figures=(draw_lyapunov(whole, drawn, LAYERS[0], figures),),
+        figures=(draw_lyapunov(whole, drawn, layer, figures),),
         table=(("run", "w(0) / m", "C at", "t / s", "rate: relative difference", "V rises by / J"), tuple(rows)),
     )
-
-
-VELOCITY = {"rho": "rho q_dot", "actual": "the actual velocity"}
 
 
 def _cells(record: Record) -> tuple[str, str, str]:
@@ -106,8 +119,8 @@ def _cells(record: Record) -> tuple[str, str, str]:
 # --- what eq. 19 rests on ----------------------------------------------------------------------------------------
 
 
-def _skew_claim() -> Claim:
-    found = {epsilon: skewness(load("five_bar"), STATES, epsilon) for epsilon in (1e-2, *LAYERS)}
+def skew_claim(found: Mapping[float, Skewness]) -> Claim:
+    """Judge how skew D_dot - 2 C is, by epsilon."""
     rows = tuple(
         (f"{e:g}", f"{x.on:.1e}", f"{x.off_rho_rho:.1e}", f"{x.off_actual_actual:.1e}", f"{x.off_actual_rho:.2g}")
         for e, x in found.items()
@@ -121,10 +134,11 @@ def _skew_claim() -> Claim:
         where="section II-C, eq. 19",
         says="D_dot - 2 C is skew-symmetric, so that its term in eq. 19 vanishes.",
         found=(
-            f"Over {found[LAYERS[0]].states} random states, D_dot by differences of D. On phi = 0 it is, to {on:.1e} "
-            "of D_dot's largest entry. Off it D_dot belongs to the perturbed flow, with w / epsilon in z_dot: with C "
-            f"at that actual velocity (eq. 16) S = D_dot - 2 C is skew to {actual:.1e}; with C at rho q_dot (eq. 8) it "
-            f"is not, S + S^T is {min(mixed):.2g} to {max(mixed):.2g} of D_dot, which tends to 2 for small epsilon: "
+            f"Over {next(iter(found.values())).states} random states, D_dot by differences of D. On phi = 0 it is, to "
+            f"{on:.1e} of D_dot's largest entry. Off it D_dot belongs to the perturbed flow, with w / epsilon in "
+            f"z_dot: with C at that actual velocity (eq. 16) S = D_dot - 2 C is skew to {actual:.1e}; with C at rho "
+            f"q_dot (eq. 8) it is not, S + S^T is {min(mixed):.2g} to {max(mixed):.2g} of D_dot, which tends to 2 for "
+            "small epsilon: "
             "D_dot grows with w / epsilon and C does not. C at rho q_dot belongs to the flow on the level set of phi: "
             f"skew there to {level:.1e}."
         ),
@@ -152,7 +166,8 @@ GAINS: dict[str, tuple[Array, Array]] = {
 }
 
 
-def _gains_claim() -> Claim:
+def gains_claim() -> Claim:
+    """Judge eqs. 18 and 19 as quadratic forms for gains of several kinds."""
     rows, fits, misfits = [], list[float](), list[float]()
     for name, (Lambda, K_D) in GAINS.items():
         A, form = Lambda.T @ K_D, rate_form(Lambda, K_D)
@@ -160,7 +175,7 @@ def _gains_claim() -> Claim:
         gap, printed = (float(np.abs(form - f(Lambda, K_D)).max()) for f in (claimed_form, printed_form))
         (fits if symmetric else misfits).append(gap)
         lows = (f"{np.linalg.eigvalsh(x)[0]:.3g}" for x in ((A + A.T) / 2, form))
-        rows.append((name, _yes(symmetric), f"{gap:.2g}", f"{printed:.2g}", *lows, _yes(_accepted(Lambda, K_D))))
+        rows.append((name, _yes(symmetric), f"{gap:.2g}", f"{printed:.2g}", *lows, _yes(accepted(Lambda, K_D))))
     return Claim(
         key="tracking-gains",
         where="section II-C, eqs. 18 and 19",
@@ -186,7 +201,8 @@ def _yes(answer: bool) -> str:
     return "yes" if answer else "no"
 
 
-def _accepted(Lambda: Array, K_D: Array) -> bool:
+def accepted(Lambda: Array, K_D: Array) -> bool:
+    """Whether the program takes gains."""
     desired = Harmonics([HarmonicsSpec(), HarmonicsSpec()])
     try:
         Tracking(Lambda, K_D, desired)
@@ -198,8 +214,8 @@ def _accepted(Lambda: Array, K_D: Array) -> bool:
 # --- section III-C: "the more exact reduced model periodically sees some deviations" -----------------------------
 
 
-def _deviations_claim(figures: Path) -> Claim:
-    t, error, found = deviations({name: x for group in SETTINGS.values() for name, x in group.items()})
+def deviations_claim(t: Array, error: Array, found: Mapping[str, Deviation], figures: Path) -> Claim:
+    """Judge deviations from the exact run by setting of `SETTINGS`."""
     tight, loose, shared, own = ([found[name] for name in group] for group in SETTINGS.values())
     largest = max(x.largest for x in tight)
     periodic = [name for name, x in found.items() if _periodic(x)]

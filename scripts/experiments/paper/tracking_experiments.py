@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
-from scripts.experiments.paper.deviations import Deviation, Setting, deviation, instants, track
+from scripts.experiments.paper.deviations import Deviation, Setting, Track, deviation, instants, track
 from scripts.experiments.paper.lyapunov import Record, record
 
 __all__ = [
@@ -134,7 +134,11 @@ SETTINGS: dict[str, dict[str, Setting]] = {
 }
 
 
-def deviations(settings: Mapping[str, Setting], periods: int = PERIODS) -> tuple[Array, Array, dict[str, Deviation]]:
+def deviations(
+    settings: Mapping[str, Setting],
+    periods: int = PERIODS,
+    run: Callable[[str, Setting, Array], Track] = track,
+) -> tuple[Array, Array, dict[str, Deviation]]:
     """Compare runs of the tracking scene with its exact one.
 
     Returns
@@ -146,8 +150,8 @@ def deviations(settings: Mapping[str, Setting], periods: int = PERIODS) -> tuple
     found : dict of str to Deviation
     """
     times = instants(periods)
-    exact = track(SCENE, EXACT, times)
+    exact = run(SCENE, EXACT, times)
     controller = _tracking(load_scene(SCENE))
     desired = np.array([controller.desired(float(t))[0] for t in times])
-    found = {name: deviation(track(SCENE, setting, times), exact) for name, setting in settings.items()}
+    found = {name: deviation(run(SCENE, setting, times), exact) for name, setting in settings.items()}
     return times, np.abs(exact.q - desired).max(axis=1), found

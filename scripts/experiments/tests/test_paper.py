@@ -1,18 +1,24 @@
-"""The page: what is on it and in which order. The studies themselves are tested elsewhere."""
+"""What is on the pages of the paper, as data: keys, verdicts, commands. The studies themselves are tested elsewhere."""
 
 from __future__ import annotations
 
 import importlib
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from scripts.experiments.markdown import escaped, table
-from scripts.experiments.paper import page as paper
+from scripts.experiments.paper import page
 from scripts.experiments.paper.claim import Claim
+from scripts.experiments.paper.contents import KEYS, SECTIONS, STUDIES
+from scripts.experiments.paper.errata import ERRATA
 
-KEYS = [key for _, keys in paper.SECTIONS for key in keys]
+ROOT = Path(__file__).parents[3]
+DOCS = ROOT / "docs"
+VERDICT = r"\[(holds|holds with a condition|does not hold)\]\(#([a-z0-9-]+)\) \|$"
 
 
 def claim(key: str) -> Claim:
@@ -20,64 +26,64 @@ def claim(key: str) -> Claim:
         key=key,
         where="section II, eq. 3",
         says=f"What {key} says: |x| < y.",
-        command="ckc list; ckc check five_bar",
         found="`a | b` is 3 < 4.",
         verdict="holds with a condition",
+        commands=("ckc list",),
         figures=(f"{key}.png",),
         table=(("a", "|b|"), (("1", "2"),)),
     )
 
 
 def test_every_claim_has_its_place_and_its_study() -> None:
-    assert sorted(KEYS) == sorted(key for keys in paper.STUDIES.values() for key in keys)
-    assert len(set(KEYS)) == len(KEYS)
+    assert sorted(KEYS) == sorted(key for keys in STUDIES.values() for key in keys)
+    assert len(set(KEYS)) == len(KEYS) == sum(map(len, SECTIONS.values()))
+    assert all(callable(importlib.import_module(f"scripts.experiments.paper.{study}").claims) for study in STUDIES)
 
 
-@pytest.mark.parametrize("study", paper.STUDIES)
-def test_studies_name_the_claims_that_are_listed(study: str) -> None:
-    module = importlib.import_module(f"scripts.experiments.paper.{study}")
-    text = Path(str(module.__file__)).read_text(encoding="utf-8")
-    assert callable(module.claims)
-    assert sorted(re.findall(r'\bkey="([^"]+)"', text)) == sorted(paper.STUDIES[study])
+def test_the_page_has_every_claim_in_the_papers_order() -> None:
+    text = page.page(page.as_frame(claim(key) for key in KEYS))
+    assert re.findall(r"^### (.+)$", text, re.MULTILINE) == list(KEYS)
+    assert re.findall(VERDICT, text, re.MULTILINE) == [("holds with a condition", key) for key in KEYS]
+    assert re.findall(r"^!\[.*\]\((.*)\)$", text, re.MULTILINE) == [f"paper/{key}.png" for key in KEYS]
+    assert len(re.findall(r"^\| a \| \\\|b\\\| \|$", text, re.MULTILINE)) == len(KEYS)
 
 
-def test_page_has_every_claim_in_the_papers_order() -> None:
-    text = paper.page([claim(key) for key in reversed(KEYS)])
-    assert re.findall(r"^### (.+)$", text, re.MULTILINE) == KEYS
-    assert re.findall(r"\(#([a-z0-9-]+)\)", text) == KEYS
-    assert f"of {len(KEYS)}, 0 hold, {len(KEYS)} hold with a condition, 0 do not hold" in text
-    assert "![cost: cost.png](paper/cost.png)" in text
-    assert "\n```sh\nckc list\nckc check five_bar\n```\n" in text
-    assert "| What cost says: \\|x\\| < y. |" in text
+def test_the_committed_page_is_that_of_the_committed_verdicts() -> None:
+    """Of 26 statements 10 hold, 12 with a condition and 4 do not: a change of one is a finding, and is looked at."""
+    claims = pd.read_csv(DOCS / "paper" / "claims.csv")
+    assert claims.key.tolist() == list(KEYS)
+    counts = claims.verdict.value_counts().to_dict()
+    assert counts == {"holds": 10, "holds with a condition": 12, "does not hold": 4}
+    found = re.findall(VERDICT, (DOCS / "paper.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert found == list(claims[["verdict", "key"]].itertuples(index=False, name=None))
 
 
-def test_a_study_with_other_claims_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(paper.STUDIES, "domain", ("implicit-function",))
-    monkeypatch.setattr("scripts.experiments.paper.domain.claims", lambda figures: [claim("spf-domain")])
-    with pytest.raises(RuntimeError, match="answers spf-domain; listed are implicit-function"):
-        paper._answer("domain", tmp_path)
+def test_what_is_quick_still_has_its_committed_verdict(tmp_path: Path) -> None:
+    keys = [*STUDIES["domain"], *STUDIES["singular_claims"]]
+    committed = pd.read_csv(DOCS / "paper" / "claims.csv").set_index("key").verdict
+    found = page.as_frame(page.collect(keys, tmp_path)).set_index("key")
+    assert found.verdict.to_dict() == committed[found.index].to_dict()
+    assert set(found.index) == set(keys)
+    assert all((tmp_path / name).stat().st_size > 1000 for name in found.figures.explode().dropna())
 
 
-def test_one_entry_is_printed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert paper.main(["--only", "implicit-function", "--out", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    assert "Verdict: holds" in out
-    assert "spf-domain" not in out
+@pytest.mark.parametrize("name", ["paper.md", "errata.md"])
+def test_commands_on_a_page_exist(name: str) -> None:
+    blocks = re.findall(r"^```sh\n(.*?)^```$", (DOCS / name).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    lines = {line for block in blocks for line in block.splitlines()}
+    known = {"paper": set(KEYS), "errata": set(ERRATA)}
+    own = name.removesuffix(".md")
+    told = {tuple(line.split()[1:]) for line in lines if line.startswith("./scripts/experiment ")}
+    assert all(key in known[experiment] for experiment, key in told)
+    assert {key for experiment, key in told if experiment == own} == known[own]
+    for line in lines - {f"./scripts/experiment {' '.join(words)}" for words in told}:
+        assert line == "./scripts/demo" or line.startswith("ckc ")
 
 
-def test_bad_arguments_are_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as ended:
-        paper.main(["--only", "nothing"])
-    assert ended.value.code == 2
-    said = capsys.readouterr().err.split("no such entry; there are ")[1]
-    assert sorted(said.replace(",", " ").split()) == sorted(KEYS)
-    (tmp_path / "file").touch()
-    with pytest.raises(SystemExit) as ended:
-        paper.main(["--out", str(tmp_path / "file")])
-    assert ended.value.code == 2
-    assert "cannot be written" in capsys.readouterr().err
-
-
-def test_sentences_do_not_become_markup() -> None:
-    assert escaped("a*b <x> `c*d` q_dot < 3") == "a\\*b \\<x> `c*d` q_dot < 3"
-    assert table(("a|b",), [("`|c|`",)]) == ["| a\\|b |", "|---|", "| `\\|c\\|` |"]
+@pytest.mark.parametrize("line", [["paper", "nothing"], ["errata", "nothing"], ["stability", "nothing"]])
+def test_a_wrong_name_is_told_the_right_ones(line: list[str]) -> None:
+    command = [sys.executable, "-m", "scripts.experiments", *line]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    known = {"paper": KEYS, "errata": ERRATA, "stability": ("gain", "long")}[line[0]]
+    assert (found.returncode, found.stdout) == (2, "")
+    assert all(key in found.stderr for key in known)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ckc_pin import Mechanism, load
-from ckc_pin.analysis.certificate import certify, rest_height
-from ckc_pin.analysis.gradient import Bound, bound_along, chart_step, explore_branch, gradient_bounds
+from ckc_pin.analysis.certificate import Certificate, certify, rest_height
+from ckc_pin.analysis.gradient import bound_along, chart_step, explore_branch, gradient_bounds
 from ckc_pin.analysis.sheet import explore
 from ckc_pin.analysis.walk import follow, least, margin, margin_gradient, same_configuration, way
 from ckc_pin.control import SetPoint
@@ -25,6 +25,7 @@ from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.simulation.initial import Start
 from ckc_pin.simulation.simulate import simulate
 from scripts.experiments.paper import set_point
+from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import derivative, record
 from scripts.experiments.paper.set_point_experiments import (
     DENSE,
@@ -381,34 +382,48 @@ def test_derivative_of_samples() -> None:
 # --- the claims --------------------------------------------------------------------------------------------------
 
 
-def test_claims_show_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same code on thinned experiments."""
-    monkeypatch.setattr(set_point, "FORMULATIONS", {"reduced, eq. 6": {"formulation": "reduced"}})
-    monkeypatch.setattr(set_point, "DENSE", {**DENSE, "t_end": 0.3})
-    monkeypatch.setattr(set_point, "DIVISIONS", 12)
-    rows = {name: set_point.ROWS[name] for name in ("equilibrium, K_P = 10 I", "(0.3, 0.5), K_P = 10 I")}
-    low = {"equilibrium, K_P = 0.5 I": set_point.LOW_GAIN}
-    monkeypatch.setattr(set_point, "ROWS", {**rows, **low})
-    monkeypatch.setattr(set_point, "bounds", lambda mechanism: [_thin_bounds(mechanism)])
-    monkeypatch.setattr(set_point, "equilibria_of", lambda case: equilibria_of(case, 10, 30))
-    claims = {claim.key: claim for claim in set_point.claims(tmp_path)}
-    assert {key: claim.verdict for key, claim in claims.items()} == {
-        "set-point-lyapunov": "holds",
-        "set-point-gradient-bound": "holds with a condition",
-        "set-point-gain-condition": "holds with a condition",
-        "set-point-unique": "holds",
-    }
-    for claim in claims.values():
-        assert all((tmp_path / name).stat().st_size > 10_000 for name in claim.figures)
-        assert claim.table is not None
-        assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
-    assert "(0.2481, 0.1196)" in claims["set-point-unique"].found
-    assert " / s_min^3.0" in claims["set-point-gradient-bound"].found
+CHOSEN = ("equilibrium, K_P = 10 I", "(0.3, 0.5), K_P = 10 I", "equilibrium, K_P = 0.5 I")
 
 
-def _thin_bounds(mechanism: Mechanism) -> list[Bound]:
+@pytest.fixture(scope="module")
+def certified() -> dict[str, tuple[Case, Certificate]]:
+    cases = {name: load_case(set_point.ROWS[name]) for name in CHOSEN}
+    return {name: (case, case.certificate(12)) for name, case in cases.items()}
+
+
+def complete(claim: Claim, figures: Path) -> str:
+    """Return the verdict of a claim whose table and figures are whole."""
+    assert all((figures / name).stat().st_size > 5_000 for name in claim.figures)
+    assert claim.table is not None
+    assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
+    return claim.verdict
+
+
+def test_verdict_on_the_gain_condition(certified: dict[str, tuple[Case, Certificate]], tmp_path: Path) -> None:
+    case, own = certified[CHOSEN[0]]
+    run, found = along_run({**DENSE, "formulation": "reduced", "t_end": 0.3})
+    assert complete(set_point.gain_claim(case, own, certified, run, tmp_path), tmp_path) == "holds with a condition"
+    assert complete(set_point.lyapunov_claim({"reduced": found}, tmp_path), tmp_path) == "holds"
+    rising = record(replace(run, lyapunov=found.value[::-1].copy()), lambda k: 1.0)
+    assert complete(set_point.lyapunov_claim({"reduced": rising}, tmp_path), tmp_path) == "does not hold"
+
+
+def test_verdict_on_uniqueness(certified: dict[str, tuple[Case, Certificate]], tmp_path: Path) -> None:
+    solutions = {name: equilibria_of(case, 10, 30) for name, (case, _) in certified.items()}
+    assert complete(set_point.uniqueness_claim(certified, solutions), tmp_path) == "holds"
+    two = {**solutions, CHOSEN[1]: solutions[CHOSEN[1]] * 2}  # where the gain condition is certified
+    assert complete(set_point.uniqueness_claim(certified, two), tmp_path) == "does not hold"
+
+
+def test_verdict_on_the_bound(five_bar: Pair, tmp_path: Path) -> None:
+    mechanism, case = five_bar[0], load_case()
+    step = chart_step(mechanism, 16)
     sheet = explore_branch(mechanism, mechanism.assembled, 16)
-    return gradient_bounds(mechanism, sheet, [0.5, 0.1, 0.05], chart_step(mechanism, 16))
+    growing = [gradient_bounds(mechanism, sheet, [0.5, 0.1, 0.05], step)]
+    right = (1e-11, 1e-15, 43)
+    assert complete(set_point.gradient_claim(case, right, growing, tmp_path), tmp_path) == "holds with a condition"
+    flat = [[replace(bound, norm=3.0) for bound in growing[0]]]
+    assert complete(set_point.gradient_claim(case, right, flat, tmp_path), tmp_path) == "holds"
 
 
 def test_rest_height_is_the_controllers_function_at_rest() -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from scripts.experiments.paper import tikhonov
@@ -19,10 +17,8 @@ from scripts.experiments.paper.boundary_layer import (
     problem_after_layer,
     solve_eq_12,
 )
-from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.consistent_start import measure
 from scripts.experiments.paper.experiment import W0, Problem, five_bar_problem, on_level
-from scripts.experiments.paper.show import print_claim, run_as_command
 from scripts.experiments.paper.tikhonov import Convergence, converge
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, Z, complex_step
 from tests.conftest import Pair, assert_close
@@ -211,7 +207,7 @@ def test_epsilon_changes_nothing_from_a_consistent_start(problems: dict[str, Pro
     assert np.all(found.eq_17 == found.dop853)
 
 
-# --- verdicts and the command ------------------------------------------------------------------------------------
+# --- verdicts ----------------------------------------------------------------------------------------------------
 
 
 def convergence(order: float, unsure: float = 1e-3) -> Convergence:
@@ -230,59 +226,14 @@ def convergence(order: float, unsure: float = 1e-3) -> Convergence:
     ],
 )
 def test_verdict_on_the_order(moving: Convergence, verdict: str) -> None:
-    claim = tikhonov._order_claim(convergence(1.0), moving, "start", "figure.png")
+    claim = tikhonov.order_claim(convergence(1.0), moving, "start", "figure.png")
     assert claim.verdict == verdict
     assert claim.table is not None
-    assert claim.table[1][2][:3] == ("1e-06", "1.00e-06", "1.000")
+    assert float(claim.table[1][2][1]) == pytest.approx(1e-6)
 
 
 def test_verdict_on_the_velocity(problems: dict[str, Problem]) -> None:
     problem = problems["moving"]
     flat = replace(convergence(1.0), x=np.full(3, 0.07))
-    claim = tikhonov._velocity_claim(convergence(1.0), flat, convergence(1.0), problem, problem, "figure.png")
+    claim = tikhonov.velocity_claim(convergence(1.0), flat, convergence(1.0), problem, problem, "figure.png")
     assert claim.verdict == "does not hold"
-    assert "7.00e-02" in claim.found
-
-
-def test_figure_is_written(tmp_path: Path) -> None:
-    name = tikhonov._draw([convergence(1.0)] * 2, [convergence(1.0)] * 3, tmp_path)
-    assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-
-
-CLAIM = Claim("key", "eq. 1", "says [so]", "cmd", "found 1e-3", "holds", ("a.png",), (("ε", "rest: x"), (("1", "2"),)))
-
-
-def test_command_prints_claims_and_makes_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "deep" / "folder"
-    monkeypatch.setattr("sys.argv", ["study", "--out", str(out)])
-    seen: list[Path] = []
-
-    def study(figures: Path) -> list[Claim]:
-        seen.append(figures)
-        return [CLAIM]
-
-    run_as_command("study", "about", [study])
-    text = capsys.readouterr().out
-    assert seen == [out]
-    assert out.is_dir()
-    for part in ("says [so]", "found 1e-3", "Verdict: holds", "a.png", "rest"):
-        assert part in text
-
-
-def test_command_refuses_a_folder_that_is_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr("sys.argv", ["study", "--out", str(tmp_path / "file")])
-    with pytest.raises(SystemExit) as stop:
-        run_as_command("study", "about", [])
-    assert stop.value.code == 2
-    assert "cannot write figures there" in capsys.readouterr().err
-
-
-def test_wide_tables_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    claim = tikhonov._order_claim(convergence(1.0), convergence(1.0), "start", "figure.png")
-    print_claim(claim, Console(width=80))
-    assert "…" not in capsys.readouterr().out

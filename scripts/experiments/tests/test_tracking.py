@@ -14,7 +14,6 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.simulation.scene import load_scene
 from scripts.experiments.paper import tracking
-from scripts.experiments.paper import tracking_experiments as experiments
 from scripts.experiments.paper.deviations import (
     PERIOD,
     Deviation,
@@ -27,7 +26,16 @@ from scripts.experiments.paper.deviations import (
     track,
 )
 from scripts.experiments.paper.experiment import Problem
-from scripts.experiments.paper.tracking_experiments import EXACT, SCENE, SETTINGS, W0, lyapunov_along, off_manifold
+from scripts.experiments.paper.lyapunov import Record
+from scripts.experiments.paper.tracking_experiments import (
+    EXACT,
+    SCENE,
+    SETTINGS,
+    W0,
+    deviations,
+    lyapunov_along,
+    off_manifold,
+)
 from scripts.experiments.paper.tracking_identities import (
     Skewness,
     _defect,
@@ -199,9 +207,9 @@ def test_rate_form_is_the_rate_of_a_linear_closed_loop(symmetric: bool) -> None:
 
 def test_gains_that_the_program_takes() -> None:
     K_D = np.array([[10.0, 3.0], [3.0, 5.0]])
-    assert tracking._accepted(np.linalg.solve(K_D, np.diag([1.0, 2.0])), K_D)
-    assert not tracking._accepted(np.diag([1.0, 3.0]), K_D)
-    assert not tracking._accepted(-np.eye(2), K_D)
+    assert tracking.accepted(np.linalg.solve(K_D, np.diag([1.0, 2.0])), K_D)
+    assert not tracking.accepted(np.diag([1.0, 3.0]), K_D)
+    assert not tracking.accepted(-np.eye(2), K_D)
 
 
 # --- deviations --------------------------------------------------------------------------------------------------
@@ -303,45 +311,51 @@ def made_up(settings: Mapping[str, Setting], periodic: str) -> tuple[Array, Arra
     return t, np.exp(-t), found
 
 
-def thin(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracking, "ON_MANIFOLD", {"reduced, eq. 6": {"formulation": "reduced"}})
-    monkeypatch.setattr(tracking, "START", SHORT)
-    monkeypatch.setattr(tracking, "WHOLE", {"t_end": 0.2, "solver.output_dt": 0.002, "solver.rtol": 1e-9})
-    monkeypatch.setattr(tracking, "LAYERS", (1e-3,))
-    monkeypatch.setattr(tracking, "STATES", 4)
-    monkeypatch.setattr(tracking, "deviations", lambda settings: made_up(settings, "controller's own sigma to 1e-2 m"))
+@pytest.fixture(scope="module")
+def good() -> Record:
+    return lyapunov_along({"formulation": "reduced", **SHORT})
 
 
-def test_claims_show_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same code on thinned experiments."""
-    thin(monkeypatch)
-    claims = {claim.key: claim for claim in tracking.claims(tmp_path)}
-    assert {key: claim.verdict for key, claim in claims.items()} == {
-        "tracking-lyapunov": "holds with a condition",
-        "tracking-skew": "holds with a condition",
-        "tracking-gains": "holds with a condition",
-        "tracking-deviations": "does not hold",
-    }
-    for claim in claims.values():
-        assert all((tmp_path / name).stat().st_size > 10_000 for name in claim.figures)
-        assert claim.table is not None
-        assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
-    assert "V rises in 0 of 6 records" in claims["tracking-lyapunov"].found
-    assert claims["tracking-deviations"].found.endswith("repeating: controller's own sigma to 1e-2 m.")
+def judged_rate(rho: Record, actual: Record, on: Record, figures: Path) -> str:
+    off = {(1e-3, name, moving): x for name, x in (("rho", rho), ("actual", actual)) for moving in (False, True)}
+    claim = tracking.lyapunov_claim({"reduced": on}, {"reduced": on}, off, figures)
+    assert all((figures / name).stat().st_size > 10_000 for name in claim.figures)
+    assert claim.table is not None
+    assert [len(row) for row in claim.table[1]] == [len(claim.table[0])] * 6
+    return claim.verdict
+
+
+def test_verdict_on_the_rate_asks_for_the_right_convention(good: Record, tmp_path: Path) -> None:
+    """As measured only C at rho q_dot misses eq. 19; were it the other, the statement would not hold."""
+    bad = replace(good, rate=1.01 * good.rate)
+    assert judged_rate(good, good, good, tmp_path) == "holds"
+    assert judged_rate(bad, good, good, tmp_path) == "holds with a condition"
+    assert judged_rate(good, bad, good, tmp_path) == "does not hold"
+    assert judged_rate(good, good, bad, tmp_path) == "does not hold"
+
+
+def test_verdict_on_the_rate_is_that_of_short_runs(good: Record, tmp_path: Path) -> None:
+    rho, actual = (off_manifold(1e-3, name, True) for name in ("rho", "actual"))
+    assert judged_rate(rho, actual, good, tmp_path) == "holds with a condition"
+
+
+def test_verdict_on_gains_is_of_quadratic_forms_alone() -> None:
+    claim = tracking.gains_claim()
+    assert claim.verdict == "holds with a condition"
+    assert claim.table is not None
+    assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
 
 
 @pytest.mark.parametrize(("deviates", "verdict"), [(False, "does not hold"), (True, "holds")])
-def test_verdict_on_deviations_follows_the_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviates: bool, verdict: str
-) -> None:
+def test_verdict_on_deviations_follows_the_numbers(tmp_path: Path, deviates: bool, verdict: str) -> None:
     (tight,) = SETTINGS["nothing"]
-    monkeypatch.setattr(tracking, "deviations", lambda settings: made_up(settings, tight if deviates else "none"))
-    claim = tracking._deviations_claim(tmp_path)
+    every = {name: x for group in SETTINGS.values() for name, x in group.items()}
+    claim = tracking.deviations_claim(*made_up(every, tight if deviates else "none"), tmp_path)
     assert claim.verdict == verdict
-    assert claim.found.endswith(f"repeating: {tight if deviates else 'none'}.")
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in claim.figures)
 
 
-def test_deviations_are_measured_from_the_exact_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deviations_are_measured_from_the_exact_run() -> None:
     tracks: list[tuple[object, object]] = []
 
     def fake(scene: str, setting: Setting, times: Array) -> Track:
@@ -349,9 +363,8 @@ def test_deviations_are_measured_from_the_exact_run(monkeypatch: pytest.MonkeyPa
         q_d = np.array([desired(float(t))[0] for t in times])
         return Track(q_d + (0.25 if setting is EXACT else 0.375 + 0.125 * np.sin(times)[:, None]), 0.0)
 
-    monkeypatch.setattr(experiments, "track", fake)
     own = SETTINGS["controller's sigma"]
-    t, error, found = experiments.deviations(own, periods=2)
+    t, error, found = deviations(own, 2, fake)
     assert_close(t[[0, -1]], [0.0, 2 * PERIOD], 1e-12)
     assert_close(error, 0.25, 1e-12)
     assert tracks == [(None, None), (None, 1e-2), (None, 1e-3)]
@@ -363,21 +376,6 @@ def test_deviations_are_measured_from_the_exact_run(monkeypatch: pytest.MonkeyPa
     ("on", "mixed", "verdict"),
     [(1e-11, 2.0, "holds with a condition"), (1e-11, 1e-11, "holds"), (1e-3, 2.0, "does not hold")],
 )
-def test_verdict_on_skewness_follows_the_numbers(
-    monkeypatch: pytest.MonkeyPatch, on: float, mixed: float, verdict: str
-) -> None:
-    monkeypatch.setattr(tracking, "skewness", lambda *_: Skewness(on, 1e-11, mixed, 1e-11, 4))
-    assert tracking._skew_claim().verdict == verdict
-
-
-@pytest.mark.parametrize(("wrong", "verdict"), [("rho", "holds with a condition"), ("actual", "does not hold")])
-def test_verdict_on_the_rate_asks_for_the_right_convention(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str, verdict: str
-) -> None:
-    """As measured only C at rho q_dot misses eq. 19; were it the other, the statement would not hold."""
-    thin(monkeypatch)
-    good = lyapunov_along({"formulation": "reduced", **SHORT})
-    bad = replace(good, rate=1.01 * good.rate)
-    monkeypatch.setattr(tracking, "lyapunov_along", lambda *_: good)
-    monkeypatch.setattr(tracking, "off_manifold", lambda epsilon, name, moving: bad if name == wrong else good)
-    assert tracking._lyapunov_claim(tmp_path).verdict == verdict
+def test_verdict_on_skewness_follows_the_numbers(on: float, mixed: float, verdict: str) -> None:
+    found = {epsilon: Skewness(on, 1e-11, mixed, 1e-11, 4) for epsilon in (1e-2, 1e-3)}
+    assert tracking.skew_claim(found).verdict == verdict
