@@ -30,15 +30,15 @@ std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
     return std::make_unique<Spline>(breaks, coefficients);
   }
   require(kind == "point", "desired: harmonics, spline or point");
-  PointMotion::Told told{closure_of(get<nb::dict>(table, "closure")), get<Indices>(table, "psi"),
+  PointMotion::Task task{closure_of(get<nb::dict>(table, "closure")), get<Indices>(table, "psi"),
                          get<Indices>(table, "axis"), get<Vector>(table, "level")};
-  const auto n = told.psi.size();
-  require(told.axis.size() == n && told.level.size() == static_cast<Eigen::Index>(n), "point: rows of one length");
-  require_indices(told.psi, told.closure.rows, "psi");
+  const auto n = task.psi.size();
+  require(task.axis.size() == n && task.level.size() == static_cast<Eigen::Index>(n), "point: rows of one length");
+  require_indices(task.psi, task.closure.rows, "psi");
   const auto knots = get<Matrix>(table, "knots");
   const auto times = get<Vector>(table, "times");
   require(knots.cols() == times.size() && times.size() > 1 && knots.allFinite(), "knots: a column a time is needed");
-  return std::make_unique<PointMotion>(get<std::string>(table, "model"), get<Indices>(table, "place"), std::move(told),
+  return std::make_unique<PointMotion>(get<std::string>(table, "model"), get<Indices>(table, "place"), std::move(task),
                                        motion_of(get<nb::dict>(table, "path"), 3), get<Indices>(table, "q"), times,
                                        knots, get<double>(table, "tolerance"), get<double>(table, "end"),
                                        get<std::string>(table, "past_end"));

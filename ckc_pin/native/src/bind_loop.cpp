@@ -73,10 +73,10 @@ void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb
                         get<double>(solver, "max_step"),    get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
                         get<double>(solver, "closed")};
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
-  std::vector<Event> watched;
-  for (const auto& row : events) watched.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
+  std::vector<Event> functions;
+  for (const auto& row : events) functions.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
   self->core->profile.on = get<bool>(solver, "profile");
-  self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(watched));
+  self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(functions));
 }
 
 void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {
@@ -212,10 +212,10 @@ void bind_loop(nb::module_& m) {
       .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("hold",
            [](Run& run, nb::handle u) {
-             Vector held(run.core->d);
-             require(read(u, held), "u: an array of d doubles is needed");
-             const bool finite = held.allFinite();
-             if (finite) run.loop->hold(held);
+             Vector constant(run.core->d);
+             require(read(u, constant), "u: an array of d doubles is needed");
+             const bool finite = constant.allFinite();
+             if (finite) run.loop->hold(constant);
              return finite;
            },
            "u"_a)

@@ -135,14 +135,14 @@ void Sampling::put(double t, In u) {
 
 Control::Control(const Core& core, Indices actuated, bool direct, Vector limit)
     : actuation_(core, std::move(actuated), direct, std::move(limit)) {
-  held.setZero(core.d), u.setZero(core.d), sampled_.setZero(core.d);
+  constant.setZero(core.d), u.setZero(core.d), sampled_.setZero(core.d);
   tau.setZero(actuation_.at.size()), u_tree.setZero(core.n);
 }
 
 void Control::begin() {
   if (!sampling) return;
   sampling->next = 0, sampling->count = 0;
-  held.setZero();
+  constant.setZero();
 }
 
 bool Control::ask(const Measured& at, Out u) {
@@ -156,7 +156,7 @@ bool Control::act(const Measured& at) {
   if (feedback()) {
     if (!ask(at, u)) return false;
   } else {
-    u = held;
+    u = constant;
   }
   if (acts())
     actuation_.apply(at.core, u, tau, u_tree);
@@ -174,7 +174,7 @@ bool Control::sample(const Measured& at) {
     ++sampling->next;
   }
   for (; sampling->count && sampling->ring[sampling->first].first <= now; --sampling->count) {
-    held = sampling->ring[sampling->first].second;
+    constant = sampling->ring[sampling->first].second;
     sampling->first = (sampling->first + 1) % sampling->ring.size();
   }
   return true;

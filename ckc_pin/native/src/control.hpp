@@ -1,4 +1,4 @@
-// What acts on a mechanism: nothing, a u that is held, one of the paper's controllers or a caller's own, sampled or not,
+// What acts on a mechanism: nothing, a constant u, one of the paper's controllers or a caller's own, sampled or not,
 // through actuators with limits.
 #pragma once
 
@@ -96,14 +96,14 @@ class Control {
  public:
   Control(const Core& core, Indices actuated, bool direct, Vector limit);
 
-  std::unique_ptr<Controller> law;  // null: only what is held acts
+  std::unique_ptr<Controller> law;  // null: only a constant u acts
   std::optional<Sampling> sampling;
-  Vector held;                      // (d)
+  Vector constant;                      // (d)
   Problem problem;
   Vector u, tau, u_tree;            // what acts: (d), (actuators), (n)
 
   void begin();  // a run begins: nothing was sampled yet
-  bool acts() const { return law || !held.isZero(0); }
+  bool acts() const { return law || !constant.isZero(0); }
   // Whether u follows the state between samples.
   bool feedback() const { return law && !sampling; }
   bool act(const Measured& at);

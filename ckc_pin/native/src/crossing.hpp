@@ -1,5 +1,5 @@
 // Positions where J loses rank: seen within steps and ahead of them, passed by a collocation step where the formulation
-// does not need the branch from J, or told as the end of the run.
+// does not need the branch from J, or reported as the end of the run.
 #pragma once
 
 #include <memory>

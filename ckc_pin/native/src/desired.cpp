@@ -42,11 +42,11 @@ bool Spline::operator()(double t, Out x, Out x_dot, Out x_ddot) {
 constexpr int most_steps = 20;
 constexpr double longest = 0.5;  // rad or m: a longer Newton step in one coordinate is not local any more
 
-PointMotion::PointMotion(const std::string& model, Indices place, Told told, std::unique_ptr<Motion> path, Indices q,
+PointMotion::PointMotion(const std::string& model, Indices place, Task task, std::unique_ptr<Motion> path, Indices q,
                          Vector times, Matrix knots, double tolerance, double end, std::string past_end)
     : tree_(model, std::move(place)),
-      rows_(tree_, told.closure),
-      told_(std::move(told)),
+      rows_(tree_, task.closure),
+      task_(std::move(task)),
       path_(std::move(path)),
       q_(std::move(q)),
       times_(std::move(times)),
@@ -69,8 +69,8 @@ bool PointMotion::close() {
     rows_.set(tree_, q_tree_);
     rows_.jacobian(tree_);
     for (int i = 0; i < tree_.n; ++i) {
-      residual_(i) = rows_.phi(told_.psi[i]) - wanted_(i);
-      J_.row(i) = rows_.J.row(told_.psi[i]);
+      residual_(i) = rows_.phi(task_.psi[i]) - wanted_(i);
+      J_.row(i) = rows_.J.row(task_.psi[i]);
     }
     const double size = residual_.lpNorm<Eigen::Infinity>();
     if (k && !(size <= std::max(0.5 * before, tolerance_))) return false;
@@ -92,10 +92,10 @@ bool PointMotion::operator()(double t, Out x, Out x_dot, Out x_ddot) {
     return false;
   }
   if (!(*path_)(t, x_, x_dot_, x_ddot_)) return false;
-  const auto tell = [&](const Vector& told, const Vector* level, Vector& row) {
-    for (int i = 0; i < tree_.n; ++i) row(i) = told_.axis[i] >= 0 ? told(told_.axis[i]) : level ? (*level)(i) : 0.0;
+  const auto fill = [&](const Vector& path, const Vector* level, Vector& row) {
+    for (int i = 0; i < tree_.n; ++i) row(i) = task_.axis[i] >= 0 ? path(task_.axis[i]) : level ? (*level)(i) : 0.0;
   };
-  tell(x_, &told_.level, wanted_);
+  fill(x_, &task_.level, wanted_);
   // the knots around t, the nearer one first; the last one may be singular, at the workspace's edge
   const double* begin = times_.data();
   const auto count = times_.size();
@@ -118,13 +118,13 @@ bool PointMotion::operator()(double t, Out x, Out x_dot, Out x_ddot) {
     problem = "the desired path of the point cannot be followed here";
     return false;
   }
-  tell(x_dot_, nullptr, wanted_);
+  fill(x_dot_, nullptr, wanted_);
   factor_.solve(wanted_, v_);
   tree_.bias(q_tree_, v_);
   rows_.rates(tree_);
   rows_.bias(J_dot_v_);
-  tell(x_ddot_, nullptr, wanted_);
-  for (int i = 0; i < tree_.n; ++i) wanted_(i) -= J_dot_v_(told_.psi[i]);
+  fill(x_ddot_, nullptr, wanted_);
+  for (int i = 0; i < tree_.n; ++i) wanted_(i) -= J_dot_v_(task_.psi[i]);
   factor_.solve(wanted_, a_);
   t_ = t;
   for (size_t k = 0; k < q_.size(); ++k) {

@@ -40,17 +40,17 @@ class Spline : public Motion {
   std::vector<Matrix> coefficients_;
 };
 
-// q_d(t) that takes a point along a path, by Newton's method on Psi(q') = [phi; the point's told coordinates].
+// q_d(t) that takes a point along a path, by Newton's method on Psi(q') = [phi; the point's coordinates].
 class PointMotion : public Motion {
  public:
-  struct Told {
+  struct Task {
     Closure closure;      // of Psi and more
     Indices psi;          // its n rows that determine q'
     std::vector<int> axis;  // by row of psi: which of x, y, z it tells, -1 for one that keeps its level
-    Vector level;         // of psi; zero where told
+    Vector level;         // of psi; zero where the path gives it
   };
   // `knots`: configurations along the path, (nq, count), at `times`; past `end` the path leaves the workspace.
-  PointMotion(const std::string& model, Indices place, Told told, std::unique_ptr<Motion> path, Indices q,
+  PointMotion(const std::string& model, Indices place, Task task, std::unique_ptr<Motion> path, Indices q,
               Vector times, Matrix knots, double tolerance, double end, std::string past_end);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
 
@@ -59,7 +59,7 @@ class PointMotion : public Motion {
 
   Tree tree_;
   Rows rows_;
-  Told told_;
+  Task task_;
   std::unique_ptr<Motion> path_;
   Indices q_;
   Vector times_;

@@ -19,7 +19,7 @@ struct Event {
   enum Of { q, q_dot, sigma_min_phi_z, sigma_min_J, function };
   Of of;
   int coordinate = 0;
-  double value = 0.0, sign = 1.0;  // it crosses where sign (what is watched - value) crosses zero
+  double value = 0.0, sign = 1.0;  // it crosses where sign (its function - value) crosses zero
   int direction = 0;               // 1: rising, -1: falling, 0: both
   bool stop = false;
   double floor = 0.0;              // what counts as zero

@@ -214,7 +214,7 @@ Accepted LevelSet::accept(double t, Out y, double here) {
   return Accepted::restarted;
 }
 
-// Tell the core's state in other coordinates; false where phi_z is singular in them.
+// Write the core's state in other coordinates; false where phi_z is singular in them.
 bool LevelSet::move_to(const Partition& partition, double t, Out y) {
   const Vector q_tree = core.q_tree, v = velocity;
   core.split(partition.q, partition.z);

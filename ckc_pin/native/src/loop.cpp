@@ -4,18 +4,14 @@
 #include <chrono>
 #include <cmath>
 
-#include "stiffness.hpp"
-
 namespace ckc {
 
 using Clock = std::chrono::steady_clock;
 
 // At least, in a run that crosses losses of rank: with less they come out up to 1e-2 off after ten seconds.
 constexpr double fine_rtol = 1e-7;
-constexpr long first_check = 50;     // steps after which stiffness is looked at again, then twice as many
-constexpr double shortest_told = 1e-9;  // of what is left: a step whose end, or inside, cannot be told is made again
+constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
 constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
-constexpr double few_steps = 2.0;    // of RK45: a segment that takes no more is its
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
@@ -63,8 +59,8 @@ void Loop::jump() {
 }
 
 void Loop::hold(In u) {
-  if (control->held == u) return;
-  control->held = u;
+  if (control->constant == u) return;
+  control->constant = u;
   jump();
 }
 
@@ -93,7 +89,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
       if (const auto stop = sample()) return *stop;
     last_instant_ = control->sampling ? std::min(until, control->sampling->instant()) - near : until;
     while (recorder.due(now.t + near)) {
-      if (!recorder.add(*system, recorder.instant(), now.y)) return untold();
+      if (!recorder.add(*system, recorder.instant(), now.y)) return unknown();
       recorder.passed();
     }
     if (!(now.t < until)) return {Stop::end, now.t};
@@ -117,7 +113,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
 }
 
 Stop Loop::within(double until) {
-  if (!beyond_->motion->between(until, y_out_)) return untold();
+  if (!beyond_->motion->between(until, y_out_)) return unknown();
   t_present_ = until, y_present_ = y_out_;
   return {Stop::end, until};
 }
@@ -134,9 +130,9 @@ void Loop::back() {
 std::optional<Stop> Loop::sample() {
   if (!system->exact(now.t, now.y)) return trouble();
   system->core.inertia(), system->core.bias(system->v_tree);
-  held_before_ = control->held;
+  constant_before_ = control->constant;
   if (!control->sample(system->measured(now.t))) return trouble();
-  if (control->held != held_before_) jump();
+  if (control->constant != constant_before_) jump();
   return {};
 }
 
@@ -157,45 +153,6 @@ std::optional<Stop> Loop::begin(double bound) {
     if (!method_) choose(bound);
   }
   return {};
-}
-
-void Loop::take(Method& method) {
-  if (method_ == &method) return;
-  method_ = &method;
-  method_->forget();
-}
-
-void Loop::take_implicit() {
-  radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
-  take(*radau_);
-}
-
-// "auto": implicit where damping or a controller makes the motion stiff.
-void Loop::choose(double bound) {
-  const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping);
-  if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound - now.t))) {
-    take_implicit();
-  } else {
-    take(options_.method == "RK45" ? rk45_ : dop853_);
-    check_at_ = may_be_stiff ? first_check : 0;
-  }
-  if (now.h == 0.0) now.h = method_->first_length(bound, method_->error_order());
-}
-
-void Loop::choose_again(double bound) {
-  if (!method_ || method_ == radau_.get() || options_.method != "auto") return;
-  const double reach = method_ == &rk45_ ? rk45_.reach_of_order_five() : dop853_.reach_of_order_five();
-  Explicit& best = bound - now.t <= few_steps * reach ? rk45_ : dop853_;
-  if (&best == method_) return;
-  take(best);
-  now.h = &best == &rk45_ ? reach : std::max(now.h, few_steps * reach);
-}
-
-bool Loop::is_stiff(double duration) {
-  Matrix jacobian;
-  ++work.jacobians;
-  return system->jacobian(now.t, now.y, now.f, jacobian, work.rhs) && system->modes(now.y, jacobian) &&
-         stiff(jacobian, duration);
 }
 
 std::optional<Stop> Loop::one_step(double bound, bool last) {
@@ -228,7 +185,7 @@ std::optional<Stop> Loop::ordinary(double bound, bool last) {
   const double h = now.t_new - now.t;
   if (h < options_.min_step && now.t_new < bound) return Stop{Stop::min_step, now.t};
   const auto shorter = [&](double part) { return method_->retry(part * h), std::nullopt; };
-  const bool can_be_shorter = h > shortest_told * (bound - now.t);
+  const bool can_be_shorter = h > shortest_known * (bound - now.t);
   if (!system->at_last(now.t_new, now.y_new)) return can_be_shorter ? shorter(0.5) : std::optional(trouble());
   if (energy_.at(*system, tolerance_.rtol, tolerance_.atol) > energy_change) {
     if (can_be_shorter) return shorter(0.5);
@@ -260,22 +217,13 @@ std::optional<Stop> Loop::finish(const Made& step, double bound, bool last) {
   const double h = now.t_new - now.t;
   const bool ordinary = std::isnan(step.met);
   if (const auto stop = keep(step, last)) {
-    if (!ordinary || stop->why != Stop::output || !(h > shortest_told * (bound - now.t))) return stop;
+    if (!ordinary || stop->why != Stop::output || !(h > shortest_known * (bound - now.t))) return stop;
     return method_->retry(0.5 * h), std::nullopt;
   }
   ++steps[number()];
   if (ordinary) return length_ = h, check_stiffness(bound);
   method_->forget();
   crossings.push_back(step.met);
-  return {};
-}
-
-// After a while, and then after twice as long: what was not stiff at the start may have become so.
-std::optional<Stop> Loop::check_stiffness(double bound) {
-  if (!check_at_ || ++kept_ < check_at_) return {};
-  check_at_ *= 2;
-  if (const auto stop = begin(bound)) return stop;
-  if (now.t < bound && is_stiff(bound - now.t)) check_at_ = 0, take_implicit();
   return {};
 }
 
@@ -303,7 +251,7 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
     if (const auto stop = look(motion, last, halt)) return stop;
     if (const auto stop = outputs(motion, std::min(now.t_new, halt))) return stop;
     if (std::isfinite(halt)) {
-      if (halt < now.t_new && !motion.between(halt, y_out_)) return untold();
+      if (halt < now.t_new && !motion.between(halt, y_out_)) return unknown();
       now.t_old = now.t, now.y_old = now.y;
       now.y = halt < now.t_new ? y_out_ : now.y_new, now.t = halt;
       begun_ = false;
@@ -325,7 +273,7 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
 std::optional<Stop> Loop::look(Interpolant& motion, bool last, double& halt) {
   if (events.check(motion, last, halt)) return {};
   if (events.failed >= 0) return Stop{Stop::function, now.t, events.failed_value, events.failed};
-  return untold();
+  return unknown();
 }
 
 std::optional<Stop> Loop::outputs(Interpolant& motion, double until) {
@@ -334,14 +282,14 @@ std::optional<Stop> Loop::outputs(Interpolant& motion, double until) {
     if (t == now.t_new)
       y_out_ = now.y_new;
     else if (!motion.between(t, y_out_))
-      return untold();
-    if (!recorder.add(*system, t, y_out_)) return untold();
+      return unknown();
+    if (!recorder.add(*system, t, y_out_)) return unknown();
   }
   return {};
 }
 
-// Why a state within a step cannot be told.
-Stop Loop::untold() {
+// Why a state within a step cannot be known.
+Stop Loop::unknown() {
   const Stop stop = trouble();
   return stop.why == Stop::step ? Stop{Stop::output, now.t} : stop;
 }

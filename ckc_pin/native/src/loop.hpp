@@ -47,7 +47,7 @@ class Loop {
   // Begin at t from a configuration closed on phi = w, moving with v'; what was before has no influence.
   void start(double t, In q_tree, In v_tree, In w);
   void record(Vector instants, double* rows, Eigen::Index most) { recorder.begin(std::move(instants), rows, most); }
-  // Let a u act from now on, held.
+  // Let a u act from now on, constant.
   void hold(In u);
   // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
   // Where it does not end, and nothing has changed for some advances, a step may reach beyond; the present state is
@@ -97,7 +97,7 @@ class Loop {
   int number() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // of the method
   std::optional<Stop> sample();
   Stop trouble();
-  Stop untold();
+  Stop unknown();
   void jump();
   void choose(double bound);      // a method, at the start
   void choose_again(double bound);  // of the explicit ones, for another segment
@@ -126,7 +126,7 @@ class Loop {
     double t = 0.0;
     Vector q_tree, v_tree, w;
   } begin_;
-  Vector y_out_, held_before_;
+  Vector y_out_, constant_before_;
 
   bool reaches_ = false;         // whether a step may go beyond the time asked for,
   std::optional<Made> beyond_;   // the one that does,

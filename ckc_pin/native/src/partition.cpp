@@ -27,22 +27,22 @@ bool choose(const Core& core, const Matrix& J, Indices& z) {
   for (const auto& root : core.tree.roots)
     for (int k = root.v; k < root.v + 6; ++k) rooted[k] = true;
   for (int k = 0; k < core.n; ++k) (rooted[k] ? inside : rest).push_back(k);
-  const int held = static_cast<int>(inside.size());
-  if (held && held <= std::min<int>(core.rank, static_cast<int>(J.rows()))) {
+  const int within = static_cast<int>(inside.size());
+  if (within && within <= std::min<int>(core.rank, static_cast<int>(J.rows()))) {
     const Matrix block = columns_of(J, inside);
     const Eigen::ColPivHouseholderQR<Matrix> qr(block);
     const auto pivots = qr.matrixQR().diagonal().cwiseAbs();
-    if (pivots(held - 1) > core.scales.rank * pivots(0)) {
-      const Matrix basis = qr.householderQ() * Matrix::Identity(J.rows(), held);
+    if (pivots(within - 1) > core.scales.rank * pivots(0)) {
+      const Matrix basis = qr.householderQ() * Matrix::Identity(J.rows(), within);
       Matrix left = columns_of(J, rest);
       left -= basis * (basis.transpose() * left);
       z = inside;
-      take(left, rest, core.rank - held, z);
+      take(left, rest, core.rank - within, z);
       return true;
     }
   }
   const Matrix free = columns_of(J, rest);
-  if (held) {
+  if (within) {
     const Eigen::JacobiSVD<Matrix> svd(free);
     const auto& values = svd.singularValues();
     if (values.size() < core.rank || !(values(core.rank - 1) > core.scales.rank * values(0))) return false;

@@ -1,4 +1,4 @@
-// Watches for J losing rank, where branches of the motion meet.
+// Monitors J for a loss of rank, where branches of the motion meet.
 //
 // At a change point (a flat four-bar) the loops stop to determine the motion: a step that passes over it can come out
 // on the other branch, within tolerance and wrong. The least singular value s(t) of J shows it as a V that reaches zero:

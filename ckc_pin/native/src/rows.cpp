@@ -64,11 +64,11 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
   for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair]});
   for (const auto& rows : c.logs)
     for (int out : rows.out) joints(out, {rows.joint_a, rows.joint_b});
-  std::set<int> held(c.point_joint.begin(), c.point_joint.end());
-  held.insert(c.direction_joint.begin(), c.direction_joint.end());
-  for (const auto& rows : c.logs) held.insert(rows.joint_a), held.insert(rows.joint_b);
-  held.erase(0);  // the world does not move
-  held_.assign(held.begin(), held.end());
+  std::set<int> used(c.point_joint.begin(), c.point_joint.end());
+  used.insert(c.direction_joint.begin(), c.direction_joint.end());
+  for (const auto& rows : c.logs) used.insert(rows.joint_a), used.insert(rows.joint_b);
+  used.erase(0);  // the world does not move
+  joints_.assign(used.begin(), used.end());
   phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
   for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
   for (int i = 0; i < c.rows; ++i) {
@@ -138,7 +138,7 @@ void Rows::relative(const Tree& tree) {
 
 void Rows::rates(const Tree& tree) {
   const Closure& c = closure;
-  for (int joint : held_) velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.acceleration(joint);
+  for (int joint : joints_) velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.acceleration(joint);
   for (size_t k = 0; k < p_.size(); ++k) {
     const Vector6& v = velocity_[c.point_joint[k]];
     p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);
@@ -219,6 +219,16 @@ void Rows::bias(Out J_dot_v) const {
       if (wrench.joint) value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
     J_dot_v(i) = value;
   }
+}
+
+std::vector<Indices> Rows::pattern_of(const Indices& columns, int n) const {
+  Indices at(n, -1);
+  for (size_t j = 0; j < columns.size(); ++j) at[columns[j]] = static_cast<int>(j);
+  std::vector<Indices> found(closure.rows);
+  for (int i = 0; i < closure.rows; ++i)
+    for (int j : pattern[i])
+      if (at[j] >= 0) found[i].push_back(at[j]);
+  return found;
 }
 
 }  // namespace ckc

@@ -40,6 +40,7 @@ class Rows {
   Vector phi;                    // (rows)
   Matrix J, J_dot;               // (rows, n); zero outside the pattern
 
+  std::vector<Indices> pattern_of(const Indices& columns, int n) const;  // of those of n columns, counted among them
   void set(const Tree& tree, In q);  // phi and the wrenches, from the tree's placements
   void jacobian(const Tree& tree);
   void rates(const Tree& tree);      // the wrenches' rates, from the tree's velocities and accelerations
@@ -52,7 +53,7 @@ class Rows {
 
   int pairs_;
   std::vector<Vector3> p_, r_, e_, p_dot_, r_dot_, e_dot_;
-  Indices held_;  // joints that rows hold on to, and their motion
+  Indices joints_;  // joints that rows hold on to, and their motion
   std::vector<Vector6> velocity_, acceleration_;
   std::vector<std::vector<Wrench>> wrenches_;  // by row
 };

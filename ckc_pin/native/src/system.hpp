@@ -27,7 +27,7 @@ enum class Trouble {
 enum class Accepted {
   kept,
   changed,    // y is another one now, on the same motion
-  restarted,  // y is told in other coordinates: nothing that is remembered of former steps holds
+  restarted,  // y is in other coordinates: nothing that is remembered of former steps holds
   refused,    // the coordinates end here
 };
 

@@ -1,0 +1,157 @@
+// The tangent space of the closure: eq. 1's acceleration by projection on it, and steps that close the loops.
+#include <algorithm>
+#include <cmath>
+
+#include "core.hpp"
+
+namespace ckc {
+
+// Relative size of the last pivot of J at which its rank counts as lost; and below which the metric of D' is given up.
+constexpr double singular = 1e-12, weak = 1e-3;
+// Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
+constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
+
+// tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
+bool Core::basis_by_partition() {
+  if (basis_at_ != sets) {
+    basis_at_ = -1;
+    basis_.compute(rows.J, basis_z_);
+    free_ = basis_q_;
+    if (!(basis_.pivot_ratio() > sound)) return false;
+    for (int k = 0; k < n - rank; ++k) {
+      residual_ = -rows.J.col(basis_q_[k]);
+      basis_.solve(residual_, z_);
+      tangent_.col(k).setZero();
+      tangent_(basis_q_[k], k) = 1.0;
+      for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
+    }
+    if (!(steepness() < steep)) return false;
+    basis_at_ = sets;
+  }
+  basis_.solve(negative_, z_);
+  for (size_t i = 0; i < basis_z_.size(); ++i) x_(basis_z_[i]) = z_(i);
+  return true;
+}
+
+// The largest entry of the tangent basis, free of units: each column has a one.
+double Core::steepness() const {
+  double largest = 0.0;
+  for (int k = 0; k < n - rank; ++k)
+    for (int i = 0; i < n; ++i)
+      largest = std::max(largest, std::abs(tangent_(i, k)) / scales.columns(i) * scales.columns(free_[k]));
+  return largest;
+}
+
+// Take the pivoting's columns for the tangent basis from now on, if they are other ones and good for a while.
+void Core::repartition() {
+  if (!(steepness() < better)) return;
+  const auto& order = qr_.colsPermutation().indices();
+  pivots_.assign(order.data(), order.data() + rank);
+  std::sort(pivots_.begin(), pivots_.end());
+  if (pivots_ == basis_z_) return;
+  basis_z_ = pivots_;
+  basis_q_.assign(order.data() + rank, order.data() + n);
+  basis_.shape(rows.closure.rows, rank, rows.pattern_of(basis_z_, n));
+}
+
+// J P = Q [R S], and the columns that the pivoting left over are the freedoms; slides in units of the mechanism's size.
+bool Core::basis_by_pivoting(double least) {
+  qr_.compute(rows.J * scales.columns.asDiagonal());
+  const auto& r = qr_.matrixQR();
+  const auto& order = qr_.colsPermutation().indices();
+  if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
+  turned_ = negative_;
+  for (int k = 0; k < rank; ++k) {  // Q^T
+    const auto v = r.col(k).tail(turned_.size() - k - 1);
+    const double along = qr_.hCoeffs()(k) * (turned_(k) + v.dot(turned_.tail(v.size())));
+    turned_(k) -= along;
+    turned_.tail(v.size()) -= along * v;
+  }
+  tangent_.setZero();
+  for (int i = rank - 1; i >= 0; --i) {  // -R^-1 of it and of S, by rows
+    double value = turned_(i);
+    for (int k = i + 1; k < rank; ++k) value -= r(i, k) * x_(order(k));
+    x_(order(i)) = value / r(i, i);
+    for (int j = 0; j < n - rank; ++j) {
+      double entry = -r(i, rank + j);
+      for (int k = i + 1; k < rank; ++k) entry -= r(i, k) * tangent_(order(k), j);
+      tangent_(order(i), j) = entry / r(i, i);
+    }
+  }
+  for (int j = 0; j < n - rank; ++j) tangent_(free_[j] = order(rank + j), j) = 1.0;
+  x_.array() *= scales.columns.array();
+  for (int j = 0; j < n - rank; ++j) tangent_.col(j).array() *= scales.columns.array() / scales.columns(free_[j]);
+  return true;
+}
+
+bool Core::tangent_basis(In residual, double least) {
+  jacobian();
+  x_.setZero();
+  negative_ = -residual;  // which may be residual_
+  if (!rows.closure.rows)
+    tangent_.setIdentity();
+  else if (!basis_by_partition()) {
+    if (!basis_by_pivoting(least)) return false;
+    repartition();
+  }
+  return true;
+}
+
+void Core::tangent_inertia() {
+  tree_inertia();
+  if (dense_)
+    D_tangent_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * tangent_;
+  else
+    for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
+  square_.noalias() = tangent_.transpose() * D_tangent_;
+  square_factor_.compute(square_);
+}
+
+void Core::with_force(In force, Out x) {
+  small_b_.noalias() = tangent_.transpose() * force;
+  square_factor_.solve(small_b_, small_);
+  x = x_;
+  for (int k = 0; k < n - rank; ++k) x += small_(k) * tangent_.col(k);
+}
+
+void Core::z_step(In residual, Out x) {
+  phi_z.solve(residual, z_);
+  x.setZero();
+  for (size_t k = 0; k < z.size(); ++k) x(z[k]) = -z_(k);
+}
+
+bool Core::closing_step(In residual, Out x) {
+  if (!tangent_basis(residual, weak)) return shortest_step(residual, x);
+  tangent_inertia();
+  D_times(x_, y_);
+  y_ = -y_;
+  with_force(y_, x);
+  return true;
+}
+
+bool Core::shortest_step(In residual, Out x) {
+  if (!tangent_basis(residual, singular)) return false;
+  square_.noalias() = tangent_.transpose() * tangent_;
+  square_factor_.compute(square_);
+  y_ = -x_;
+  with_force(y_, x);
+  return true;
+}
+
+const Matrix* Core::tangent() {
+  residual_.setZero();
+  return tangent_basis(residual_, singular) ? &tangent_ : nullptr;
+}
+
+bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
+  residual_ = J_dot_v + correction;
+  if (!tangent_basis(residual_, singular)) return false;
+  tangent_inertia();
+  D_times(x_, y_);
+  y_ = u_tree - bias_tree - y_;
+  if (springs.any_damping) springs.add_damping(v_tree, y_);
+  with_force(y_, acceleration);
+  return true;
+}
+
+}  // namespace ckc
