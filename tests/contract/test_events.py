@@ -1,4 +1,4 @@
-"""Events: found however they lie in a step, located on the motion that numpy and SciPy compute, refused when wrong."""
+"""Events: found however they lie in a step, located on the motion that numpy and SciPy compute."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ckc_pin import Event, InputError, Run, Terms, load, load_scene, simulate
 from ckc_pin.native import _core
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
-from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
 
 Array = NDArray[np.float64]
@@ -292,84 +291,3 @@ def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
     assert event["direction"] in (-1, 1)
     run = simulate("five_bar/swing", {"t_end": 0.3, "event": [{"coordinate": "theta_2", "value": 0.5}]})
     assert Run.load(run.save(tmp_path / "run.npz")).events == answer.json["events"]
-
-
-# --- refused -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ((3,), "Event: 3 is no function"),
-        ((abs, 2), "direction = 2; valid: -1, 0, 1"),
-        ((abs, True), "direction = True"),
-        ((abs, 0, 1), "stop = 1: True or False is needed"),
-        ((abs, 0, True, 5), "name = 5: a string is needed"),
-    ],
-)
-def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        Event(*arguments)
-
-
-@pytest.mark.parametrize("value", [None, "0.3", np.zeros(2), [0.1], 1j])
-def test_a_function_that_gives_no_number_is_refused(value: Any) -> None:
-    with pytest.raises(InputError, match=r"the event 'odd' gave .*; a number is needed"):
-        simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: value, name="odd")])
-
-
-def test_a_function_alone_is_refused() -> None:
-    with pytest.raises(
-        InputError, match=r"events\[0\]: .* is no Event; write Event\(function, direction, stop, name\)"
-    ):
-        simulate("five_bar/swing", events=[lambda t, terms: t])  # type: ignore[list-item]
-
-
-def test_a_function_that_becomes_nan_stops_the_run() -> None:
-    def lost(t: float, terms: Terms) -> float:
-        return float("nan") if t > 0.2 else 1.0
-
-    run = simulate("five_bar/swing", {"t_end": 1.0}, events=[Event(lost)])
-    assert run.status == "stopped"
-    assert run.message.endswith("the event 'lost' is nan")
-    assert 0.05 < run.t[-1] <= 0.3
-
-
-SCENE = ("run", "bar/swing.scene.toml", "--set")
-BAD = [
-    ("{}", "event[0]: the key 'coordinate' is missing; of = 'q' needs one"),
-    ('{of="q_dot"}', "event[0]: the key 'coordinate' is missing; of = 'q_dot' needs one"),
-    ('{of="limit", value=1.0}', "event[0]: of = 'limit' has no key 'value'; the limits are those of the URDF"),
-    ('{of="limit"}', "event[0]: no joint of five_bar has limits in its URDF"),
-    ('{of="sigma_min_J", coordinate="theta_1", value=1.0}', "event[0]: of = 'sigma_min_J' has no key 'coordinate'"),
-    ('{of="sigma_min_phi_z"}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
-    ('{of="sigma_min_phi_z", value=-1.0}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
-    ('{coordinate="x", of="limit"}', "event[0].coordinate: no coordinate 'x'; there are theta_1, theta_2"),
-    ('{coordinate="theta_1", value=nan}', "event[0].value = nan: a finite number is needed"),
-]
-
-
-@pytest.mark.parametrize(("event", "says"), BAD, ids=[event for event, _ in BAD])
-def test_bad_events_in_a_scene(event: str, says: str, bar: Path) -> None:
-    expect(Bad(event, (*SCENE, f"event=[{event}]"), [says]), bar)
-
-
-def test_an_open_chain_has_no_margin(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="has no closed loop, so there is no sigma_min_J"):
-        simulate(_pendulum(tmp_path), {"event": [{"of": "sigma_min_J", "value": 0.1}]})
-
-
-def _pendulum(folder: Path) -> Path:
-    (folder / "p.urdf").write_text(
-        '<robot name="p"><link name="a"/><link name="b"><inertial><mass value="1"/><origin xyz="1 0 0"/>'
-        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="swing" '
-        'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>',
-        encoding="utf-8",
-    )
-    (folder / "mechanism.toml").write_text('name = "pendulum"\nurdf = "p.urdf"\n', encoding="utf-8")
-    scene = folder / "s.scene.toml"
-    scene.write_text(
-        'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\n[initial.q]\nswing = 0.1\n',
-        encoding="utf-8",
-    )
-    return scene

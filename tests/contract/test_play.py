@@ -1,120 +1,20 @@
-"""Playback: what the viewer is told, who may listen, and that nothing stays behind."""
+"""Playback: what the viewer is told."""
 
 from __future__ import annotations
 
-import asyncio
-import gc
-import os
-import signal
-import socket
-import subprocess
-import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from http.client import HTTPConnection
 from urllib.request import urlopen
 
-import msgspec
 import numpy as np
 import pytest
-from tornado.httpclient import HTTPClientError, HTTPRequest
-from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 import ckc_pin
 from ckc_pin.errors import InputError
-from ckc_pin.view import commands
 from ckc_pin.view.drawing import FEWEST, scene
 from ckc_pin.view.player import play
-from ckc_pin.view.server import ViewServer
-from tests.contract.helpers.viewer import listening, raw_viewer, vanish
+from tests.contract.helpers.playback import floats, matrix, messages_to, objects, placed, rotated, tracks
 from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_ARM, write_scene
 
 L_PROXIMAL, L_DISTAL, BASE = 0.2794, 0.3048, 0.3048  # of five_bar
-
-Server = Callable[..., ViewServer]
-
-
-@pytest.fixture(scope="session")
-def tracking(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
-    return run("five_bar/tracking", formulation="reduced")
-
-
-@pytest.fixture(scope="session")
-def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
-    return run("five_bar/swing")
-
-
-@pytest.fixture
-def serve() -> Iterator[Server]:
-    """play(..., block=False), stopped at the end of the test."""
-    started: list[ViewServer] = []
-
-    def start(*runs: ckc_pin.Run, **options: float) -> ViewServer:
-        server = play(runs, block=False, **options)
-        assert server is not None
-        started.append(server)
-        return server
-
-    yield start
-    for server in started:
-        server.stop()
-
-
-def messages_to(server: ViewServer, count: int, **headers: str) -> list[dict]:
-    """What a viewer that connects now is told in its first messages."""
-
-    async def listen() -> list[bytes]:
-        url = server.url.replace("http", "ws")
-        connection = await websocket_connect(HTTPRequest(url, headers=headers), max_message_size=2**26)
-        messages = [await asyncio.wait_for(connection.read_message(), 20) for _ in range(count)]
-        await leave(connection)
-        return messages
-
-    return [msgspec.msgpack.decode(message) for message in asyncio.run(listen())]
-
-
-async def leave(connection: WebSocketClientConnection) -> None:
-    connection.close()
-    while await connection.read_message() is not None:
-        pass
-
-
-def floats(value: msgspec.msgpack.Ext, columns: int) -> np.ndarray:
-    """A Float32Array of the viewer as rows."""
-    assert value.code == 0x17
-    return np.frombuffer(value.data, dtype="<f4").reshape(-1, columns).astype(float)
-
-
-def objects(drawing: list[dict]) -> dict[str, dict]:
-    return {c["path"]: c["object"] for c in drawing if c["type"] == "set_object"}
-
-
-def tracks(drawing: list[dict]) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Times, positions and quaternions by path."""
-    (animation,) = [c for c in drawing if c["type"] == "set_animation"]
-    found = {}
-    for one in animation["animations"]:
-        position, quaternion = (one["clip"]["tracks"] * 2)[:2]
-        if (position["name"], quaternion["name"]) != (".position", ".quaternion"):
-            continue
-        assert one["clip"]["fps"] == 1  # times are seconds
-        times = floats(position["times"], 1)[:, 0]
-        found[one["path"]] = times, floats(position["values"], 3), floats(quaternion["values"], 4)
-    return found
-
-
-def matrix(columns: list[float]) -> np.ndarray:
-    return np.array(columns).reshape(4, 4).T
-
-
-def rotated(quaternions: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """A point turned by quaternions x, y, z, w."""
-    vector, w = quaternions[:, :3], quaternions[:, 3:]
-    return point + 2 * np.cross(vector, np.cross(vector, point) + w * point)
-
-
-# --- what the viewer is told ---------------------------------------------------------------------
 
 
 def test_page_and_viewer_are_served(serve, swing):
@@ -273,11 +173,6 @@ def test_quaternions_are_continuous(tmp_path):
 # --- the side to look from -----------------------------------------------------------------------
 
 
-def placed(drawing: list[dict], path: str = "/world") -> np.ndarray:
-    (command,) = [c for c in drawing if c["type"] == "set_transform" and c["path"] == path]
-    return matrix(command["matrix"])
-
-
 def test_a_planar_mechanism_faces_the_viewer(swing, tmp_path):
     # In the viewer's scene x is right, z is up, and the camera looks along +y.
     five_bar = placed(scene([swing]))[:3, :3]
@@ -376,178 +271,3 @@ def test_names_from_files_are_text_to_the_page(tmp_path):
         page = answer.read().decode()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)&lt;" in page
-
-
-# --- the server ----------------------------------------------------------------------------------
-
-
-def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing):
-    server = serve(swing)
-    count = len(server.stage.messages())
-    first = messages_to(server, count)
-    server.send(commands.set_transform("/world", 2 * np.eye(4)))
-    second = messages_to(server, count)
-    assert [c["path"] for c in second] == [c["path"] for c in first]
-    np.testing.assert_array_equal(placed(second), 2 * np.eye(4))
-    assert second[-1]["type"] == "set_animation"
-    assert objects(second) == objects(first)
-
-
-def test_a_viewer_that_is_there_gets_it_at_once(serve, swing):
-    server = serve(swing)
-
-    async def listen() -> dict:
-        connection = await websocket_connect(server.url.replace("http", "ws"), max_message_size=2**26)
-        for _ in server.stage.messages():
-            await connection.read_message()
-        server.send(commands.set_property("/Axes", "visible", True))
-        message = await asyncio.wait_for(connection.read_message(), 20)
-        await leave(connection)
-        return msgspec.msgpack.decode(message)
-
-    assert asyncio.run(listen()) == {"type": "set_property", "path": "/Axes", "property": "visible", "value": True}
-
-
-def status(server: ViewServer, path: str, **headers: str) -> int:
-    connection = HTTPConnection("127.0.0.1", server.port, timeout=20)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    return answer.status
-
-
-@pytest.mark.parametrize("path", ["/", "/main.min.js", "/start.js", "/nothing"])
-def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
-    server = serve(swing)
-    expected = 404 if path == "/nothing" else 200
-    for name in ("127.0.0.1", "localhost"):
-        assert status(server, path, Host=f"{name}:{server.port}") == expected
-        assert status(server, path, Origin=f"http://{name}:{server.port}") == expected
-    for host in ("evil.example", "127.0.0.1", f"127.0.0.1:{server.port + 1}", f"evil.example:{server.port}", ""):
-        assert status(server, path, Host=host) == 403
-    for origin in ("http://evil.example", "null", f"https://127.0.0.1:{server.port}", "http://localhost"):
-        assert status(server, path, Origin=origin) == 403
-
-
-def test_websockets_of_other_pages_are_refused(serve, swing):
-    server = serve(swing)
-    count = len(server.stage.messages())
-    assert len(messages_to(server, count, Origin=f"http://localhost:{server.port}")) == count
-    for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
-        with pytest.raises(HTTPClientError) as refused:
-            messages_to(server, 1, **headers)
-        assert refused.value.code == 403
-
-
-def test_listens_on_loopback_only(serve, swing):
-    before = listening()
-    server = serve(swing)
-    assert listening() - before == {f"0100007F:{server.port:04X}"}
-
-
-def test_a_port_in_use_is_said(serve, swing):
-    taken = serve(swing).port
-    with pytest.raises(InputError, match=rf"port {taken} on 127.0.0.1: address already in use; choose another"):
-        serve(swing, port=taken)
-    for port in (-1, 65536):
-        with pytest.raises(InputError, match="choose one from 1 to 65535"):
-            serve(swing, port=port)
-
-
-def test_bad_input(swing):
-    with pytest.raises(InputError, match="no run given"):
-        play([], block=False)
-    for speed in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="speed"):
-            play(swing, speed=speed, block=False)
-
-
-def test_nothing_is_left_after_stop(swing):
-    threads, files = threading.enumerate(), len(os.listdir("/dev/fd"))
-    server = play(swing, block=False)
-    messages_to(server, 3)
-    server.stop()
-    server.stop()  # again is no harm
-    assert threading.enumerate() == threads
-    assert len(os.listdir("/dev/fd")) == files
-    with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", server.port)) != 0
-    with play(swing, port=server.port, block=False) as again:  # the port is free at once
-        assert again.port == server.port
-
-
-def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
-    server = serve(swing)
-    vanish(raw_viewer(server))
-    for _ in range(50):
-        server.send(commands.polyline("/world/line", np.zeros((5000, 3)), (0, 0, 0)))
-    deadline = time.monotonic() + 20
-    while server.viewers and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not server.viewers
-    assert len(messages_to(server, 3)) == 3
-    server.stop()
-    gc.collect()  # asyncio complains about forgotten errors only now
-    assert not caplog.records
-
-
-def test_stop_does_not_wait_for_a_viewer_that_hangs(swing):
-    server = play(swing, block=False)
-    with raw_viewer(server) as stalled:
-        server.stop()
-        assert not server._thread.is_alive()
-        while stalled.recv(2**16):  # what was under way, then the end
-            pass
-
-
-def test_play_prints_the_address_and_waits_for_ctrl_c(swing, tmp_path):
-    saved = swing.save(tmp_path / "run.npz")
-    code = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background job has it ignored
-        f"import ckc_pin; ckc_pin.play(ckc_pin.Run.load({str(saved)!r}))"
-    )
-    command = [sys.executable, "-W", "error", "-c", code]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        url = process.stdout.readline().split()[0]
-        with urlopen(url) as answer:
-            assert answer.status == 200
-        process.send_signal(signal.SIGINT)
-        try:
-            _, errors = process.communicate(timeout=20)
-        finally:
-            process.kill()
-    assert (process.returncode, errors) == (0, "")
-
-
-def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
-    saved = swing.save(tmp_path / "run.npz")
-    code = (
-        "import sys, ckc_pin\n"
-        "from ckc_pin.view.drawing import scene\n"
-        "from ckc_pin.view.player import play\n"
-        f"run = ckc_pin.Run.load({str(saved)!r})\n"
-        "scene([run])\n"
-        "assert not {'tornado', 'meshcat', 'matplotlib', 'yourdfpy'} & set(sys.modules)\n"
-        "play(run, block=False).stop()\n"
-        "assert not {'zmq', 'meshcat', 'IPython', 'matplotlib'} & set(sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-
-
-def test_a_browser_that_cannot_be_opened_is_said(swing, monkeypatch, capsys):
-    asked = []
-    monkeypatch.setattr("webbrowser.open", lambda url: bool(asked.append(url)))
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with play(swing, open_browser=True, block=False) as server:
-        assert not asked  # one for terminals would take ours
-    assert f"no display here; open {server.url}" in capsys.readouterr().err
-    monkeypatch.setenv("DISPLAY", ":7")
-    with play(swing, open_browser=True, block=False) as server:
-        assert asked == [server.url]
-    assert f"open {server.url} in yours" in capsys.readouterr().err
