@@ -19,8 +19,8 @@ from typing import Literal
 
 import numpy as np
 
+from ckc_pin.analysis.explored import Explored, explore
 from ckc_pin.analysis.gradient import symmetric_least
-from ckc_pin.analysis.sheet import Sheet, explore
 from ckc_pin.analysis.walk import Border, follow, least, margin, same_configuration
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
@@ -85,13 +85,13 @@ class SublevelSet:
 
     Attributes
     ----------
-    sheet : Sheet
+    explored : Explored
     eigenvalues, margins : (points,) arrays
-        Least eigenvalue of K_P + sym dh/dq, and |s|, at the sheet's nodes.
+        Least eigenvalue of K_P + sym dh/dq, and |s|, at the nodes explored.
     step : (d,) array
     """
 
-    sheet: Sheet
+    explored: Explored
     eigenvalues: Array
     margins: Array
     step: Array
@@ -127,11 +127,11 @@ def sublevel_set(
     step = np.sqrt(2 * max(level, 1e-12) * np.diagonal(np.linalg.inv(controller.K_P))) / divisions
     target = controller.target.at
     level = max(level, rest_height(mechanism, controller, target))  # zero but for rounding
-    sheet = explore(mechanism, target, step, lambda at: rest_height(mechanism, controller, at), level, seed=seed)
+    explored = explore(mechanism, target, step, lambda at: rest_height(mechanism, controller, at), level, seed=seed)
     return SublevelSet(
-        sheet=sheet,
-        eigenvalues=np.array([_stiffness(mechanism, controller, at) for at in sheet.nodes]),
-        margins=np.array([margin(at) for at in sheet.nodes]),
+        explored=explored,
+        eigenvalues=np.array([_stiffness(mechanism, controller, at) for at in explored.nodes]),
+        margins=np.array([margin(at) for at in explored.nodes]),
         step=step,
     )
 
@@ -157,19 +157,21 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
     found = sublevel_set(mechanism, controller, level, divisions)
     search = _Search(mechanism, controller, found, level)
     tight, soft = search.tightest(), search.softest()
-    singular = bool(found.sheet.ends) or margin(tight) <= SINGULAR
+    singular = bool(found.explored.ends) or margin(tight) <= SINGULAR
     failure = search.first_failure([tight, soft])
     safe_level, worst = failure or (level, soft)
     return Certificate(
-        status="certified" if failure is None and not found.sheet.full and search.connected(start) else "not certified",
+        status="certified"
+        if failure is None and not found.explored.full and search.connected(start)
+        else "not certified",
         reason=search.reason(singular, tight, soft, start),
         level=level,
         least_eigenvalue=np.nan if singular else search.stiffness(soft),
         least_margin=0.0 if singular else margin(tight),
         safe_level=safe_level,
         worst_q=mechanism.independent_part(worst.q_tree),
-        sampled=found.sheet.sampled,
-        points=len(found.sheet.nodes),
+        sampled=found.explored.sampled,
+        points=len(found.explored.nodes),
         resolution=found.step,
     )
 
@@ -206,25 +208,27 @@ class _Search:
         return margin(at) <= SINGULAR or self.stiffness(at) <= 0
 
     def tightest(self) -> Kinematics:
-        if self.found.sheet.ends:
-            return min(self.found.sheet.ends, key=lambda end: end.water).at
+        if self.found.explored.ends:
+            return min(self.found.explored.ends, key=lambda end: end.water).at
         return self._lowest(margin, self.found.margins)
 
     def softest(self) -> Kinematics:
-        if self.found.sheet.ends:
-            return self.found.sheet.nodes[int(np.argmin(self.found.eigenvalues))]
+        if self.found.explored.ends:
+            return self.found.explored.nodes[int(np.argmin(self.found.eigenvalues))]
         return self._lowest(self.stiffness, self.found.eigenvalues)
 
     def first_failure(self, refined: list[Kinematics]) -> tuple[float, Kinematics] | None:
         """Return up to which level of U nothing fails, and where something does first; None if nowhere."""
-        sheet = self.found.sheet
-        failing = [(w, at) for w, at, x in zip(sheet.water, sheet.nodes, self.found.eigenvalues, strict=True) if x <= 0]
+        explored = self.found.explored
+        failing = [
+            (w, at) for w, at, x in zip(explored.water, explored.nodes, self.found.eigenvalues, strict=True) if x <= 0
+        ]
         failing += [(max(0.0, self.height(at)), at) for at in refined if self.fails(at)]
-        failing += [(end.water, end.at) for end in sheet.ends]
+        failing += [(end.water, end.at) for end in explored.ends]
         if not failing:
             return None
         water, first = min(failing, key=lambda pair: pair[0])
-        below = max((w for w in sheet.water if w < water), default=0.0)
+        below = max((w for w in explored.water if w < water), default=0.0)
         near = Border(self.mechanism, NEAR, near=True) if margin(first) <= SINGULAR else self._failing
         lowest = least(self.mechanism, first, self.height, self.found.step, near)
         return min(below, max(0.0, self.height(lowest))), lowest if 0.0 <= self.height(lowest) < water else first
@@ -234,18 +238,18 @@ class _Search:
             return f"the set reaches a singular configuration, near {self._where(tight)}"
         if self.stiffness(soft) <= 0:
             return f"K_P + dh/dq has the eigenvalue {self.stiffness(soft):.3g} at {self._where(soft)}, inside the set"
-        if self.found.sheet.full:
-            return f"the set goes on beyond the {len(self.found.sheet.nodes)} points that were looked at"
+        if self.found.explored.full:
+            return f"the set goes on beyond the {len(self.found.explored.nodes)} points that were looked at"
         if not self.connected(start):
             return "the start is not connected to q_d within {V_L(q, 0) <= V_L(start)}"
         return "K_P + dh/dq is positive definite on the whole set, and no singular configuration lies on it"
 
     def connected(self, start: Start) -> bool:
         """Whether the start is next to a node of the lattice, or seen from q_d, on the same branch."""
-        if self.found.sheet.sampled:
+        if self.found.explored.sampled:
             return self._seen(start.at)
         q = self.mechanism.independent_part(start.at.q_tree)
-        for at in self.found.sheet.nodes:
+        for at in self.found.explored.nodes:
             straight = q - self.mechanism.independent_part(at.q_tree)
             if np.all(np.abs(straight) <= 1.01 * self.found.step) and self._leads(at, straight, start.at):
                 return True
@@ -267,7 +271,7 @@ class _Search:
         return reached == 1.0 and same_configuration(self.mechanism, end, there)
 
     def _lowest(self, value: Callable[[Kinematics], float], values: Array) -> Kinematics:
-        nodes, step = self.found.sheet.nodes, self.found.step
+        nodes, step = self.found.explored.nodes, self.found.step
         return least(self.mechanism, nodes[int(np.argmin(values))], value, step, self._inside)
 
     def _failing(self, at: Kinematics) -> Kinematics | None:

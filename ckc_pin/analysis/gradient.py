@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.sheet import Sheet, explore
+from ckc_pin.analysis.explored import Explored, explore
 from ckc_pin.analysis.walk import Border, follow, least, margin, way
 from ckc_pin.control.desired import Desired
 from ckc_pin.dynamics.equilibrium import h_gradient
@@ -69,7 +69,7 @@ def chart_step(mechanism: Mechanism, divisions: int) -> Array:
     return np.where(metres, 2 * mechanism.size, 2 * np.pi) / divisions
 
 
-def explore_branch(mechanism: Mechanism, branch: Kinematics, divisions: int) -> Sheet:
+def explore_branch(mechanism: Mechanism, branch: Kinematics, divisions: int) -> Explored:
     """Explore all of a branch: a turn of every angle, lengths by the mechanism's size to either side."""
     step = chart_step(mechanism, divisions)
     angles = ~mechanism.tree.in_metres[mechanism.partition.q]
@@ -82,36 +82,36 @@ def explore_branch(mechanism: Mechanism, branch: Kinematics, divisions: int) -> 
     return explore(mechanism, branch, step, inside, 0.0, np.where(angles, divisions, 0))
 
 
-def gradient_bounds(mechanism: Mechanism, sheet: Sheet, margins: Sequence[float], step: Array) -> list[Bound]:
+def gradient_bounds(mechanism: Mechanism, explored: Explored, margins: Sequence[float], step: Array) -> list[Bound]:
     """Bound dh/dq on |s| >= s_min over an explored branch, for several s_min.
 
     Where dh/dq grows towards singularity the bound is reached on the border |s| = s_min. So besides the nodes
-    inside, the points where the sheet's edges cross the border are solved for; from the most extreme of all
+    inside, the points where its edges cross the border are solved for; from the most extreme of all
     these a local search goes on, along the border where it has to.
 
     Parameters
     ----------
     mechanism : Mechanism
-    sheet : Sheet
+    explored : Explored
         From `explore_branch`.
     margins : sequence of float
         s_min, each in (0, 1).
     step : (d,) array
-        The sheet's.
+        That of the exploration.
 
     Raises
     ------
     InputError
         Nothing on the branch is as far from singular as that.
     """
-    volumes = [margin(at) for at in sheet.nodes]
-    edges = [(i, sheet.nodes[j], volumes[j]) for i, j in sheet.edges]
-    edges += [(end.node, end.at, margin(end.at)) for end in sheet.ends]
+    volumes = [margin(at) for at in explored.nodes]
+    edges = [(i, explored.nodes[j], volumes[j]) for i, j in explored.edges]
+    edges += [(end.node, end.at, margin(end.at)) for end in explored.ends]
     bounds = []
     for s_min in margins:
-        ats = [at for at, volume in zip(sheet.nodes, volumes, strict=True) if volume >= s_min]
+        ats = [at for at, volume in zip(explored.nodes, volumes, strict=True) if volume >= s_min]
         ats += [
-            _crossing(mechanism, sheet.nodes[i], there, s_min)
+            _crossing(mechanism, explored.nodes[i], there, s_min)
             for i, there, volume in edges
             if (volumes[i] - s_min) * (volume - s_min) < 0
         ]
@@ -119,7 +119,7 @@ def gradient_bounds(mechanism: Mechanism, sheet: Sheet, margins: Sequence[float]
             raise InputError(f"{mechanism.name}: no configuration found with |s| >= {s_min:g}")
         admit = Border(mechanism, s_min)
         norm, low = (_extreme(mechanism, ats, value, step, admit) for value in (_minus_norm, _low))
-        bounds.append(_bound(mechanism, s_min, norm, low, len(ats), sheet.sampled))
+        bounds.append(_bound(mechanism, s_min, norm, low, len(ats), explored.sampled))
     return bounds
 
 

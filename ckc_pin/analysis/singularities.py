@@ -100,22 +100,22 @@ class SingularSystem:
     def __init__(self, mechanism: Mechanism, point: str | None = None) -> None:
         self.mechanism = mechanism
         self.point = point
-        self._held = _point_rows(mechanism, point) if point is not None else None
+        self._fixed = _point_rows(mechanism, point) if point is not None else None
         self._select = np.zeros((mechanism.d, mechanism.n))
         self._select[np.arange(mechanism.d), mechanism.partition.q] = 1.0
 
     def rows(self, at: Kinematics) -> Array:
-        """Return [J; S], whose null vector v is, shape (rows + held, n)."""
-        if self._held is None:
+        """Return [J; S], whose null vector v is, shape (rows + fixed, n)."""
+        if self._fixed is None:
             return np.vstack([at.J, self._select])
-        return np.vstack([at.J, self._held.jacobian(self._pose(at))])
+        return np.vstack([at.J, self._fixed.jacobian(self._pose(at))])
 
     def rows_dot(self, at: Kinematics, v: Array) -> Array:
         """Return the derivative of [J; S] along a tangent velocity, same shape."""
-        if self._held is None:
+        if self._fixed is None:
             return np.vstack([at.J_dot(v), np.zeros_like(self._select)])
         pose = self._pose(at)
-        return np.vstack([at.J_dot(v), self._held.jacobian_dot(pose, Rate(pose, v))])
+        return np.vstack([at.J_dot(v), self._fixed.jacobian_dot(pose, Rate(pose, v))])
 
     def residual(self, at: Kinematics, v: Array) -> Array:
         """Return [phi; J v; S v; (v . v - 1) / 2]."""
@@ -152,10 +152,10 @@ class SingularSystem:
         return at, v, float(np.abs(residual).max())
 
     def _pose(self, at: Kinematics) -> Pose:
-        held = self._held
-        if held is None:
-            raise ValueError("q is held, not a point")
-        return Pose(self.mechanism.tree, held.anchors, at.q_tree)
+        fixed = self._fixed
+        if fixed is None:
+            raise ValueError("q is fixed, not a point")
+        return Pose(self.mechanism.tree, fixed.anchors, at.q_tree)
 
 
 def find_singular(mechanism: Mechanism, q_start: Array | None = None, point: str | None = None) -> SingularPoint:
@@ -247,7 +247,7 @@ def _best_chart(mechanism: Mechanism, at: Kinematics, J: Array, rank: int) -> tu
 
 
 def _kind(at: Kinematics, v: Array, tolerance: float) -> Literal["locked", "fold"]:
-    """Tell whether the loops close again with q held and z moved along v by a finite amount, singular there too.
+    """Tell whether the loops close again with q fixed and z moved along v by a finite amount, singular there too.
 
     Where two branches only meet, the way back to the meeting point is all that closes.
     """

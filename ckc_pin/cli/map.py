@@ -25,7 +25,7 @@ __all__ = ["map_"]
 )
 @options.mechanism
 @click.option("--scene", help="Draw this scene's desired trajectory on top.")
-@click.option("--over", metavar="A,B", help="The axes; all others are held.")
+@click.option("--over", metavar="A,B", help="The axes; all others are fixed.")
 @click.option("--space", default="joint", help="joint, or cartesian: where a point goes.")
 @click.option("--point", help="A [[point]]; absent: the first one.")
 @click.option("--cells", type=int, default=200, help="Along each axis.")

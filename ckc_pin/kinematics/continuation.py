@@ -1,7 +1,7 @@
 """Continuation: a way is followed by pieces, each halved where it fails and twice as long where the last succeeded.
 
 Following a way by pieces is what keeps the assembly branch: Newton's method from far away may close on another one.
-Whoever follows one says how a piece is predicted and corrected; that it does not end on another branch is told by the
+Whoever follows one says how a piece is predicted and corrected; that it does not end on another branch is known by the
 sign of a determinant, for between two branches there is a singular configuration.
 """
 

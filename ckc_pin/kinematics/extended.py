@@ -2,7 +2,7 @@
 
 Eq. 3 stacks phi(q') and S q' - q to say that q determines q'. A point's coordinates p(q') can stand where S q'
 does: then they determine q', and following them is inverse kinematics. `Extended` has all these rows in one closure;
-`Task` selects those that are told what to be, on the level set phi = 0, S q' = q or p(q') = x.
+`Task` selects those whose values are given, on the level set phi = 0, S q' = q or p(q') = x.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Extended:
 
 @dataclass(frozen=True)
 class Task:
-    """d rows that are told what to be, and with phi = 0 determine the configuration: Psi of eq. 3.
+    """d rows whose values are given, and with phi = 0 determine the configuration: Psi of eq. 3.
 
     Attributes
     ----------
@@ -83,12 +83,12 @@ class Task:
 
     @property
     def every(self) -> IntArray:
-        """The rows of Psi, n of them: those of phi that are not redundant, then the told ones."""
+        """The rows of Psi, n of them: those of phi that are not redundant, then the given ones."""
         return np.concatenate([self.extended.free, self.rows])
 
-    def level(self, told: Array) -> Array:
-        """Psi's wanted values (count, n) from the told ones (count, d)."""
-        return np.hstack([np.zeros((len(told), len(self.extended.free))), told])
+    def level(self, given: Array) -> Array:
+        """Psi's wanted values (count, n) from the given ones (count, d)."""
+        return np.hstack([np.zeros((len(given), len(self.extended.free))), given])
 
     def evaluate(self, q_tree: Array) -> tuple[Array, Array]:
         """All rows and their Jacobians at configurations (count, nq)."""
@@ -96,7 +96,7 @@ class Task:
 
 
 def find_point(mechanism: Mechanism, name: str | None = None) -> str:
-    """Return the name of a point, the first one unless told.
+    """Return the name of a point, the first one unless given.
 
     Raises
     ------

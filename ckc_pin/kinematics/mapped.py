@@ -7,7 +7,7 @@ from typing import Literal
 
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
-__all__ = ["LABELS", "Approach", "Axis", "Kind", "Locus", "Path", "Sheet", "SingularityMap", "Space"]
+__all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
 
 Space = Literal["joint", "cartesian"]
 Kind = Literal["locked", "fold", "rank loss", "serial"]
@@ -46,7 +46,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class Aspect:
     """What one branch reaches without a singular configuration on the way.
 
     In the joint space an assembly branch; in the Cartesian space a working mode.
@@ -81,8 +81,8 @@ class Locus:
     at : (m, axes) array
         Its place in the map, angles not wrapped.
     point : (m, 3) array or None
-    on : (sheets, m) array of bool
-        Which parts of it are seen from which sheet.
+    on : (aspects, m) array of bool
+        Which parts of it are seen from which aspect.
     closed : bool
     residual : float
         Largest residual of the equations solved, m and rad.
@@ -127,8 +127,8 @@ class Path:
     t : (m,) array
         Seconds; in the Cartesian space as far as it can be followed.
     at : (m, axes) array
-    on : (sheets, m) array of bool
-        Which parts of it are on which sheet.
+    on : (aspects, m) array of bool
+        Which parts of it are on which aspect.
     leaves_at : float or None
     closest_t, sigma_min : float
         When it comes closest to a singular phi_z, and its smallest singular value then.
@@ -158,18 +158,18 @@ class SingularityMap:
         Whose serial singularities and places these are.
     axes : tuple of Axis
         One or two.
-    held : dict of str to float
-        The other told values.
+    fixed : dict of str to float
+        The other given values.
     measure : "det phi_z" or "sigma_min(phi_z)"
     measure_unit : str
-    sheets : tuple of Sheet
+    aspects : tuple of Aspect
         The assembled one first.
     more_branches : bool
         Whether there are branches beyond those shown.
     loci : tuple of Locus
     path : Path or None
     seconds : float
-        What the sheets took to compute.
+        What the aspects took to compute.
     notes : tuple of str
     """
 
@@ -177,10 +177,10 @@ class SingularityMap:
     space: Space
     point: str | None
     axes: tuple[Axis, ...]
-    held: dict[str, float]
+    fixed: dict[str, float]
     measure: str
     measure_unit: str
-    sheets: tuple[Sheet, ...]
+    aspects: tuple[Aspect, ...]
     more_branches: bool
     loci: tuple[Locus, ...]
     path: Path | None
@@ -189,6 +189,6 @@ class SingularityMap:
 
     @property
     def counts(self) -> IntArray:
-        """How many sheets reach each cell, shape (n_1, n_2)."""
-        total: IntArray = sum(sheet.reached.astype(int) for sheet in self.sheets)  # type: ignore[assignment]
+        """How many aspects reach each cell, shape (n_1, n_2)."""
+        total: IntArray = sum(aspect.reached.astype(int) for aspect in self.aspects)  # type: ignore[assignment]
         return total

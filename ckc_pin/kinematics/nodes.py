@@ -1,4 +1,4 @@
-"""Many configurations moved at once to told values of a `Task`: Newton's method by array operations."""
+"""Many configurations moved at once to given values of a `Task`: Newton's method by array operations."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Nodes:
     Attributes
     ----------
     q_tree : (count, nq) array
-    told : (count, d) array
-        The values of the told rows.
+    given : (count, d) array
+        The values of the given rows.
     J : (count, rows, n) array
         Of all rows.
     det : (count,) array
@@ -39,16 +39,16 @@ class Nodes:
     """
 
     q_tree: Array
-    told: Array
+    given: Array
     J: Array
     det: Array
 
     def __getitem__(self, which: IntArray | BoolArray) -> Nodes:
-        return Nodes(self.q_tree[which], self.told[which], self.J[which], self.det[which])
+        return Nodes(self.q_tree[which], self.given[which], self.J[which], self.det[which])
 
     def put(self, which: IntArray | BoolArray, other: Nodes) -> None:
         """Replace some."""
-        for name in ("q_tree", "told", "J", "det"):
+        for name in ("q_tree", "given", "J", "det"):
             getattr(self, name)[which] = getattr(other, name)
 
 
@@ -58,14 +58,14 @@ def nodes_at(task: Task, q_tree: Array) -> Nodes:
     return Nodes(q_tree, rows[:, task.rows], jacobian, np.linalg.det(jacobian[:, task.every]))
 
 
-def solve(task: Task, start: Array, told: Array, iterations: int = ITERATIONS) -> tuple[Nodes, BoolArray]:
-    """Newton on Psi(q') = [0; told] from starts near by.
+def solve(task: Task, start: Array, given: Array, iterations: int = ITERATIONS) -> tuple[Nodes, BoolArray]:
+    """Newton on Psi(q') = [0; given] from starts near by.
 
     Parameters
     ----------
     task : Task
     start : (count, nq) array
-    told : (count, d) array
+    given : (count, d) array
 
     Returns
     -------
@@ -75,8 +75,8 @@ def solve(task: Task, start: Array, told: Array, iterations: int = ITERATIONS) -
     """
     mechanism, every = task.extended.mechanism, task.every
     tolerance = max(TOLERANCE * max(mechanism.size, 1.0), 10 * mechanism.tolerance)
-    count, level = len(start), task.level(told)
-    found = Nodes(start.copy(), told, np.zeros((count, task.extended.closure.rows, mechanism.n)), np.zeros(count))
+    count, level = len(start), task.level(given)
+    found = Nodes(start.copy(), given, np.zeros((count, task.extended.closure.rows, mechanism.n)), np.zeros(count))
     solved, active, left = np.zeros(count, bool), np.arange(count), np.full(count, np.inf)
     for _ in range(iterations):
         rows, jacobian = task.evaluate(found.q_tree[active])
@@ -112,7 +112,7 @@ def _solve(matrix: Array, right: Array) -> Array:
 
 
 def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) -> tuple[Nodes, BoolArray]:
-    """Change the told values of nodes along straight lines, each on its branch.
+    """Change the given values of nodes along straight lines, each on its branch.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
         step = _solve(here.J[:, task.every], right)
         near = np.abs(step / tree.reach).max(axis=1) <= MAX_STEP
         guess = integrate(tree, here.q_tree, np.where(near[:, None], step, 0.0))
-        trial, solved = solve(task, guess, start.told[active] + (done + part)[:, None] * change[active])
+        trial, solved = solve(task, guess, start.given[active] + (done + part)[:, None] * change[active])
         good = solved & near & (trial.det * here.det > 0)
         at.put(active[good], trial[good])
         return good
@@ -145,15 +145,15 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
     return at, follow_many(len(change), advance, shortest) == 1.0
 
 
-def solutions(task: Task, told: Array, most: int) -> Array:
-    """List configurations with these told values, as different shapes, the assembled one's branch first.
+def solutions(task: Task, given: Array, most: int) -> Array:
+    """List configurations with these given values, as different shapes, the assembled one's branch first.
 
     They are found from random starts, so that some may be missed.
 
     Parameters
     ----------
     task : Task
-    told : (d,) array
+    given : (d,) array
     most : int
         How many at most.
 
@@ -167,7 +167,7 @@ def solutions(task: Task, told: Array, most: int) -> Array:
     steps = random.uniform(-1.0, 1.0, (STARTS, mechanism.n)) * reach
     steps[0] = 0.0
     starts = integrate(mechanism.tree, np.tile(mechanism.q_tree, (STARTS, 1)), steps)
-    closed = _settle(task, starts, np.tile(told, (STARTS, 1)))
+    closed = _settle(task, starts, np.tile(given, (STARTS, 1)))
     found: list[int] = []
     look = shapes(mechanism, closed)
     for k in range(len(closed)):
@@ -176,9 +176,9 @@ def solutions(task: Task, told: Array, most: int) -> Array:
     return closed[found[:most]]
 
 
-def _settle(task: Task, start: Array, told: Array) -> Array:
+def _settle(task: Task, start: Array, given: Array) -> Array:
     """Newton with steps cut to what is local; return the configurations that close, in order."""
-    mechanism, every, level = task.extended.mechanism, task.every, task.level(told)
+    mechanism, every, level = task.extended.mechanism, task.every, task.level(given)
     q_tree = start.copy()
     for _ in range(60):
         rows, jacobian = task.evaluate(q_tree)
@@ -191,7 +191,7 @@ def _settle(task: Task, start: Array, told: Array) -> Array:
         if np.all(longest < 1e-12):
             break
         q_tree = integrate(mechanism.tree, q_tree, step * np.minimum(1.0, WALK / longest))
-    nodes, solved = solve(task, q_tree, told)
+    nodes, solved = solve(task, q_tree, given)
     return nodes.q_tree[solved]
 
 

@@ -149,7 +149,7 @@ class Point:
         Raises
         ------
         InputError
-            Not a place, or one that cannot be reached in this working mode, told from others by the sign of the
+            Not a place, or one that cannot be reached in this working mode, known from others by the sign of the
             determinant of Psi's Jacobian where the line does not lead there.
         """
         begin = self.kinematics((start or self.mechanism.assembled).q_tree)
@@ -169,7 +169,7 @@ class Point:
         return [self._inverse(q_tree) for q_tree in self._solutions(self._wanted(x, begin), begin)]
 
     def kinematics(self, q_tree: Array) -> Kinematics:
-        """Return Psi = [phi; the told coordinates of the point] at a configuration; its z are all coordinates."""
+        """Return Psi = [phi; the given coordinates of the point] at a configuration; its z are all coordinates."""
         return Kinematics(self.mechanism.tree, self._psi, self._split, q_tree)
 
     def follow(self, begin: Kinematics, wanted: Array) -> Kinematics | None:
@@ -237,9 +237,9 @@ class Point:
 
     def rates(self, psi: Kinematics, x_dot: Array, x_ddot: Array) -> tuple[Array, Array]:
         """Return v' and its rate, shape (n,) each, that give the point a velocity and an acceleration (3,)."""
-        told = self.extended.fixing - self.extended.place[0]
+        given = self.extended.fixing - self.extended.place[0]
         none = np.zeros(len(self.extended.loops))
-        first, second = (np.concatenate([none, np.append(x, np.zeros(3))[told]]) for x in (x_dot, x_ddot))
+        first, second = (np.concatenate([none, np.append(x, np.zeros(3))[given]]) for x in (x_dot, x_ddot))
         v = psi.phi_z_factor.solve(first)
         return v, psi.phi_z_factor.solve(second - psi.J_dot(v) @ v)
 
@@ -258,22 +258,22 @@ class Point:
         return wanted
 
     def _level(self, wanted: Array, begin: Kinematics) -> Array:
-        """Psi's wanted values: the loops closed, each place of (..., 3) as told, the orientation as at the start."""
+        """Psi's wanted values: the loops closed, each place of (..., 3) as given, the orientation as at the start."""
         loops = len(self.extended.loops)
         level = np.tile(begin.phi, (*wanted.shape[:-1], 1))
         level[..., :loops] = 0.0
-        told = self.extended.fixing - self.extended.place[0]
-        level[..., loops + np.flatnonzero(told < 3)] = wanted[..., told[told < 3]]
+        given = self.extended.fixing - self.extended.place[0]
+        level[..., loops + np.flatnonzero(given < 3)] = wanted[..., given[given < 3]]
         return level
 
     def _met(self, at: Kinematics, wanted: Array) -> bool:
-        """Whether the point is there in all of x, y, z: some of them may not be among the told ones."""
+        """Whether the point is there in all of x, y, z: some of them may not be among the given ones."""
         return bool(np.abs(self.position(at.q_tree) - wanted).max() <= OFF * self.mechanism.size)
 
     def _solutions(self, wanted: Array, begin: Kinematics) -> list[Array]:
         task = Task(self.extended, self.extended.fixing)
-        told = self._level(wanted, begin)[len(self.extended.loops) :]
-        return [q for q in solutions(task, told, MOST) if self._met(self.kinematics(q), wanted)]
+        given = self._level(wanted, begin)[len(self.extended.loops) :]
+        return [q for q in solutions(task, given, MOST) if self._met(self.kinematics(q), wanted)]
 
     def _anywhere(self, begin: Kinematics, wanted: Array) -> Kinematics | None:
         """Return a solution on the same side of Psi's singular configurations, the one that is nearest."""

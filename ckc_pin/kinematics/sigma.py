@@ -195,7 +195,7 @@ def _end_of_line(at: Kinematics, done: float, iterations: int) -> Sigma:
 def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
     """Where the straight line ends, look at q itself: from z at its end, then from z anywhere.
 
-    A q behind an unreachable region may still lie on this branch; told by the sign of det phi_z.
+    A q behind an unreachable region may still lie on this branch; known by the sign of det phi_z.
     """
     target = np.zeros(at.tree.n)
     target[at.partition.q] = dq

@@ -18,7 +18,7 @@ from ckc_pin.view.labels import plain, symbol
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["det_label", "draw_map", "draw_sheet", "handles", "look", "require_figures", "save_map", "write"]
+__all__ = ["det_label", "draw_aspect", "draw_map", "handles", "look", "require_figures", "save_map", "write"]
 
 UNREACHED = "#C9C9C9"
 COLOURS = "PuOr"  # its middle is singular, and its sides are told apart by every eye
@@ -86,30 +86,30 @@ def look() -> Any:
 def _plane(found: SingularityMap) -> Figure:
     from matplotlib.figure import Figure
 
-    columns = min(len(found.sheets), 2)
-    rows = -(-len(found.sheets) // columns)
+    columns = min(len(found.aspects), 2)
+    rows = -(-len(found.aspects) // columns)
     figure = Figure(figsize=(4.7 * columns + 1.3, 4.2 * rows * _tall(found) + 1.4), layout="constrained")
     figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
-    most = max(float(np.nanmax(np.abs(sheet.det_phi_z))) for sheet in found.sheets)
+    most = max(float(np.nanmax(np.abs(aspect.det_phi_z))) for aspect in found.aspects)
     panels = []
-    for k in range(len(found.sheets)):
+    for k in range(len(found.aspects)):
         ax = figure.add_subplot(rows, columns, k + 1)
         panels.append(ax)
-        shown = draw_sheet(ax, found, k, most)
+        shown = draw_aspect(ax, found, k, most)
         ax.set_title(_panel_title(found, k))
     figure.colorbar(shown, ax=panels, label=det_label(found), shrink=0.85)
     figure.legend(handles=handles(found), loc="outside lower left", ncols=columns, handlelength=2.8)
     return figure
 
 
-def draw_sheet(ax: Any, found: SingularityMap, k: int, most: float) -> Any:
-    """Draw a sheet into an axes: what is reached, the loci, the trajectory; `most` is the largest |det phi_z|."""
+def draw_aspect(ax: Any, found: SingularityMap, k: int, most: float) -> Any:
+    """Draw an aspect into an axes: what is reached, the loci, the trajectory; `most` is the largest |det phi_z|."""
     ax.set_facecolor(UNREACHED)
     ax.grid(False)
     first, second = found.axes
     edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in found.axes]
     colours = {"cmap": COLOURS, "vmin": -PALER * most, "vmax": PALER * most}
-    shown = ax.pcolormesh(*edges, found.sheets[k].det_phi_z.T, **colours, shading="flat", rasterized=True)
+    shown = ax.pcolormesh(*edges, found.aspects[k].det_phi_z.T, **colours, shading="flat", rasterized=True)
     for locus in found.loci:
         _locus(ax, found.axes, locus, k)
     if found.path is not None:
@@ -138,22 +138,22 @@ def _tall(found: SingularityMap) -> float:
     return float(np.clip((second.high - second.low) / (first.high - first.low), 0.4, 1.5))
 
 
-def _locus(ax: Any, axes: Sequence[Axis], locus: Locus, sheet: int) -> None:
+def _locus(ax: Any, axes: Sequence[Axis], locus: Locus, aspect: int) -> None:
     if np.ptp(locus.at, axis=0).max() < POINT:
-        if locus.on[sheet].any():
+        if locus.on[aspect].any():
             _curve(ax, axes, locus.at[:1], marker="o", markersize=7, markeredgecolor="white", zorder=4,
                    color=LOOKS[locus.kind]["color"])  # fmt: skip
         return
-    _curve(ax, axes, np.where(locus.on[sheet][:, None], locus.at, np.nan), zorder=3, **LOOKS[locus.kind])
+    _curve(ax, axes, np.where(locus.on[aspect][:, None], locus.at, np.nan), zorder=3, **LOOKS[locus.kind])
 
 
-def _path(ax: Any, found: SingularityMap, sheet: int) -> None:
+def _path(ax: Any, found: SingularityMap, aspect: int) -> None:
     path = found.path
-    if path is None or not path.on[sheet].any():
+    if path is None or not path.on[aspect].any():
         return
-    at = np.where(path.on[sheet][:, None], path.at, np.nan)
+    at = np.where(path.on[aspect][:, None], path.at, np.nan)
     _curve(ax, found.axes, at, zorder=5, **DESIRED)
-    if path.on[sheet][0]:
+    if path.on[aspect][0]:
         _curve(ax, found.axes, path.at[:1], zorder=6, marker="s", markersize=5.5, markeredgecolor="white",
                color=DESIRED["color"])  # fmt: skip
 
@@ -192,8 +192,8 @@ def _line(found: SingularityMap) -> Figure:
     if place:
         _point_curves(ax, found)
     else:
-        for k, sheet in enumerate(found.sheets):
-            ax.plot(axis.values, sheet.det_phi_z[:, 0], color=style.COLOURS[k], linewidth=1.8)
+        for k, aspect in enumerate(found.aspects):
+            ax.plot(axis.values, aspect.det_phi_z[:, 0], color=style.COLOURS[k], linewidth=1.8)
         _gray(ax, axis, found.counts[:, 0] == 0)
         for locus in found.loci:
             if locus.on.any():
@@ -211,11 +211,11 @@ def _line(found: SingularityMap) -> Figure:
 
 def _point_curves(ax: Any, found: SingularityMap) -> None:
     """Where the point of a mechanism of one freedom goes, in the plane that holds most of it."""
-    every = np.concatenate([sheet.point[sheet.reached] for sheet in found.sheets if sheet.point is not None])
+    every = np.concatenate([aspect.point[aspect.reached] for aspect in found.aspects if aspect.point is not None])
     first, second = np.sort(np.argsort(-np.ptp(every, axis=0), kind="stable")[:2])
-    for k, sheet in enumerate(found.sheets):
-        if sheet.point is not None:
-            ax.plot(*sheet.point[:, 0, [first, second]].T, color=style.COLOURS[k], linewidth=1.8)
+    for k, aspect in enumerate(found.aspects):
+        if aspect.point is not None:
+            ax.plot(*aspect.point[:, 0, [first, second]].T, color=style.COLOURS[k], linewidth=1.8)
     for locus in found.loci:
         if locus.point is not None and locus.on.any():
             ax.plot(*locus.point[0, [first, second]], "o", markersize=7, markeredgecolor="white", zorder=4,
@@ -236,16 +236,16 @@ def _gray(ax: Any, axis: Axis, unreached: Array) -> None:
 
 def _title(found: SingularityMap) -> str:
     name = plain(found.mechanism)
-    held = ", ".join(f"{symbol(k)} = {x:.4g}" for k, x in found.held.items())
+    fixed = ", ".join(f"{symbol(k)} = {x:.4g}" for k, x in found.fixed.items())
     where = f", workspace of {found.point}" if found.space == "cartesian" else ", singularity map"
-    return f"{name}{where}{f' at {held}' if held else ''}"
+    return f"{name}{where}{f' at {fixed}' if fixed else ''}"
 
 
 def _panel_title(found: SingularityMap, k: int) -> str:
     what = _what(found)
-    sheet = found.sheets[k]
+    aspect = found.aspects[k]
     which = f"{what} {k + 1}{' (as assembled)' if k == 0 else ''}"
-    return f"{which}: reaches {100 * float(np.mean(sheet.reached)):.1f} %"
+    return f"{which}: reaches {100 * float(np.mean(aspect.reached)):.1f} %"
 
 
 def _what(found: SingularityMap) -> str:
@@ -271,11 +271,11 @@ def handles(found: SingularityMap) -> list[Any]:
     if len(found.axes) == 1:
         what = _what(found)
         shown += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
-                    for k in range(len(found.sheets))]  # fmt: skip
+                    for k in range(len(found.aspects))]  # fmt: skip
     if found.path is not None:
         name = plain(found.path.name)
         shown.append(Line2D([], [], label=f"desired: {name} (square: start)", **DESIRED))
-    if len(found.axes) == 2 and not all(sheet.reached.all() for sheet in found.sheets):
+    if len(found.axes) == 2 and not all(aspect.reached.all() for aspect in found.aspects):
         shown.append(
             Patch(
                 color=UNREACHED, label=f"not reached in this {_what(found)}".replace("in this branch", "on this branch")

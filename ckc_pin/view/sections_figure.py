@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.view.labels import plain
-from ckc_pin.view.map_figure import det_label, draw_sheet, handles, look, write
+from ckc_pin.view.map_figure import det_label, draw_aspect, handles, look, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,15 +49,15 @@ def draw_sections(found: Sequence[SingularityMap]) -> Figure:
         tall = float(np.clip(high / wide, 0.4, 1.6))
         figure = Figure(figsize=(3.3 * columns + 1.2, 3.2 * rows * tall + 1.3), layout="constrained")
         name = plain(first.mechanism)
-        (held,) = first.held
-        title = f"{name}, workspace of {first.point}: sections across {held}, working mode as assembled"
+        (fixed,) = first.fixed
+        title = f"{name}, workspace of {first.point}: sections across {fixed}, working mode as assembled"
         figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-        most = max(float(np.nanmax(np.abs(one.sheets[0].det_phi_z))) for one in found)
+        most = max(float(np.nanmax(np.abs(one.aspects[0].det_phi_z))) for one in found)
         cell = float(np.prod([(axis.high - axis.low) / len(axis.values) for axis in first.axes]))
         panels = [figure.add_subplot(rows, columns, k + 1) for k in range(len(found))]
         for k, (ax, one) in enumerate(zip(panels, found, strict=True)):
-            shown = draw_sheet(ax, one, 0, most)
-            ax.set_title(f"${held}$ = {one.held[held]:.3f} m: {cell * np.sum(one.sheets[0].reached):.3f} m²")
+            shown = draw_aspect(ax, one, 0, most)
+            ax.set_title(f"${fixed}$ = {one.fixed[fixed]:.3f} m: {cell * np.sum(one.aspects[0].reached):.3f} m²")
             if k % columns:
                 ax.set_ylabel("")
             if k + columns < len(found):

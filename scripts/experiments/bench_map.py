@@ -16,6 +16,6 @@ def main(cells: int) -> None:
         found = singularity_map(mechanism, cells=cells)
         every = perf_counter() - began
         print(
-            f"{cells} x {cells} cells, {len(found.sheets)} branches: {found.seconds:.2f} s for the cells, "
+            f"{cells} x {cells} cells, {len(found.aspects)} branches: {found.seconds:.2f} s for the cells, "
             f"{every:.2f} s with {len(found.loci)} loci traced (limit {LIMIT:g} s)"
         )

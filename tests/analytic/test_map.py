@@ -43,10 +43,10 @@ def test_reached_is_where_two_circles_meet(joint):
     distance, (_, l2, _, l4) = abs(left - right), model.l
     inside = (distance <= l2 + l4) & (distance >= abs(l2 - l4))
     sure = np.minimum(abs(distance - l2 - l4), abs(distance - abs(l2 - l4))) > 1e-3
-    assert len(found.sheets) == 2
-    for sheet in found.sheets:
-        assert np.array_equal(sheet.reached[sure], inside[sure])
-        assert np.mean(sheet.reached != inside) < 2e-3
+    assert len(found.aspects) == 2
+    for aspect in found.aspects:
+        assert np.array_equal(aspect.reached[sure], inside[sure])
+        assert np.mean(aspect.reached != inside) < 2e-3
 
 
 def test_det_phi_z_is_twice_the_triangle_of_the_distal_links(joint):
@@ -55,10 +55,10 @@ def test_det_phi_z_is_twice_the_triangle_of_the_distal_links(joint):
     a, b, c = abs(left - right), model.l[1], model.l[3]
     heron = np.maximum((a + b + c) * (b + c - a) * (a + c - b) * (a + b - c), 0.0) ** 0.5 / 2
     signs = []
-    for sheet in found.sheets:
-        there = sheet.reached
-        assert_close(abs(sheet.det_phi_z[there]), heron[there], 1e-8)
-        signs += set(np.sign(sheet.det_phi_z[there]))
+    for aspect in found.aspects:
+        there = aspect.reached
+        assert_close(abs(aspect.det_phi_z[there]), heron[there], 1e-8)
+        signs += set(np.sign(aspect.det_phi_z[there]))
     assert sorted(signs) == [-1.0, 1.0]  # one on each branch
 
 
@@ -157,15 +157,15 @@ def test_cartesian_workspace_is_two_rings_met(cartesian):
         reach = abs(x - base + 1j * y)
         inside &= (reach <= l + m) & (reach >= abs(l - m))
         sure &= (abs(reach - l - m) > 1e-4) & (abs(reach - abs(l - m)) > 1e-4)
-    assert len(found.sheets) == 4
+    assert len(found.aspects) == 4
     modes = set()
-    for sheet in found.sheets:
-        assert np.array_equal(sheet.reached[sure], inside[sure])
-        elbow = np.sign(np.sin(sheet.q_tree[sheet.reached][:, [1, 3]]))
+    for aspect in found.aspects:
+        assert np.array_equal(aspect.reached[sure], inside[sure])
+        elbow = np.sign(np.sin(aspect.q_tree[aspect.reached][:, [1, 3]]))
         assert_close(elbow, np.tile(elbow[0], (len(elbow), 1)), 0.0)  # one working mode throughout
         modes.add(tuple(elbow[0]))
-        place = sheet.point[sheet.reached]
-        assert_close(place, np.column_stack([x[sheet.reached], y[sheet.reached], 0 * x[sheet.reached]]), 1e-8)
+        place = aspect.point[aspect.reached]
+        assert_close(place, np.column_stack([x[aspect.reached], y[aspect.reached], 0 * x[aspect.reached]]), 1e-8)
     assert len(modes) == 4
 
 
@@ -185,9 +185,9 @@ def test_second_derivatives_in_either_order(name):
     mechanism = load(name)
     extended = extend(mechanism, next(iter(mechanism.points)))
     random = np.random.default_rng(5)
-    held = extended.joints[2:]
+    fixed = extended.joints[2:]
     for serial in (False, True):
-        system = LocusSystem(extended, serial, held, np.zeros(len(held)))
+        system = LocusSystem(extended, serial, fixed, np.zeros(len(fixed)))
         step = random.uniform(-0.3, 0.3, mechanism.n)
         at = extended.kinematics(mechanism.tree.integrate(mechanism.q_tree, step))
         v, e = random.normal(size=(2, mechanism.n))
@@ -197,22 +197,22 @@ def test_second_derivatives_in_either_order(name):
         assert_close(system.jacobian(at, v)[:, : mechanism.n] @ e, numeric, 1e-7 * max(1.0, abs(numeric).max()))
 
 
-def test_one_freedom_and_held_ones():
+def test_one_freedom_and_fixed_ones():
     crank = singularity_map("slider_crank", cells=48)
-    assert crank.sheets[0].reached.all()
+    assert crank.aspects[0].reached.all()
     assert sorted(round(abs(wrapped(locus.at[0, 0] + 1e-9)), 6) for locus in crank.loci) == [0, 0, 3.141593, 3.141593]
-    held = singularity_map("three_rrr", over=["a_3", "a_1"], cells=24)
-    assert [axis.name for axis in held.axes] == ["a_3", "a_1"]
-    assert held.held == {"a_2": pytest.approx(1.419)}
+    fixed = singularity_map("three_rrr", over=["a_3", "a_1"], cells=24)
+    assert [axis.name for axis in fixed.axes] == ["a_3", "a_1"]
+    assert fixed.fixed == {"a_2": pytest.approx(1.419)}
     mechanism = load("three_rrr")
-    for locus in held.loci:
+    for locus in fixed.loci:
         assert_close(locus.q_tree[:, mechanism.coordinates.index("a_2")], 1.419, 1e-9)
         for q_tree in locus.q_tree[:: max(1, len(locus.q_tree) // 20)]:
             at = mechanism.kinematics(q_tree)
             assert abs(at.phi).max() < 1e-10
             if locus.kind == "fold":
                 assert at.sigma_min() < 1e-9
-    assert {locus.kind for locus in held.loci} == {"fold", "serial"}
+    assert {locus.kind for locus in fixed.loci} == {"fold", "serial"}
 
 
 def test_numbers_of_a_map_are_plain(joint):

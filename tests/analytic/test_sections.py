@@ -44,14 +44,14 @@ def test_sections_reach_what_the_closed_form_does():
     sections = Stack(ckc_pin.load("delta"), None, ("x", "y")).sections(4, 24)
     for grid in sections:
         x, y = np.meshgrid(*(axis.values for axis in grid.domain.axes), indexing="ij")
-        (height,) = np.unique(grid.told[grid.reached, 2].round(12))
+        (height,) = np.unique(grid.given[grid.reached, 2].round(12))
         place = np.stack([x, y, np.full(x.shape, height)], axis=-1).reshape(-1, 3)
         room, reached = slack(place), grid.reached
         np.testing.assert_array_equal(reached, room > 0)
-        np.testing.assert_allclose(grid.told[reached], place[reached], atol=1e-9)
+        np.testing.assert_allclose(grid.given[reached], place[reached], atol=1e-9)
         frame = np.abs(place[:, :2]).max(axis=1) > 0.97 * np.abs(place[:, :2]).max()
         assert room[frame].max() < 0  # the window cuts nothing off
-    assert sections[-1].told[sections[-1].reached, 2].max() > -0.18
+    assert sections[-1].given[sections[-1].reached, 2].max() > -0.18
 
 
 def test_the_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
@@ -60,14 +60,14 @@ def test_the_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
         for locus in one.loci:
             assert locus.residual < 1e-8
             shown = locus.point[np.any(locus.on, axis=0)]
-            np.testing.assert_allclose(shown[:, 2], one.held["z"], atol=1e-9)
+            np.testing.assert_allclose(shown[:, 2], one.fixed["z"], atol=1e-9)
             np.testing.assert_allclose(slack(shown), 0.0, atol=1e-8)
 
 
 def test_the_figure_has_a_panel_for_each_section(stack):
     figure = draw_sections(stack)
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
-    assert [title.split(" m:")[0] for title in titles] == [f"$z$ = {one.held['z']:.3f}" for one in stack]
+    assert [title.split(" m:")[0] for title in titles] == [f"$z$ = {one.fixed['z']:.3f}" for one in stack]
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from typing import Any, get_args
 
 import msgspec
 import pytest
-from ckc_pin.formats.importing.robot_yaml import RobotYaml
 
 from ckc_pin import InputError
+from ckc_pin.formats.urdf.robot_yaml import RobotYaml
 from ckc_pin.mechanism.faults import faults
 from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.spec import FrameSpec, LoopType, MechanismSpec

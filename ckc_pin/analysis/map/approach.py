@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.analysis.map.aspect import Grid
 from ckc_pin.analysis.map.domain import Domain
 from ckc_pin.analysis.map.loci import seen
-from ckc_pin.analysis.map.sheet import Grid
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import PointPath
@@ -96,9 +96,9 @@ def add_path(
 
 
 def _shown(locus: Locus, cartesian: bool) -> BoolArray:
-    """Which points of a locus are compared, shape (sheets, m).
+    """Which points of a locus are compared, shape (aspects, m).
 
-    All of one where a sheet ends, as far as it is seen at all, and of one that the map shows as a point: there any
+    All of one where an aspect ends, as far as it is seen at all, and of one that the map shows as a point: there any
     of its configurations stands for all.
     """
     ends = (locus.kind == "serial") == cartesian
@@ -108,7 +108,7 @@ def _shown(locus: Locus, cartesian: bool) -> BoolArray:
 
 
 def _way(follower: _Follower, desired: Desired, t: Array, grids: Sequence[Grid]) -> tuple[Array, BoolArray]:
-    """Places along the trajectory, (m, axes), and which sheets they lie on, (sheets, m) of bool."""
+    """Places along the trajectory, (m, axes), and which aspects they lie on, (aspects, m) of bool."""
     way = np.array([follower(desired(float(x))[0]) for x in t])
     if not follower.cartesian:  # q_d, reached or not, is compared with the assembled branch
         return way, np.repeat(np.arange(len(grids))[:, None] == 0, len(t), axis=1)
@@ -131,8 +131,8 @@ class _Follower:
             return q[self.domain.over]
         self.at = sigma(self.mechanism, q, self.at).at
         self.passed.append(self.at.q_tree)
-        told, _ = evaluate(self.mechanism.tree, self.domain.task.extended.closure, self.at.q_tree[None])
-        return np.asarray(told[0, rows])
+        given, _ = evaluate(self.mechanism.tree, self.domain.task.extended.closure, self.at.q_tree[None])
+        return np.asarray(given[0, rows])
 
 
 def _closest(
@@ -142,8 +142,8 @@ def _closest(
 
     Parameters
     ----------
-    shown, on : (sheets, m) arrays of bool
-        Which points of the locus and of the trajectory lie on which sheet; those of one are compared.
+    shown, on : (aspects, m) arrays of bool
+        Which points of the locus and of the trajectory lie on which aspect; those of one are compared.
     place : callable
         Where the trajectory is at a time.
     """

@@ -1,4 +1,4 @@
-"""`singularity_map`: sheets, loci and a trajectory over two coordinates, joints or those of a point."""
+"""`singularity_map`: aspects, loci and a trajectory over two coordinates, joints or those of a point."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from time import perf_counter
 import numpy as np
 
 from ckc_pin.analysis.map.approach import add_path, read_wanted
+from ckc_pin.analysis.map.aspect import HURRIED, fill
 from ckc_pin.analysis.map.domain import Domain, joint_axis, middles, reach
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.analysis.map.progress import Progress, Steps
-from ckc_pin.analysis.map.sheet import HURRIED, fill
 from ckc_pin.analysis.map.value import located, map_value, name_of
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
@@ -32,7 +32,7 @@ MULTIPLE = 8  # of cells along an axis, so that coarse grids lie on the fine one
 MARGIN = 3.0  # cells of a first look around what it finds: thin corners fall between cells
 FIRST_LOOK = 48  # cells along an axis while a Cartesian window is looked for
 CELLS = (16, 2000)
-MEMORY = 1.5e9  # bytes that the Jacobians of one sheet may take
+MEMORY = 1.5e9  # bytes that the Jacobians of one aspect may take
 
 
 def singularity_map(
@@ -56,7 +56,7 @@ def singularity_map(
     space : "joint" or "cartesian"
         Over independent coordinates, or over the place of a point.
     over : one or two names, optional
-        The axes: independent coordinates, or of x, y, z. All others are held as assembled. Default: the first two.
+        The axes: independent coordinates, or of x, y, z. All others are fixed as assembled. Default: the first two.
     point : str, optional
         The point whose serial singularities are wanted, default the first one. Without any [[point]] there are none.
     cells : int
@@ -119,7 +119,7 @@ def _branches(task: Task) -> tuple[Array, bool]:
     mechanism = task.extended.mechanism
     if not mechanism.tree.flat or len(mechanism.dependent) > LARGEST:
         return mechanism.q_tree[None], True
-    found = solutions(task, nodes_at(task, mechanism.q_tree[None]).told[0], MOST + 1)
+    found = solutions(task, nodes_at(task, mechanism.q_tree[None]).given[0], MOST + 1)
     return found[:MOST], len(found) > MOST
 
 
@@ -140,7 +140,7 @@ def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tup
 
 
 def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
-    """Choose the told rows and which of them are the axes."""
+    """Choose the given rows and which of them are the axes."""
     mechanism = extended.mechanism
     if mechanism.rooted and not cartesian:
         raise InputError(
@@ -180,7 +180,7 @@ def _joints(task: Task, chosen: IntArray, names: Sequence[str], cells: int) -> D
 
 def _window(task: Task, chosen: IntArray, names: Sequence[str], starts: Array, cells: int) -> Domain:
     """Return the Cartesian window that the branches reach: looked at in ever smaller ones that still hold them."""
-    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).told[0][chosen]
+    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).given[0][chosen]
     low, high = middle - reach(task), middle + reach(task)
     for _ in range(6):
         domain = _box(task, chosen, names, low, high, FIRST_LOOK)

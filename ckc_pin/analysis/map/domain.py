@@ -1,4 +1,4 @@
-"""What a map is drawn over: two told rows of a `Task`, their windows, and a grid."""
+"""What a map is drawn over: two given rows of a `Task`, their windows, and a grid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Domain", "joint_axis", "reach"]
 
 @dataclass(frozen=True)
 class Domain:
-    """A grid over some of a task's told rows, the others held as assembled.
+    """A grid over some of a task's given rows, the others fixed as assembled.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class Domain:
         return first, *(second or [1])  # type: ignore[return-value]
 
     @property
-    def held(self) -> IntArray:
-        """Places among `task.rows` of the rows that are held."""
+    def fixed(self) -> IntArray:
+        """Places among `task.rows` of the rows that are fixed."""
         return np.setdiff1d(np.arange(len(self.task.rows)), self.over)
 
     def values(self, cells: IntArray) -> Array:
@@ -61,8 +61,8 @@ class Domain:
                 gap[:, k] = np.remainder(gap[:, k] + np.pi, 2 * np.pi) - np.pi
         return gap
 
-    def told(self, change: Array) -> Array:
-        """Changes of all told rows (count, d) for changes along the axes (count, axes)."""
+    def change_of_all(self, change: Array) -> Array:
+        """Changes of all given rows (count, d) for changes along the axes (count, axes)."""
         full = np.zeros((len(change), len(self.task.rows)))
         full[:, self.over] = change
         return full

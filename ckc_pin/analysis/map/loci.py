@@ -1,4 +1,4 @@
-"""The singular configurations of a map: found from where the sheets end or come close to them, traced by continuation.
+"""The singular configurations of a map: found from where the aspects end or come close to them, traced by continuation.
 
 A grid cannot hit a curve. It only says where to start Newton's method on the equations of
 `ckc_pin.analysis.singularities`, to which two things are added: what a map over two of more coordinates holds, and
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.analysis.map.aspect import Grid
 from ckc_pin.analysis.map.domain import Domain
 from ckc_pin.analysis.map.progress import Steps
-from ckc_pin.analysis.map.sheet import Grid
 from ckc_pin.analysis.singular_curve import SingularCurve, trace
 from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
 from ckc_pin.kinematics.extended import Extended
@@ -28,34 +28,34 @@ from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 __all__ = ["LocusSystem", "find_loci", "seen"]
 
 SPARSE = 64  # cells along an axis that are looked at for starts
-TRIES = 12  # starts of one sheet that lead nowhere
+TRIES = 12  # starts of one aspect that lead nowhere
 STEP = 0.04  # rad or m along a curve
 LONGEST = 3000  # points of a curve
-NEAR = 0.35  # of the mechanism's size: cells next to the end of a sheet look that much alike
+NEAR = 0.35  # of the mechanism's size: cells next to the end of an aspect look that much alike
 SPREAD = 2.0  # times what the cells around differ: what looks less alike lies on another branch
-ALIKE = 3.0  # times as far as the nearest sheet: still on this one too
+ALIKE = 3.0  # times as far as the nearest aspect: still on this one too
 GAP = 4  # points
 BLOCK = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
 
 
 class LocusSystem(SingularSystem):
-    """Singular configurations within a map: those of `SingularSystem` with some told rows held.
+    """Singular configurations within a map: those of `SingularSystem` with some given rows fixed.
 
     Parameters
     ----------
     extended : Extended
     serial : bool
         Whether the point (its frame, where `Extended.place` has turns) stands still, or the independent coordinates.
-    held : (k,) int array
+    fixed : (k,) int array
         Rows of the extended closure that keep the values (k,) given.
     values : (k,) array
     """
 
-    def __init__(self, extended: Extended, serial: bool, held: IntArray, values: Array) -> None:
+    def __init__(self, extended: Extended, serial: bool, fixed: IntArray, values: Array) -> None:
         super().__init__(extended.mechanism)
         self.extended = extended
         self._still = np.concatenate([extended.loops, extended.place if serial else extended.joints])
-        self._where = np.concatenate([extended.loops, held])
+        self._where = np.concatenate([extended.loops, fixed])
         self._values = np.concatenate([np.zeros(len(extended.loops)), values])
 
     def rows(self, at: Kinematics) -> Array:
@@ -67,7 +67,7 @@ class LocusSystem(SingularSystem):
         return at.J_dot(v)[self._still]
 
     def residual(self, at: Kinematics, v: Array) -> Array:
-        """Return [phi; held; still v; (v . v - 1) / 2]."""
+        """Return [phi; fixed; still v; (v . v - 1) / 2]."""
         where = at.phi[self._where] - self._values
         return np.concatenate([where, self.rows(at) @ v, [0.5 * (v @ v - 1.0)]])
 
@@ -104,7 +104,7 @@ class _Found:
 def find_loci(
     extended: Extended, domain: Domain, grids: Sequence[Grid], cartesian: bool, steps: Steps | None = None
 ) -> list[Locus]:
-    """Find the singular configurations that the sheets of a map show.
+    """Find the singular configurations that the aspects of a map show.
 
     Parameters
     ----------
@@ -114,14 +114,14 @@ def find_loci(
     grids : sequence of Grid
         Filled.
     cartesian : bool
-        Whether the sheets end where the point is serially singular, instead of where phi_z is.
+        Whether the aspects end where the point is serially singular, instead of where phi_z is.
     steps : Steps, optional
-        Told each sheet that has been searched, once for each of the two kinds.
+        Called with each aspect that has been searched, once for each of the two kinds.
     """
     found: list[_Found] = []
-    held, values = _held(extended, domain, grids[0])
+    fixed, values = _fixed(extended, domain, grids[0])
     for serial in (False, True) if len(extended.place) else (False,):
-        system = LocusSystem(extended, serial, held, values)
+        system = LocusSystem(extended, serial, fixed, values)
         for grid in grids:
             _search(system, serial, grid, grids, found, edges=serial == cartesian)
             if steps is not None:
@@ -141,11 +141,11 @@ def find_loci(
     ]
 
 
-def _held(extended: Extended, domain: Domain, grid: Grid) -> tuple[IntArray, Array]:
-    """Return the held rows of a domain's task as rows of the closure extended by the point, and their values."""
+def _fixed(extended: Extended, domain: Domain, grid: Grid) -> tuple[IntArray, Array]:
+    """Return the fixed rows of a domain's task as rows of the closure extended by the point, and their values."""
     names = [extended.closure.names.index(domain.task.extended.closure.names[k]) for k in domain.task.rows]
-    held = np.array(names, np.intp)[domain.held]
-    return held, grid.told[np.flatnonzero(grid.reached)[0]][domain.held]
+    fixed = np.array(names, np.intp)[domain.fixed]
+    return fixed, grid.given[np.flatnonzero(grid.reached)[0]][domain.fixed]
 
 
 def _search(
@@ -174,11 +174,11 @@ def _search(
 
 
 def _close(
-    open_: BoolArray, places: Array, spacing: Array, domain: Domain, locus: _Found, sheet: int, serial: bool
+    open_: BoolArray, places: Array, spacing: Array, domain: Domain, locus: _Found, aspect: int, serial: bool
 ) -> None:
-    """Cross out the starts next to a locus as it is seen from a sheet."""
+    """Cross out the starts next to a locus as it is seen from an aspect."""
     if locus.serial == serial:
-        for point in locus.at[locus.on[sheet]]:
+        for point in locus.at[locus.on[aspect]]:
             open_ &= ~np.all(np.abs(domain.change(np.repeat(point[None], len(places), 0), places)) <= 2 * spacing, 1)
 
 
@@ -197,7 +197,7 @@ def _starts(system: LocusSystem, grid: Grid, edges: bool) -> tuple[IntArray, Arr
         before, after = (np.roll(size, shift, k) for shift in (1, -1))
         if not axis.turns:
             for values, end in ((before, 0), (after, -1)):
-                np.moveaxis(values, k, 0)[end] = np.inf  # the window's edge is none of the sheet's
+                np.moveaxis(values, k, 0)[end] = np.inf  # the window's edge is none of the aspect's
         chosen |= (size <= before) & (size <= after)
         chosen |= edges & inside & (np.isnan(before) | np.isnan(after))
     picked = np.argwhere(chosen & inside)
@@ -221,7 +221,7 @@ def _known(system: LocusSystem, at: Kinematics, serial: bool, found: list[_Found
 def _follow(
     system: LocusSystem, serial: bool, at: Kinematics, null: Array, grids: Sequence[Grid], edges: bool
 ) -> _Found:
-    """Trace the curve through a solution, classify it, and see which sheets show it."""
+    """Trace the curve through a solution, classify it, and see which aspects show it."""
     mechanism, domain = system.mechanism, grids[0].domain
     kind = _kind(system, serial, at, null)
     if len(domain.axes) == 2:
@@ -229,8 +229,8 @@ def _follow(
     else:
         curve = SingularCurve(at.q_tree[None], null[None], False, float(np.abs(system.residual(at, null)).max()))
     look = shapes(mechanism, curve.q_tree)
-    told, _ = evaluate(mechanism.tree, domain.task.extended.closure, curve.q_tree)
-    place = told[:, domain.task.rows[domain.over]]
+    given, _ = evaluate(mechanism.tree, domain.task.extended.closure, curve.q_tree)
+    place = given[:, domain.task.rows[domain.over]]
     return _Found(serial, kind, curve, look, place, seen(place, look, grids, edges))
 
 
@@ -244,22 +244,22 @@ def _kind(system: LocusSystem, serial: bool, at: Kinematics, null: Array) -> Kin
 
 
 def seen(place: Array, look: Array, grids: Sequence[Grid], ends: bool = False) -> BoolArray:
-    """Which points of a curve (m, axes) lie on which sheet: where the cells around look alike, shape (sheets, m).
+    """Which points of a curve (m, axes) lie on which aspect: where the cells around look alike, shape (aspects, m).
 
-    Where a sheet `ends` on it a mechanism moves fast, and the last cells may all be on one side at some distance.
+    Where an aspect `ends` on it a mechanism moves fast, and the last cells may all be on one side at some distance.
     """
     domain = grids[0].domain
     mechanism = domain.task.extended.mechanism
     away = np.full((len(grids), len(place)), np.inf)
     block = _block(domain, place)
-    for sheet, grid in enumerate(grids):
+    for aspect, grid in enumerate(grids):
         near = np.full((*block.shape, look.shape[1]), np.nan)
         there = grid.reached[block]
         near[there] = shapes(mechanism, grid.q_tree[block[there]])
         known = np.flatnonzero(np.any(there, axis=1))
         gap = np.nanmin(np.max(np.abs(near[known] - look[known][:, None]), axis=2), axis=1)
         spread = np.max(np.nanmax(near[known], axis=1) - np.nanmin(near[known], axis=1), axis=1)
-        away[sheet, known] = np.where(gap <= (NEAR * mechanism.size if ends else SPREAD * spread), gap, np.inf)
+        away[aspect, known] = np.where(gap <= (NEAR * mechanism.size if ends else SPREAD * spread), gap, np.inf)
     inside = np.ones(len(place), bool)
     for k, axis in enumerate(domain.axes):
         inside &= axis.turns | ((place[:, k] >= axis.low) & (place[:, k] <= axis.high))

@@ -26,12 +26,12 @@ def map_plain(found: SingularityMap) -> dict[str, Any]:
         "point": found.point,
         "axes": [{"name": a.name, "unit": a.unit, "low": a.low, "high": a.high, "cells": len(a.values)}
                  for a in found.axes],
-        "held": found.held,
+        "held": found.fixed,
         "measure": found.measure,
         "branches": [
-            {"reached": float(np.mean(sheet.reached)), "least": float(np.nanmin(sheet.det_phi_z)),
-             "largest": float(np.nanmax(sheet.det_phi_z))}
-            for sheet in found.sheets
+            {"reached": float(np.mean(aspect.reached)), "least": float(np.nanmin(aspect.det_phi_z)),
+             "largest": float(np.nanmax(aspect.det_phi_z))}
+            for aspect in found.aspects
         ],
         "more_branches": found.more_branches,
         "loci": [
@@ -54,9 +54,12 @@ def map_table(found: SingularityMap) -> Group:
     """Return a map's numbers for people."""
     space = f"place of {found.point}" if found.space == "cartesian" else "independent coordinates"
     over = ", ".join(f"{a.name} {a.low:.4g} ... {a.high:.4g} {a.unit}" for a in found.axes)
-    held = f"; held: {', '.join(f'{k} = {x:.4g}' for k, x in found.held.items())}" if found.held else ""
+    fixed = f"; fixed: {', '.join(f'{k} = {x:.4g}' for k, x in found.fixed.items())}" if found.fixed else ""
     size = " x ".join(str(len(axis.values)) for axis in found.axes)
-    parts: list[Any] = [Text(f"{found.mechanism}, {space}: {over}{held}"), Text(f"{size} cells, {found.seconds:.2f} s")]
+    parts: list[Any] = [
+        Text(f"{found.mechanism}, {space}: {over}{fixed}"),
+        Text(f"{size} cells, {found.seconds:.2f} s"),
+    ]
     parts += ["", _branches(found), "", _loci(found) if found.loci else Text("no singular configurations found")]
     if found.path is not None:
         parts += ["", *_desired(found, found.path)]
@@ -73,14 +76,14 @@ def sections_table(found: Sequence[SingularityMap]) -> Group:
     first = found[0]
     over = ", ".join(f"{a.name} {a.low:.4g} ... {a.high:.4g} {a.unit}" for a in first.axes)
     cell = float(np.prod([(a.high - a.low) / len(a.values) for a in first.axes]))
-    (held,) = first.held
-    table = _table(f"{held}, m", "area reached, m²", f"{first.measure} from", "to", "singular curves")
+    (fixed,) = first.fixed
+    table = _table(f"{fixed}, m", "area reached, m²", f"{first.measure} from", "to", "singular curves")
     for one in found:
-        (sheet,) = one.sheets
+        (aspect,) = one.aspects
         kinds = [_short(locus) for locus in one.loci if locus.on.any()]
         curves = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-        table.add_row(f"{one.held[held]:.4f}", f"{cell * np.sum(sheet.reached):.4f}",
-                      f"{np.nanmin(sheet.det_phi_z):.4g}", f"{np.nanmax(sheet.det_phi_z):.4g}", curves)  # fmt: skip
+        table.add_row(f"{one.fixed[fixed]:.4f}", f"{cell * np.sum(aspect.reached):.4f}",
+                      f"{np.nanmin(aspect.det_phi_z):.4g}", f"{np.nanmax(aspect.det_phi_z):.4g}", curves)  # fmt: skip
     head = f"{first.mechanism}, place of {first.point} in sections of the working mode as assembled: {over}"
     return Group(Text(head), Text(f"{first.seconds:.2f} s"), "", table)
 
@@ -88,10 +91,10 @@ def sections_table(found: Sequence[SingularityMap]) -> Group:
 def _branches(found: SingularityMap) -> Table:
     what = "working mode" if found.space == "cartesian" and len(found.axes) == 2 else "branch"
     table = _table(what, "reached", f"{found.measure} from", "to")
-    for k, sheet in enumerate(found.sheets):
-        least, largest = float(np.nanmin(sheet.det_phi_z)), float(np.nanmax(sheet.det_phi_z))
+    for k, aspect in enumerate(found.aspects):
+        least, largest = float(np.nanmin(aspect.det_phi_z)), float(np.nanmax(aspect.det_phi_z))
         assembled = " (as assembled)" if k == 0 else ""
-        table.add_row(f"{k + 1}{assembled}", f"{np.mean(sheet.reached):.4f}", f"{least:.4g}", f"{largest:.4g}")
+        table.add_row(f"{k + 1}{assembled}", f"{np.mean(aspect.reached):.4f}", f"{least:.4g}", f"{largest:.4g}")
     if found.more_branches:
         table.add_row("others are there, or may be", "", "", "")
     return table

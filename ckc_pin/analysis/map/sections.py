@@ -13,10 +13,10 @@ from time import perf_counter
 
 import numpy as np
 
+from ckc_pin.analysis.map.aspect import CORNERS, HURRIED, SIDES, Grid, fill, flood
 from ckc_pin.analysis.map.domain import Domain, middles, reach
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.analysis.map.progress import Progress, Steps
-from ckc_pin.analysis.map.sheet import CORNERS, HURRIED, SIDES, Grid, fill, flood
 from ckc_pin.analysis.map.value import located, map_value
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Task, extend, find_point
@@ -109,7 +109,7 @@ class Stack:
         self.over = np.array([NAMES.index(name) for name in over], np.intp)
         self.third = int(np.setdiff1d(np.arange(3), self.over)[0])
         self.start = mechanism.q_tree
-        self.middle = nodes_at(self.task, self.start[None]).told[0]
+        self.middle = nodes_at(self.task, self.start[None]).given[0]
         self.steps = steps or Steps(None, 1)
 
     def sections(self, count: int, cells: int) -> list[Grid]:
@@ -127,7 +127,7 @@ class Stack:
         for look in range(LOOKS):
             found = self._fill_coarse(low, high)
             self.steps.step()
-            places = np.concatenate([self.middle[None], *(grid.told[grid.reached] for grid in found)])
+            places = np.concatenate([self.middle[None], *(grid.given[grid.reached] for grid in found)])
             room = MARGIN * (high - low) / LOOK
             tight_low = np.maximum(places.min(axis=0) - room, low)
             tight_high = np.minimum(places.max(axis=0) + room, high)
@@ -174,10 +174,10 @@ class Stack:
         """Reach what can be reached of a section, beginning from all that is reached right above and below it."""
         grid = self._grid(low, high, cells)
         for layer in coarse:
-            near = np.flatnonzero(layer.reached & (np.abs(layer.told[:, self.third] - height) <= NEAR * self.spacing))
-            target = grid.domain.nearest(layer.told[near][:, self.over])
-            way = self._up(height - layer.told[near, self.third], len(near))
-            way[:, self.over] = grid.domain.values(target) - layer.told[near][:, self.over]
+            near = np.flatnonzero(layer.reached & (np.abs(layer.given[:, self.third] - height) <= NEAR * self.spacing))
+            target = grid.domain.nearest(layer.given[near][:, self.over])
+            way = self._up(height - layer.given[near, self.third], len(near))
+            way[:, self.over] = grid.domain.values(target) - layer.given[near][:, self.over]
             nodes, arrived = follow(self.task, layer.nodes(near), way, HURRIED)
             grid.put(grid.flat(target[arrived]), nodes[arrived])
         flood(grid, 1, SHORTEST, ways=AROUND)  # pieces may be narrower than a cell

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ckc_pin.analysis.map.sheet import Grid
+from ckc_pin.analysis.map.aspect import Grid
 from ckc_pin.kinematics.extended import Extended, Task
-from ckc_pin.kinematics.mapped import Locus, Path, Sheet, SingularityMap, Space
+from ckc_pin.kinematics.mapped import Aspect, Locus, Path, SingularityMap, Space
 from ckc_pin.mechanism.many import ManyPoses
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -28,19 +28,19 @@ def map_value(
     seconds: float,
     notes: tuple[str, ...] = (),
 ) -> SingularityMap:
-    """Put sheets that reach something, their loci and a trajectory together."""
+    """Put aspects that reach something, their loci and a trajectory together."""
     mechanism, domain = extended.mechanism, grids[0].domain
     square = mechanism.assembled.phi_z.shape[0] == mechanism.assembled.phi_z.shape[1]
-    start = grids[0].told[np.flatnonzero(grids[0].reached)[0]]
+    start = grids[0].given[np.flatnonzero(grids[0].reached)[0]]
     return SingularityMap(
         mechanism=mechanism.name,
         space=space,
         point=extended.point,
         axes=domain.axes,
-        held={name_of(domain.task, k): float(np.round(start[k], 12)) + 0.0 for k in domain.held},
+        fixed={name_of(domain.task, k): float(np.round(start[k], 12)) + 0.0 for k in domain.fixed},
         measure="det phi_z" if square else "sigma_min(phi_z)",
         measure_unit=_unit(mechanism) if square else "",
-        sheets=tuple(_sheet(extended, grid, square) for grid in grids),
+        aspects=tuple(_aspect(extended, grid, square) for grid in grids),
         more_branches=more_branches,
         loci=tuple(loci),
         path=path,
@@ -50,14 +50,14 @@ def map_value(
 
 
 def name_of(task: Task, k: int) -> str:
-    """Name a told row of a task."""
+    """Name a given row of a task."""
     extended, row = task.extended, int(task.rows[k])
     if len(extended.place) and row >= extended.place[0]:
         return extended.axis(row)
     return extended.mechanism.independent[k]
 
 
-def _sheet(extended: Extended, grid: Grid, square: bool) -> Sheet:
+def _aspect(extended: Extended, grid: Grid, square: bool) -> Aspect:
     mechanism, shape = extended.mechanism, grid.domain.shape
     inside = np.flatnonzero(grid.reached)
     phi_z = grid.J[inside][:, : len(extended.loops)][:, :, mechanism.partition.z]
@@ -66,7 +66,7 @@ def _sheet(extended: Extended, grid: Grid, square: bool) -> Sheet:
     place = np.full((len(grid.reached), 3), np.nan)
     if extended.point is not None:
         place[inside] = _positions(extended, grid.q_tree[inside])
-    return Sheet(
+    return Aspect(
         reached=grid.reached.reshape(shape),
         det_phi_z=det.reshape(shape),
         q_tree=grid.q_tree.reshape(*shape, -1),

@@ -65,7 +65,7 @@ def judged(work: Work, program: str, setting: str, motion: Motion, reference: Re
     whole = motion.status == "done" and len(motion.q_tree) == len(work.instants)
     finite = whole and bool(np.all(np.isfinite(motion.q_tree)))
     errors = np.abs(work.observed(motion.q_tree) - reference.values).max(axis=1) if finite else np.empty(0)
-    closure, drift = _held(work, motion) if finite else (None, None)
+    closure, drift = _kept_closed(work, motion) if finite else (None, None)
     return Row(
         work=work.key,
         program=program,
@@ -83,7 +83,7 @@ def judged(work: Work, program: str, setting: str, motion: Motion, reference: Re
     )
 
 
-def _held(work: Work, motion: Motion) -> tuple[float, float | None]:
+def _kept_closed(work: Work, motion: Motion) -> tuple[float, float | None]:
     """Largest |phi|, and how far the energy leaves its value at the start; None where a controller acts."""
     mechanism = work.mechanism
     states = [

@@ -90,9 +90,9 @@ def main(arguments: list[str]) -> int:
         if given.jobs > 1:
             with ProcessPoolExecutor(given.jobs, initializer=_single_thread) as pool:
                 found = pool.map(one, seeds, repeat(kind), repeat(given.mechanism), chunksize=4)
-                records += _watched(found, kind, given.runs)
+                records += _counted(found, kind, given.runs)
         else:
-            records += _watched((one(seed, kind, given.mechanism) for seed in seeds), kind, given.runs)
+            records += _counted((one(seed, kind, given.mechanism) for seed in seeds), kind, given.runs)
     print(table(records))
     if given.out:
         with given.out.open("w", newline="", encoding="utf-8") as file:
@@ -102,7 +102,7 @@ def main(arguments: list[str]) -> int:
     return 1 if any(record.verdict in ("RAW", "WRONG") for record in records) else 0
 
 
-def _watched(records: Iterator[Record], kind: str, count: int) -> list[Record]:
+def _counted(records: Iterator[Record], kind: str, count: int) -> list[Record]:
     """Collect records, and say on a terminal how far it is."""
     found: list[Record] = []
     for record in records:

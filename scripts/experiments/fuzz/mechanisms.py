@@ -142,12 +142,12 @@ def _two_loops(builder: Builder, flat: Array | None, freedoms: int) -> None:
 
 
 def _platform(builder: Builder) -> None:
-    """A free plate held to the world by rods and points, or by legs whose joints tell where it is."""
+    """A free plate tied to the world by rods and points, or by legs whose joints tell where it is."""
     random = builder.random
-    held = [["distance"] * 5, ["distance"] * 4, ["point", "distance"], ["hinge"], ["universal"], ["point"]]
+    partly = [["distance"] * 5, ["distance"] * 4, ["point", "distance"], ["hinge"], ["universal"], ["point"]]
     legged = [["weld"], ["weld", "distance"], ["point"] * 3, ["hinge", "universal"], ["point", "hinge"]]
     whole = random.random() < 0.7
-    kinds = legged[int(random.integers(len(legged)))] if whole else held[int(random.integers(len(held)))]
+    kinds = legged[int(random.integers(len(legged)))] if whole else partly[int(random.integers(len(partly)))]
     rows = sum(ROWS[kind] for kind in kinds)
     joints = max(0, rows - 6) + int(random.integers(1, 3)) if whole else int(random.integers(0, 3))
     share = np.diff([0, *sorted(random.integers(0, joints + 1, len(kinds) - 1).tolist()), joints])

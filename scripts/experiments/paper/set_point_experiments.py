@@ -142,6 +142,6 @@ def bounds(mechanism: Mechanism, margins: Sequence[float] = MARGINS, divisions: 
 def equilibria_of(case: Case, divisions: int = 16, starts: int = 80) -> list[Equilibrium]:
     """Solve eq. 15 from points spread over the sublevel set that a case starts in; return the solutions in it."""
     found = sublevel_set(case.mechanism, case.controller, case.level, divisions)
-    nodes = found.sheet.nodes[:: max(1, len(found.sheet.nodes) // starts)]
+    nodes = found.explored.nodes[:: max(1, len(found.explored.nodes) // starts)]
     solutions = equilibria(case.mechanism, case.controller, nodes)
     return [solution for solution in solutions if solution.height <= case.level]

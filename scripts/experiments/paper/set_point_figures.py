@@ -61,8 +61,8 @@ def draw_set(case: Case, certificate: Certificate, run: Run, divisions: int, fol
     """The sublevel set that a start lies in, where the gain condition fails on it, and the run (d = 2)."""
     figure, (ax,) = chart()
     found = sublevel_set(case.mechanism, case.controller, case.level, divisions)
-    q, ends = (_plane(case, ats) for ats in (found.sheet.nodes, [end.at for end in found.sheet.ends]))
-    height = np.array([rest_height(case.mechanism, case.controller, at) for at in found.sheet.nodes])
+    q, ends = (_plane(case, ats) for ats in (found.explored.nodes, [end.at for end in found.explored.ends]))
+    height = np.array([rest_height(case.mechanism, case.controller, at) for at in found.explored.nodes])
     fails, safe = found.eigenvalues <= 0, height <= certificate.safe_level
     dots: dict[str, Any] = {"s": 14 * (50 / divisions) ** 2, "marker": "s", "linewidths": 0}
     ax.scatter(

@@ -38,8 +38,8 @@ def test_the_fastest_run_to_an_accuracy_stays_within_it() -> None:
     best = fastest(rows, ["work"]).set_index("target").wall_s
     assert best.to_dict() == {1e-3: 1.0, 1e-6: 2.0}
     assert fastest(rows.assign(status="stopped"), ["work"]).empty
-    told = fastest(rows.assign(accuracy=1e-5), ["work"])
-    assert told.target.tolist() == [1e-3]
+    said = fastest(rows.assign(accuracy=1e-5), ["work"])
+    assert said.target.tolist() == [1e-3]
     assert set(fastest(rows.assign(accuracy=1e-5), ["work"], untold=True).target) == {1e-3, 1e-6}
 
 

@@ -73,15 +73,15 @@ def test_commands_on_a_page_exist(name: str) -> None:
     lines = {line for block in blocks for line in block.splitlines()}
     known = {"paper": set(KEYS), "errata": set(ERRATA)}
     own = name.removesuffix(".md")
-    told = {tuple(line.split()[1:]) for line in lines if line.startswith("./scripts/experiment ")}
-    assert all(key in known[experiment] for experiment, key in told)
-    assert {key for experiment, key in told if experiment == own} == known[own]
-    for line in lines - {f"./scripts/experiment {' '.join(words)}" for words in told}:
+    said = {tuple(line.split()[1:]) for line in lines if line.startswith("./scripts/experiment ")}
+    assert all(key in known[experiment] for experiment, key in said)
+    assert {key for experiment, key in said if experiment == own} == known[own]
+    for line in lines - {f"./scripts/experiment {' '.join(words)}" for words in said}:
         assert line == "./scripts/demo" or line.startswith("ckc ")
 
 
 @pytest.mark.parametrize("line", [["paper", "nothing"], ["errata", "nothing"], ["stability", "nothing"]])
-def test_a_wrong_name_is_told_the_right_ones(line: list[str]) -> None:
+def test_a_wrong_name_is_answered_with_the_right_ones(line: list[str]) -> None:
     command = [sys.executable, "-m", "scripts.experiments", *line]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     known = {"paper": KEYS, "errata": ERRATA, "stability": ("gain", "long")}[line[0]]

@@ -10,8 +10,8 @@ import pytest
 
 from ckc_pin import Mechanism, load
 from ckc_pin.analysis.certificate import Certificate, certify, rest_height
+from ckc_pin.analysis.explored import explore
 from ckc_pin.analysis.gradient import bound_along, chart_step, explore_branch, gradient_bounds
-from ckc_pin.analysis.sheet import explore
 from ckc_pin.analysis.walk import follow, least, margin, margin_gradient, same_configuration, way
 from ckc_pin.control import SetPoint
 from ckc_pin.control.desired import Harmonics
@@ -158,34 +158,37 @@ def test_margin_is_the_sine_between_the_distal_links(five_bar: Pair) -> None:
 def test_flood_finds_the_disc_and_its_edges() -> None:
     mechanism = pendulum(2)
     centre = mechanism.assembled
-    sheet = explore(mechanism, centre, np.full(2, 0.1), lambda at: float(np.sum(at.q_tree**2)), 1.0)
+    explored = explore(mechanism, centre, np.full(2, 0.1), lambda at: float(np.sum(at.q_tree**2)), 1.0)
     lattice = [(i, j) for i in range(-12, 13) for j in range(-12, 13) if 0.01 * (i * i + j * j) <= 1]
-    assert len(sheet.nodes) == len(lattice)
-    assert len(sheet.edges) == sum((i + 1, j) in lattice for i, j in lattice) * 2
-    assert sheet.water == sorted(sheet.water)
-    assert not sheet.ends
-    assert not sheet.sampled
-    assert not sheet.full
+    assert len(explored.nodes) == len(lattice)
+    assert len(explored.edges) == sum((i + 1, j) in lattice for i, j in lattice) * 2
+    assert explored.water == sorted(explored.water)
+    assert not explored.ends
+    assert not explored.sampled
+    assert not explored.full
 
 
 def test_water_has_to_rise_over_the_ridge() -> None:
     """A node behind a ridge is connected at the ridge's height, not at its own."""
     mechanism = pendulum(1)
-    sheet = explore(mechanism, mechanism.assembled, np.full(1, 0.1), lambda at: float(np.sin(at.q_tree[0]) ** 2), 2.0,
-                    np.array([63]))  # fmt: skip
-    far = min(range(len(sheet.nodes)), key=lambda k: abs(sheet.nodes[k].q_tree[0] - 3.1))
-    assert np.sin(sheet.nodes[far].q_tree[0]) ** 2 < 0.01
-    assert_close(sheet.water[far], 1.0, 0.01)
-    assert len(sheet.nodes) == 63  # the lattice meets itself after a turn
+
+    def height(at) -> float:
+        return float(np.sin(at.q_tree[0]) ** 2)
+
+    explored = explore(mechanism, mechanism.assembled, np.full(1, 0.1), height, 2.0, np.array([63]))
+    far = min(range(len(explored.nodes)), key=lambda k: abs(explored.nodes[k].q_tree[0] - 3.1))
+    assert np.sin(explored.nodes[far].q_tree[0]) ** 2 < 0.01
+    assert_close(explored.water[far], 1.0, 0.01)
+    assert len(explored.nodes) == 63  # the lattice meets itself after a turn
 
 
 def test_rays_stay_below_the_level() -> None:
     mechanism = pendulum(3)
-    sheet = explore(mechanism, mechanism.assembled, np.full(3, 0.2), lambda at: float(np.sum(at.q_tree**2)), 1.0)
-    radii = np.array([np.linalg.norm(at.q_tree) for at in sheet.nodes])
-    assert sheet.sampled
+    explored = explore(mechanism, mechanism.assembled, np.full(3, 0.2), lambda at: float(np.sum(at.q_tree**2)), 1.0)
+    radii = np.array([np.linalg.norm(at.q_tree) for at in explored.nodes])
+    assert explored.sampled
     assert radii.max() <= 1.0 < radii.max() + 0.2
-    directions = np.array([np.sign(at.q_tree) for at in sheet.nodes[1:]])
+    directions = np.array([np.sign(at.q_tree) for at in explored.nodes[1:]])
     assert len(np.unique(directions, axis=0)) == 8
 
 
@@ -418,11 +421,11 @@ def test_verdict_on_uniqueness(certified: dict[str, tuple[Case, Certificate]], t
 def test_verdict_on_the_bound(five_bar: Pair, tmp_path: Path) -> None:
     mechanism, case = five_bar[0], load_case()
     step = chart_step(mechanism, 16)
-    sheet = explore_branch(mechanism, mechanism.assembled, 16)
-    growing = [gradient_bounds(mechanism, sheet, [0.5, 0.1, 0.05], step)]
+    explored = explore_branch(mechanism, mechanism.assembled, 16)
+    rising = [gradient_bounds(mechanism, explored, [0.5, 0.1, 0.05], step)]
     right = (1e-11, 1e-15, 43)
-    assert complete(set_point.gradient_claim(case, right, growing, tmp_path), tmp_path) == "holds with a condition"
-    flat = [[replace(bound, norm=3.0) for bound in growing[0]]]
+    assert complete(set_point.gradient_claim(case, right, rising, tmp_path), tmp_path) == "holds with a condition"
+    flat = [[replace(bound, norm=3.0) for bound in rising[0]]]
     assert complete(set_point.gradient_claim(case, right, flat, tmp_path), tmp_path) == "holds"
 
 

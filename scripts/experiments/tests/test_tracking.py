@@ -107,7 +107,7 @@ def test_function_and_rate_are_those_of_the_numpy_five_bar(formulation: str) -> 
     assert_close(found.predicted[::40], expected, 1e-8, relative=True)
 
 
-def test_record_begins_where_it_is_told_to() -> None:
+def test_record_begins_where_it_should() -> None:
     whole, later = (lyapunov_along({"formulation": "reduced", **SHORT}, since) for since in (0.0, 0.01))
     assert len(later.t) == 201
     assert_close(later.t, whole.t[-201:], 0.0)
@@ -215,7 +215,7 @@ def test_gains_that_the_program_takes() -> None:
 # --- deviations --------------------------------------------------------------------------------------------------
 
 
-def test_periodic_and_irregular_deviations_are_told_apart() -> None:
+def test_periodic_and_irregular_deviations_are_distinguished() -> None:
     t, periods = instants(5), 5
     still = Track(np.zeros((len(t), 2)), 0.0)
     wave = np.column_stack([1e-3 * (2 + np.sin(t)), np.zeros_like(t)])

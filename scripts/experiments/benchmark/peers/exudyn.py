@@ -178,12 +178,12 @@ class _System(Steps):
             at, axis = self._world(a), np.array(loop.axis_a) / np.linalg.norm(loop.axis_a)
             turned = np.eye(3) if loop.rows_in == "world" else at.rotation
             axes = turned @ np.column_stack([*perpendicular(axis), axis])
-            held = {"point": [1, 1, 1, 0, 0, 0], "point_2d": [1, 1, 0, 0, 0, 0], "hinge": [1, 1, 1, 1, 1, 0]}
+            constrained = {"point": [1, 1, 1, 0, 0, 0], "point_2d": [1, 1, 0, 0, 0, 0], "hinge": [1, 1, 1, 1, 1, 0]}
             mbs.CreateGenericJoint(
                 itemNumbers=bodies,
                 position=at.translation,
                 rotationMatrixAxes=axes,
-                constrainedAxes=held.get(loop.type, [1] * 6),
+                constrainedAxes=constrained.get(loop.type, [1] * 6),
                 show=False,
             )
 

@@ -1,4 +1,4 @@
-"""A sheet: everything that one branch reaches over a grid, by continuation from neighbour to neighbour.
+"""An aspect: everything that one branch reaches over a grid, by continuation from neighbour to neighbour.
 
 A coarse grid is flooded from the branch's first configuration; then the spacing is halved until every cell has been
 tried from its neighbours. So nearly all starts are close by, and thousands of cells are solved together.
@@ -31,7 +31,7 @@ class Grid:
         self.domain = domain
         self.reached = np.zeros(cells, bool)
         self.q_tree = np.full((cells, nq), np.nan)
-        self.told = np.zeros((cells, len(task.rows)))
+        self.given = np.zeros((cells, len(task.rows)))
         self.J = np.zeros((cells, task.extended.closure.rows, n))
         self.det = np.zeros(cells)
 
@@ -41,12 +41,12 @@ class Grid:
 
     def nodes(self, numbers: IntArray) -> Nodes:
         """What has been computed there."""
-        return Nodes(self.q_tree[numbers], self.told[numbers], self.J[numbers], self.det[numbers])
+        return Nodes(self.q_tree[numbers], self.given[numbers], self.J[numbers], self.det[numbers])
 
     def put(self, numbers: IntArray, nodes: Nodes) -> None:
         """Mark cells as reached."""
         self.reached[numbers] = True
-        self.q_tree[numbers], self.told[numbers] = nodes.q_tree, nodes.told
+        self.q_tree[numbers], self.given[numbers] = nodes.q_tree, nodes.given
         self.J[numbers], self.det[numbers] = nodes.J, nodes.det
 
 
@@ -56,12 +56,12 @@ def fill(domain: Domain, start: Array, shortest: float = SHORTEST) -> Grid:
     stride = _stride(domain.shape)
     first = nodes_at(domain.task, start[None])
     near = _cells(domain.shape, stride)
-    here = first.told[:, domain.over]
+    here = first.given[:, domain.over]
     way = domain.change(np.repeat(here, len(near), axis=0), domain.values(near))
     spacing = np.array([stride * (axis.high - axis.low) / len(axis.values) for axis in domain.axes])
     close = np.all(np.abs(way) <= 1.5 * spacing, axis=1)
     near, way = near[close], way[close]
-    nodes, arrived = follow(domain.task, first[np.zeros(len(near), np.intp)], domain.told(way))
+    nodes, arrived = follow(domain.task, first[np.zeros(len(near), np.intp)], domain.change_of_all(way))
     grid.put(grid.flat(near[arrived]), nodes[arrived])
     while True:
         flood(grid, stride, HURRIED)
@@ -117,7 +117,7 @@ def _spread(grid: Grid, cells: IntArray, direction: IntArray, shortest: float) -
     if not len(cells):
         return cells
     start = grid.nodes(grid.flat(cells))
-    way = domain.change(start.told[:, domain.over], domain.values(target))
-    nodes, arrived = follow(domain.task, start, domain.told(way), shortest)
+    way = domain.change(start.given[:, domain.over], domain.values(target))
+    nodes, arrived = follow(domain.task, start, domain.change_of_all(way), shortest)
     grid.put(grid.flat(target[arrived]), nodes[arrived])
     return target[arrived]

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["End", "Sheet", "explore"]
+__all__ = ["End", "Explored", "explore"]
 
 RAYS = 300  # for d > 2
 MAX_POINTS = 30_000
@@ -34,7 +34,7 @@ class End:
 
 
 @dataclass
-class Sheet:
+class Explored:
     """The explored part of a branch, in the order in which rising water would reach it.
 
     Attributes
@@ -68,7 +68,7 @@ def explore(
     level: float,
     turn: IntArray | None = None,
     seed: int = 0,
-) -> Sheet:
+) -> Explored:
     """Explore the part of a branch around a configuration where a height stays at or below a level.
 
     Parameters
@@ -101,8 +101,8 @@ def explore(
 
 def _flood(
     mechanism: Mechanism, centre: Kinematics, step: Array, height: Height, level: float, turn: IntArray | None
-) -> Sheet:
-    sheet = Sheet()
+) -> Explored:
+    explored = Explored()
     origin = (0,) * mechanism.d
     number: dict[tuple[int, ...], int] = {}
     waiting: list[tuple[float, int, tuple[int, ...], Kinematics]] = []
@@ -111,18 +111,18 @@ def _flood(
         waiting.append((height(centre), order, origin, centre))
     while waiting:
         water, _, place, at = heapq.heappop(waiting)
-        number[place] = len(sheet.nodes)
-        sheet.nodes.append(at)
-        sheet.water.append(water)
-        if len(sheet.nodes) >= MAX_POINTS:
-            sheet.full = True
+        number[place] = len(explored.nodes)
+        explored.nodes.append(at)
+        explored.water.append(water)
+        if len(explored.nodes) >= MAX_POINTS:
+            explored.full = True
             break
         for k in range(mechanism.d):
             for sign in (-1, 1):
                 along = place[k] + sign
                 beside = (*place[:k], along % turn[k] if turn is not None and turn[k] else along, *place[k + 1 :])
                 if beside in number:
-                    sheet.edges.append((number[beside], number[place]))
+                    explored.edges.append((number[beside], number[place]))
                 if beside in seen:
                     continue
                 dq = np.zeros(mechanism.d)
@@ -132,36 +132,36 @@ def _flood(
                 if rises > level:
                     continue
                 if reached < 1.0:
-                    sheet.ends.append(End(rises, number[place], there))
+                    explored.ends.append(End(rises, number[place], there))
                     continue
                 seen.add(beside)
                 order += 1
                 heapq.heappush(waiting, (rises, order, beside, there))
-    return sheet
+    return explored
 
 
-def _cast(mechanism: Mechanism, centre: Kinematics, step: Array, height: Height, level: float, seed: int) -> Sheet:
-    sheet = Sheet(sampled=True)
+def _cast(mechanism: Mechanism, centre: Kinematics, step: Array, height: Height, level: float, seed: int) -> Explored:
+    explored = Explored(sampled=True)
     if height(centre) > level:
-        return sheet
+        return explored
     random = np.random.default_rng(seed)
-    sheet.nodes.append(centre)
-    sheet.water.append(height(centre))
+    explored.nodes.append(centre)
+    explored.water.append(height(centre))
     for _ in range(RAYS):
         direction = random.standard_normal(mechanism.d)
         dq = step * direction / np.linalg.norm(direction)
-        at, last, water = centre, 0, sheet.water[0]
-        while len(sheet.nodes) < MAX_POINTS:
+        at, last, water = centre, 0, explored.water[0]
+        while len(explored.nodes) < MAX_POINTS:
             at, reached = follow(mechanism, at, dq)
             water = max(water, height(at))
             if water > level:
                 break
             if reached < 1.0:
-                sheet.ends.append(End(water, last, at))
+                explored.ends.append(End(water, last, at))
                 break
-            sheet.edges.append((last, len(sheet.nodes)))
-            last = len(sheet.nodes)
-            sheet.nodes.append(at)
-            sheet.water.append(water)
-    sheet.full = len(sheet.nodes) >= MAX_POINTS
-    return sheet
+            explored.edges.append((last, len(explored.nodes)))
+            last = len(explored.nodes)
+            explored.nodes.append(at)
+            explored.water.append(water)
+    explored.full = len(explored.nodes) >= MAX_POINTS
+    return explored
