@@ -18,7 +18,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["missing", "rows"]
+__all__ = ["Joints", "missing", "rows"]
 
 SAME = 1e-6  # relative: how well mass matrix and bias agree where both programs have one mechanism
 COARSEST, STEPS = 1e-2, 9  # of the span or of 2 s, and how many halves
@@ -61,7 +61,7 @@ def rows(
         return f"it refuses the model: {' '.join(str(error).split())}"
     start = find_start(mechanism, scene)
     state = start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
-    joints, data = _Joints(mechanism, model), mujoco.MjData(model)
+    joints, data = Joints(mechanism, model), mujoco.MjData(model)
     off = _difference(mechanism, joints, model, data, state)
     if not off <= SAME:
         return f"its mass matrix or its forces at the start differ by {off:.1e}"
@@ -69,7 +69,7 @@ def rows(
 
 
 def _steps(
-    model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], n: int, t: Array, deadline: float
+    model: Any, data: Any, joints: Joints, state: tuple[Array, Array], n: int, t: Array, deadline: float
 ) -> Iterator[tuple[str, float, Motion]]:
     import mujoco
 
@@ -93,7 +93,7 @@ def _steps(
         yield method, dt, _run(model, data, joints, state, many, instants)
 
 
-def _foreseen(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], steps: int) -> float:
+def _foreseen(model: Any, data: Any, joints: Joints, state: tuple[Array, Array], steps: int) -> float:
     import mujoco
 
     _reset(model, data, joints, state)
@@ -103,7 +103,7 @@ def _foreseen(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array]
     return (perf_counter() - began) / trial * steps
 
 
-def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], many: int, instants: int) -> Motion:
+def _run(model: Any, data: Any, joints: Joints, state: tuple[Array, Array], many: int, instants: int) -> Motion:
     """Step from instant to instant; reading the states out is not timed."""
     import mujoco
 
@@ -121,14 +121,14 @@ def _run(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array], man
     return Motion("done", "", q_tree, v_tree, min(walls), None, None, many * instants, "fixed step")
 
 
-def _reset(model: Any, data: Any, joints: _Joints, state: tuple[Array, Array]) -> None:
+def _reset(model: Any, data: Any, joints: Joints, state: tuple[Array, Array]) -> None:
     import mujoco
 
     mujoco.mj_resetData(model, data)
     joints.put(data, *state)
 
 
-def _difference(mechanism: Mechanism, joints: _Joints, model: Any, data: Any, state: tuple[Array, Array]) -> float:
+def _difference(mechanism: Mechanism, joints: Joints, model: Any, data: Any, state: tuple[Array, Array]) -> float:
     """How far D', and without a free root also the bias, are from Pinocchio's at the start, relative."""
     import mujoco
 
@@ -146,7 +146,7 @@ def _difference(mechanism: Mechanism, joints: _Joints, model: Any, data: Any, st
     return off
 
 
-class _Joints:
+class Joints:
     """Pinocchio's states in MuJoCo's order and back."""
 
     def __init__(self, mechanism: Mechanism, model: Any) -> None:

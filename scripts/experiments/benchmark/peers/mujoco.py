@@ -11,12 +11,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.analysis.precision.mujoco import Joints
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
 from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
@@ -68,7 +68,7 @@ class Mujoco:
         q_tree, v_tree = start_of(work)
         model = _model(work.mechanism)
         data = mujoco.MjData(model)
-        joints = _Joints(work.mechanism, model)
+        joints = Joints(work.mechanism, model)
         to = joints.put(data, q_tree, v_tree)
         mujoco.mj_forward(model, data)
         M = np.zeros((model.nv, model.nv))
@@ -97,7 +97,7 @@ class Mujoco:
             model.eq_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
         for unused in ("AUTORESET", "CONTACT", "LIMIT", "FRICTIONLOSS", "SENSOR"):
             model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
-        data, joints = mujoco.MjData(model), _Joints(work.mechanism, model)
+        data, joints = mujoco.MjData(model), Joints(work.mechanism, model)
         q_tree, v_tree = start_of(work)
 
         def reset() -> None:
@@ -107,51 +107,6 @@ class Mujoco:
         return stepped(
             work, dt, reset, lambda k: mujoco.mj_step(model, data, nstep=k), lambda: joints.state(data), budget
         )
-
-
-class _Joints:
-    """Pinocchio's states in MuJoCo's order and back."""
-
-    def __init__(self, mechanism: Mechanism, model: Any) -> None:
-        self._tree = mechanism.tree
-        names = list(mechanism.tree.model.names)
-        self._there = {k: model.joint(names[k]) for k in range(1, len(names))}
-
-    def put(self, data: Any, q_tree: Array, v_tree: Array) -> Array:
-        """Set a state; return the map from Pinocchio's velocities to MuJoCo's, shape (n, n)."""
-        tree = self._tree
-        pin.forwardKinematics(tree.model, tree.data, q_tree)
-        to = np.zeros((len(data.qvel), tree.n))
-        for k, there in self._there.items():
-            joint, at, v_at = tree.model.joints[k], int(there.qposadr[0]), int(there.dofadr[0])
-            if joint.nv == 1:
-                data.qpos[at] = q_tree[joint.idx_q]
-                to[v_at, joint.idx_v] = 1.0
-                continue
-            placement = tree.data.oMi[k]
-            x, y, z, w = pin.Quaternion(placement.rotation).coeffs()
-            data.qpos[at : at + 7] = [*placement.translation, w, x, y, z]
-            to[v_at : v_at + 3, joint.idx_v : joint.idx_v + 3] = placement.rotation
-            to[v_at + 3 : v_at + 6, joint.idx_v + 3 : joint.idx_v + 6] = np.eye(3)
-        data.qvel[:] = to @ v_tree
-        return to
-
-    def state(self, data: Any) -> tuple[Array, Array]:
-        """Return q_tree and v_tree by coordinate."""
-        tree = self._tree
-        q_tree, v_tree = tree.neutral(), np.zeros(tree.n)
-        for k, there in self._there.items():
-            joint, at, v_at = tree.model.joints[k], int(there.qposadr[0]), int(there.dofadr[0])
-            if joint.nv == 1:
-                q_tree[joint.idx_q], v_tree[joint.idx_v] = data.qpos[at], data.qvel[v_at]
-                continue
-            w, x, y, z = data.qpos[at + 3 : at + 7]
-            rotation = pin.Quaternion(float(w), float(x), float(y), float(z)).matrix()
-            placed = tree.model.jointPlacements[k].actInv(pin.SE3(rotation, np.array(data.qpos[at : at + 3])))
-            q_tree[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(placed)
-            v_tree[joint.idx_v : joint.idx_v + 3] = rotation.T @ data.qvel[v_at : v_at + 3]
-            v_tree[joint.idx_v + 3 : joint.idx_v + 6] = data.qvel[v_at + 3 : v_at + 6]
-        return tree.to_coordinates(q_tree), v_tree
 
 
 def _installed() -> bool:
