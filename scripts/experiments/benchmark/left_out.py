@@ -45,8 +45,8 @@ MODULES: Modules = {
     "meshcat": ("import meshcat", "playback in a browser"),
     "matplotlib": ("import matplotlib.figure, matplotlib.backends.backend_agg", "figures"),
     "yourdfpy": ("import yourdfpy", "visual meshes"),
-    "sksundae": ("import sksundae", "SUNDIALS, for `ckc report`"),
-    "mujoco": ("import mujoco", "checking what `ckc export` writes"),
+    "sksundae": ("import sksundae", "SUNDIALS, a second opinion in the benchmark"),
+    "mujoco": ("import mujoco", "`ckc import` of MJCF, and MuJoCo in `ckc report`"),
     "click": ("import click, rich", "the command line; a run from Python needs none"),
     "scipy.integrate": ("import scipy.integrate", "a second opinion by SciPy's solvers"),
 }
