@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def _close(builder: Builder, kind: str, a: str, b: str, flat: Array | None, name
     elif kind in ("cylindrical", "prismatic"):  # what slides along the axis may be off
         apart = axis / np.linalg.norm(axis) * builder.scale * random.uniform(-0.2, 0.2)
         apart = apart if kind == "cylindrical" else np.zeros(3)
-    loop = {
+    loop: dict[str, Any] = {
         "name": name,
         "type": kind,
         "frame_a": {"link": a, "xyz": inside},

@@ -208,7 +208,7 @@ class Motion:
             if self.rank is None:
                 self.rank = int((sv > REDUNDANT * sv[:, :1]).sum(axis=1).max())
             r = self.rank
-            gap = sv[:, r - 1] / sv[:, 0]
+            gap = np.asarray(sv[:, r - 1] / sv[:, 0], dtype=float)
             y = -apply(np.swapaxes(Vt[:, :r], 1, 2), apply(np.swapaxes(U[:, :, :r], 1, 2), gamma) / sv[:, :r])
             N = np.swapaxes(Vt[:, r:], 1, 2)
             inner = np.swapaxes(N, 1, 2) @ H @ N
@@ -216,7 +216,7 @@ class Motion:
                 N, np.linalg.solve(inner, apply(np.swapaxes(N, 1, 2), force - apply(H, y))[..., None])[..., 0]
             )
         else:
-            y = np.linalg.solve(H, force[..., None])[..., 0]
+            y = np.asarray(np.linalg.solve(H, force[..., None])[..., 0], dtype=float)
         return (
             a_0 + np.einsum("pnbi,pn->pbi", T_v, y),
             alpha_0 + np.einsum("pnbi,pn->pbi", T_w, y),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from scripts.experiments.fuzz.read import Model
-from scripts.experiments.fuzz.spatial import Array, apply, cross, dot, rotation, rotation_vector, turn
+from scripts.experiments.fuzz.spatial import Array, IntArray, apply, cross, dot, rotation, rotation_vector, turn
 
 __all__ = ["coordinates", "difference", "energy", "joint_values", "split", "state"]
 
@@ -49,7 +49,7 @@ def state(model: Model, q: Array, v: Array) -> Array:
     return Y
 
 
-def joint_values(model: Model, Y: Array, bodies: Array, near: Array) -> tuple[Array, Array]:
+def joint_values(model: Model, Y: Array, bodies: IntArray, near: Array) -> tuple[Array, Array]:
     """Coordinates and rates (P, k) of one-freedom joints, angles within half a turn of `near`."""
     x, R, vel, w = split(Y)
     com = np.vstack([model.com, np.zeros(3)])
