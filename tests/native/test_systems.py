@@ -73,6 +73,19 @@ def test_jacobians_are_those_of_the_reference(scene, changes):
     assert np.abs(found - wanted).max() <= 1e-6 * np.abs(wanted).max()
 
 
+@pytest.mark.parametrize("formulation", ["reduced", "spf"])
+def test_a_coarse_tolerance_leaves_no_noise_in_jacobians(formulation):
+    """What the loops may be open at a tolerance is far more than a difference moves them."""
+    ready, ivp = both("five_bar/tracking", {"formulation": formulation, "solver.rtol": 1e-2})
+    random, h = np.random.default_rng(0), 1e-6
+    for k in range(8):
+        t, y = 0.1 * k, ivp.y0 + 0.1 * random.standard_normal(len(ivp.y0))
+        ready.loop.rhs(t, y + 1e-3 * random.standard_normal(len(y)))  # from where z is predicted
+        found = ready.loop.jacobian(t, y)
+        wanted = np.transpose([(ivp.f(t, y + step) - ivp.f(t, y - step)) / (2 * h) for step in h * np.eye(len(y))])
+        assert np.abs(found - wanted).max() <= 1e-5 * np.abs(wanted).max()
+
+
 @pytest.mark.parametrize("scene", ["five_bar/tracking", "stewart/wave"])
 def test_the_modes_of_a_dae_are_those_of_the_reduced_model(scene):
     """From rest, where either linearization is that of the freedoms."""

@@ -179,11 +179,9 @@ nb::object rhs(Run& run, double t, Given y) {
 nb::object jacobian(Run& run, double t, Given y) {
   System& system = *run.loop->system;
   require(y, system.size, "y");
-  Vector f(system.size);
   Matrix found;
   long evaluations = 0;
-  const bool exists = system.rhs(t, y, f) && system.jacobian(t, y, f, found, evaluations);
-  return exists ? nb::cast(found) : nb::none();
+  return system.jacobian(t, y, found, evaluations) ? nb::cast(found) : nb::none();
 }
 
 // Seconds of a right-hand side as the loop calls it, the least of several rounds over states: rows of (t, y).

@@ -100,7 +100,7 @@ bool LevelSet::newton(double tolerance) {
     const double previous = size;
     size = unclosed();
     if (iteration && !(size <= std::max(0.5 * previous, tolerance))) return false;
-    const bool polish = refusals_ > 1 && size > 0.0 && (!iteration || size < gains * previous);
+    const bool polish = (to_rounding_ || refusals_ > 1) && size > 0.0 && (!iteration || size < gains * previous);
     if (size <= tolerance && (!polish || iteration == max_iterations)) {
       expected_ = iteration;
       return true;
@@ -128,7 +128,7 @@ double LevelSet::unclosed() {
 bool LevelSet::rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!y.allFinite()) return fails(Trouble::infinite);
-  if (!state(t, y, refusals_ ? tolerance_ : std::max(tolerance_, slack_))) return fails(Trouble::open);
+  if (!state(t, y, refusals_ || to_rounding_ ? tolerance_ : std::max(tolerance_, slack_))) return fails(Trouble::open);
   core.inertia();
   core.bias(v_tree);
   if (!act(t)) return false;
@@ -142,6 +142,14 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
   else
     core.reduced_acceleration(control.u_tree, y_dot.tail(d));
   return y_dot.allFinite() || fails(Trouble::infinite);
+}
+
+// What the slack of the loops leaves open is far more than a difference moves.
+bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  to_rounding_ = true;
+  const bool exists = System::jacobian(t, y, jacobian, evaluations);
+  to_rounding_ = false;
+  return exists;
 }
 
 void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {

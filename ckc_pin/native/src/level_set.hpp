@@ -20,6 +20,7 @@ class LevelSet : public System {
   double margin() override { return phi_z_margin(); }
   Accepted accept(double t, Out y, double margin) override;
   bool own_partition(double t, Out y, bool& changed) override;
+  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   void rates(std::vector<std::pair<int, int>>& of) const override;
   double decay() const override { return -1.0 / epsilon_; }
   double layer() const override { return on_manifold_ ? System::layer() : epsilon_; }
@@ -49,6 +50,7 @@ class LevelSet : public System {
   // How often the rates of z have disagreed in these coordinates: the loops are closed without slack then, and after
   // that to rounding. Of the balance, the time since counts against it, in steps as they were before.
   int refusals_ = 0;
+  bool to_rounding_ = false;  // loops are closed so whatever came before
   double balance_ = 0.0, length_ = 0.0, accepted_ = 0.0;
   double t_start_ = 0.0;
   double alarm_;      // margin at which a better q is looked for

@@ -44,7 +44,7 @@ void Loop::choose_again(double bound) {
 bool Loop::is_stiff(double duration) {
   Matrix jacobian;
   ++work.jacobians;
-  return system->jacobian(now.t, now.y, now.f, jacobian, work.rhs) && system->modes(now.y, jacobian) &&
+  return system->jacobian(now.t, now.y, jacobian, work.rhs) && system->modes(now.y, jacobian) &&
          stiff(jacobian, duration);
 }
 

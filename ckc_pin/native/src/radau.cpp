@@ -98,15 +98,9 @@ void Radau::guess(double h) {
 bool Radau::new_jacobian(double h) {
   for (double x : {ahead, 0.0}) {
     if (x > 0.0 && last_.h == 0.0) continue;
-    double t = step_.t + x * h;
-    if (x > 0.0) {
-      extrapolate(x, h, y_stage_);
-      if (!evaluate(t, y_stage_, f_stage_)) continue;
-    } else {
-      y_stage_ = step_.y, f_stage_ = step_.f;
-    }
+    extrapolate(x, h, y_stage_);
     ++work_.jacobians;
-    if (system_.jacobian(t, y_stage_, f_stage_, J_, work_.rhs)) {
+    if (system_.jacobian(step_.t + x * h, y_stage_, J_, work_.rhs)) {
       J_known_ = J_fresh_ = true, factorized_ = 0.0;
       system_.rates(rates_);
       rest_.clear(), place_.assign(system_.size, 0);

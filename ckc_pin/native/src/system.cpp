@@ -33,15 +33,17 @@ double System::phi_z_margin() {
   return phi_z_->least() / std::max(std::sqrt(square), 1e-300);
 }
 
-bool System::jacobian(double t, In y, In f, Matrix& jacobian, long& evaluations) {
-  jacobian.resize(size, size), rate_.resize(size);
+bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  jacobian.resize(size, size), rate_.resize(size), rate_here_.resize(size);
   moved_ = y;
+  ++evaluations;
+  if (!rhs(t, moved_, rate_here_)) return false;
   for (int k = 0; k < size; ++k) {
     moved_(k) = y(k) + difference * std::max(1.0, std::abs(y(k)));
     const double step = moved_(k) - y(k);
     ++evaluations;
     if (!rhs(t, moved_, rate_)) return false;
-    jacobian.col(k) = (rate_ - f) / step;
+    jacobian.col(k) = (rate_ - rate_here_) / step;
     moved_(k) = y(k);
   }
   return jacobian.allFinite();

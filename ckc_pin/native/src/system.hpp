@@ -55,8 +55,8 @@ class System {
   virtual Accepted accept(double t, Out y, double margin) = 0;
   // Make the user's own partition that of q; false where phi_z is singular there.
   virtual bool own_partition(double, Out, bool& changed) { return changed = false, true; }
-  // d rhs / d y by differences, f = rhs(t, y), counted in `evaluations`; false where one does not exist.
-  virtual bool jacobian(double t, In y, In f, Matrix& jacobian, long& evaluations);
+  // d rhs / d y by differences, counted in `evaluations`; false where one does not exist.
+  virtual bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
   // Entries of y whose rate is another entry: (where, which).
   virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
   // Time in which the motion may change, known from the start, s: that of a boundary layer.
@@ -102,7 +102,7 @@ class System {
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_;
+  Vector moved_, rate_, rate_here_;
 };
 
 }  // namespace ckc
