@@ -100,3 +100,36 @@ def test_baumgarte_decays_as_it_says() -> None:
 def test_what_does_not_go_together(changes: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
         simulate("five_bar/swing", changes)
+
+
+@pytest.mark.parametrize(
+    ("q", "q_dot"),
+    [
+        ((-0.93414013, -0.41820761), (7.45699329, 0.99570948)),
+        ((0.69231067, -0.69793467), (7.95535897, 7.69336542)),
+        ((-0.57268896, -1.80892173), (-6.54795127, 1.28531818)),
+    ],
+)
+def test_a_constant_u_does_the_work_that_is_gained_where_q_is_no_chart(
+    q: tuple[float, float], q_dot: tuple[float, float]
+) -> None:
+    """phi_z passes through singular configurations, where a velocity closed by z alone may be anything."""
+    names = ("theta_1", "theta_3")
+    changes = {
+        "formulation": "dae",
+        "t_end": 1.0,
+        "solver.output_dt": 1e-4,
+        "solver.rtol": 1e-4,
+        "solver.method": "RK45",
+        "initial": {"q": dict(zip(names, q, strict=True)), "q_dot": dict(zip(names, q_dot, strict=True))},
+        "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01, "sample_time": 1.0,
+                       "q_d": {"theta_1": -1.2, "theta_3": 1.9}},
+    }  # fmt: skip
+    run = simulate("five_bar/swing", changes)
+    assert run.status == "done"
+    margin = [abs(FIVE_BAR.s(q_tree)) for q_tree in run.q_tree]
+    assert min(margin) < 1e-3 < max(margin)
+    moved = run.q_tree - run.q_tree[0]
+    work = moved[:, [run.column(name) for name in run.independent]] @ run.u[0]
+    gained = run.energy - run.energy[0]
+    assert np.abs(gained - work).max() < 100 * 1e-4 * np.abs(run.energy).max()

@@ -5,6 +5,7 @@
 namespace ckc {
 
 constexpr int most_steps = 10;
+constexpr double longer = 4.0;       // times: next to where phi_z is singular, z alone has far to go
 constexpr double rounding = 2e-16;   // of a product: a velocity that is allowed to the last digit stays what it is
 constexpr double negligible = 1e-9;  // rad, or of the mechanism's size: Newton's last step onto the closure
 
@@ -17,7 +18,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       beta_(beta),
       projects_(projects) {
   crosses = projects;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
@@ -64,12 +65,17 @@ bool Dae::rate(double t, In v, Out y_dot) {
   return y_dot.allFinite() || fails(Trouble::infinite);
 }
 
-// Stiff control would answer to any change of what it sees: where one acts, z alone is moved.
+// Stiff control would answer to any change of what it sees: where one acts, z alone is moved, unless that takes steps
+// far longer than the loops need.
 bool Dae::closing_step(In residual) {
-  if (control.acts()) core.factor();
-  if (!control.acts() || core.phi_z.singular()) return core.closing_step(residual, step_);
-  core.z_step(residual, step_);
-  return step_.allFinite();
+  if (!core.closing_step(residual, step_)) return false;
+  if (!control.acts()) return true;
+  core.factor();
+  if (core.phi_z.singular()) return true;
+  core.z_step(residual, z_step_);
+  const Vector& units = core.scales.columns;
+  if (z_step_.cwiseQuotient(units).norm() < longer * step_.cwiseQuotient(units).norm()) step_ = z_step_;
+  return true;
 }
 
 bool Dae::project(In y) {
