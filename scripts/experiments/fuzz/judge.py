@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import DOP853
 
+from scripts.experiments.fuzz.joint_forces import JointForces
 from scripts.experiments.fuzz.motion import LEAST_GAP, Motion
 from scripts.experiments.fuzz.read import Model
 from scripts.experiments.fuzz.spatial import Array
@@ -39,23 +40,24 @@ class Judge:
         self.model = model
         self.motion = Motion(model)
 
-    def pieces(self, q: Array, v: Array, dt: Array, target: float) -> Judged:
+    def pieces(self, q: Array, v: Array, dt: Array, target: float, drive: JointForces | None = None) -> Judged:
         """Where pieces (P, n) end after times (P,), to a relative target."""
         target = max(target, FINEST)
         with np.errstate(all="ignore"):
-            return self._pieces(q, v, dt, target)
+            return self._pieces(q, v, dt, target, drive)
 
-    def _pieces(self, q: Array, v: Array, dt: Array, target: float) -> Judged:
+    def _pieces(self, q: Array, v: Array, dt: Array, target: float, drive: JointForces | None) -> Judged:
         Y = state(self.model, q, v)
         near = q + v * dt[:, None]
         substeps = 1
-        end, gap = self.integrate(Y, near, dt, substeps)
+        end, gap = self.integrate(Y, near, dt, substeps, drive)
         q_end, v_end = coordinates(self.model, end, near)
         resolved, used = np.zeros(len(q), bool), np.full(len(q), MOST_SUBSTEPS)
         while substeps < MOST_SUBSTEPS and not resolved.all():
             substeps *= 2
             open_ = ~resolved
-            end, finer_gap = self.integrate(Y[open_], near[open_], dt[open_], substeps)
+            acting = None if drive is None else drive[open_]
+            end, finer_gap = self.integrate(Y[open_], near[open_], dt[open_], substeps, acting)
             q_new, v_new = coordinates(self.model, end, near[open_])
             off = self.error(q_end[open_], v_end[open_], q_new, v_new)
             q_end[open_], v_end[open_], gap[open_] = q_new, v_new, finer_gap
@@ -63,12 +65,15 @@ class Judge:
             resolved[open_] = off <= target
         return Judged(q_end, v_end, resolved & (gap > LEAST_GAP), used)
 
-    def sensitive(self, q: Array, v: Array, dt: Array, end: Judged, which: np.ndarray) -> np.ndarray:
+    def sensitive(
+        self, q: Array, v: Array, dt: Array, end: Judged, which: np.ndarray, drive: JointForces | None = None
+    ) -> np.ndarray:
         """Which pieces, of some, magnify a small error of the velocity by more than they should within their time."""
         found = np.zeros(len(q), bool)
         at = np.flatnonzero(which & end.resolved)
         if len(at):
-            beside = self.pieces(q[at], v[at] * (1 + NUDGE), dt[at], FINEST)  # as the loops allow
+            acting = None if drive is None else drive[at]
+            beside = self.pieces(q[at], v[at] * (1 + NUDGE), dt[at], FINEST, acting)  # as the loops allow
             found[at] = self.error(beside.q, beside.v, end.q[at], end.v[at]) > MAGNIFIED * NUDGE
         return found
 
@@ -79,7 +84,9 @@ class Judge:
         worse = np.maximum(of_q, of_v)
         return np.where(np.isfinite(worse), worse, np.inf)
 
-    def integrate(self, Y: Array, near: Array, dt: Array, substeps: int) -> tuple[Array, Array]:
+    def integrate(
+        self, Y: Array, near: Array, dt: Array, substeps: int, drive: JointForces | None = None
+    ) -> tuple[Array, Array]:
         """States after times (P,) by steps of one length, and how near a loss of rank they came."""
         h = (dt / substeps)[:, None, None]
         least = np.full(len(Y), np.inf)
@@ -88,7 +95,7 @@ class Judge:
             for s in range(len(WEIGHTS)):
                 at = Y + h * np.tensordot(STAGES[s, :s], K[:s], 1) if s else Y
                 try:
-                    K[s], gap = self.motion.rate(at, near)
+                    K[s], gap = self.motion.rate(at, near, drive)
                 except np.linalg.LinAlgError:
                     return np.full_like(Y, np.nan), np.zeros(len(Y))
                 least = np.minimum(least, np.where(np.isfinite(gap), gap, 0.0))

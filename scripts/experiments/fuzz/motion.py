@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from scripts.experiments.fuzz.joint_forces import JointForces
 from scripts.experiments.fuzz.read import Frame, Model
 from scripts.experiments.fuzz.spatial import Array, IntArray, apply, cross, dot
 from scripts.experiments.fuzz.state import joint_values, split
@@ -146,7 +147,7 @@ class Motion:
             np.concatenate([gamma / size, gamma_dot, np.zeros((len(Y), len(self.a_turn)))], axis=1),
         )
 
-    def forces(self, Y: Array, near: Array) -> tuple[Array, Array, Array]:
+    def forces(self, Y: Array, near: Array, drive: JointForces | None = None) -> tuple[Array, Array, Array]:
         """Forces and torques on bodies (P, nb + 1, 3), and along joints (P, n)."""
         model = self.model
         x, R, v, w = split(Y)
@@ -173,16 +174,19 @@ class Motion:
         if len(self.damped):
             at = model.column[self.damped]
             along[:, at] -= model.damping[at] * joint_values(model, Y, self.damped, near[:, at])[1]
+        if drive is not None:
+            at = drive.columns
+            along[:, at] += drive.along(*joint_values(model, Y, self.carrier[at], near[:, at]))
         return push, torque, along
 
-    def accelerations(self, Y: Array, near: Array) -> tuple[Array, Array, Array]:
+    def accelerations(self, Y: Array, near: Array, drive: JointForces | None = None) -> tuple[Array, Array, Array]:
         """Accelerations and angular accelerations (P, nb + 1, 3), and each piece's distance from a loss of rank."""
         model = self.model
         P, n = len(Y), model.n
         _, R, _, w = split(Y)
         T_v, T_w = self.motions(Y)
         a_0, alpha_0 = self.left_over(Y)
-        push, torque, along = self.forces(Y, near)
+        push, torque, along = self.forces(Y, near, drive)
         I = R[:, :-1] @ model.inertia @ np.swapaxes(R[:, :-1], -1, -2)
         Iw = apply(I, w[:, :-1])
         push[:, :-1] -= model.mass[:, None] * a_0[:, :-1]
@@ -223,10 +227,10 @@ class Motion:
             gap,
         )
 
-    def rate(self, Y: Array, near: Array) -> tuple[Array, Array]:
+    def rate(self, Y: Array, near: Array, drive: JointForces | None = None) -> tuple[Array, Array]:
         """dY/dt, and each piece's distance from a loss of rank."""
         _, R, v, w = split(Y)
-        a, alpha, gap = self.accelerations(Y, near)
+        a, alpha, gap = self.accelerations(Y, near, drive)
         out = np.empty_like(Y)
         out[..., :3], out[..., 12:15], out[..., 15:] = v, a, alpha
         out[..., 3:12] = cross(w[..., None, :], np.swapaxes(R, -1, -2)).swapaxes(-1, -2).reshape(*Y.shape[:-1], 9)

@@ -11,6 +11,7 @@ import numpy as np
 import ckc_pin
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
+from scripts.experiments.fuzz.joint_forces import PER_SAMPLE
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array
 
@@ -100,6 +101,8 @@ def _changes(random: np.random.Generator, mechanism: Mechanism, about: _Shipped)
         changes["event"] = _events(random, mechanism, q, q_dot)
     if q is not None and not mechanism.rooted and random.random() < 0.12:
         changes["controller"] = _controller(random, mechanism, q)
+        if "sample_time" in changes["controller"]:  # every change of u is at an output instant
+            changes["solver.output_dt"] = changes["controller"]["sample_time"] / PER_SAMPLE
     else:
         changes["controller"] = None
     return changes

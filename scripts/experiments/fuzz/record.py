@@ -12,6 +12,7 @@ import numpy as np
 import ckc_pin
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation import Run
+from scripts.experiments.fuzz.joint_forces import Unlike, joint_forces
 from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
 from scripts.experiments.fuzz.read import NoJudge, read
@@ -115,20 +116,23 @@ def _judge(record: Record, run: Run, motion: Motion) -> None:
     allowed = max(10 * mechanism.tolerance, OPEN * max(1.0, mechanism.size))
     if finite and not run.max_phi <= allowed:
         wrong = f"open by {run.max_phi:.2g}"
-    if finite and not record.control and not run.w.any() and len(run.t) > 1:
+    if finite and not run.w.any() and len(run.t) > 1:
         try:
-            wrong = _pieces(record, run, motion.seed) or wrong
+            wrong = _pieces(record, run, motion) or wrong
         except NoJudge as error:
             record.why = f"no judge: {error}"
+        except Unlike as error:
+            wrong = str(error)
     if wrong and run.status == "done":
         record.verdict = "WRONG"
     record.why = wrong or record.why
 
 
-def _pieces(record: Record, run: Run, seed: int) -> str:
+def _pieces(record: Record, run: Run, motion: Motion) -> str:
     """Judge some pieces; what is wrong with them, if anything."""
     judge = Judge(read(run.texts))
-    model, rtol = judge.model, record.rtol
+    model, rtol, controller = judge.model, record.rtol, motion.changes.get("controller")
+    conservative = model.conservative and controller is None
     order = [run.coordinates.index(label) for label in model.labels]
     q, v = run.q_tree[:, order], run.v_tree[:, order]
     kinetic, potential = energy(model, q, v)
@@ -140,21 +144,26 @@ def _pieces(record: Record, run: Run, seed: int) -> str:
     wrong = ""
     if np.abs(total - run.energy).max() > 1e-9 * max(scale, float(np.abs(total).max())):
         wrong = "the energy written down is not that of the states"
-    if model.conservative:
+    if conservative:
         record.drift = float(np.abs(total - total[0]).max() / scale)
         record.jump = float(np.abs(np.diff(total)).max() / scale)
-    chosen = _choose(np.random.default_rng([seed, 4]), total if model.conservative else None, v)
-    dt = np.diff(run.t)[chosen]
+    rows, acting = np.arange(len(run.t)), None
+    if controller is not None:
+        rows, acting = joint_forces(controller, model, run, motion.changes["solver.output_dt"])
+    q, v, t = q[rows], v[rows], run.t[rows]
+    chosen = _choose(np.random.default_rng([motion.seed, 4]), total if conservative else None, v)
+    acting = None if acting is None else acting[chosen]
+    dt = np.diff(t)[chosen]
     if judge.has_no_mass(q[chosen]):
         raise NoJudge("a freedom that moves no mass")
-    end = judge.pieces(q[chosen], v[chosen], dt, 1e-3 * rtol)
+    end = judge.pieces(q[chosen], v[chosen], dt, 1e-3 * rtol, acting)
     off = judge.error(q[chosen + 1], v[chosen + 1], end.q, end.v)
-    end.resolved[judge.sensitive(q[chosen], v[chosen], dt, end, off > DOUBTFUL * rtol)] = False
+    end.resolved[judge.sensitive(q[chosen], v[chosen], dt, end, off > DOUBTFUL * rtol, acting)] = False
     record.pieces, record.unresolved = int(end.resolved.sum()), int((~end.resolved).sum())
     if record.pieces:
         errors = off[end.resolved] / rtol
         record.p50, record.p90, record.worst = (float(np.percentile(errors, p)) for p in (50, 90, 100))
-        record.worst_t = float(run.t[chosen[end.resolved][np.argmax(errors)]])
+        record.worst_t = float(t[chosen[end.resolved][np.argmax(errors)]])
         record.errors = " ".join(f"{x:.3g}" for x in errors)
         record.gross = run.status == "done" and bool(off[end.resolved].max() > GROSS)
         if off[end.resolved].max() > ALLOWED * rtol + FLOOR:
