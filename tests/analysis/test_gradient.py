@@ -1,0 +1,66 @@
+"""dh/dq's bounds on a branch and along a trajectory, against the five-bar of the appendix in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ckc_pin import load
+from ckc_pin.analysis.gradient import bound_along, chart_step, explore_branch, gradient_bounds
+from ckc_pin.analysis.walk import margin, margin_gradient
+from ckc_pin.control.desired import Harmonics
+from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.sigma import sigma
+from tests.analysis.set_point import five_bar_border, five_bar_gradient, pendulum
+from tests.analytic.five_bar import FIVE_BAR
+from tests.conftest import Pair, assert_close
+
+
+@pytest.mark.parametrize(("s_min", "finer"), [(0.5, 1e-3), (0.1, 1e-4)])
+def test_bounds_are_the_extremes_on_the_border(five_bar: Pair, s_min: float, finer: float) -> None:
+    mechanism, _ = five_bar
+    step = chart_step(mechanism, 36)
+    (bound,) = gradient_bounds(mechanism, explore_branch(mechanism, mechanism.assembled, 36), [s_min], step)
+    border = [five_bar_gradient(q, finer) for q in five_bar_border(s_min, 600)]
+    assert_close(bound.norm, max(np.linalg.norm(g, 2) for g in border), 1e-3, relative=True)
+    assert_close(
+        bound.low, min(np.linalg.eigvalsh((g + g.T) / 2)[0] for g in border), 5e-3, relative=True
+    )  # the border is sampled
+    for q, value in ((bound.norm_q, bound.norm), (bound.low_q, -bound.low)):
+        assert abs(FIVE_BAR.s(FIVE_BAR.sigma(q))) >= s_min * (1 - 1e-6)
+        assert value <= np.linalg.norm(five_bar_gradient(q, finer), 2) * (1 + 1e-5)
+
+
+def test_the_other_branch_is_the_mirror_image(five_bar: Pair) -> None:
+    """Reflected in the base line gravity points up: dh/dq changes its sign."""
+    mechanism, _ = five_bar
+    own, other = assembly_branches(mechanism)
+    step = chart_step(mechanism, 20)
+    bounds = [gradient_bounds(mechanism, explore_branch(mechanism, at, 20), [0.6], step)[0] for at in (own, other)]
+    assert_close(bounds[1].norm, bounds[0].norm, 2e-3, relative=True)
+    assert_close(bounds[1].low, -bounds[0].norm, 2e-3, relative=True)  # the norm is a positive eigenvalue's
+    assert bounds[0].low > bounds[1].low + 1
+
+
+def test_bound_along_a_trajectory(five_bar: Pair) -> None:
+    mechanism, _ = five_bar
+    waves = [(np.pi / 3, 1.0, 0.0)], [(np.pi / 4, 1.0, -np.pi / 2)]
+    desired = Harmonics([HarmonicsSpec(harmonics=waves[0]), HarmonicsSpec(offset=np.pi / 4, harmonics=waves[1])])
+    times = np.linspace(0, 2 * np.pi, 100)
+    gradients = [five_bar_gradient(desired(t)[0], 1e-3) for t in times]
+    found = bound_along(mechanism, desired, times)
+    assert_close(found.norm, max(np.linalg.norm(g, 2) for g in gradients), 1e-8, relative=True)
+    with pytest.raises(InputError, match="leaves the branch"):
+        bound_along(load("five_bar_as_printed"), desired, times)
+
+
+def test_margin_is_the_sine_between_the_distal_links(five_bar: Pair) -> None:
+    mechanism, numpy_twin = five_bar
+    for q in np.random.default_rng(1).uniform(-0.8, 0.8, (10, 2)):
+        at = sigma(mechanism, q).at
+        assert_close(margin(at), abs(numpy_twin.s(numpy_twin.sigma(q))), 1e-12)
+        s = [[abs(numpy_twin.s(numpy_twin.sigma(q + sign * 1e-5 * e))) for sign in (1, -1)] for e in np.eye(2)]
+        assert_close(margin_gradient(at), [(a - b) / 2e-5 for a, b in s], 1e-8)
+    assert margin(pendulum(2).assembled) == 1.0
