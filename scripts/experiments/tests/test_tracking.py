@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,28 +14,23 @@ from ckc_pin.simulation.scene import load_scene
 from scripts.experiments.paper import tracking
 from scripts.experiments.paper.deviations import (
     PERIOD,
-    Deviation,
     FromLast,
     OwnSigma,
-    Setting,
     Track,
     deviation,
     instants,
     track,
 )
 from scripts.experiments.paper.experiment import Problem
-from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.tracking_experiments import (
     EXACT,
     SCENE,
     SETTINGS,
     W0,
-    deviations,
     lyapunov_along,
     off_manifold,
 )
 from scripts.experiments.paper.tracking_identities import (
-    Skewness,
     _defect,
     claimed_form,
     printed_form,
@@ -291,91 +284,3 @@ def test_eq_8_and_the_reduced_model_track_like_numpy() -> None:
         assert_close(track(SCENE, setting, times).q, expected, 1e-7)
     with pytest.raises(InputError, match="a scene with a controller is needed"):
         track("five_bar/swing", EXACT, times)
-
-
-# --- the claims --------------------------------------------------------------------------------------------------
-
-
-def made_up(settings: Mapping[str, Setting], periodic: str) -> tuple[Array, Array, dict[str, Deviation]]:
-    """Runs of known deviation: `periodic` by 1e-3 rad in the period of eq. 21, tight ones by none, others by noise."""
-    t, random = instants(3), np.random.default_rng(4)
-    still = Track(np.zeros((len(t), 2)), 0.0)
-    found = {}
-    for name in settings:
-        tight = name in SETTINGS["nothing"] or name in SETTINGS["sigma of both"]
-        off = np.zeros_like(t) if tight else 1e-4 * random.uniform(0, 1, len(t))
-        off = 1e-3 * (2 + np.sin(t)) if name == periodic else off
-        found[name] = deviation(
-            Track(off[:, None] + still.q + 1e-13 * random.uniform(0, 1, still.q.shape), 1e-2), still
-        )
-    return t, np.exp(-t), found
-
-
-@pytest.fixture(scope="module")
-def good() -> Record:
-    return lyapunov_along({"formulation": "reduced", **SHORT})
-
-
-def judged_rate(rho: Record, actual: Record, on: Record, figures: Path) -> str:
-    off = {(1e-3, name, moving): x for name, x in (("rho", rho), ("actual", actual)) for moving in (False, True)}
-    claim = tracking.lyapunov_claim({"reduced": on}, {"reduced": on}, off, figures)
-    assert all((figures / name).stat().st_size > 10_000 for name in claim.figures)
-    assert claim.table is not None
-    assert [len(row) for row in claim.table[1]] == [len(claim.table[0])] * 6
-    return claim.verdict
-
-
-def test_verdict_on_the_rate_asks_for_the_right_convention(good: Record, tmp_path: Path) -> None:
-    """As measured only C at rho q_dot misses eq. 19; were it the other, the statement would not hold."""
-    bad = replace(good, rate=1.01 * good.rate)
-    assert judged_rate(good, good, good, tmp_path) == "holds"
-    assert judged_rate(bad, good, good, tmp_path) == "holds with a condition"
-    assert judged_rate(good, bad, good, tmp_path) == "does not hold"
-    assert judged_rate(good, good, bad, tmp_path) == "does not hold"
-
-
-def test_verdict_on_the_rate_is_that_of_short_runs(good: Record, tmp_path: Path) -> None:
-    rho, actual = (off_manifold(1e-3, name, True) for name in ("rho", "actual"))
-    assert judged_rate(rho, actual, good, tmp_path) == "holds with a condition"
-
-
-def test_verdict_on_gains_is_of_quadratic_forms_alone() -> None:
-    claim = tracking.gains_claim()
-    assert claim.verdict == "holds with a condition"
-    assert claim.table is not None
-    assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
-
-
-@pytest.mark.parametrize(("deviates", "verdict"), [(False, "does not hold"), (True, "holds")])
-def test_verdict_on_deviations_follows_the_numbers(tmp_path: Path, deviates: bool, verdict: str) -> None:
-    (tight,) = SETTINGS["nothing"]
-    every = {name: x for group in SETTINGS.values() for name, x in group.items()}
-    claim = tracking.deviations_claim(*made_up(every, tight if deviates else "none"), tmp_path)
-    assert claim.verdict == verdict
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in claim.figures)
-
-
-def test_deviations_are_measured_from_the_exact_run() -> None:
-    tracks: list[tuple[object, object]] = []
-
-    def fake(scene: str, setting: Setting, times: Array) -> Track:
-        tracks.append((setting.tolerance, setting.own))
-        q_d = np.array([desired(float(t))[0] for t in times])
-        return Track(q_d + (0.25 if setting is EXACT else 0.375 + 0.125 * np.sin(times)[:, None]), 0.0)
-
-    own = SETTINGS["controller's sigma"]
-    t, error, found = deviations(own, 2, fake)
-    assert_close(t[[0, -1]], [0.0, 2 * PERIOD], 1e-12)
-    assert_close(error, 0.25, 1e-12)
-    assert tracks == [(None, None), (None, 1e-2), (None, 1e-3)]
-    for x in found.values():
-        assert_close(x.size, np.abs(0.125 + 0.125 * np.sin(t)), 1e-12)
-
-
-@pytest.mark.parametrize(
-    ("on", "mixed", "verdict"),
-    [(1e-11, 2.0, "holds with a condition"), (1e-11, 1e-11, "holds"), (1e-3, 2.0, "does not hold")],
-)
-def test_verdict_on_skewness_follows_the_numbers(on: float, mixed: float, verdict: str) -> None:
-    found = {epsilon: Skewness(on, 1e-11, mixed, 1e-11, 4) for epsilon in (1e-2, 1e-3)}
-    assert tracking.skew_claim(found).verdict == verdict
