@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import signal
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ckc_pin
 from ckc_pin import InputError, Run, Terms, load_scene, simulate
 from ckc_pin.simulation.interrupts import Interrupts
 from ckc_pin.simulation.run_file import MAX_BYTES, MAX_META
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
+from tests.contract.helpers.under_way import under_way
 
 # --- in this process -----------------------------------------------------------------------------
 
@@ -161,24 +158,15 @@ def test_signals_while_saving(
 ) -> None:
     """Ctrl-C twice at once, or not at all; then more of them while the run is written."""
     words = ["run", "five_bar/swing", "--json", "--out", str(tmp_path), "--set", f"t_end={t_end}"]
-    with subprocess.Popen(
-        [sys.executable, "-c", CKC, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(ckc_pin.__file__).parent.parent)},
-    ) as process:
-        try:
-            assert process.stderr is not None
-            assert process.stderr.readline() == "under way\n"
-            for number in first:
-                process.send_signal(number)
-            assert process.stderr.readline() == "saving\n"
-            for number in meanwhile:
-                process.send_signal(number)
-            out, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
+    with under_way(CKC, *words) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "under way\n"
+        for number in first:
+            process.send_signal(number)
+        assert process.stderr.readline() == "saving\n"
+        for number in meanwhile:
+            process.send_signal(number)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == code, err
     assert json.loads(out)["status"] == status
     assert "the run is saved" in err

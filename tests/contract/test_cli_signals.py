@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import ckc_pin
+from tests.contract.helpers.under_way import under_way
 
 # The command, in a process of its own, which says on standard error when it is under way.
 CKC = """
@@ -40,21 +41,11 @@ ckc_pin.cli.main()
 )
 def test_an_interrupted_run_is_printed_and_saved(number: signal.Signals, code: int, says: str, tmp_path: Path) -> None:
     words = ["run", "five_bar/swing", "--json", "--out", str(tmp_path), "--set", "t_end=9000.0"]
-    here = str(Path(ckc_pin.__file__).parent.parent)
-    with subprocess.Popen(
-        [sys.executable, "-c", CKC, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": here},
-    ) as process:
-        try:
-            assert process.stderr is not None
-            assert process.stderr.readline() == "under way\n"
-            process.send_signal(number)
-            out, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
+    with under_way(CKC, *words) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "under way\n"
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == code
     found = json.loads(out)
     assert found["status"] == "interrupted"

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import ckc_pin
 from ckc_pin.cli import report as command
 from tests.analysis.swing_table import SCENE, pendulum, write_table
 from tests.contract.helpers.command import ckc
+from tests.contract.helpers.under_way import under_way
 
 PLAIN = {"status", "message", "scenes", "written"}
 SECTION = {"scene", "status", "message", "reference", "model_difference", "rows", "advice", "notes", "seconds"}
@@ -179,37 +176,28 @@ import signal, sys
 import ckc_pin.cli
 from ckc_pin.analysis.precision import compute
 signal.signal(signal.SIGINT, signal.default_int_handler)
-judged, made = compute._judged, []
+apart, compared = compute.apart, []
 
 def announced(*arguments):
-    row = judged(*arguments)
-    made.append(row)
-    if len(made) == 10:
+    compared.append(arguments)
+    if len(compared) == 10:
         print("under way", file=sys.stderr, flush=True)
-    return row
+    return apart(*arguments)
 
-compute._judged = announced
+compute.apart = announced
 ckc_pin.cli.main()
 """
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_report_is_printed_and_saved(number: signal.Signals, code: int, table: Path) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", CKC, "report", "table", "five_bar/swing", "--budget", "500", "--json", "--out", "out"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(ckc_pin.__file__).parent.parent)},
-    ) as process:
-        try:
-            assert process.stderr is not None
-            assert process.stderr.readline().startswith("this may take 1000 s")
-            assert process.stderr.readline() == "under way\n"
-            process.send_signal(number)
-            out, _ = process.communicate(timeout=120)
-        finally:
-            process.kill()
+    words = ["report", "table", "five_bar/swing", "--budget", "500", "--json", "--out", "out"]
+    with under_way(CKC, *words) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("this may take 1000 s")
+        assert process.stderr.readline() == "under way\n"
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=120)
     assert process.returncode == code
     found = json.loads(out)
     assert found["status"] == "interrupted"
