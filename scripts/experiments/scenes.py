@@ -8,15 +8,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, as_ivp, simulate
+from ckc_pin.analysis.precision.settings import FORMULATIONS
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.simulation.scene import catalogue
 
-FORMULATIONS: dict[str, dict[str, Any]] = {
-    "dae": {"formulation": "dae"},
-    "reduced": {"formulation": "reduced"},
-    "spf, w": {"formulation": "spf", "spf_coordinates": "w"},
-    "spf, z": {"formulation": "spf", "spf_coordinates": "z"},
-}
 TIGHT = 1e-11
 ALLOWED = 100  # tolerances of a step: what a run adds up to
 # s: NumPy takes a millisecond a right-hand side; and what is chaotic forgets its tolerance later

@@ -14,7 +14,7 @@ from ckc_pin.analysis.precision import mujoco
 from ckc_pin.analysis.precision.advice import Advice, advise
 from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move, on_span
 from ckc_pin.analysis.precision.reference import Reference, find_reference
-from ckc_pin.analysis.precision.settings import Setting, changed, off_manifold, settings
+from ckc_pin.analysis.precision.settings import changed, off_manifold, settings
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
@@ -164,7 +164,18 @@ def _ours(
                 motion = _none(mechanism, *LATE)
             elif "max_wall_s" in motion.reason:
                 spent[setting.family] = "not tried", f"at rtol {setting.rtol:.0e} it took more than {limit:.2g} s"
-        found.rows.append(_judged(found.reference, mechanism, motion, setting, setting.changes(scene)))
+        found.rows.append(
+            _judged(
+                found.reference,
+                mechanism,
+                motion,
+                program="ckc_pin",
+                formulation=setting.formulation,
+                method=setting.method,
+                rtol=setting.rtol,
+                changes=setting.changes(scene),
+            )
+        )
     late = sum((row.status, row.reason) == LATE for row in found.rows)
     if late:
         found.notes.append(f"{late} settings were not tried: the budget was used up before")
@@ -176,15 +187,20 @@ def _peer(found: WorkPrecision, rows: Iterable[tuple[str, float, Motion]] | str,
         return
     assert found.reference is not None
     for method, dt, motion in rows:
-        found.rows.append(_judged(found.reference, mechanism, motion, (method, dt), {}))
+        found.rows.append(_judged(found.reference, mechanism, motion, program="MuJoCo", method=method, dt=dt))
 
 
 def _judged(
     reference: Reference,
     mechanism: Mechanism,
     motion: Motion,
-    setting: Setting | tuple[str, float],
-    changes: dict[str, Any],
+    *,
+    program: str,
+    method: str,
+    formulation: str | None = None,
+    rtol: float | None = None,
+    dt: float | None = None,
+    changes: dict[str, Any] | None = None,
 ) -> PrecisionRow:
     """Return the row of a motion; one that is not whole has no error."""
     whole = motion.status == "done" and len(motion.q_tree) == len(reference.t)
@@ -194,14 +210,13 @@ def _judged(
         status, reason = "failed", "its motion is not finite"
     off = apart(mechanism.tree, motion, reference.motion) if finite else None
     error = None if off is None else float(off.scaled.max())
-    ours = setting if isinstance(setting, Setting) else None
     return PrecisionRow(
-        program="ckc_pin" if ours else "MuJoCo",
-        formulation=ours.formulation if ours else None,
-        method=ours.method if ours else setting[0],  # type: ignore[index]
-        rtol=ours.rtol if ours else None,
-        dt=None if ours else setting[1],  # type: ignore[index]
-        changes=changes,
+        program=program,
+        formulation=formulation,
+        method=method,
+        rtol=rtol,
+        dt=dt,
+        changes=changes or {},
         status=status,
         reason=reason,
         error=error,

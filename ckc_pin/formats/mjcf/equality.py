@@ -161,7 +161,10 @@ class Equalities:
         order: dict[frozenset[str], int] = {}
         for closure in closures:
             order.setdefault(frozenset((closure.a.link, closure.b.link)), len(order))
-        key = lambda c: order[frozenset((c.a.link, c.b.link))]  # noqa: E731
+
+        def key(closure: _Closure) -> int:
+            return order[frozenset((closure.a.link, closure.b.link))]
+
         for _, group in groupby(sorted(closures, key=key), key):
             yield list(group)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from time import perf_counter
 from typing import Any
 
+from ckc_pin.analysis.precision.motion import without_place
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.simulate import run_prepared
@@ -106,6 +106,5 @@ def compute(work: Work, changes: dict[str, Any], budget: float) -> Motion:
         return refused(work, str(error))
     stats = run.stats
     method = f" ({stats['method']})" if changes["solver.method"] == "auto" else ""
-    without_place = re.sub(r" near [^:]*:", ":", run.message)  # a line of 81 coordinates
-    reason = f"{without_place}{method}" if run.status != "done" else str(stats["method"])
+    reason = f"{without_place(run.message)}{method}" if run.status != "done" else str(stats["method"])
     return Motion(run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["steps"], stats["rhs"])
