@@ -16,7 +16,7 @@ from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
 
-__all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "read_run", "write_run"]
+__all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "hashes_of", "read_run", "write_run"]
 
 FORMAT = 1
 MAX_BYTES = 2**31  # of a run, expanded
@@ -90,7 +90,7 @@ READ = {"events": list[_Event], "stats": _Stats, "scene": _Scene, "profile": dic
 
 def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array], meta: RunMeta) -> None:
     """Write a run's file (InputError where that cannot be)."""
-    meta.hashes = _hashes(meta)
+    meta.hashes = hashes_of(meta)
     content = {
         **arrays,
         "coordinates": np.array(coordinates),
@@ -123,7 +123,7 @@ def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
         raise
     except Exception as error:  # whatever a damaged archive makes NumPy, zlib or msgspec raise
         raise InputError(f"{path}: not a run file, or damaged ({type(error).__name__}: {error})") from None
-    if MECHANISM_FILE not in meta.texts or meta.hashes != _hashes(meta):
+    if MECHANISM_FILE not in meta.texts or meta.hashes != hashes_of(meta):
         raise InputError(f"{path}: damaged: its texts do not match their hashes")
     for name, kind in READ.items():
         try:
@@ -186,7 +186,7 @@ def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Ar
         raise InputError(f"{path}: damaged: t does not increase")
 
 
-def _hashes(meta: RunMeta) -> dict[str, str]:
+def hashes_of(meta: RunMeta) -> dict[str, str]:
     """SHA-256 of every text, and of the scene as resolved."""
     scene = msgspec.json.encode(meta.scene, order="sorted")
     return {

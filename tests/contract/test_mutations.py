@@ -21,7 +21,7 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert
 from ckc_pin.simulation.report import profile_table, run_table, to_json
-from ckc_pin.simulation.run_file import RunMeta, _hashes
+from ckc_pin.simulation.run_file import RunMeta, hashes_of
 from ckc_pin.simulation.scene import make_scene
 
 NUMBERS = [float("nan"), float("inf"), -float("inf"), 0, -1, 5e-324, 1e-300, 1e300, 1.7e308, 1e12, 1e-12, 1e9, 2**63,
@@ -130,7 +130,7 @@ def test_run_files(tmp_path: Path) -> None:
     for _ in range(250):
         meta = mutated(r, given)
         try:
-            hashes = _hashes(msgspec.convert(meta, RunMeta))
+            hashes = hashes_of(msgspec.convert(meta, RunMeta))
         except (msgspec.ValidationError, OverflowError):
             hashes = {}
         content["meta"] = np.frombuffer(json.dumps(meta | {"hashes": hashes}).encode(), dtype=np.uint8)

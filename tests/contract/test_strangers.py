@@ -192,13 +192,13 @@ def _saved(tmp_path: Path) -> Path:
 
 
 def _with_meta(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    from ckc_pin.simulation.run_file import RunMeta, _hashes
+    from ckc_pin.simulation.run_file import RunMeta, hashes_of
 
     with np.load(path) as data:
         content = {name: data[name] for name in data.files}
     meta = json.loads(content["meta"].tobytes())
     change(meta)
-    hashes = _hashes(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # a stranger can do that too
+    hashes = hashes_of(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # a stranger can do that too
     content["meta"] = np.frombuffer(json.dumps(meta | {"hashes": hashes}).encode(), dtype=np.uint8)
     np.savez(path, **content)
 

@@ -13,7 +13,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Skewness", "claimed_form", "printed_form", "rate_form", "skewness"]
+__all__ = ["Skewness", "claimed_form", "defect", "printed_form", "rate_form", "skewness"]
 
 TRIES = 50  # for each state
 STEP = 1e-4  # rad or m along a velocity of unit size, of the differences that give D_dot
@@ -76,12 +76,12 @@ def skewness(mechanism: Mechanism, count: int, epsilon: float, off: float = 0.02
         actual[moved.partition.z] = spf_z_dot(moved, q_dot, epsilon, moved.phi)
         pairs = ((at, at.rho @ q_dot, at.rho @ q_dot), (moved, level, level), (moved, actual, level),
                  (moved, actual, actual))  # fmt: skip
-        worst = np.maximum(worst, [_defect(mechanism, *pair) for pair in pairs])
+        worst = np.maximum(worst, [defect(mechanism, *pair) for pair in pairs])
     on, rho_rho, actual_rho, actual_actual = (float(x) for x in worst)
     return Skewness(on, rho_rho, actual_rho, actual_actual, states)
 
 
-def _defect(mechanism: Mechanism, at: Kinematics, along: Array, at_velocity: Array) -> float:
+def defect(mechanism: Mechanism, at: Kinematics, along: Array, at_velocity: Array) -> float:
     speed = float(np.linalg.norm(along))
 
     def D(distance: float) -> Array:

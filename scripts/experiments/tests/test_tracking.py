@@ -31,8 +31,8 @@ from scripts.experiments.paper.tracking_experiments import (
     off_manifold,
 )
 from scripts.experiments.paper.tracking_identities import (
-    _defect,
     claimed_form,
+    defect,
     printed_form,
     rate_form,
     skewness,
@@ -150,7 +150,7 @@ def test_defect_is_the_numpy_five_bars(five_bar: Pair) -> None:
             S = rate - 2 * FIVE_BAR.C(q_tree, velocity)
             expected = np.abs(S + S.T).max() / np.abs(rate).max()
             assert expected < 1e-13 if skew else expected > 0.1
-            assert_close(_defect(mechanism, at, along, velocity), expected, 1e-8 * max(1.0, expected))
+            assert_close(defect(mechanism, at, along, velocity), expected, 1e-8 * max(1.0, expected))
 
 
 def test_convention_decides_off_the_closure_only(pair: Pair) -> None:
