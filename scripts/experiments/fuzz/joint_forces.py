@@ -16,7 +16,7 @@ __all__ = ["PER_SAMPLE", "JointForces", "Unlike", "joint_forces"]
 
 PER_SAMPLE = 10  # output instants from one sample to the next; delays are multiples of one
 ROUNDING = 1e-9  # relative
-MOST_TURN = 1.0  # rad, of a piece: the judge knows angles within half a turn of where velocities lead
+FAR = 1.0  # rad, of a joint between two samples: pieces are shorter then
 
 
 class Unlike(Exception):
@@ -75,7 +75,7 @@ def joint_forces(
     steady = rows[~changes & (rows > late)]
     seen = feedback[(steady - late) // PER_SAMPLE * PER_SAMPLE]
     _compare(run.u[steady], seen, _constant(run.u[steady], seen, limit), limit)
-    far = np.abs(run.v_tree).max(axis=1) * PER_SAMPLE * output_dt > MOST_TURN
+    far = np.abs(run.v_tree).max(axis=1) * PER_SAMPLE * output_dt > FAR
     ends = np.union1d(rows[changes | far], [0, rows[-1]])
     return ends, JointForces(columns, run.u[np.where(changes, np.minimum(rows + 1, rows[-1]), rows)[ends]])
 

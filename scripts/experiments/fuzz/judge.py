@@ -19,6 +19,7 @@ FINEST = 2e-12  # relative; below that two results differ by rounding
 MOST_SUBSTEPS = 128
 NUDGE = 1e-6  # relative
 MAGNIFIED = 300.0  # times: such a piece is several of the motion's own times long, or meets what it nearly hits
+MOST_TURN = 2.0  # rad, of a piece: angles are known within half a turn of where velocities lead
 LARGEST = 1e12  # of an acceleration at rest
 STAGES, WEIGHTS = DOP853.A, DOP853.B  # order 8, with fixed steps here
 
@@ -63,7 +64,8 @@ class Judge:
             q_end[open_], v_end[open_], gap[open_] = q_new, v_new, finer_gap
             used[open_] = substeps
             resolved[open_] = off <= target
-        return Judged(q_end, v_end, resolved & (gap > LEAST_GAP), used)
+        turn = np.maximum(np.abs(v), np.abs(v_end)).max(axis=1) * dt
+        return Judged(q_end, v_end, resolved & (gap > LEAST_GAP) & (turn < MOST_TURN), used)
 
     def sensitive(
         self, q: Array, v: Array, dt: Array, end: Judged, which: np.ndarray, drive: JointForces | None = None
