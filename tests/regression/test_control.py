@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Run, check
+from ckc_pin import Run, check, simulate
 from ckc_pin.mechanism.library import library
-from tests.analytic.five_bar import Q, desired
+from tests.analytic.five_bar import FIVE_BAR, Q, desired
 from tests.conftest import REFERENCES, assert_close
 from tests.regression.reference import FORMULATIONS, Trajectory, trajectory
 
@@ -142,3 +142,24 @@ def test_as_printed_stalls_at_the_singular_configuration(run: Callable[..., Run]
     model = REFERENCES["five_bar_as_printed"]
     assert abs(model.s(ours.q_tree[-1])) < 1e-3
     assert_close([model.phi(q) for q in ours.q_tree], 0, 1e-12)
+
+
+@pytest.mark.parametrize("sampled", [{}, {"sample_time": 0.05, "delay": 0.02}], ids=["continuous", "sampled"])
+def test_set_point_control_goes_on_in_other_coordinates_where_phi_z_is_singular(sampled: dict[str, float]) -> None:
+    """It looks at q and q_dot alone, and u acts on their joints: as the DAE, which needs no q to go on."""
+    names = ("theta_1", "theta_3")
+    changes = {
+        "t_end": 1.0,
+        "solver.rtol": 1e-10,
+        "initial": {"q": dict(zip(names, (-0.93414013, -0.41820761), strict=True)),
+                    "q_dot": dict(zip(names, (7.45699329, 0.99570948), strict=True))},
+        "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01, "q_d": {"theta_1": -1.2, "theta_3": 1.9}, **sampled},
+    }  # fmt: skip
+    reduced, spf, dae = (simulate("five_bar/swing", {**changes, "formulation": x}) for x in ("reduced", "spf", "dae"))
+    assert min(abs(FIVE_BAR.s(q_tree)) for q_tree in dae.q_tree) < 0.05
+    assert dae.status == "done"
+    for run in (reduced, spf):
+        assert (run.status, run.stats["switches"] > 0) == ("done", True)
+        assert_close(run.q_tree, dae.q_tree, 1e-6)
+        assert_close(run.u, dae.u, 1e-6)
+        assert_close(run.lyapunov, dae.lyapunov, 1e-5)

@@ -130,7 +130,7 @@ nb::tuple trouble(Run& run) {
   const Problem& problem = loop.control->problem;
   const std::string why = troubles[static_cast<int>(loop.system->trouble)], says = problem.says;
   const Vector u = problem.u;
-  const bool here = loop.settle_core(), of_q = loop.control->acts() || std::isfinite(loop.system->margin());
+  const bool here = loop.settle_core(), of_q = loop.control->needs_own_partition() || std::isfinite(loop.system->margin());
   const double margin = here && of_q ? loop.system->phi_z_margin() : std::nan("");
   const double size = here ? run.core->rows.J.norm() : std::nan("");
   return nb::make_tuple(why, says, u, margin * size, margin, Vector(run.core->q_tree), run.core->q, run.core->z);

@@ -4,12 +4,13 @@
 
 namespace ckc {
 
-SetPoint::SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d)
+SetPoint::SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d, Indices q)
     : K_P_(std::move(K_P)),
       K_V_(std::move(K_V)),
       q_d_(std::move(q_d)),
       h_d_(std::move(h_d)),
       potential_d_(potential_d),
+      own_(std::move(q)),
       e_(q_d_.size()),
       product_(q_d_.size()) {}
 
@@ -22,10 +23,17 @@ bool SetPoint::u(const Measured& at, Out u, Problem&) {
 }
 
 double SetPoint::lyapunov(const Measured& at, double potential_energy, In) {
-  at.core.inertia();
+  double kinetic;
+  if (at.core.q == own_) {
+    at.core.inertia();
+    product_.noalias() = at.core.D * at.q_dot;
+    kinetic = 0.5 * at.q_dot.dot(product_);
+  } else {  // D is that of other coordinates
+    momentum_.resize(at.core.n);
+    kinetic = at.core.energy(at.v_tree, momentum_).kinetic;
+  }
   e_ = at.q - q_d_;
-  product_.noalias() = at.core.D * at.q_dot;
-  const double kinetic = 0.5 * at.q_dot.dot(product_), fallen = potential_energy - potential_d_ - e_.dot(h_d_);
+  const double fallen = potential_energy - potential_d_ - e_.dot(h_d_);
   product_.noalias() = K_P_ * e_;
   return kinetic + fallen + 0.5 * e_.dot(product_);
 }
@@ -84,9 +92,9 @@ double Tracking::lyapunov(const Measured& at, double, In w) {
   return 0.5 * r_.dot(product_) + a_.dot(v_) + 0.5 * w.squaredNorm();
 }
 
-Actuation::Actuation(const Core& core, Indices at_, bool direct, Vector limit)
-    : at(std::move(at_)), direct_(direct), limit_(std::move(limit)) {
-  if (direct_) return;
+Actuation::Actuation(const Core& core, Indices at_, bool direct_, Vector limit)
+    : at(std::move(at_)), direct(direct_), limit_(std::move(limit)) {
+  if (direct) return;
   const int m = static_cast<int>(at.size());
   transmission_.setZero(m, core.d);  // u = transmission^T tau
   if (m == core.d)
@@ -97,7 +105,7 @@ Actuation::Actuation(const Core& core, Indices at_, bool direct, Vector limit)
 
 void Actuation::apply(Core& core, Out u, Out tau, Out u_tree) {
   const auto m = static_cast<Eigen::Index>(at.size());
-  if (direct_) {
+  if (direct) {
     tau = u;
   } else {
     core.reduce();
@@ -113,7 +121,7 @@ void Actuation::apply(Core& core, Out u, Out tau, Out u_tree) {
   tau = tau.cwiseMin(limit_).cwiseMax(-limit_);
   u_tree.setZero();
   for (Eigen::Index k = 0; k < m; ++k) u_tree(at[k]) = tau(k);
-  if (direct_)
+  if (direct)
     u = tau;
   else
     u.noalias() = transmission_.transpose() * tau;
@@ -134,8 +142,8 @@ void Sampling::put(double t, In u) {
 }
 
 Control::Control(const Core& core, Indices actuated, bool direct, Vector limit)
-    : actuation_(core, std::move(actuated), direct, std::move(limit)) {
-  constant.setZero(core.d), u.setZero(core.d), sampled_.setZero(core.d);
+    : actuation_(core, std::move(actuated), direct, std::move(limit)), own_(core.q) {
+  for (Vector* x : {&constant, &u, &sampled_, &q_, &q_dot_}) x->setZero(core.d);
   tau.setZero(actuation_.at.size()), u_tree.setZero(core.n);
 }
 
@@ -145,8 +153,17 @@ void Control::begin() {
   constant.setZero();
 }
 
+Measured Control::in_own_q(const Measured& at) {
+  if (at.core.q == own_) return at;
+  for (size_t k = 0; k < own_.size(); ++k) {
+    q_(k) = at.core.q_tree(at.core.tree.place[own_[k]]);
+    q_dot_(k) = at.v_tree(own_[k]);
+  }
+  return {at.t, at.core, q_, q_dot_, at.v_tree};
+}
+
 bool Control::ask(const Measured& at, Out u) {
-  if (!law->u(at, u, problem)) return false;
+  if (!law->u(in_own_q(at), u, problem)) return false;
   if (u.allFinite()) return true;
   problem.u = u;
   return false;
@@ -181,7 +198,7 @@ bool Control::sample(const Measured& at) {
 }
 
 double Control::lyapunov(const Measured& at, double potential_energy, In w) {
-  return law ? law->lyapunov(at, potential_energy, w) : 0.0;
+  return law ? law->lyapunov(in_own_q(at), potential_energy, w) : 0.0;
 }
 
 }  // namespace ckc

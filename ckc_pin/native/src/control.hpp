@@ -33,20 +33,24 @@ class Controller {
   virtual bool u(const Measured& at, Out u, Problem& problem) = 0;
   // Its Lyapunov function; NaN where it has none here. w: what phi is.
   virtual double lyapunov(const Measured&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
+  // Whether it looks at terms of q's own partition, or at q and q_dot alone.
+  virtual bool needs_terms() const { return true; }
 };
 
 // Eq. 14.
 class SetPoint : public Controller {
  public:
-  SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d);
+  SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d, Indices q);
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
+  bool needs_terms() const override { return false; }
 
  private:
   Matrix K_P_, K_V_;
   Vector q_d_, h_d_;
   double potential_d_;
-  Vector e_, product_;
+  const Indices own_;
+  Vector e_, product_, momentum_;
 };
 
 // Eq. 16. `model`: the controller's own idea of the plant, at the measured q' and at rho q_dot, or "actual".
@@ -71,9 +75,9 @@ class Actuation {
   Actuation(const Core& core, Indices at, bool direct, Vector limit);
   void apply(Core& core, Out u, Out tau, Out u_tree);
   const Indices at;
+  const bool direct;  // u is what the actuators do
 
  private:
-  bool direct_;
   Vector limit_;  // infinite where there is none
   Matrix transmission_;
   Factor factor_;
@@ -104,6 +108,9 @@ class Control {
 
   void begin();  // a run begins: nothing was sampled yet
   bool acts() const { return law || !constant.isZero(0); }
+  // Whether the motion has to stay in the coordinates q that u is of: the law, or who steps, looks at terms in them, or
+  // eq. 6's force has no other meaning.
+  bool needs_own_partition() const { return acts() && !(law && !law->needs_terms() && actuation_.direct); }
   // Whether u follows the state between samples.
   bool feedback() const { return law && !sampling; }
   bool act(const Measured& at);
@@ -112,8 +119,10 @@ class Control {
 
  private:
   bool ask(const Measured& at, Out u);
+  Measured in_own_q(const Measured& at);
   Actuation actuation_;
-  Vector sampled_;
+  const Indices own_;  // q, whatever the coordinates of the motion are
+  Vector sampled_, q_, q_dot_;
 };
 
 }  // namespace ckc

@@ -67,7 +67,7 @@ void Loop::hold(In u) {
 Stop Loop::advance(double until, bool final, double pause, double budget) {
   const auto started = Clock::now();
   const auto spent = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
-  system->may_switch = !control->acts();
+  system->may_switch = !control->needs_own_partition();
   const double from = t();
   until_ = until, ++unchanged_;
   if (beyond_) {
@@ -76,7 +76,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
     beyond_.reset();
     if (const auto stop = finish(step, now.t_new, false)) return *stop;
   }
-  if (control->acts()) {
+  if (control->needs_own_partition()) {
     bool changed = false;
     if (!system->own_partition(now.t, now.y, changed)) return {Stop::chart, now.t, system->margin()};
     if (changed) begun_ = false, jump();
