@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,14 @@ def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = F
     if not gap.max(initial=0.0) <= limit:
         at = tuple(map(int, np.unravel_index(np.argmax(gap), gap.shape)))
         raise AssertionError(f"off by {gap[at]:.3g}, allowed {limit:.3g}: {ours[at]} for {theirs[at]} at {at}")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What the user has compiled before is not there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("no_cache")))
+        yield
 
 
 @pytest.fixture(scope="session", params=REFERENCES)

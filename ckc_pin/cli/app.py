@@ -31,6 +31,7 @@ COMMANDS = {
     "list": "look:list_",
     "check": "look:check",
     "terms": "look:terms",
+    "compile": "look:compile_",
     "run": "run:run",
     "plot": "view:plot",
     "play": "view:play",

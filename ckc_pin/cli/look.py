@@ -10,7 +10,7 @@ from ckc_pin.cli.output import errors, print_json, print_table
 from ckc_pin.simulation.arguments import read_table
 from ckc_pin.simulation.report import check_plain, check_table, terms_plain, terms_table
 
-__all__ = ["check", "list_", "terms"]
+__all__ = ["check", "compile_", "list_", "terms"]
 
 
 @click.command("list", epilog=options.examples("ckc list"))
@@ -59,3 +59,24 @@ def terms(mechanism: str, q: str, v: str, as_json: bool) -> None:
         print_json(terms_plain(found))
     else:
         print_table(terms_table(found))
+
+
+@click.command("compile", epilog=options.examples("ckc compile five_bar"))
+@options.mechanism
+@options.as_json
+def compile_(mechanism: str, as_json: bool) -> None:
+    """Compile a mechanism's terms; its runs take them from then on."""
+    from time import perf_counter
+
+    from ckc_pin.generated.library import compiled, find
+
+    loaded, started = ckc_pin.load(mechanism), perf_counter()
+    there = find(loaded) is not None
+    library = compiled(loaded)
+    seconds = perf_counter() - started
+    if as_json:
+        print_json({"mechanism": loaded.name, "file": library.path, "compiled": not there, "seconds": seconds})
+    elif there:
+        print(f"{loaded.name}: its terms were compiled before: {library.path}")
+    else:
+        print(f"{loaded.name}: compiled and checked against Pinocchio in {seconds:.1f} s: {library.path}")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.generated.library import Library
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import RANK_TOLERANCE, scales
@@ -16,10 +17,19 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["closure_table", "core_table"]
 
 
-def core_table(mechanism: Mechanism) -> dict[str, Any]:
-    """Return what a native core of a mechanism is made of; each has a workspace of its own."""
+def core_table(mechanism: Mechanism, library: Library | None = None) -> dict[str, Any]:
+    """Return what a native core of a mechanism is made of; each has a workspace of its own.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    library : Library, optional
+        Its terms, compiled; absent, they are Pinocchio's.
+    """
     rows, columns = scales(mechanism.tree, mechanism.closure)
+    written = {} if library is None else {"written": (library.path, library.parameters)}
     return {
+        **written,
         "model": mechanism.tree.model.saveToString(),
         "place": mechanism.tree.place.tolist(),
         "closure": closure_table(mechanism.closure, mechanism.n),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import is_path
@@ -41,6 +42,8 @@ class Check:
     gap : (above, below)
         Relative singular values of the scaled J around the cut that the rank is.
     warnings : tuple of str
+    terms : "pinocchio" or "generated"
+        Whose terms a run takes: the latter where they were compiled before.
     desired : DesiredCheck or None
         For a scene with a controller.
     branches : (k, n) array or None
@@ -61,6 +64,7 @@ class Check:
     cond_phi_z: float
     gap: tuple[float, float]
     warnings: tuple[str, ...]
+    terms: str
     desired: DesiredCheck | None = None
     branches: Array | None = None
 
@@ -121,6 +125,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         cond_phi_z=float(values[0] / values[-1]) if values[-1] > 0 else float("inf"),
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
         warnings=(*mechanism.warnings, *warnings),
+        terms="generated" if find(mechanism) else "pinocchio",
         desired=desired,
     )
 

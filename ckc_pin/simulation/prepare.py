@@ -19,6 +19,7 @@ from ckc_pin.control.controllers import Controller, SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
+from ckc_pin.generated.library import Library, compiled, find
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
@@ -161,7 +162,7 @@ def prepare(
     if controller is not None or free:
         actuation.require_transmission(start.at)
     loop = _core.Loop(
-        core_table(mechanism),
+        core_table(mechanism, _library(mechanism, scene.spec.solver.terms)),
         _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
@@ -169,6 +170,13 @@ def prepare(
     )
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
     return Prepared(scene, mechanism, controller, functions, instants, start, texts, loop)
+
+
+def _library(mechanism: Mechanism, terms: str) -> Library | None:
+    """Compiled terms where they are asked for; "auto" takes those that are there, and never makes a run wait."""
+    if terms == "pinocchio":
+        return None
+    return compiled(mechanism) if terms == "generated" else find(mechanism)
 
 
 def _output_instants(scene: Scene) -> Array:

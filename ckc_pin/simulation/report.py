@@ -61,6 +61,7 @@ def check_table(found: Check) -> Group:
     if found.det_phi_z is not None:
         table.add_row("det phi_z", f"{found.det_phi_z:.6g}")
     table.add_row("sigma_min(phi_z), cond", f"{found.sigma_min_phi_z:.6g}, {found.cond_phi_z:.4g}")
+    table.add_row("terms", found.terms)
     for k, numbers in enumerate(found.branches if found.branches is not None else ()):
         shown = "  ".join(f"{c} = {x:.6f}" for c, x in zip(found.coordinates, numbers, strict=True))
         table.add_row(f"branch {k + 1}", shown)

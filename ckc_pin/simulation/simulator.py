@@ -151,7 +151,7 @@ class Simulator:
     @property
     def stats(self) -> dict[str, Any]:
         """What was evaluated since the last reset, by the names of `Run.stats`."""
-        return {**self._alone("stats", self._loop.stats), "terms": "pinocchio"}
+        return dict(self._alone("stats", self._loop.stats))
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state; what was before has no influence on what follows.

@@ -153,7 +153,8 @@ def test_set_point_control_goes_on_in_other_coordinates_where_phi_z_is_singular(
         "solver.rtol": 1e-10,
         "initial": {"q": dict(zip(names, (-0.93414013, -0.41820761), strict=True)),
                     "q_dot": dict(zip(names, (7.45699329, 0.99570948), strict=True))},
-        "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01, "q_d": {"theta_1": -1.2, "theta_3": 1.9}, **sampled},
+        "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01,
+                       "q_d": {"theta_1": -1.2, "theta_3": 1.9}, **sampled},
     }  # fmt: skip
     reduced, spf, dae = (simulate("five_bar/swing", {**changes, "formulation": x}) for x in ("reduced", "spf", "dae"))
     assert min(abs(FIVE_BAR.s(q_tree)) for q_tree in dae.q_tree) < 0.05

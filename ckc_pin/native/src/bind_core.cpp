@@ -85,9 +85,15 @@ SpringTable springs_of(const nb::dict& table) {
 
 std::unique_ptr<Core> core_of(const nb::dict& table) {
   Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
+  std::unique_ptr<Written> written;
+  if (table.contains("written")) {
+    const auto library = nb::cast<nb::tuple>(table["written"]);
+    written = std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
+  }
   auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
                                      closure_of(nb::cast<nb::dict>(table["closure"])),
-                                     springs_of(nb::cast<nb::dict>(table["springs"])), get<int>(table, "rank"), scales);
+                                     springs_of(nb::cast<nb::dict>(table["springs"])), get<int>(table, "rank"), scales,
+                                     std::move(written));
   require(core->scales.rows, core->rows.closure.rows, "row_scale"), require(core->scales.columns, core->n, "column_scale");
   const auto q = get<Indices>(table, "q"), z = get<Indices>(table, "z");
   require_partition(*core, q, z);
@@ -130,6 +136,7 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   require(u_tree, core.n, "u_tree"), require(correction, core.rows.closure.rows, "correction");
   Vector acceleration(core.n);
+  if (core.written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return acceleration;
   core.set(q_tree, true), core.jacobian(), core.bias(v_tree);
   if (!core.dae_acceleration(u_tree, correction, acceleration))
     acceleration.setConstant(std::numeric_limits<double>::quiet_NaN());

@@ -145,6 +145,7 @@ nb::dict stats(const Run& run) {
     steps += loop.steps[k];
     if (loop.steps[k]) by_method[methods[k]] = loop.steps[k];
   }
+  found["terms"] = run.core->written ? "generated" : "pinocchio";
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
   found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
   found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;

@@ -8,7 +8,8 @@ namespace ckc {
 constexpr int small = 12;        // coordinates
 constexpr double crowded = 0.2;  // share of D' that is not zero, from which a product with all of it costs less
 
-Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_, Scales scales_)
+Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_, Scales scales_,
+           std::unique_ptr<Written> written_)
     : tree(model, std::move(place)),
       rows(tree, std::move(closure)),
       springs(tree, std::move(table)),
@@ -16,10 +17,11 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       rank(rank_),
       scales(std::move(scales_)),
       d(0),
+      written(std::move(written_)),
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
-  C_tree.setZero(n, n);
+  C_tree.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
   square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
@@ -43,13 +45,26 @@ void Core::split(Indices q_, Indices z_) {
 void Core::set(In q_tree_, bool with_inertia) {
   ++sets;
   q_tree = q_tree_;
-  Profile::Entry entry(profile, with_inertia ? Profile::D_tree : Profile::phi);
+  Profile::Entry entry(profile, with_inertia && !written ? Profile::D_tree : Profile::phi);
+  if (written) {
+    written->place(q_tree, rows.phi, rows.J);
+    here_ = jacobian_of_rows;
+    return;
+  }
   if (with_inertia)
     tree.inertia(q_tree);
   else
     tree.set(q_tree);
-  here_ = with_inertia ? inertia_of_tree : 0u;
+  here_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
   rows.set(tree, q_tree);
+}
+
+// For what is not written out.
+void Core::set_tree() {
+  if (has(tree_is_set)) return;
+  tree.set(q_tree);
+  rows.set(tree, q_tree);
+  here_ |= tree_is_set;
 }
 
 void Core::jacobian() {
@@ -84,7 +99,10 @@ void Core::reduce() {
 void Core::tree_inertia() {
   if (has(inertia_of_tree)) return;
   Profile::Entry entry(profile, Profile::D_tree);
-  tree.inertia(q_tree);
+  if (written)
+    written->inertia(q_tree, D_written_);
+  else
+    tree.inertia(q_tree);
   here_ |= inertia_of_tree;
 }
 
@@ -93,7 +111,7 @@ void Core::inertia() {
   tree_inertia(), reduce();
   Profile::Entry entry(profile, Profile::D);
   if (dense_) {
-    D_rho_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * rho;
+    D_rho_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * rho;
     D.noalias() = rho.transpose() * D_rho_;
   } else {
     for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
@@ -105,20 +123,21 @@ void Core::inertia() {
 }
 
 void Core::D_times(In x, Out product) const {
-  const Matrix& D_tree = tree.D();
+  const Matrix& D = D_tree();
   product.setZero();
   for (int j = 0; j < n; ++j) {
     double sum = 0.0;
     for (int i : tree.ancestors[j]) {
       if (i == j) continue;
-      product(i) += D_tree(i, j) * x(j);
-      sum += D_tree(i, j) * x(i);
+      product(i) += D(i, j) * x(j);
+      sum += D(i, j) * x(i);
     }
-    product(j) += sum + D_tree(j, j) * x(j);
+    product(j) += sum + D(j, j) * x(j);
   }
 }
 
 double Core::potential_energy() {
+  if (written) return written->potential_energy(q_tree);
   spring_lengths();
   return tree.potential_energy(q_tree) + springs.energy(tree, q_tree);
 }
@@ -138,32 +157,44 @@ void Core::reduced(In force, Out generalized) const {
   for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
 }
 
-void Core::rates(In v) {
-  if (has(row_rates) && v_tree == v) return;
-  v_tree = v;
-  here_ &= ~(bias_of_tree | coriolis_of_tree);
-  tree.bias(q_tree, v_tree);
+// The tree's velocities, and from them the rows'.
+void Core::row_rates_of_tree() {
+  if (has(row_rates)) return;
+  set_tree();
+  bias_tree = tree.bias(q_tree, v_tree);
   rows.rates(tree);
   here_ |= row_rates;
+}
+
+void Core::jacobian_rate(In v) {
+  if (written) return written->jacobian_rate(q_tree, v, rows.J_dot);
+  if (!(v_tree == v)) v_tree = v, here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
+  row_rates_of_tree();
+  rows.jacobian_dot(tree, tree.jacobian_rate(q_tree, v_tree));
 }
 
 void Core::bias(In v) {
   if (has(bias_of_tree) && v_tree == v) return;
   Profile::Entry entry(profile, Profile::bias_tree);
-  v_tree = v;
-  bias_tree = tree.bias(q_tree, v_tree);
-  rows.rates(tree);
+  if (!(v_tree == v)) v_tree = v, here_ &= ~(row_rates | coriolis_of_tree);
+  here_ |= bias_of_tree;
+  if (written) return written->bias(q_tree, v_tree, bias_tree, J_dot_v, damping_tree);
+  row_rates_of_tree();
   rows.bias(J_dot_v);
-  here_ = (here_ & ~coriolis_of_tree) | row_rates | bias_of_tree;
-  spring_lengths();
-  if (!springs.any) return;
-  elastic_.setZero();
+  if (springs.any) spring_forces(), bias_tree -= elastic_;
+  if (!springs.any_damping) return;
+  spring_lengths(), damping_tree.setZero();
+  springs.add_damping(v_tree, damping_tree);
+}
+
+void Core::spring_forces() {
+  spring_lengths(), elastic_.setZero();
   springs.add_elastic(tree, q_tree, elastic_);
-  bias_tree -= elastic_;
 }
 
 void Core::spring_lengths() {
   if (has(lengths_of_springs)) return;
+  set_tree();
   if (springs.any || springs.any_damping) springs.set(tree);
   here_ |= lengths_of_springs;
 }
@@ -171,10 +202,14 @@ void Core::spring_lengths() {
 void Core::coriolis() {
   if (has(coriolis_of_tree)) return;
   Profile::Entry entry(profile, Profile::C_tree);
+  if (written && !has(row_rates)) {
+    set_tree(), tree.bias(q_tree, v_tree), rows.rates(tree);
+    here_ |= row_rates;
+  }
   C_tree = tree.coriolis(q_tree, v_tree);
   rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);
-  if (springs.any) h_tree -= elastic_;
+  if (springs.any) spring_forces(), h_tree -= elastic_;
   here_ |= coriolis_of_tree;
 }
 
@@ -200,8 +235,7 @@ void Core::reduced_acceleration(In u_tree, Out q_ddot) {
   rho_dot_q_dot_.setZero();
   for (size_t i = 0; i < z.size(); ++i) rho_dot_q_dot_(z[i]) = z_(i);
   D_times(rho_dot_q_dot_, y_);
-  x_ = u_tree - bias_tree - y_;
-  if (springs.any_damping) springs.add_damping(v_tree, x_);
+  x_ = u_tree - bias_tree - y_ + damping_tree;
   reduced(x_, d_);
   D_factor.solve(d_, q_ddot);
 }
@@ -214,8 +248,7 @@ void Core::tree_acceleration(In q_ddot, Out a) const {
 void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
   coriolis();
   C_times(q_dot, d_);
-  x_ = u_tree - h_tree;
-  if (springs.any_damping) springs.add_damping(v_tree, x_);
+  x_ = u_tree - h_tree + damping_tree;
   for (int k = 0; k < d; ++k) d_(k) = rho.col(k).dot(x_) - d_(k);
   D_factor.solve(d_, q_ddot);
 }

@@ -10,6 +10,7 @@
 #include "rows.hpp"
 #include "springs.hpp"
 #include "profile.hpp"
+#include "written.hpp"
 
 namespace ckc {
 
@@ -25,7 +26,8 @@ struct Scales {
 
 class Core {
  public:
-  Core(const std::string& model, Indices place, Closure closure, SpringTable springs, int rank, Scales scales);
+  Core(const std::string& model, Indices place, Closure closure, SpringTable springs, int rank, Scales scales,
+       std::unique_ptr<Written> written = {});
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
@@ -37,6 +39,7 @@ class Core {
   int d;
   Indices q, z;
   Profile profile;
+  const std::unique_ptr<Written> written;  // the terms of the tree and the rows; null: Pinocchio's
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
@@ -58,9 +61,10 @@ class Core {
 
   // --- at a velocity, which is that of what follows ---
   void bias(In v_tree);       // C'v + h' less springs, J_dot v
-  void rates(In v_tree);      // of the rows alone, as `bias` leaves them
   void coriolis();            // after `bias`: C', J_dot and h' less springs
+  void jacobian_rate(In v_tree);  // rows.J_dot alone
   Vector v_tree, bias_tree, h_tree, J_dot_v;
+  Vector damping_tree;        // what dampers do, zero without
   Matrix C_tree;
   void velocity(In q_dot, Out v) const;           // rho q_dot
   void reduced(In force, Out generalized) const;  // rho^T force
@@ -83,14 +87,20 @@ class Core {
   const Matrix* tangent();
   // Eq. 1 by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
+  // Eq. 1 at any state, written out; false where there is no such code, or where it would have to pivot.
+  bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 
  private:
   enum Part : unsigned {
     inertia_of_tree = 1, jacobian_of_rows = 2, factor_of_phi_z = 4, rho_of_phi_z = 8, inertia_of_q = 16, row_rates = 32,
-    bias_of_tree = 64, coriolis_of_tree = 128, lengths_of_springs = 256,
+    bias_of_tree = 64, coriolis_of_tree = 128, lengths_of_springs = 256, tree_is_set = 512,
   };
   bool has(Part part) const { return here_ & part; }
+  const Matrix& D_tree() const { return written ? D_written_ : tree.D(); }
+  void set_tree();
+  void row_rates_of_tree();
   void spring_lengths();
+  void spring_forces();  // elastic_
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
   void tangent_inertia();                         // factorized
   void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions
@@ -101,7 +111,7 @@ class Core {
 
   bool dense_;          // whether D' is
   unsigned here_ = 0;  // parts that are those of q_tree and v_tree
-  Matrix D_rho_, tangent_, D_tangent_;
+  Matrix D_written_, D_rho_, tangent_, D_tangent_;
   Indices free_;  // the coordinates that the tangent basis' columns are of
   Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
   Factor basis_;

@@ -8,6 +8,7 @@ namespace ckc {
 
 // Relative size of the last pivot of J at which its rank counts as lost; and below which the metric of D' is given up.
 constexpr double singular = 1e-12, weak = 1e-3;
+constexpr double trusted = 1e-4;  // of a diagonal entry left by elimination without pivoting: four digits are lost then
 // Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
 constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
 
@@ -100,7 +101,7 @@ bool Core::tangent_basis(In residual, double least) {
 void Core::tangent_inertia() {
   tree_inertia();
   if (dense_)
-    D_tangent_.noalias() = tree.D().selfadjointView<Eigen::Upper>() * tangent_;
+    D_tangent_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * tangent_;
   else
     for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
@@ -148,10 +149,13 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   if (!tangent_basis(residual_, singular)) return false;
   tangent_inertia();
   D_times(x_, y_);
-  y_ = u_tree - bias_tree - y_;
-  if (springs.any_damping) springs.add_damping(v_tree, y_);
+  y_ = u_tree - bias_tree - y_ + damping_tree;
   with_force(y_, acceleration);
   return true;
+}
+
+bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
+  return written && written->acceleration(q_tree, v, u_tree, correction, acceleration) > trusted;
 }
 
 }  // namespace ckc

@@ -18,7 +18,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       beta_(beta),
       projects_(projects) {
   crosses = projects;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), unmoved_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
@@ -40,6 +40,16 @@ bool Dae::place(In y) {
 
 bool Dae::rhs(double t, In y, Out y_dot) {
   if (!y.allFinite()) return fails(Trouble::infinite);
+  if (core.written && !control.acts() && alpha_ == 0.0 && beta_ == 0.0) {  // no term is needed but the acceleration
+    q_tree_ = y.head(core.tree.nq);
+    core.tree.normalize(q_tree_);
+    residual_.setZero();
+    if (core.written_acceleration(q_tree_, y.tail(core.n), unmoved_, residual_, y_dot.tail(core.n))) {
+      counts.factorizations += 2;
+      core.tree.configuration_rate(q_tree_, y.tail(core.n), y_dot.head(core.tree.nq));
+      return y_dot.allFinite() || fails(Trouble::infinite);
+    }
+  }
   place(y);
   return rate(t, y.tail(core.n), y_dot);
 }
@@ -61,7 +71,9 @@ bool Dae::rate(double t, In v, Out y_dot) {
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  if (!core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n))) return fails(Trouble::rank);
+  if (!core.written_acceleration(core.q_tree, v, control.u_tree, residual_, y_dot.tail(n)) &&
+      !core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n)))
+    return fails(Trouble::rank);
   return y_dot.allFinite() || fails(Trouble::infinite);
 }
 

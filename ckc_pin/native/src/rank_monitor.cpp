@@ -29,8 +29,7 @@ RankMonitor::Rank RankMonitor::at(System& system) {
   spectrum_.compute(core.rows.J, core.scales.rows, core.scales.columns);
   spectrum_.vectors(u_, v_);
   const double least = v_.norm(), largest = spectrum_.largest();
-  core.rates(system.velocity);
-  core.rows.jacobian_dot(core.tree, core.tree.jacobian_rate(core.q_tree, system.velocity));
+  core.jacobian_rate(system.velocity);
   v_.array() *= core.scales.columns.array();
   u_.array() *= core.scales.rows.array();
   double rate = 0.0;

@@ -1,0 +1,178 @@
+"""The tree in world axes, as expressions: where its bodies are, how they move, and what that costs in inertia."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.generated.parameters import Parameters, constant
+from ckc_pin.mechanism.tree import Tree
+
+__all__ = ["Column", "MovingBody", "bodies"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """What one tangent coordinate does to every body above it: it turns about an axis, or slides along one."""
+
+    at: int
+    turns: bool
+    axis: Any
+    origin: Any
+
+
+@dataclass(frozen=True)
+class MovingBody:
+    """A joint's frame in world axes: rotation, origin, and with dv'/dt = 0 its rates and accelerations."""
+
+    R: Any
+    origin: Any
+    omega: Any
+    speed: Any
+    alpha: Any
+    acceleration: Any
+    columns: tuple[Column, ...]
+
+    def point(self, local: Any) -> tuple[Any, Any, Any]:
+        """Position, velocity and acceleration of a point fixed in the body."""
+        lever = times(self.R, local)
+        turned = cross(self.omega, lever)
+        return (
+            self.origin + lever,
+            self.speed + turned,
+            self.acceleration + cross(self.alpha, lever) + cross(self.omega, turned),
+        )
+
+    def direction(self, local: Any) -> tuple[Any, Any, Any]:
+        """A direction fixed in the body, its rate and its acceleration."""
+        e = times(self.R, local)
+        turned = cross(self.omega, e)
+        return e, turned, cross(self.alpha, e) + cross(self.omega, turned)
+
+    def point_jacobian(self, at: Any, n: int) -> Any:
+        """d position / d q', (3, n), of a point that moves with the body."""
+        import casadi as cs
+
+        found = cs.SX(3, n)
+        for column in self.columns:
+            found[:, column.at] = cross(column.axis, at - column.origin) if column.turns else column.axis
+        return cs.sparsify(found)
+
+    def turn_jacobian(self, n: int) -> Any:
+        """Angular velocity by v', (3, n)."""
+        import casadi as cs
+
+        found = cs.SX(3, n)
+        for column in self.columns:
+            if column.turns:
+                found[:, column.at] = column.axis
+        return cs.sparsify(found)
+
+
+def cross(a: Any, b: Any) -> Any:
+    """a x b, of columns."""
+    import casadi as cs
+
+    return cs.sparsify(cs.cross(a, b))
+
+
+def dot(a: Any, b: Any) -> Any:
+    """a . b, of columns."""
+    import casadi as cs
+
+    return cs.sparsify(cs.dot(a, b))
+
+
+def times(a: Any, b: Any) -> Any:
+    """The product of two matrices, without what is zero in it."""
+    import casadi as cs
+
+    return cs.sparsify(cs.mtimes(a, b))
+
+
+def bodies(tree: Tree, q: Any, v: Any, parameters: Parameters) -> list[MovingBody]:
+    """Return the body of each of Pinocchio's joints, the world first.
+
+    Parameters
+    ----------
+    tree : Tree
+    q, v : casadi.SX of nq and n
+        Pinocchio's q', a free root's quaternion of unit length; v'.
+    parameters : Parameters
+        Takes the offsets of the joints.
+    """
+    import casadi as cs
+
+    model, none = tree.model, cs.SX(3, 1)
+    found = [MovingBody(cs.SX.eye(3), none, none, none, none, none, ())]
+    for k in range(1, model.njoints):
+        joint, placement, parent = model.joints[k], model.jointPlacements[k], found[model.parents[k]]
+        stands = times(parent.R, constant(placement.rotation))
+        d = times(parent.R, parameters.column("offset", k))
+        at_q, at_v = joint.idx_q, joint.idx_v
+        if joint.nq == 7:
+            found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], at_v))
+            continue
+        local, turns = tree.axis(k)
+        a = times(stands, constant(local))
+        R = times(stands, _turn(local, q[at_q])) if turns else stands
+        d = d if turns else d + a * q[at_q]
+        found.append(_moved(parent, R, d, a * v[at_v], at_v, turns, a))
+    return found
+
+
+def _moved(parent: MovingBody, R: Any, d: Any, rate: Any, at: int, turns: bool, axis: Any) -> MovingBody:
+    omega, alpha = parent.omega, parent.alpha
+    swept = cross(omega, d)
+    speed = parent.speed + swept
+    acceleration = parent.acceleration + cross(alpha, d) + cross(omega, swept)
+    origin = parent.origin + d
+    if turns:
+        alpha = alpha + cross(omega, rate)
+        omega = omega + rate
+    else:
+        speed = speed + rate
+        acceleration = acceleration + 2 * cross(omega, rate)
+    return MovingBody(R, origin, omega, speed, alpha, acceleration, (*parent.columns, Column(at, turns, axis, origin)))
+
+
+def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> MovingBody:
+    import casadi as cs
+
+    d = d + times(stands, q[:3])
+    R = times(stands, _of_quaternion(q[3:]))
+    slide, spin = times(R, v[:3]), times(R, v[3:])
+    omega, swept = parent.omega + spin, cross(parent.omega, d)
+    origin = parent.origin + d
+    columns = [Column(at + k, k >= 3, R[:, k % 3], origin) for k in range(6)]
+    return MovingBody(
+        R,
+        origin,
+        omega,
+        parent.speed + swept + slide,
+        parent.alpha + cross(parent.omega, spin),
+        cs.sparsify(
+            parent.acceleration + cross(parent.alpha, d) + cross(parent.omega, swept + slide) + cross(omega, slide)
+        ),
+        (*parent.columns, *columns),
+    )
+
+
+def _turn(axis: Any, angle: Any) -> Any:
+    """Rotation about an axis of unit length, by Rodrigues' formula."""
+    import casadi as cs
+
+    a = constant(axis)
+    c, s = cs.cos(angle), cs.sin(angle)
+    along = constant(np.outer(axis, axis))
+    return cs.sparsify(along + c * constant(np.eye(3) - np.outer(axis, axis)) + s * cs.skew(a))
+
+
+def _of_quaternion(x: Any) -> Any:
+    """Rotation of a quaternion (x, y, z, w) of unit length."""
+    import casadi as cs
+
+    u, w = x[:3], x[3]
+    return cs.SX.eye(3) + 2 * w * cs.skew(u) + 2 * cs.mtimes(cs.skew(u), cs.skew(u))

@@ -1,0 +1,124 @@
+"""Calls terms against Pinocchio's and the reference's, before they are used."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+
+import numpy as np
+
+from ckc_pin.dynamics.formulations import dae_acceleration
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.library import Library
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Calls", "require_equal"]
+
+STATES = 25  # on the closure, and as many off it
+EQUAL = 1e-11  # relative to the largest entry
+SOUND = 1e-3  # of a diagonal left by elimination, from which the acceleration is compared: with less digits are lost
+SPREAD = 0.5  # rad, or of the mechanism's size: how far states are from the assembled one
+
+
+class Calls:
+    """A library's functions, called from Python.
+
+    Parameters
+    ----------
+    library : Library
+    """
+
+    def __init__(self, library: Library) -> None:
+        self._library = ctypes.CDLL(library.path)
+        self._pointer = ctypes.POINTER(ctypes.c_double)
+        self._numbers = np.zeros(0)
+        (self._numbers,) = self.call("numbers", library.parameters)
+
+    def call(self, name: str, *arguments: Array) -> list[Array]:
+        """Return a function's results, vectors by columns of what they are."""
+        sizes = getattr(self._library, f"{name}_sparsity_out")
+        sizes.restype = ctypes.POINTER(ctypes.c_longlong)
+        count = getattr(self._library, f"{name}_n_out")
+        count.restype = ctypes.c_longlong
+        results = [np.zeros(sizes(k)[0] * sizes(k)[1]) for k in range(count())]
+        given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
+        if name != "numbers":
+            given.append(self._numbers)
+        getattr(self._library, name)(self._pointers(given), self._pointers(results), None, None, 0)
+        return results
+
+    def _pointers(self, arrays: list[Array]) -> ctypes.Array[ctypes._Pointer[ctypes.c_double]]:
+        return (self._pointer * len(arrays))(*(x.ctypes.data_as(self._pointer) for x in arrays))
+
+
+def require_equal(mechanism: Mechanism, library: Library) -> None:
+    """Compare at random states, on the closure and off it.
+
+    Raises
+    ------
+    InputError
+        A term that differs by more than 1e-11.
+    """
+    code, random = Calls(library), np.random.default_rng(0)
+    compared = 0
+    for at, closed in _configurations(mechanism, random):
+        v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.reach
+        if closed and mechanism.closure.rows:
+            v = v - np.linalg.pinv(at.J, rcond=1e-9) @ (at.J @ v)
+        terms = Terms(mechanism, at, v)
+        q = at.q_tree
+        found = dict(zip(("phi", "J"), code.call("place", q), strict=True))
+        found["D_tree"] = code.call("inertia", q)[0]
+        found |= zip(("bias_tree", "J_dot_v", "damping"), code.call("bias", q, v), strict=True)
+        found["J_dot"] = code.call("jacobian_rate", q, v)[0]
+        found["potential"] = code.call("potential_energy", q)[0]
+        D = np.triu(terms.D_tree)
+        right = {
+            "phi": at.phi, "J": at.J, "D_tree": D + np.triu(D, 1).T, "bias_tree": terms.bias_tree,
+            "J_dot_v": terms.J_dot @ v, "damping": terms.damping_force, "J_dot": terms.J_dot,
+            "potential": np.array([terms.potential_energy]),
+        }  # fmt: skip
+        fast, J = float(np.abs(v).max()), float(np.abs(at.J).max(initial=0.0))
+        scale = {  # of what they are sums of
+            "phi": mechanism.size, "J_dot": J * fast, "J_dot_v": J * fast**2, "bias_tree": float(D.max()) * fast**2,
+            "potential": float(np.abs(terms.h_tree).max()) * max(1.0, mechanism.size),
+        }  # fmt: skip
+        for name, wanted in right.items():
+            _compare(mechanism, name, found[name], np.ravel(wanted, order="F"), scale.get(name, 0.0))
+        if mechanism.redundant and not closed:
+            continue  # redundant rows contradict each other there
+        u = random.uniform(-1, 1, mechanism.n)
+        acceleration, share = code.call("acceleration", q, v, u, np.zeros(mechanism.closure.rows))
+        if share[0] > SOUND:
+            try:
+                _compare(mechanism, "acceleration", acceleration, dae_acceleration(terms, u), 0.0)
+                compared += 1
+            except NumericalError:
+                continue
+    if not compared:
+        raise InputError(f"{mechanism.name}: its acceleration would have to be eliminated with pivoting everywhere")
+
+
+def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:
+    tree = mechanism.tree
+    yield mechanism.assembled, True
+    here = mechanism.independent_part(mechanism.q_tree)
+    reach = tree.reach[mechanism.partition.q]
+    for k in range(STATES):
+        step = SPREAD * random.uniform(-1, 1, tree.n) * tree.reach
+        yield mechanism.kinematics(tree.integrate(mechanism.q_tree, step)), False
+        if not mechanism.splits_root:
+            found = sigma(mechanism, here + SPREAD * random.uniform(-1, 1, mechanism.d) * reach * 0.9 ** (k % 10))
+            if found.verdict == "converged":
+                yield found.at, True
+
+
+def _compare(mechanism: Mechanism, name: str, found: Array, wanted: Array, scale: float) -> None:
+    largest = max(scale, float(np.abs(wanted).max(initial=0.0)), 1e-300)
+    off = float(np.abs(found - wanted).max(initial=0.0)) / largest
+    if not off <= EQUAL:
+        raise InputError(f"{mechanism.name}: {name} as compiled is not what Pinocchio gives: off by {off:.1e}")

@@ -1,0 +1,174 @@
+"""A mechanism's terms as CasADi expressions: the tree of eq. 1, its closure, springs, dampers and energy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
+from ckc_pin.generated.parameters import Parameters, numbers, present
+from ckc_pin.generated.rows import RowTerms, row_terms
+from ckc_pin.mechanism.mechanism import Mechanism
+
+__all__ = ["Expressions", "expressions"]
+
+
+@dataclass(frozen=True)
+class Expressions:
+    """Terms at a state (q', v'), as functions of symbols.
+
+    Attributes
+    ----------
+    q, v : casadi.SX of nq and n
+        Pinocchio's q', a free root's quaternion of unit length; v'.
+    parameters : Parameters
+        Masses, centres of mass, inertias, offsets, stiffnesses, lengths, gravity.
+    q_dot : casadi.SX of nq
+        The rate of q' at v'.
+    D_tree : casadi.SX, (n, n)
+    bias_tree : casadi.SX of n
+        C' v' + h' less what springs and constant forces do.
+    damping : casadi.SX of n
+        What dampers do.
+    rows : RowTerms
+    kinetic, potential : casadi.SX
+        Energies, J; of gravity, springs and constant forces.
+    """
+
+    q: Any
+    v: Any
+    parameters: Parameters
+    q_dot: Any
+    D_tree: Any
+    bias_tree: Any
+    damping: Any
+    rows: RowTerms
+    kinetic: Any
+    potential: Any
+
+
+def expressions(mechanism: Mechanism) -> Expressions:
+    """Write a mechanism's terms out."""
+    import casadi as cs
+
+    tree, parameters = mechanism.tree, Parameters(present(numbers(mechanism)))
+    q, v = cs.SX.sym("q", tree.nq), cs.SX.sym("v", tree.n)
+    found = bodies(tree, q, v, parameters)
+    gravity = parameters.column("gravity")
+    q_dot = _configuration_rate(mechanism, q, v)
+    D_tree, bias, potential = _inertia(mechanism, found, gravity, parameters)
+    elastic, damping, stored = _springs(mechanism, found, q, v, parameters)
+    rows = row_terms(mechanism.closure, found, q, v, q_dot, tree.place.tolist(), parameters)
+    kinetic = dot(v, times(D_tree, v)) / 2
+    return Expressions(q, v, parameters, q_dot, D_tree, bias - elastic, damping, rows, kinetic, potential + stored)
+
+
+def _inertia(
+    mechanism: Mechanism, found: list[MovingBody], gravity: Any, parameters: Parameters
+) -> tuple[Any, Any, Any]:
+    """D', C' v' + h', and the potential energy of gravity.
+
+    Composite bodies, and what their bias accelerations ask for, from the leaves to the root: a force along each
+    coordinate meets what its joint carries.
+    """
+    import casadi as cs
+
+    model, n = mechanism.tree.model, mechanism.n
+    D, bias, potential = cs.SX(n, n), cs.SX(n, 1), cs.SX(1, 1)
+    mass = [cs.SX(1, 1) for _ in found]  # of what a joint carries, with its first and second moments about the origin
+    first = [cs.SX(3, 1) for _ in found]
+    second = [cs.SX(3, 3) for _ in found]
+    force = [cs.SX(3, 1) for _ in found]
+    torque = [cs.SX(3, 1) for _ in found]  # about the origin of the joint's own frame
+    for k in range(1, model.njoints):
+        body, m = found[k], parameters.number("mass", k)
+        local, I = parameters.column("centre", k), parameters.symmetric("inertia", k)
+        I = I + m * (dot(local, local) * cs.SX.eye(3) - times(local, local.T))
+        mass[k], first[k] = m, times(body.R, m * local)
+        second[k] = times(times(body.R, cs.sparsify(I)), body.R.T)
+        falls = body.acceleration - gravity
+        swept = cross(body.omega, first[k])
+        force[k] = cs.sparsify(m * falls + cross(body.alpha, first[k]) + cross(body.omega, swept))
+        torque[k] = cs.sparsify(
+            cross(first[k], falls) + times(second[k], body.alpha) + cross(body.omega, times(second[k], body.omega))
+        )
+        potential = potential - dot(gravity, m * body.origin + first[k])
+    for k in range(model.njoints - 1, 0, -1):
+        body, parent = found[k], model.parents[k]
+        own = body.columns[len(found[parent].columns) :]
+        for column in own:
+            bias[column.at] = dot(column.axis, torque[k] if column.turns else force[k])
+            # the force and the torque about the joint's origin that its unit acceleration asks for
+            pushed = cross(column.axis, first[k]) if column.turns else mass[k] * column.axis
+            turned = times(second[k], column.axis) if column.turns else cross(first[k], column.axis)
+            for other in body.columns:
+                if other.at > column.at:
+                    continue
+                arm = cross(body.origin - other.origin, pushed) if other.turns else None
+                entry = dot(other.axis, turned + arm) if other.turns else dot(other.axis, pushed)
+                D[other.at, column.at] = D[column.at, other.at] = entry
+        if parent:
+            d = body.origin - found[parent].origin
+            force[parent] = force[parent] + force[k]
+            torque[parent] = torque[parent] + torque[k] + cross(d, force[k])
+            second[parent] = second[parent] + cs.sparsify(
+                second[k]
+                + 2 * dot(d, first[k]) * cs.SX.eye(3)
+                - times(d, first[k].T)
+                - times(first[k], d.T)
+                + mass[k] * (dot(d, d) * cs.SX.eye(3) - times(d, d.T))
+            )
+            first[parent] = first[parent] + first[k] + mass[k] * d
+            mass[parent] = mass[parent] + mass[k]
+    armature = cs.vertcat(*(parameters.number("armature", k) for k in range(n)))
+    return cs.sparsify(D + cs.diag(armature)), bias, potential
+
+
+def _springs(
+    mechanism: Mechanism, found: list[MovingBody], q: Any, v: Any, parameters: Parameters
+) -> tuple[Any, Any, Any]:
+    """What springs and constant forces do, what dampers do, and the energy stored."""
+    import casadi as cs
+
+    springs, n = mechanism.springs, mechanism.n
+    elastic, damping, stored = cs.SX(n, 1), cs.SX(n, 1), cs.SX(1, 1)
+    for k in range(n):
+        x = q[int(mechanism.tree.place[k])]
+        pull = parameters.number("constant", k)
+        stiffness = parameters.number("joint_stiffness", k)
+        stretched = x - parameters.number("joint_rest", k)
+        elastic[k] = pull - stiffness * stretched
+        stored = stored + stiffness * stretched**2 / 2 - pull * x
+        damping[k] = -parameters.number("joint_damping", k) * v[k]
+    ends = [(found[joint], parameters.column("end", k)) for k, joint in enumerate(springs.anchors.point_joint)]
+    count = len(springs.stiffness)
+    for k, ((a, local_a), (b, local_b)) in enumerate(zip(ends[:count], ends[count:], strict=True)):
+        at_a, rate_a, _ = a.point(local_a)
+        at_b, rate_b, _ = b.point(local_b)
+        r = at_a - at_b
+        length = cs.sqrt(dot(r, r))
+        along = r / cs.if_else(length > 0, length, 1)  # at length zero it pulls nowhere
+        jacobian = times(along.T, a.point_jacobian(at_a, n) - b.point_jacobian(at_b, n))
+        stiffness = parameters.number("stiffness", k)
+        stretched = length - parameters.number("rest_length", k)
+        elastic = elastic - stiffness * stretched * jacobian.T
+        stored = stored + stiffness * stretched**2 / 2
+        c = parameters.number("damping", k)
+        damping = damping - c * dot(along, rate_a - rate_b) * jacobian.T
+    return elastic, damping, stored
+
+
+def _configuration_rate(mechanism: Mechanism, q: Any, v: Any) -> Any:
+    import casadi as cs
+
+    tree = mechanism.tree
+    rate = cs.SX(tree.nq, 1)
+    for k in range(tree.n):
+        rate[int(tree.place[k])] = v[k]
+    for at_q, at_v in tree.free:
+        u, w, spin = q[at_q + 3 : at_q + 6], q[at_q + 6], v[at_v + 3 : at_v + 6]
+        slide = v[at_v : at_v + 3]
+        rate[at_q : at_q + 3] = slide + 2 * cs.cross(u, cs.cross(u, slide) + w * slide)
+        rate[at_q + 3 : at_q + 6] = (w * spin + cs.cross(u, spin)) / 2
+        rate[at_q + 6] = -cs.dot(u, spin) / 2
+    return rate

@@ -1,0 +1,256 @@
+"""Written-out terms as shared libraries: found in the user's cache, or compiled, checked and put there.
+
+A file of the cache is called KEY-COMPILER-CONTENT.so: the hash of all that enters the code, of the compiler and its
+flags, and of the file itself. One whose content is another is not loaded but made again. Two processes that make the
+same file at once both succeed, the second one's replaces the first one's.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from ckc_pin.errors import InputError
+from ckc_pin.generated.parameters import numbers, present, values
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rows import RelativeLog
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["Library", "cache_folder", "compiled", "find"]
+
+FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
+PATIENCE = 600.0  # s, for the compiler
+MOST_COORDINATES = 24  # of a tree that is written out: text grows with their square, compilers take longer still
+
+
+@dataclass(frozen=True)
+class Library:
+    """Terms of one mechanism, compiled.
+
+    Attributes
+    ----------
+    path : str
+        The shared library.
+    parameters : (k,) array
+        The mechanism's numbers, which its code takes as arguments.
+    """
+
+    path: str
+    parameters: Array
+
+
+def cache_folder() -> Path:
+    """Return where compiled terms are kept: the user's cache, whose folder nobody else writes to."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "ckc_pin" / "terms"
+
+
+def find(mechanism: Mechanism) -> Library | None:
+    """Return the mechanism's terms if they were compiled before; None if not, or if the file has changed since."""
+    folder = cache_folder()
+    if mechanism.n > MOST_COORDINATES or not folder.is_dir():
+        return None
+    return _look(mechanism, folder, _compiler())
+
+
+def compiled(mechanism: Mechanism) -> Library:
+    """Return the mechanism's terms, from the cache or compiled now.
+
+    Raises
+    ------
+    InputError
+        A tree with too many coordinates, no CasADi, no C compiler or one that fails, no place to write, or code whose
+        results are not those of Pinocchio.
+    """
+    if mechanism.n > MOST_COORDINATES:
+        raise InputError(
+            f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {MOST_COORDINATES}"
+        )
+    compiler = _compiler()
+    found = _look(mechanism, cache_folder(), compiler)
+    if found is not None:
+        return found
+    if compiler is None:
+        raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
+    return _make(mechanism, compiler)
+
+
+@dataclass(frozen=True)
+class _Compiler:
+    path: str
+    flags: tuple[str, ...]
+    key: str
+
+
+def _compiler() -> _Compiler | None:
+    import shutil
+
+    path = shutil.which("cc")
+    if path is None:
+        return None
+    flags = (*FLAGS, *_machine_flags())
+    real = Path(path).resolve()
+    stat = real.stat()
+    return _Compiler(path, flags, _hash((str(real), stat.st_size, stat.st_mtime_ns, flags))[:16])
+
+
+@cache
+def _machine_flags() -> tuple[str, ...]:
+    """Wider registers where the machine has them; no fused operations, whose results are other ones."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return ()
+    try:
+        return ("-mavx2",) if " avx2 " in Path("/proc/cpuinfo").read_text(encoding="ascii") else ()
+    except OSError:
+        return ()
+
+
+def _hash(what: object) -> str:
+    return sha256(msgspec.json.encode(what, order="deterministic")).hexdigest()
+
+
+def _key(mechanism: Mechanism) -> str:
+    """The hash of all that enters the code: our own text, the tree, the table of rows, and which numbers are zero."""
+    tree, closure = mechanism.tree, mechanism.closure
+    joints = [
+        (
+            tree.model.parents[k],
+            tree.model.joints[k].idx_q,
+            tree.model.joints[k].idx_v,
+            tree.model.jointPlacements[k].rotation.tolist(),
+            None if tree.model.joints[k].nq == 7 else (tree.axis(k)[0].tolist(), bool(tree.axis(k)[1])),
+        )
+        for k in range(1, tree.model.njoints)
+    ]
+    groups = [
+        (
+            type(group).__name__,
+            {name: np.asarray(x).tolist() for name, x in vars(group).items() if _is_constant(group, name)},
+        )
+        for group in closure.groups
+    ]
+    anchors = closure.anchors
+    table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
+    which = {name: np.asarray(x).tolist() for name, x in present(numbers(mechanism)).items()}
+    springs = mechanism.springs.anchors.point_joint.tolist()
+    return _hash((_own_text(), joints, groups, table, which, springs, mechanism.redundant, platform.machine()))[:32]
+
+
+def _is_constant(group: object, name: str) -> bool:
+    return isinstance(group, RelativeLog) or name in ("out", "pair", "direction", "a", "b")
+
+
+@cache
+def _own_text() -> str:
+    folder = Path(__file__).parent
+    return _hash([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
+
+
+def _look(mechanism: Mechanism, folder: Path, compiler: _Compiler | None) -> Library | None:
+    """A file of that key, of that compiler or, where there is none, of any."""
+    pattern = f"{_key(mechanism)}-{compiler.key if compiler else '*'}-*.so"
+    try:
+        if not _is_ours(folder):
+            return None
+        for path in sorted(folder.glob(pattern)):
+            if path.stem.rpartition("-")[2] == sha256(path.read_bytes()).hexdigest()[:32]:
+                return Library(str(path), _values(mechanism))
+    except OSError:
+        return None
+    return None
+
+
+def _is_ours(folder: Path) -> bool:
+    stat = folder.stat()
+    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022
+
+
+def _values(mechanism: Mechanism) -> Array:
+    given = numbers(mechanism)
+    return values(given, present(given))
+
+
+def _make(mechanism: Mechanism, compiler: _Compiler) -> Library:
+    import tempfile
+
+    from ckc_pin.generated.comparison import require_equal
+
+    with tempfile.TemporaryDirectory(prefix="ckc_pin-") as made:
+        library = Path(made) / "terms.so"
+        _compile(mechanism, compiler, Path(made) / "terms.c", library)
+        require_equal(mechanism, Library(str(library), _values(mechanism)))
+        content = library.read_bytes()
+        name = f"{_key(mechanism)}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
+        return Library(str(_put(name, content)), _values(mechanism))
+
+
+def _compile(mechanism: Mechanism, compiler: _Compiler, text: Path, library: Path) -> None:
+    import subprocess
+
+    try:
+        from ckc_pin.generated.code import functions, source
+
+        written = source(functions(mechanism))
+    except ModuleNotFoundError as error:
+        says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
+        raise InputError(says) from error
+    try:
+        text.write_text(written, encoding="ascii")
+        done = subprocess.run(
+            [compiler.path, *compiler.flags, "-o", str(library), str(text), "-lm"],
+            capture_output=True, text=True, errors="replace", timeout=PATIENCE, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{mechanism.name}: the C compiler took more than {PATIENCE:g} s for its terms") from None
+    except OSError as error:
+        raise InputError(f"{mechanism.name}: its terms cannot be compiled: {error.strerror}") from error
+    if done.returncode != 0 or not library.exists():
+        says = next((line for line in done.stderr.splitlines() if line.strip()), f"exit code {done.returncode}")
+        raise InputError(f"{mechanism.name}: the C compiler fails: {says:.200}")
+
+
+def _put(name: str, content: bytes) -> Path:
+    """Write a library to the cache, or where that cannot be to a folder that goes with the process."""
+    try:
+        folder = cache_folder()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if _is_ours(folder):
+            return _replace(folder / name, content)
+    except OSError:
+        pass
+    try:
+        return _replace(_own_folder() / name, content)
+    except OSError as error:
+        raise InputError(f"compiled terms cannot be written: {error.strerror}") from error
+
+
+def _replace(path: Path, content: bytes) -> Path:
+    import tempfile
+
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        try:
+            file.write(content)
+            file.close()
+            os.replace(file.name, path)
+        except OSError:
+            os.unlink(file.name)
+            raise
+    return path
+
+
+@cache
+def _own_folder() -> Path:
+    import atexit
+    import shutil
+    import tempfile
+
+    folder = tempfile.mkdtemp(prefix="ckc_pin-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)

@@ -1,0 +1,116 @@
+"""The numbers of a mechanism that are arguments of its written-out code: what may vary without compiling anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rows import Affine, Distance
+from ckc_pin.mechanism.tree import Array, BoolArray
+
+__all__ = ["Parameters", "constant", "numbers", "present", "values"]
+
+NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
+
+
+def numbers(mechanism: Mechanism) -> dict[str, Array]:
+    """Return all numbers that may be arguments: of joints, of bodies, of the closure's rows, of springs.
+
+    Keys and shapes, in SI units: gravity (3); by joint, the world's first, offset and centre (joints, 3), mass
+    (joints) and inertia (joints, 3, 3); armature (n); by frame point (points, 3); by row length and affine_offset
+    (rows), affine (rows, n); by coordinate constant, joint_stiffness, joint_rest, joint_damping (n); by spring end
+    (2 springs, 3), stiffness, rest_length, damping (springs).
+    """
+    model, closure, springs, n = mechanism.tree.model, mechanism.closure, mechanism.springs, mechanism.n
+    length, affine_offset = np.zeros(closure.rows), np.zeros(closure.rows)
+    affine = np.zeros((closure.rows, n))
+    for group in closure.groups:
+        if isinstance(group, Distance):
+            length[group.out] = group.length
+        elif isinstance(group, Affine):
+            affine[group.out], affine_offset[group.out] = group.matrix, group.offset
+    return {
+        "gravity": np.array(model.gravity.linear),
+        "offset": np.array([placement.translation for placement in model.jointPlacements]),
+        "mass": np.array([inertia.mass for inertia in model.inertias]),
+        "centre": np.array([inertia.lever * (inertia.mass > 0) for inertia in model.inertias]),
+        "inertia": np.array([inertia.inertia for inertia in model.inertias]),
+        "armature": np.array(model.armature),
+        "point": np.reshape(closure.anchors.point_local, (-1, 3)),
+        "length": length,
+        "affine": affine,
+        "affine_offset": affine_offset,
+        "constant": springs.constant,
+        "joint_stiffness": springs.joint_stiffness,
+        "joint_rest": springs.joint_rest,
+        "joint_damping": springs.joint_damping,
+        "end": np.reshape(springs.anchors.point_local, (-1, 3)),
+        "stiffness": springs.stiffness,
+        "rest_length": springs.rest_length,
+        "damping": springs.damping,
+    }
+
+
+def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:
+    """Which numbers are arguments: what is zero is left out of the code, so that a planar mechanism's is planar."""
+    return {name: np.abs(x) > NEGLIGIBLE for name, x in given.items()}
+
+
+def values(given: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
+    """Return the arguments, in the order of `Parameters.vector`."""
+    return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in given.items()])
+
+
+class Parameters:
+    """Symbols for those numbers.
+
+    Parameters
+    ----------
+    which : mapping of str to bool arrays
+        As `present` gives it.
+
+    Attributes
+    ----------
+    vector : casadi.SX
+    """
+
+    def __init__(self, which: Mapping[str, BoolArray]) -> None:
+        import casadi as cs
+
+        self._symbols: dict[str, dict[tuple[int, ...], Any]] = {}
+        for name, there in which.items():
+            at = [tuple(int(i) for i in index) for index in np.argwhere(there)]
+            self._symbols[name] = {index: cs.SX.sym("_".join([name, *map(str, index)])) for index in at}
+        self.vector = cs.vertcat(*(symbol for found in self._symbols.values() for symbol in found.values()))
+
+    def number(self, name: str, *index: int) -> Any:
+        """Return one of them, a structural zero where there is none."""
+        import casadi as cs
+
+        return self._symbols[name].get(tuple(int(k) for k in index), cs.SX(1, 1))
+
+    def column(self, name: str, *index: int) -> Any:
+        """Return three of them as a column."""
+        import casadi as cs
+
+        return cs.vertcat(*(self.number(name, *index, k) for k in range(3)))
+
+    def symmetric(self, name: str, *index: int) -> Any:
+        """Return nine of them as a matrix, of which the lower triangle is read."""
+        import casadi as cs
+
+        rows = [[self.number(name, *index, max(i, j), min(i, j)) for j in range(3)] for i in range(3)]
+        return cs.vertcat(*(cs.horzcat(*row) for row in rows))
+
+
+def constant(given: Array) -> Any:
+    """Return a matrix of plain numbers, without what is zero and with ones that are ones."""
+    import casadi as cs
+
+    near = np.array(given, dtype=float)
+    for whole in (0.0, 1.0, -1.0):
+        near[np.abs(near - whole) <= NEGLIGIBLE] = whole
+    return cs.sparsify(cs.SX(near))

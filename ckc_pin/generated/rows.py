@@ -1,0 +1,178 @@
+"""The closure's rows as expressions, by the primitives of `mechanism.rows`: phi, J and J_dot v."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ckc_pin.generated.bodies import MovingBody, cross, dot, times
+from ckc_pin.generated.parameters import Parameters, constant
+from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+
+__all__ = ["RowTerms", "row_terms"]
+
+NEAR_PARALLEL = 0.0025  # of sin^2 of the angle, rad^2: series below
+
+
+@dataclass(frozen=True)
+class RowTerms:
+    """phi (rows), J (rows, n) and J_dot v (rows)."""
+
+    phi: Any
+    J: Any
+    J_dot_v: Any
+
+
+@dataclass(frozen=True)
+class _Moving:
+    """A vector, its rate, its acceleration at dv'/dt = 0, and its derivative along v', (3, n)."""
+
+    value: Any
+    rate: Any
+    acceleration: Any
+    jacobian: Any
+
+    def __sub__(self, other: _Moving) -> _Moving:
+        return _Moving(
+            self.value - other.value,
+            self.rate - other.rate,
+            self.acceleration - other.acceleration,
+            self.jacobian - other.jacobian,
+        )
+
+
+def row_terms(
+    closure: Closure,
+    bodies: Sequence[MovingBody],
+    q: Any,
+    v: Any,
+    q_dot: Any,
+    place: Sequence[int],
+    parameters: Parameters,
+) -> RowTerms:
+    """Return a closure's rows.
+
+    Parameters
+    ----------
+    closure : Closure
+    bodies : sequence of MovingBody
+    q, v, q_dot : casadi.SX
+        Pinocchio's q', v', and the rate of q' at v'.
+    place : sequence of int
+        Where the coordinates of joints of one freedom stand in q'.
+    parameters : Parameters
+        Takes the offsets of frames, lengths of rods, ratios and offsets of couplings.
+    """
+    import casadi as cs
+
+    n = v.numel()
+    anchors = closure.anchors
+    points = [_point(bodies[joint], parameters.column("point", k), n) for k, joint in enumerate(anchors.point_joint)]
+    directions = [
+        _direction(bodies[joint], constant(local), n)
+        for joint, local in zip(anchors.direction_joint, anchors.direction_local, strict=True)
+    ]
+    pairs = [a - b for a, b in zip(points[: len(points) // 2], points[len(points) // 2 :], strict=True)]
+    phi, J, J_dot_v = cs.SX(closure.rows, 1), cs.SX(closure.rows, n), cs.SX(closure.rows, 1)
+
+    def put(out: int, row: tuple[Any, Any, Any]) -> None:
+        phi[out], J[out, :], J_dot_v[out] = row
+
+    for group in closure.groups:
+        match group:
+            case Component():
+                for out, pair, direction in zip(group.out, group.pair, group.direction, strict=True):
+                    put(int(out), _product(directions[direction], pairs[pair]))
+            case Dot():
+                for out, a, b in zip(group.out, group.a, group.b, strict=True):
+                    put(int(out), _product(directions[a], directions[b]))
+            case Distance():
+                for out, pair in zip(group.out, group.pair, strict=True):
+                    put(int(out), _distance(pairs[pair], parameters.number("length", out)))
+            case Affine():
+                for out in group.out:
+                    row = cs.horzcat(*(parameters.number("affine", out, k) for k in range(n)))
+                    value = times(row, cs.vertcat(*(q[k] for k in place)))
+                    put(int(out), (value - parameters.number("affine_offset", out), row, 0))
+            case RelativeLog():
+                for k in range(len(group.joint_a)):
+                    a, b = bodies[group.joint_a[k]], bodies[group.joint_b[k]]
+                    found = _parallel(a, b, constant(group.rotation_a[k]), constant(group.rotation_b[k]), n)
+                    rate = times(found[1], v)
+                    along = cs.jtimes(rate, q, q_dot)
+                    for i in range(3):
+                        put(int(group.out[3 * k + i]), (found[0][i], found[1][i, :], along[i]))
+            case _:
+                raise TypeError(f"{type(group).__name__}: no such primitive is written out")
+    return RowTerms(phi, cs.sparsify(J), J_dot_v)
+
+
+def _point(body: MovingBody, local: Any, n: int) -> _Moving:
+    at, rate, acceleration = body.point(local)
+    return _Moving(at, rate, acceleration, body.point_jacobian(at, n))
+
+
+def _direction(body: MovingBody, local: Any, n: int) -> _Moving:
+    import casadi as cs
+
+    e, rate, acceleration = body.direction(local)
+    jacobian, turns = cs.SX(3, n), body.turn_jacobian(n)
+    for column in body.columns:
+        if column.turns:
+            jacobian[:, column.at] = cross(turns[:, column.at], e)
+    return _Moving(e, rate, acceleration, cs.sparsify(jacobian))
+
+
+def _product(a: _Moving, b: _Moving) -> tuple[Any, Any, Any]:
+    """The row a . b."""
+    return (
+        dot(a.value, b.value),
+        times(a.value.T, b.jacobian) + times(b.value.T, a.jacobian),
+        dot(a.acceleration, b.value) + 2 * dot(a.rate, b.rate) + dot(a.value, b.acceleration),
+    )
+
+
+def _distance(r: _Moving, length: Any) -> tuple[Any, Any, Any]:
+    return (
+        (dot(r.value, r.value) - length**2) / (2 * length),
+        times(r.value.T / length, r.jacobian),
+        (dot(r.rate, r.rate) + dot(r.value, r.acceleration)) / length,
+    )
+
+
+def _parallel(a: MovingBody, b: MovingBody, rotation_a: Any, rotation_b: Any, n: int) -> tuple[Any, Any]:
+    """log(R_A^T R_B) and its Jacobian."""
+    import casadi as cs
+
+    R_b = times(b.R, rotation_b)
+    relative = times(times(a.R, rotation_a).T, R_b)
+    sine = cs.vertcat(*(relative[j, i] - relative[i, j] for i, j in ((1, 2), (2, 0), (0, 1)))) / 2
+    cosine = (cs.trace(relative) - 1) / 2
+    square = dot(sine, sine)
+    near = cs.logic_and(square < NEAR_PARALLEL, cosine > 0)
+    apart = cs.if_else(near, 1, square)  # what the branch that is not taken is evaluated at
+    length = cs.sqrt(apart)
+    u = sine * cs.if_else(near, _series(_ARCSINE, square), cs.atan2(length, cosine) / length)
+    theta_2 = dot(u, u)
+    away = cs.if_else(near, 1, theta_2)
+    theta = cs.sqrt(away)
+    c = cs.if_else(near, _series(_LOG, theta_2), 1 / away - cs.cos(theta / 2) / cs.sin(theta / 2) / (2 * theta))
+    s = cs.skew(u)
+    rate = times(cs.SX.eye(3) + s / 2 + c * cs.mtimes(s, s), R_b.T)
+    return u, times(rate, b.turn_jacobian(n) - a.turn_jacobian(n))
+
+
+def _series(coefficients: Sequence[float], x: Any) -> Any:
+    value = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        value = coefficient + x * value
+    return value
+
+
+# arcsin(x) / x in x^2; and c of Jlog(u) = 1 + [u] / 2 + c [u]^2 in |u|^2
+_ARCSINE = [1.0]
+for _k in range(1, 9):
+    _ARCSINE.append(_ARCSINE[-1] * (2 * _k - 1) ** 2 / (2 * _k * (2 * _k + 1)))
+_LOG = [1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160]

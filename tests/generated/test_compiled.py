@@ -1,0 +1,111 @@
+"""Terms written out for a mechanism against Pinocchio's, in the native core and along runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import Mechanism, Simulator, load, simulate
+from ckc_pin.generated.library import compiled
+from ckc_pin.native import _core
+from ckc_pin.native.tables import core_table
+from scripts.experiments.fuzz.mechanisms import random_mechanism
+from tests.analytic.five_bar import FIVE_BAR
+
+SHIPPED = ["five_bar", "slider_crank_spatial", "bricard", "flyball", "andrews"]
+FREE, COUPLED = 18, 14  # of random ones: a free root on a damped spring; redundant rows, a coupling
+
+
+def are_alike(mechanism: Mechanism, count: int = 20) -> None:
+    """All terms of two cores, and the accelerations that follow, at random states on the closure and off it."""
+    ours, theirs = _core.Core(core_table(mechanism, compiled(mechanism))), _core.Core(core_table(mechanism))
+    random, n = np.random.default_rng(7), mechanism.n
+    for k in range(count):
+        closed = k % 2 == 0
+        q = mechanism.q_tree if closed else mechanism.tree.integrate(mechanism.q_tree, 0.3 * random.uniform(-1, 1, n))
+        v, u = random.uniform(-2, 2, n), random.uniform(-1, 1, n)
+        if closed:
+            J = theirs.jacobian(q)
+            v = v - np.linalg.pinv(J, rcond=1e-9) @ (J @ v)
+        wanted, found = theirs.terms(q, v), ours.terms(q, v)
+        for name, right in wanted.items():
+            scale = max(1.0, float(np.abs(right).max(initial=0.0)))
+            assert np.abs(np.asarray(found[name]) - right).max(initial=0.0) <= 1e-11 * scale, name
+        if closed or not mechanism.redundant:
+            correction = np.zeros(mechanism.closure.rows)
+            right = theirs.dae_acceleration(q, v, u, correction)
+            off = np.abs(ours.dae_acceleration(q, v, u, correction) - right).max()
+            assert off <= 1e-11 * np.abs(right).max()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_terms_of_shipped_mechanisms_are_pinocchios(name: str) -> None:
+    are_alike(load(name))
+
+
+@pytest.mark.parametrize("seed", [FREE, COUPLED])
+def test_terms_of_random_mechanisms_are_pinocchios(seed: int, tmp_path: Path) -> None:
+    are_alike(load(random_mechanism(seed).write(tmp_path / "mechanism")))
+
+
+def test_the_acceleration_is_that_of_the_appendix() -> None:
+    """Of the five-bar in numpy, none of whose code is ours."""
+    mechanism = load("five_bar")
+    core, random = _core.Core(core_table(mechanism, compiled(mechanism))), np.random.default_rng(3)
+    for _ in range(20):
+        q = FIVE_BAR.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.3, 0.3, 2))
+        q_dot = random.uniform(-3, 3, 2)
+        v = FIVE_BAR.rho(q) @ q_dot
+        found = core.dae_acceleration(q, v, np.zeros(4), np.zeros(2))
+        right = FIVE_BAR.acceleration(q, q_dot, np.zeros(2))
+        assert np.abs(found[[0, 2]] - right).max() < 1e-10 * np.abs(right).max()
+
+
+RUNS: list[tuple[str, dict[str, Any]]] = [
+    ("five_bar/swing", {"formulation": "dae"}),
+    ("five_bar/swing", {"formulation": "dae", "solver.method": "Radau", "t_end": 0.5}),
+    (
+        "five_bar/swing",
+        {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [20.0, 20.0], "t_end": 0.5},
+    ),
+    ("five_bar/swing", {"formulation": "reduced"}),
+    ("five_bar/swing", {"formulation": "spf", "epsilon": 1e-2, "initial.w": [0.01, -0.02]}),
+    ("five_bar/swing", {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-2, "t_end": 0.5}),
+    ("five_bar/swing", {"formulation": "dae", "event": [{"of": "q_dot", "coordinate": "theta_1", "value": 1.0}]}),
+    ("five_bar/tracking", {"t_end": 1.0}),
+    ("five_bar/tracking", {"formulation": "dae", "t_end": 1.0, "controller.sample_time": 1e-3}),
+    ("five_bar/set_point", {"t_end": 1.0}),
+    ("flyball", {"formulation": "dae", "t_end": 0.2}),
+    ("bricard", {"formulation": "dae", "t_end": 1.0}),
+]
+
+
+@pytest.mark.parametrize(("scene", "changes"), RUNS)
+def test_runs_end_where_they_did(scene: str, changes: dict[str, Any]) -> None:
+    """After nearly the same steps, to ten times what a step may be off."""
+    ours, theirs = (simulate(scene, {**changes, "solver.terms": terms}) for terms in ("generated", "pinocchio"))
+    assert (ours.stats["terms"], theirs.stats["terms"]) == ("generated", "pinocchio")
+    assert (ours.status, len(ours.t), len(ours.events)) == (theirs.status, len(theirs.t), len(theirs.events))
+    assert abs(ours.stats["rhs"] - theirs.stats["rhs"]) <= 0.1 * theirs.stats["rhs"]
+    allowed = 10 * ours.scene["solver"]["rtol"]
+    for a, b in ((ours.q_tree, theirs.q_tree), (ours.v_tree, theirs.v_tree), (ours.energy, theirs.energy)):
+        assert np.abs(a - b).max() <= allowed * max(1.0, np.abs(b).max())
+
+
+def test_a_loss_of_rank_is_passed_as_before() -> None:
+    """Next to it elimination without pivoting would lose its digits: the core takes over."""
+    changes = {"formulation": "dae", "solver.rtol": 1e-8}
+    ours, theirs = (simulate("n_four_bar", {**changes, "solver.terms": x}) for x in ("generated", "pinocchio"))
+    assert ours.status == theirs.status == "done"
+    assert np.abs(ours.q_tree[-1] - theirs.q_tree[-1]).max() < 1e-6
+
+
+def test_a_simulator_steps_with_them() -> None:
+    ours, theirs = (Simulator("five_bar/swing", {"solver.terms": terms}) for terms in ("generated", "pinocchio"))
+    for k in range(50):
+        u = np.array([0.1 * np.sin(k), 0.0])
+        assert np.abs(ours.step(u, 2e-3).v_tree - theirs.step(u, 2e-3).v_tree).max() < 1e-7
+    assert ours.stats["terms"] == "generated"

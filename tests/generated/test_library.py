@@ -1,0 +1,134 @@
+"""Where compiled terms are kept, and what is said when they cannot be made."""
+
+from __future__ import annotations
+
+import os
+import stat
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from ckc_pin import InputError, check, load, simulate
+from ckc_pin.generated import library
+from tests.contract.helpers.command import ckc
+
+NAME = "slider_crank"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "ckc_pin" / "terms"
+
+
+def fake_compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A `cc` that runs a script, before the real one on PATH."""
+    folder.mkdir()
+    (folder / "cc").write_text(f"#!/bin/sh\n{script}\n")
+    (folder / "cc").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
+def test_what_was_compiled_is_found_again(folder: Path) -> None:
+    mechanism = load(NAME)
+    assert library.find(mechanism) is None
+    assert check(mechanism).terms == "pinocchio"
+    made = library.compiled(mechanism)
+    assert Path(made.path).parent == folder
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    found = library.find(mechanism)
+    assert found is not None
+    assert found.path == made.path == library.compiled(load(NAME)).path
+    assert check(mechanism).terms == "generated"
+    assert simulate(NAME, {"t_end": 0.01}).stats["terms"] == "generated"
+    assert simulate(NAME, {"t_end": 0.01, "solver.terms": "pinocchio"}).stats["terms"] == "pinocchio"
+    assert library.find(load("four_bar")) is None
+
+
+def test_other_masses_are_arguments_of_the_same_code(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for name, text in load(NAME).sources.texts.items():
+        (mine / name).write_text(text.replace('<mass value="', '<mass value="1'))
+    heavy = load(mine)
+    assert heavy.tree.model.inertias[1].mass != load(NAME).tree.model.inertias[1].mass
+    assert library.compiled(heavy).path == library.compiled(load(NAME)).path
+
+
+@pytest.mark.parametrize("harm", [b"", b"\x7fELF", None], ids=["empty", "cut off", "one byte"])
+def test_a_damaged_file_is_not_loaded_but_made_again(folder: Path, harm: bytes | None) -> None:
+    path = Path(library.compiled(load(NAME)).path)
+    content = path.read_bytes()
+    path.write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:] if harm is None else harm)
+    assert library.find(load(NAME)) is None
+    assert Path(library.compiled(load(NAME)).path).read_bytes() == content
+
+
+def test_a_folder_that_others_write_to_is_not_read(folder: Path) -> None:
+    library.compiled(load(NAME))
+    folder.chmod(0o777)
+    assert library.find(load(NAME)) is None
+    assert Path(library.compiled(load(NAME)).path).parent != folder
+
+
+def test_where_nothing_can_be_written_the_process_keeps_its_own(folder: Path) -> None:
+    folder.parent.mkdir()
+    folder.write_text("no folder")
+    assert library.find(load(NAME)) is None
+    assert simulate(NAME, {"t_end": 0.01, "solver.terms": "generated"}).stats["terms"] == "generated"
+
+
+def test_without_a_compiler_there_is_the_general_core(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert simulate(NAME, {"t_end": 0.01}).stats["terms"] == "pinocchio"
+    assert check(NAME).terms == "pinocchio"
+    with pytest.raises(InputError, match="no C compiler"):
+        simulate(NAME, {"t_end": 0.01, "solver.terms": "generated"})
+
+
+def test_what_is_there_is_taken_without_a_compiler(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = library.compiled(load(NAME))
+    monkeypatch.setenv("PATH", "")
+    assert library.compiled(load(NAME)).path == made.path
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        ("echo 'terms.c:1: no space' >&2; exit 1", "the C compiler fails: terms.c:1: no space"),
+        ("exit 0", "the C compiler fails: exit code 0"),
+        ('/usr/bin/cc -Dcos=sin "$@"', "as compiled is not what Pinocchio gives"),
+    ],
+    ids=["fails", "makes nothing", "makes other code"],
+)
+def test_a_compiler_that_is_none(
+    script: str, says: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_compiler(tmp_path / "bin", script, monkeypatch)
+    answer = ckc("compile", NAME, "--json")
+    assert answer.code == 2
+    assert says in answer.json["message"]
+    assert library.find(load(NAME)) is None
+
+
+def test_two_processes_at_once(folder: Path) -> None:
+    with ProcessPoolExecutor(2) as pool:
+        paths = set(pool.map(_make, [NAME, NAME]))
+    assert len({Path(path).name.rpartition("-")[0] for path in paths}) == 1
+    assert all(Path(path).parent == folder for path in paths)
+    assert library.find(load(NAME)) is not None
+
+
+def _make(name: str) -> str:
+    return library.compiled(load(name)).path
+
+
+def test_the_command_tells_what_it_did(folder: Path) -> None:
+    first, again = ckc("compile", NAME, "--json"), ckc("compile", NAME, "--json")
+    assert (first.code, first.json["compiled"], again.json["compiled"]) == (0, True, False)
+    assert first.json["file"] == again.json["file"]
+    too_large = ckc("compile", "talos")
+    assert too_large.code == 2
+    assert "trees of up to" in too_large.err
