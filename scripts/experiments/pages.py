@@ -1,4 +1,4 @@
-"""Pages: Jinja2 templates over data frames, in GitHub's Markdown."""
+"""Pages: Jinja2 templates over data, in GitHub's Markdown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-__all__ = ["DOCS", "GZIP", "digits", "render", "versions"]
+__all__ = ["DOCS", "GZIP", "digits", "environment", "render", "said", "versions"]
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TEMPLATES = Path(__file__).parent / "templates"
@@ -21,16 +21,35 @@ GZIP: Any = {"method": "gzip", "mtime": 0}  # equal tables are equal files
 
 def render(template: str, **content: Any) -> str:
     """Fill in a template; what it asks for and is not given is an error."""
-    environment = Environment(
+    return environment().get_template(f"{template}.md.j2").render(content).lstrip("\n")
+
+
+def said(template: str, **values: Any) -> dict[str, Any]:
+    """Fill in a template's blocks, each of which is a paragraph: its lines are joined.
+
+    Returns
+    -------
+    dict of str to str
+        By the blocks' names: fields of what the template is about.
+    """
+    filled = environment().get_template(f"{template}.md.j2")
+    context = filled.new_context(values)
+    return {name: " ".join("".join(block(context)).split()) for name, block in filled.blocks.items()}
+
+
+def environment() -> Environment:
+    """Return where templates are found, and the filters they have."""
+    found = Environment(
         loader=FileSystemLoader(TEMPLATES),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"plain": _plain, "cell": _cell, "capital": lambda text: text[:1].upper() + text[1:]}
-    environment.filters |= {"digits": digits, "small": _or_empty("{:.0e}"), "count": _or_empty("{:,.0f}")}
-    return environment.get_template(f"{template}.md.j2").render(content).lstrip("\n")
+    found.filters |= {"plain": _plain, "cell": _cell, "capital": lambda text: text[:1].upper() + text[1:]}
+    found.filters |= {"digits": digits, "small": _or_empty("{:.0e}"), "count": _or_empty("{:,.0f}")}
+    found.filters["numbers"] = lambda numbers, form: ", ".join(form % x for x in numbers)
+    return found
 
 
 def digits(x: float) -> str:

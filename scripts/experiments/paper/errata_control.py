@@ -16,6 +16,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import LevelSet
 from ckc_pin.simulation.prepare import scene_controller
 from ckc_pin.simulation.scene import load_scene
+from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, march
 from scripts.experiments.paper.five_bar import FIVE_BAR
@@ -48,16 +49,10 @@ def set_point_error() -> Erratum:
     right, wrong = (_rate(reduced, 0.0, state, candidate(sign)) - expected for sign in (1.0, -1.0))
     return Erratum(
         key="set-point-error",
-        where="eqs. 14 and 16 and the function of section II-B",
-        printed="q_tilde has no definition where it is used first (eq. 14's brace says q_bar = q_d - q); eq. 16 "
-        "defines q_tilde = q - q_d",
-        correct="V = 1/2 q_dot^T D q_dot + V(q) + (q_d - q)^T h(q_d) + ...: with eq. 16's q_tilde that term has the "
-        "wrong sign. The program has q - q_d everywhere and subtracts",
         difference=abs(wrong),
         agreement=abs(right),
         unit="W",
-        measured="dV/dt + q_dot^T K_V q_dot of the closed loop at q_dot = (1, -2) rad/s, with eq. 16's error and with "
-        "eq. 14's",
+        **said("errata/set-point-error"),
     )
 
 
@@ -68,14 +63,10 @@ def candidate_offset() -> Erratum:
     at_target = controller.lyapunov(0.0, controller.target, ON_MANIFOLD)
     return Erratum(
         key="candidate-offset",
-        where="section II-B, the function candidate",
-        printed="V = 1/2 q_dot^T D q_dot + V(q) + q_tilde^T h(q_d) + 1/2 q_tilde^T K_P q_tilde, positive definite",
-        correct="minus V(q_d): a positive definite function is zero at the equilibrium",
         difference=abs(float(offset)),
         agreement=abs(at_target),
         unit="J",
-        measured="the candidate at q = q_d, q_dot = 0 (V(q) is zero with every centre of mass on the base line): as "
-        "printed, and the one that the program reports",
+        **said("errata/candidate-offset"),
     )
 
 
@@ -93,14 +84,10 @@ def equilibrium_sign() -> Erratum:
     h = Terms(mechanism, at, np.zeros(4)).h
     return Erratum(
         key="equilibrium-sign",
-        where="eq. 15",
-        printed="h(q_d) - h(q) = K_P (q_d - q)",
-        correct="h(q) - h(q_d) = K_P (q_d - q): eq. 14 at rest is u = h(q)",
         difference=float(np.abs(h_d - h - K_P @ (q_d - q)).max()),
         agreement=float(np.abs(h - h_d - K_P @ (q_d - q)).max()),
         unit="N m",
-        measured="left minus right side at an equilibrium of the closed loop other than q_d, which "
-        f"K_P = {WEAK} I is weak enough to leave: (theta_1, theta_3) = ({q[0]:.6f}, {q[1]:.6f})",
+        **said("errata/equilibrium-sign", gain=WEAK, q=q),
     )
 
 
@@ -111,15 +98,10 @@ def gain_condition() -> Erratum:
     diagonal = float(np.linalg.eigvalsh(np.eye(2).T @ (10 * np.eye(2)))[0])
     return Erratum(
         key="gain-condition",
-        where='eq. 18, "each positive definite since they are quadratic ... with constant, positive definite weights"',
-        printed="no condition on Lambda and K_D together; d_1, d_2 > 0 not said either",
-        correct="Lambda^T K_D symmetric positive definite: for the function to be positive, and for eq. 19's terms to "
-        "cancel. The program refuses gains without it",
         difference=-least,
         agreement=max(0.0, -diagonal),
         unit="N m/rad",
-        measured=f"how far below zero q_tilde^T Lambda^T K_D q_tilde goes on unit errors for "
-        f"Lambda = {Lambda.tolist()}, K_D = I (both with positive eigenvalues only), and for eq. 22's gains",
+        **said("errata/gain-condition", Lambda=Lambda.tolist()),
     )
 
 
@@ -138,16 +120,10 @@ def lyapunov_rate() -> Erratum:
     right = -error_dot @ K_D @ error_dot - error @ Lambda.T @ K_D @ Lambda @ error
     return Erratum(
         key="lyapunov-rate",
-        where="eq. 19, both lines",
-        printed="... - 2 q_dot^T Lambda K_D q_tilde ... "
-        "= -d1 q_dot^T K_D q_dot - d1 q_tilde^T Lambda^T K_D Lambda q_tilde - ...",
-        correct="... + 2 q_tilde_dot^T K_D Lambda q_tilde ... = -d1 q_tilde_dot^T K_D q_tilde_dot - ...: rates of the "
-        "error, and the sign that lets the terms cancel",
         difference=float(min(abs(first - truth), abs(last - truth))),
         agreement=float(abs(right - truth)),
         unit="W",
-        measured=f"dV/dt by differences along the closed loop of `{FIVE_BAR}/tracking` at t = {T:g} s ({truth:.4f} W), "
-        f"against the printed lines ({first:.4f} W and {last:.4f} W; the nearer one counts) and the correct one",
+        **said("errata/lyapunov-rate", t=T, truth=truth, first=first, last=last),
     )
 
 
@@ -160,16 +136,10 @@ def rate_on_trajectory() -> Erratum:
     measured = _rate(reduced, T, np.concatenate([q_d, q_d_dot]), _reported(reduced, controller))
     return Erratum(
         key="rate-on-trajectory",
-        where='section II-C, "-V_dot is locally positive definite"',
-        printed="-V_dot = d1 q_dot^T K_D q_dot + ...: not zero on the desired trajectory itself, where V is, so that V "
-        "could not stay above zero",
-        correct="positive definite in (q_tilde, q_tilde_dot, w), with the error's rate; in section II-B "
-        "-V_dot = q_dot^T K_V q_dot is only semi-definite, which is why La Salle is needed",
         difference=abs(float(q_d_dot @ controller.K_D @ q_d_dot) + measured),
         agreement=abs(measured),
         unit="W",
-        measured=f"with zero error on eq. 21 at t = {T:g} s: dV/dt by differences, which is zero, and its distance "
-        "from the printed line",
+        **said("errata/rate-on-trajectory", t=T),
     )
 
 

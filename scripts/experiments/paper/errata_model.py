@@ -12,6 +12,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene
 from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.pages import said
 from scripts.experiments.paper.along_eq21 import tracking, widest
 from scripts.experiments.paper.domain import check_psi
 from scripts.experiments.paper.erratum import Erratum
@@ -42,15 +43,10 @@ def multipliers() -> Erratum:
     together = simulate(f"{FIVE_BAR}/swing", {"formulation": "dae", "t_end": FALL})
     return Erratum(
         key="multipliers",
-        where='eq. 1 and section II, "the differential equation part of the DAE alone is sufficient"',
-        printed="D' q'' + C' q' + h' = u', phi = 0",
-        correct="D' q'' + C' q' + h' = u' + J^T lambda, phi = 0: n + (n - d) equations need as many unknowns. In eq. 6 "
-        "lambda drops out, since rho^T J^T = 0",
         difference=float(np.abs(mechanism.kinematics(apart).phi).max()),
         agreement=float(np.abs(together.phi[-1]).max()),
         unit="m",
-        measured=f"|phi| after {FALL} s of free fall from the start of `{FIVE_BAR}/swing`, at rest and closed: without "
-        "and with the multipliers",
+        **said("errata/multipliers", fall=FALL),
     )
 
 
@@ -59,13 +55,10 @@ def psi_determinant() -> Erratum:
     check = check_psi(load(FIVE_BAR), states=1)
     return Erratum(
         key="psi-determinant",
-        where='section II and III-C, "Psi_{q\'} != 0", "Psi_{q\'} = 0"',
-        printed="singular where Psi_{q'} = 0",
-        correct="singular where det Psi_{q'} = 0",
         difference=check.norm,
         agreement=check.singular,
         unit="m (|Psi_{q'}|), m² (det)",
-        measured="at singular configurations found by solving for them: least |Psi_{q'}|, largest |det Psi_{q'}|",
+        **said("errata/psi-determinant"),
     )
 
 
@@ -76,14 +69,10 @@ def coriolis_power() -> Erratum:
     )
     return Erratum(
         key="coriolis-power",
-        where='eq. 25, c12 and c34 (and "q2", "q4" for theta_2, theta_4)',
-        printed="c12 = -m2 l1 c2 theta_2_dot² sin theta_2",
-        correct="the rate to the first power: the entry multiplies a velocity",
         difference=printed,
         agreement=first,
         unit="relative",
-        measured=f"C' v' against Pinocchio's at {STATES} random states, |rates| up to 3 rad/s: with the square and "
-        "with the first power",
+        **said("errata/coriolis-power", states=STATES),
     )
 
 
@@ -93,15 +82,10 @@ def coriolis_skew() -> Erratum:
     christoffel = max(_skew(terms, terms.C_tree) for _, _, terms in _states())
     return Erratum(
         key="coriolis-skew",
-        where='eq. 25 and eq. 1, "Christoffel symbols matrices"',
-        printed="[[-2 a theta_2_dot, -a theta_2_dot], [a theta_1_dot, 0]] with a = m2 l1 c2 sin theta_2, once c12 has "
-        "its first power",
-        correct="[[-a theta_2_dot, -a (theta_1_dot + theta_2_dot)], [a theta_1_dot, 0]], what "
-        "`pin.computeCoriolisMatrix` returns: the same C' v', and D_dot' - 2 C' is skew, which eq. 19 needs",
         difference=printed,
         agreement=christoffel,
         unit="kg m²/s",
-        measured=f"largest entry of D_dot' - C' - C'^T at {STATES} random states, D_dot' by central differences",
+        **said("errata/coriolis-skew", states=STATES),
     )
 
 
@@ -110,15 +94,11 @@ def closure_angles() -> Erratum:
     at = stable_equilibrium(load(FIVE_BAR))
     return Erratum(
         key="closure-angles",
-        where="eq. 27",
-        printed="... - l3 cos(theta_3 + theta_4) - l4 cos theta_4 - c = 0",
-        correct="... - l3 cos theta_3 - l4 cos(theta_3 + theta_4) - c = 0, sines alike: links 3 and 4 are proximal and "
-        "distal in eqs. 24 to 26; c is the base link of Table I's row 0",
         difference=float(np.abs(LOOP.phi(at.q_tree)).max()),
         agreement=float(np.abs(at.phi).max()),
         unit="m",
-        measured=f"|phi| of `{FIVE_BAR}` at its hanging equilibrium: eq. 27 as printed, and the program's",
         commands=("ckc check five_bar",),
+        **said("errata/closure-angles"),
     )
 
 
@@ -127,17 +107,11 @@ def table_rows() -> Erratum:
     (_, printed, reach), (_, loop, loop_reach) = (widest(*tracking(name)) for name in (PRINTED, FIVE_BAR))
     return Erratum(
         key="table-rows",
-        where="Table I, rows 3 and 4",
-        printed="l3 = 0.3048, l4 = 0.2794 (and c, m, I with them): rows in the order of the loop, as eq. 27 puts l3 on "
-        "the sum of angles",
-        correct="links 3 and 4 of eqs. 24 to 26 (proximal, distal) take rows 4 and 3: `five_bar`. As printed, type 1 "
-        "of Fig. 2, which needs l2 = l4, does not exist, and eq. 21 leaves the workspace",
         difference=printed - reach,
         agreement=max(0.0, loop - loop_reach),
         unit="m",
-        measured="how far eq. 21 asks the elbows beyond the reach l2 + l4: "
-        f"{printed:.4f} of {reach:.4f} as printed, {loop:.4f} of {loop_reach:.4f} otherwise",
         commands=("ckc check five_bar_as_printed/tracking",),
+        **said("errata/table-rows", printed=(printed, reach), loop=(loop, loop_reach)),
     )
 
 
@@ -148,15 +122,11 @@ def type_1_points() -> Erratum:
     upper, lower = q[q[:, 0] > 0], q[q[:, 0] < 0]
     return Erratum(
         key="type-1-points",
-        where="section III-A and Fig. 2, \"Type 1 singularity is represented by just a single point\"",
-        printed="one point (theta_1, theta_3)",
-        correct=f"two, ±({upper[0, 0]:.6f}, {upper[0, 1]:.6f}): the elbows coincide above and below the base; none "
-        "when l2 and l4 differ",
         difference=float(np.linalg.norm(upper[0] - lower[0])),
         agreement=max(float(np.abs(found - found[0]).max()) for found in (upper, lower, np.vstack([upper, -lower]))),
         unit="rad",
-        measured=f"distance of the two points found, and how well {len(q)} solutions from random starts agree on them",
-    )  # fmt: skip
+        **said("errata/type-1-points", q=upper[0], solutions=len(q)),
+    )
 
 
 def lost_freedoms() -> Erratum:
@@ -165,14 +135,11 @@ def lost_freedoms() -> Erratum:
     points = search_singular(mechanism, 20)
     return Erratum(
         key="lost-freedoms",
-        where='section III-A, "the system ceases to have two DOFs"',
-        printed="one freedom where phi_z is singular",
-        correct="two: J keeps rank 2. The pair (theta_1, theta_3) describes one of them only",
         difference=min(point.sigma_min_J for point in points),
         agreement=max(point.sigma_min_phi_z for point in points),
         unit="m",
-        measured=f"at {len(points)} singular configurations: least sigma_min(J), largest sigma_min(phi_z)",
         commands=("./scripts/experiment paper singular-freedoms",),
+        **said("errata/lost-freedoms", points=len(points)),
     )
 
 

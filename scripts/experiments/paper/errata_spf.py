@@ -11,6 +11,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene
+from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, on_level
 from scripts.experiments.paper.five_bar import FIVE_BAR
@@ -40,15 +41,10 @@ def fast_error() -> Erratum:
     g, slow = EPSILON * z_dot, on.rho[z] @ Q_DOT
     return Erratum(
         key="fast-error",
-        where="eq. 11 and the sentence before it",
-        printed="y = h(t, x); dy/dtau = g - dh/dt - epsilon f grad h",
-        correct="y = z - h(t, x); dy/dtau = g - epsilon (dh/dt + (dh/dx) f): without epsilon at dh/dt setting it to "
-        "zero would not give eq. 12, and f grad h has no matching shapes",
         difference=float(np.abs(g - slow - truth).max()),
         agreement=float(np.abs(g - EPSILON * slow - truth).max()),
         unit="rad",
-        measured=f"dy/dtau of eq. 8 by differences along its flow at w = {W.tolist()} m, q_dot = {Q_DOT.tolist()} "
-        f"rad/s, epsilon = {EPSILON:g}, against both right-hand sides, h's rate along the motion taken as dh/dt",
+        **said("errata/fast-error", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
     )
 
 
@@ -62,15 +58,10 @@ def boundary_layer_sign() -> Erratum:
     printed = np.linalg.eigvals(np.array(columns).T).real
     return Erratum(
         key="boundary-layer-sign",
-        where="eq. 13",
-        printed="Re lambda(grad_y g) <= Re lambda(grad_y phi_z^-1 phi) <= c <= 0",
-        correct="Re lambda(grad_y (-phi_z^-1 phi)) <= c < 0, and it is -1: at y = 0 the gradient is minus the "
-        "identity. c = 0 would not give exponential stability",
         difference=float(printed.max()),
         agreement=float(np.abs(printed - 1.0).max()),
         unit="1 (per unit of fast time)",
-        measured="largest real part of the eigenvalues of grad_y phi_z^-1 phi on the manifold, which eq. 13 wants "
-        "below zero; how far those of the correct form are from -1",
+        **said("errata/boundary-layer-sign"),
     )
 
 
@@ -86,16 +77,11 @@ def coriolis_arguments() -> Erratum:
 
     return Erratum(
         key="coriolis-arguments",
-        where="eqs. 8, 16 and 17",
-        printed="C(q, z, q_dot) in eq. 8, C(q, q_dot, z, z_dot) in eqs. 16 and 17",
-        correct="two different matrices off the manifold: eq. 8's z_dot contains phi/epsilon. The program offers both "
-        "(`coriolis_velocity`); eq. 8's is the default, and Tikhonov's theorem covers only it from a moving start",
         difference=apart(at, W),
         agreement=apart(on, np.zeros(2)),
         unit="kg m²/s",
-        measured=f"largest difference of the two at w = {W.tolist()} m and at w = 0, q_dot = {Q_DOT.tolist()} rad/s, "
-        f"epsilon = {EPSILON:g}",
         commands=("./scripts/experiment paper tikhonov-velocity",),
+        **said("errata/coriolis-arguments", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
     )
 
 
@@ -105,13 +91,10 @@ def gravity_arguments() -> Erratum:
     h_of_q, h, own = (Terms(mechanism, where, np.zeros(4)).h for where in (on, at, at))
     return Erratum(
         key="gravity-arguments",
-        where="eq. 16, h(q)",
-        printed="u = D(q, z) a + C v + h(q) - K_D r",
-        correct="h(q, z), as in eq. 8: only then does gravity cancel in eq. 17 while w is not zero",
         difference=float(np.abs(h_of_q - own).max()),
         agreement=float(np.abs(h - own).max()),
         unit="N m",
-        measured=f"what is left in eq. 17 at w = {W.tolist()} m with h(sigma(q)), and with h(q, z)",
+        **said("errata/gravity-arguments", w=W.tolist()),
     )
 
 

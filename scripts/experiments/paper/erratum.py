@@ -9,7 +9,7 @@ __all__ = ["Erratum"]
 
 @dataclass(frozen=True)
 class Erratum:
-    """A place where the paper is not as it should be.
+    """A place where the paper is not as it should be; its texts are in ``templates/errata``.
 
     Attributes
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 import subprocess
@@ -10,7 +11,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from jinja2 import meta
 
+from scripts.experiments.pages import environment
 from scripts.experiments.paper import page
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.contents import KEYS, SECTIONS, STUDIES
@@ -56,6 +59,20 @@ def test_the_committed_page_is_that_of_the_committed_verdicts() -> None:
     assert counts == {"holds": 10, "holds with a condition": 12, "does not hold": 4}
     found = re.findall(VERDICT, (DOCS / "paper.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert found == list(claims[["verdict", "key"]].itertuples(index=False, name=None))
+
+
+def test_templates_ask_for_what_studies_give() -> None:
+    """Most studies take minutes: a value without its place in a template, or the reverse, would show late."""
+    known, named = environment(), set()
+    for module in (ROOT / "scripts" / "experiments" / "paper").glob("*.py"):
+        for call in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            if not isinstance(call, ast.Call) or getattr(call.func, "id", "") != "said":
+                continue
+            name = ast.literal_eval(call.args[0])
+            template = known.parse(known.loader.get_source(known, f"{name}.md.j2")[0])
+            assert meta.find_undeclared_variables(template) == {given.arg for given in call.keywords}, name
+            named.add(name)
+    assert named == {f"errata/{key}" for key in ERRATA}
 
 
 def test_what_is_quick_still_has_its_committed_verdict(tmp_path: Path) -> None:
