@@ -20,6 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, five_bar_problem, on_level, sample, vector
 
@@ -210,16 +211,9 @@ def _layer_claim(layer: Layer, figures: Path) -> Claim:
     name = save(figure, figures, "boundary_layer.png")
     return Claim(
         key="boundary-layer",
-        where="section II-A, eqs. 10 to 12",
-        says="in fast time z - h follows dy/dτ = -φ_z⁻¹(q, y + h) φ(q, y + h), which decays exponentially",
-        found=(
-            f"Along eq. 12 φ = w(0) exp(-τ) exactly, and |y| ≤ {layer.factor:.3f} |y(0)| exp(-τ). The SPF's y leaves "
-            f"the solution of eq. 12 by {', '.join(f'{m:.1e}' for m in layer.misses)} rad at ε = "
-            f"{', '.join(f'{e:.0e}' for e in layer.epsilons)} (largest over τ ≤ {layer.taus[-1]:g}): order "
-            f"{orders[-1]:.3f} in ε, from the first instant on, not only after t_b."
-        ),
         verdict="holds" if abs(orders[-1] - 1) <= 0.05 and layer.factor < 2 else "does not hold",
         figures=(name,),
+        **said("claims/boundary-layer", layer=layer, order=orders[-1]),
     )
 
 
@@ -238,22 +232,21 @@ def _eigenvalue_claim(problem: Problem, figures: Path) -> Claim:
     name = _draw_eigenvalues(inside, times, on.real, off, radius, figures)
     miss = float(np.abs(on + 1).max())
     stable = bool(np.nanmax(off) < 0) and missing == 0
-    branch = "all of them on the branch" if missing == 0 else f"{missing} instants with some off the branch"
     return Claim(
         key="eq-13",
-        where="section II-A, eq. 13",
-        says="Re λ{∇_y g(t, x, y + h, 0)} ≤ Re λ{∇_y φ_z⁻¹ φ} ≤ c ≤ 0, hence exponential stability",
-        found=(
-            f"At y = 0 the gradient of g = -φ_z⁻¹ φ is -I in every non-singular configuration: along {SCENE} its "
-            f"eigenvalues are -1 to {miss:.1g}. The second term as printed lacks g's minus sign, its eigenvalues are "
-            f"{-on.real.min():+.3f}, so that the chain would read -1 ≤ +1 ≤ c ≤ 0. Right is Re λ{{∇_y g}} = "
-            f"Re λ{{∇_y(-φ_z⁻¹ φ)}} ≤ c < 0, with c = -1; and c = 0 would not give exponential stability. Off the "
-            f"manifold, |w| = {radius:.4g} m in {around.shape[1]} sampled directions ({branch}), the real parts lie "
-            f"between {np.nanmin(off):.3f} and {np.nanmax(off):.3f} along the run, and between {inside.min():.3f} and "
-            f"{inside.max():.3f} along the boundary layer."
-        ),
         verdict="holds with a condition" if stable and miss < 1e-9 else "does not hold",
         figures=(name,),
+        **said(
+            "claims/eq-13",
+            scene=SCENE,
+            miss=miss,
+            printed=-on.real.min(),
+            radius=radius,
+            directions=around.shape[1],
+            missing=missing,
+            off=(np.nanmin(off), np.nanmax(off)),
+            inside=(inside.min(), inside.max()),
+        ),
     )
 
 

@@ -12,7 +12,7 @@ Verdict = Literal["holds", "holds with a condition", "does not hold"]
 
 @dataclass(frozen=True)
 class Claim:
-    """One row of docs/paper.md.
+    """One row of docs/paper.md; its texts are in ``templates/claims``.
 
     Attributes
     ----------

@@ -13,6 +13,7 @@ import numpy as np
 
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import Problem, difference, end_of, five_bar_problem
 
@@ -77,23 +78,22 @@ def claims(figures: Path) -> list[Claim]:
     name = _draw(found, figures)
     worst = max(float((each.printed / each.radau).max()) for each in found)
     same = all(bool(np.all(each.eq_17 == each.dop853)) for each in found)
-    tolerances = ", ".join(f"{each.rtol:.0e}" for each in found)
-    largest = ", ".join(f"{each.printed.max():.1e}" for each in found)
     return [
         Claim(
             key="epsilon-irrelevant",
-            where="section III-B: ε = 1e-3 'based on trial and error in order to give satisfactory accuracy'",
-            says="the accuracy of the SPF in the paper's experiments, which start on φ = 0, depends on ε",
-            found=(
-                "It does not. From w(0) = 0, q̇(0) ≠ 0, eq. 8 as printed (Radau) differs from the DAE at t = "
-                f"{T_END:g} s by at most {largest} for ε = {PRINTED[0]:g} ... {PRINTED[-1]:.0e} at rtol {tolerances}: "
-                f"it follows the tolerance, and is at most {worst:.1f} times what Radau makes of the reduced model, "
-                f"which has no ε. Eq. 17 (DOP853) gives {'bit for bit' if same else 'not exactly'} the reduced model's "
-                f"numbers for every ε down to {EQ_17[-1]:.0e}, since w = 0 is its exact solution."
-            ),
             verdict="does not hold" if same and worst < 10 else "holds",
             figures=(name,),
             table=_table(found),
+            **said(
+                "claims/epsilon-irrelevant",
+                t_end=T_END,
+                largest=[each.printed.max() for each in found],
+                printed=(PRINTED[0], PRINTED[-1]),
+                rtols=[each.rtol for each in found],
+                worst=worst,
+                same=same,
+                least=EQ_17[-1],
+            ),
         )
     ]
 

@@ -14,6 +14,7 @@ from ckc_pin.mechanism.configuration import Kinematics, Psi
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import PrintedSpf
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import march
 from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED
@@ -138,18 +139,13 @@ def _psi_claim(checks: dict[str, PsiCheck]) -> Claim:
     )
     return Claim(
         key="implicit-function",
-        where="section II, eqs. 3 to 5",
-        says="The map sigma exists where the Jacobian Psi_{q'} is non-singular, and rho = -Psi_{q'}^-1 Psi_q.",
-        found="With the last rows of Psi selecting q, |det Psi_{q'}| = |det phi_z| at every configuration tried, on "
-        "the closure and off it, so that Psi_{q'} is non-singular exactly where phi_z is; rho by eq. 5 and the "
-        "program's rho from phi_z alone agree. At solved singular configurations det Psi_{q'} vanishes and the matrix "
-        "does not: Psi_{q'} = 0 in the paper means the determinant.",
         verdict="holds" if worst < 1e-9 else "does not hold",
         table=(
             ("mechanism", "states", "|det Psi| - |det phi_z|, relative", "rho, relative", "|det Psi| where singular",
              "|Psi| there"),
             rows,
         ),
+        **said("claims/implicit-function"),
     )  # fmt: skip
 
 
@@ -160,19 +156,14 @@ def _domain_claim() -> Claim:
     stopped = not beyond.arrived.any()
     return Claim(
         key="spf-domain",
-        where="section II-A",
-        says="The domain of validity of the SPF may be shown to be a superset of the non-singular workspace V'.",
-        found=f"As the set where eq. 8 is defined: yes. It needs a regular phi_z(q, z) and no phi = 0: at "
-        f"{len(beyond.sigma_min)} random (q, z) whose q no closed configuration has, sigma_min(phi_z) is "
-        f"{beyond.sigma_min.min():.2g} m or more and eq. 8 starts. As a domain where it stands for the mechanism: no. "
-        f"From those starts, without control and from rest, {int(beyond.arrived.sum())} of {len(beyond.arrived)} reach "
-        f"phi = 0: w decays, phi = w can be met no longer, and eq. 8 stops at a singular phi_z after "
-        f"{beyond.layers.min():.2g} to {beyond.layers.max():.2g} epsilon. From random z over q that can be reached "
-        f"{int(over.arrived.sum())} of {len(over.arrived)} arrive{_others(over)}. From phi = 0 the SPF is the reduced "
-        "model, and both end where phi_z is singular.",
         verdict="holds with a condition" if larger and stopped else "holds" if larger else "does not hold",
+        **said(
+            "claims/spf-domain",
+            starts=len(beyond.arrived),
+            sigma_min=beyond.sigma_min.min(),
+            arrived=beyond.arrived.sum(),
+            layers=(beyond.layers.min(), beyond.layers.max()),
+            over_starts=len(over.arrived),
+            over_arrived=over.arrived.sum(),
+        ),
     )
-
-
-def _others(over: Beyond) -> str:
-    return "" if over.arrived.all() else ", the others meet a singular phi_z on the way"

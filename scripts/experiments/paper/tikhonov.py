@@ -15,6 +15,7 @@ import numpy as np
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
+from scripts.experiments.pages import said
 from scripts.experiments.paper import boundary_layer
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, difference, end_of, five_bar_problem, vector
@@ -131,18 +132,18 @@ def order_claim(rest: Convergence, moving: Convergence, start: str, figure: str)
     ]
     return Claim(
         key="tikhonov-order",
-        where="section II-A, eqs. 9 to 13",
-        says="after the boundary layer x - x̄ = O(ε) and z - h(t, x̄) = O(ε)",
-        found=(
-            f"Free motion of the five-bar, {start}, C at ρ q̇ (eq. 8), SPF against DAE at t = {T_END:g} s. Over the "
-            f"last two decades of ε the observed orders of (q, q̇) and of z lie between {last.min():.3f} and "
-            f"{last.max():.3f}. " + _certainty(rest, moving)
-        ),
         verdict="holds" if good else "does not hold",
         figures=(figure,),
         table=(
             ("ε", *(f"{s}: {c}" for s in ("rest", "moving") for c in ("(q, q̇)", "order", "z", "order"))),
             tuple(rows),
+        ),
+        **said(
+            "claims/tikhonov-order",
+            start=start,
+            t_end=T_END,
+            orders=(last.min(), last.max()),
+            certainty=_certainty(rest, moving),
         ),
     )
 
@@ -150,8 +151,6 @@ def order_claim(rest: Convergence, moving: Convergence, start: str, figure: str)
 def velocity_claim(
     rest: Convergence, moving: Convergence, corrected: Convergence, before: Problem, behind: Problem, figure: str
 ) -> Claim:
-    floor = moving.x[-1]
-    jump = f"{vector(before.q_dot)} to {vector(behind.q_dot)} rad/s"
     rows = [
         (f"{epsilon:.0e}", *_cells(rest, k)[:2], *_cells(moving, k)[:2], *_cells(corrected, k)[:2])
         for k, epsilon in enumerate(rest.epsilons)
@@ -160,28 +159,28 @@ def velocity_claim(
     converges = bool(np.all(np.abs(moving.orders[-2:] - 1) <= ORDER_MARGIN))
     return Claim(
         key="tikhonov-velocity",
-        where="section II-C, eq. 16, against eq. 8",
-        says="the SPF with C(q, q̇, z, ż), as eq. 16 writes it, approximates the DAE to O(ε) too",
-        found=(
-            f"From a moving start it does not: the difference stays at {floor:.2e} down to ε = "
-            f"{moving.epsilons[-1]:.0e}. With the actual ż, f of eq. 9 contains 1/ε, which Tikhonov's theorem "
-            f"excludes. The layer takes q̇ from {jump} in the limit, at equal kinetic energy, and it is the DAE from "
-            f"there that the SPF approaches, at order {corrected.orders[-1]:.3f}. From rest there is nothing to turn: "
-            f"order {rest.orders[-1]:.3f}. " + _certainty(rest, moving, corrected)
-        ),
         verdict="holds" if converges else "does not hold",
         figures=(figure,),
         table=(("ε", *heads), tuple(rows)),
+        **said(
+            "claims/tikhonov-velocity",
+            floor=moving.x[-1],
+            epsilon=moving.epsilons[-1],
+            before=before.q_dot,
+            behind=behind.q_dot,
+            corrected=corrected.orders[-1],
+            rest=rest.orders[-1],
+            certainty=_certainty(rest, moving, corrected),
+        ),
     )
 
 
 def _certainty(*studies: Convergence) -> str:
     unsure = max(float(np.max(np.append(s.x_uncertainty / s.x, s.z_uncertainty / s.z))) for s in studies)
-    enough = "below" if all(s.resolved for s in studies) else "NOT below"
-    return (
-        f"Measured twice, {FIRST[0]} on SPF and DAE, {SECOND[0]} on SPF and reduced model, rtol {FIRST[1]:g}: the two "
-        f"agree to {unsure:.0e} of each difference or better, {enough} the tenth that is asked for."
-    )
+    resolved = all(s.resolved for s in studies)
+    (first, rtol), (second, _) = FIRST, SECOND
+    text = said("claims/measured_twice", first=first, second=second, rtol=rtol, unsure=unsure, resolved=resolved)
+    return str(text["certainty"])
 
 
 def _cells(c: Convergence, k: int) -> tuple[str, str, str, str]:
