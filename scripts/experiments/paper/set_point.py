@@ -13,6 +13,7 @@ from ckc_pin.analysis.gradient import Bound
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.set_point_experiments import (
@@ -71,23 +72,22 @@ def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
     worst = max(r.largest_increase for r in records.values())
     return Claim(
         key="set-point-lyapunov",
-        where="section II-B, after eq. 15",
-        says="Along eq. 14's closed loop the Lyapunov function's rate is -q_dot^T K_V q_dot, so it never grows.",
-        found=(
-            f"In every formulation V_L falls from {records[rows[0][0]].value[0]:.2f} J to rounding: its largest "
-            f"increase between output instants is {worst:.1e} J. A spline's derivative of the recorded function agrees "
-            f"with -q_dot^T K_V q_dot to {max(r.mismatch for r in records.values()):.1e} of its largest value."
-        ),
         verdict="holds" if holds else "does not hold",
         figures=(draw_lyapunov(records, figures),),
         table=(("formulation", "largest increase / J", "rounding / J", "rate: relative difference"), rows),
+        **said(
+            "claims/set-point-lyapunov",
+            start=records[rows[0][0]].value[0],
+            increase=worst,
+            mismatch=max(r.mismatch for r in records.values()),
+        ),
     )
 
 
 def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list[list[Bound]], figures: Path) -> Claim:
     """Judge bounds on dh/dq by branch, once it is what differences of h say."""
     error, asymmetry, used = checked
-    own, tail = branches[0], branches[0][-2:]
+    own, tail, gain = branches[0], branches[0][-2:], case.controller.K_P[0, 0]
     exponent = np.log(tail[1].norm / tail[0].norm) / np.log(tail[0].margin / tail[1].margin)
     bounded = exponent < 0.1 and error <= EXACT
     rows = tuple(
@@ -97,24 +97,26 @@ def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list
     of = ["assembled branch", *(f"branch {k + 2}" for k in range(len(branches) - 1))]
     return Claim(
         key="set-point-gradient-bound",
-        where="section II-B, before eq. 15",
-        says="The gradient of h is bounded by M_1, and K_P may be chosen with k_pi > M_1.",
-        found=(
-            f"dh/dq by the chain rule through sigma agrees with differences of h at {used} random configurations to "
-            f"{error:.1e}, and is symmetric to {asymmetry:.1e}. On |s| >= s_min it has a bound, but that grows as "
-            f"{tail[1].norm * tail[1].margin ** 3:.3f} / s_min^{exponent:.2f} towards type 2: over the whole "
-            f"non-singular workspace there is no M_1. K_P = 10 I exceeds it on |s| >= {_margin_where(own, 10.0)} only."
-        ),
         verdict="holds" if bounded else "holds with a condition",
         figures=(draw_bounds(branches, case.controller.K_P, figures),),
         table=(("|s| >=", *(f"M_1, {x}" for x in of), *(f"least eigenvalue, {x}" for x in of)), rows),
+        **said(
+            "claims/set-point-gradient-bound",
+            used=used,
+            error=error,
+            asymmetry=asymmetry,
+            factor=tail[1].norm * tail[1].margin ** 3,
+            exponent=exponent,
+            gain=gain,
+            margin=_margin_where(own, gain),
+        ),
     )
 
 
-def _margin_where(branch: list[Bound], norm: float) -> str:
+def _margin_where(branch: list[Bound], norm: float) -> float:
     """Interpolate log M_1 over log s_min for the margin at which M_1 is a given value."""
     s, m = (np.log([getattr(bound, name) for bound in branch]) for name in ("margin", "norm"))
-    return f"{np.exp(np.interp(np.log(norm), m, s)):.2f}"
+    return float(np.exp(np.interp(np.log(norm), m, s)))
 
 
 def gain_claim(
@@ -137,21 +139,13 @@ def gain_claim(
     certified = sum(c.status == "certified" for _, c in certificates.values())
     return Claim(
         key="set-point-gain-condition",
-        where="section II-B",
-        says="With K_P above M_1 the candidate is a Lyapunov function, and q_d is asymptotically stable.",
-        found=(
-            f"The scene starts at V_L = {own.level:.3g} J. Not decided for the whole of it: {own.reason}. "
-            f"Up to V_L = {own.safe_level:.3g} J the argument holds, and the run is below that from "
-            f"t = {entered:.3f} s on. Larger gains do not help: they raise V_L there and at the singular one alike. "
-            f"Of the {len(rows)} starts and gains in the table {certified} are certified. The set is searched on a "
-            "lattice, and on from there where the values are least."
-        ),
         verdict="holds" if own.status == "certified" else "holds with a condition",
         figures=(draw_set(case, own, run, DIVISIONS, figures),),
         table=(
             ("start, gain", "verdict", "V_L(start) / J", "safe up to / J", "least eigenvalue", "least |s|", "points"),
             rows,
         ),
+        **said("claims/set-point-gain-condition", own=own, entered=entered, cases=len(rows), certified=certified),
     )
 
 
@@ -168,18 +162,18 @@ def uniqueness_claim(
     target = certificates[own_name][0].controller.q_d
     return Claim(
         key="set-point-unique",
-        where="section II-B, eq. 15",
-        says="The condition on K_P is sufficient for q = q_d to be the only solution of eq. 15.",
-        commands=(f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60",),
-        found=(
-            "With the sign of its left side put right (see the errata): "
-            f"Newton from points all over the sublevel set finds {'q_d alone' if unique else 'more than q_d'} where "
-            f"the gain condition is certified; at the scene's own start and gain it finds {len(solutions[own_name])}. "
-            f"With K_P = 0.5 I there are {len(solutions[low_name])} solutions, and the run ends at ({_numbers(q)}), "
-            f"{distance:.0e} rad from one of them, instead of ({_numbers(target)})."
-        ),
         verdict="holds" if unique else "does not hold",
+        commands=(f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60",),
         table=(("start, gain", "gain condition", "solutions", "stable", "stable at / rad"), rows),
+        **said(
+            "claims/set-point-unique",
+            unique=unique,
+            own=len(solutions[own_name]),
+            low=len(solutions[low_name]),
+            end=q,
+            distance=distance,
+            target=target,
+        ),
     )
 
 

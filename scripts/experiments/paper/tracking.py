@@ -14,6 +14,7 @@ from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.tree import Array
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.deviations import PERIOD, Deviation
 from scripts.experiments.paper.lyapunov import Record
@@ -94,20 +95,21 @@ def lyapunov_claim(
     drawn = {f"C at {VELOCITY[name]}": off[layer, name, True] for name in VELOCITY}
     return Claim(
         key="tracking-lyapunov",
-        where="section II-C, eqs. 18 and 19",
-        says="Along the closed loop dV/dt = -q_tilde_dot^T K_D q_tilde_dot - q_tilde^T Lambda^T K_D Lambda q_tilde "
-        "- (1/epsilon) w^T M w, with d_1 = d_2 = 1: the desired trajectory is asymptotically stable.",
-        found=(
-            "From w(0) = 0 a spline's derivative of the recorded function agrees with eq. 19 to "
-            f"{max(x.mismatch for x in on):.1e} of its largest value, for the SPF, the reduced model and the DAE "
-            f"alike, and V falls from {next(iter(first.values())).value[0]:.3g} J to {whole.value[-1]:.2g} J in "
-            f"{whole.t[-1]:g} s. From w(0) = {W0} m it agrees, the term of w included, to {actual:.1e} when C takes "
-            f"the actual velocity (eq. 16); when C takes rho q_dot (eq. 8) it is off by up to {rho:.2g} of its largest "
-            f"value in the boundary layer. V rises in {rising} of {len(on) + len(off)} records."
-        ),
         verdict="does not hold" if not kept else "holds" if rho <= SAME else "holds with a condition",
         figures=(draw_lyapunov(whole, drawn, layer, figures),),
         table=(("run", "w(0) / m", "C at", "t / s", "rate: relative difference", "V rises by / J"), tuple(rows)),
+        **said(
+            "claims/tracking-lyapunov",
+            on=max(x.mismatch for x in on),
+            start=next(iter(first.values())).value[0],
+            end=whole.value[-1],
+            t_end=whole.t[-1],
+            w=W0,
+            actual=actual,
+            rho=rho,
+            rising=rising,
+            records=len(on) + len(off),
+        ),
     )
 
 
@@ -131,17 +133,6 @@ def skew_claim(found: Mapping[float, Skewness]) -> Claim:
     mixed = [x.off_actual_rho for x in found.values()]
     return Claim(
         key="tracking-skew",
-        where="section II-C, eq. 19",
-        says="D_dot - 2 C is skew-symmetric, so that its term in eq. 19 vanishes.",
-        found=(
-            f"Over {next(iter(found.values())).states} random states, D_dot by differences of D. On phi = 0 it is, to "
-            f"{on:.1e} of D_dot's largest entry. Off it D_dot belongs to the perturbed flow, with w / epsilon in "
-            f"z_dot: with C at that actual velocity (eq. 16) S = D_dot - 2 C is skew to {actual:.1e}; with C at rho "
-            f"q_dot (eq. 8) it is not, S + S^T is {min(mixed):.2g} to {max(mixed):.2g} of D_dot, which tends to 2 for "
-            "small epsilon: "
-            "D_dot grows with w / epsilon and C does not. C at rho q_dot belongs to the flow on the level set of phi: "
-            f"skew there to {level:.1e}."
-        ),
         verdict=(
             "does not hold" if max(on, level, actual) > SKEW
             else "holds" if max(mixed) <= SKEW
@@ -151,6 +142,10 @@ def skew_claim(found: Mapping[float, Skewness]) -> Claim:
             ("epsilon", "phi = 0", "off: level set, C at rho q_dot", "off: actual, C at actual",
              "off: actual, C at rho q_dot"),
             rows,
+        ),
+        **said(
+            "claims/tracking-skew", states=next(iter(found.values())).states, on=on, actual=actual,
+            mixed=(min(mixed), max(mixed)), level=level,
         ),
     )  # fmt: skip
 
@@ -178,22 +173,13 @@ def gains_claim() -> Claim:
         rows.append((name, _yes(symmetric), f"{gap:.2g}", f"{printed:.2g}", *lows, _yes(accepted(Lambda, K_D))))
     return Claim(
         key="tracking-gains",
-        where="section II-C, eqs. 18 and 19",
-        says="Eq. 18 is positive and eq. 19 follows for gains with positive definite weights.",
-        found=(
-            "As quadratic forms in (q_tilde, q_tilde_dot), with D_dot - 2 C skew. Where Lambda^T K_D is symmetric "
-            f"eq. 19's last line is -dV_1/dt (to {max(fits):.1e}), otherwise it is off by {min(misfits):.2g} and more: "
-            "the cross terms of r^T K_D r and of d/dt q_tilde^T Lambda^T K_D q_tilde cancel only then. A positive "
-            "definite symmetric part is not enough: in the last row V is positive, and -dV_1/dt has the eigenvalue "
-            f"{rows[-1][5]}. The line before as printed, with -2 q_dot^T Lambda K_D q_tilde, is off by {rows[0][3]} "
-            "with eq. 22's gains, even with the error's rate for q_dot (see the errata)."
-        ),
         verdict="holds with a condition" if max(fits) <= 1e-10 < min(misfits) else "does not hold",
         table=(
             ("gains", "Lambda^T K_D symmetric", "last line: off by", "line before: off by",
              "least eigenvalue: Lambda^T K_D", "least eigenvalue: -dV_1/dt", "accepted by the program"),
             tuple(rows),
         ),
+        **said("claims/tracking-gains", fit=max(fits), misfit=min(misfits), eigenvalue=rows[-1][5], printed=rows[0][3]),
     )  # fmt: skip
 
 
@@ -221,27 +207,24 @@ def deviations_claim(t: Array, error: Array, found: Mapping[str, Deviation], fig
     periodic = [name for name, x in found.items() if _periodic(x)]
     return Claim(
         key="tracking-deviations",
-        where="section III-C",
-        says="The SPF exactly follows the desired trajectory, but the more exact reduced model periodically sees some "
-        "deviations, which are soon corrected by the controller; the stability result is applicable only for the SPF.",
-        found=(
-            f"The two are the same system: after the first period eq. 8, solved tightly, is {largest:.1e} rad from the "
-            "reduced model, both converge to the desired trajectory like e^-t, and eq. 19 holds for both (see "
-            "tracking-lyapunov). A deviation is numerical. A loose tolerance of the integrator makes "
-            f"{min(x.largest for x in loose):.0e} to {max(x.largest for x in loose):.0e} rad, in either "
-            f"formulation, at most {max(x.repeats for x in loose):.2f} of the variance repeating every 2 pi s. "
-            f"A sigma that leaves |phi| up to {max(x.open for x in shared):.0e} m, the same z in plant and "
-            f"controller, makes {max(x.largest for x in shared):.0e} rad in q: eq. 16 cancels whatever D, C, h "
-            "that z gives. A controller that solves sigma by itself, from its last z to "
-            f"{max(x.open for x in own):.0e} m, makes {max(x.largest for x in own):.0e} rad, "
-            f"{min(x.repeats for x in own):.2f} of the variance repeating; the SPF has z in its state and "
-            f"needs no such sigma. Periodic, with more than {PERIODIC:g} repeating: {', '.join(periodic) or 'none'}."
-        ),
         verdict="does not hold" if largest < EXACT else "holds",
         figures=(draw_deviations(t, error, {name: found[name] for name in SHOWN}, figures),),
         table=(
             ("run", "largest deviation / rad", "share that repeats", "strongest period / 2 pi s", "largest |phi| / m"),
             tuple((name, *_deviation_cells(x)) for name, x in found.items()),
+        ),
+        **said(
+            "claims/tracking-deviations",
+            tight=largest,
+            loose=(min(x.largest for x in loose), max(x.largest for x in loose)),
+            loose_repeats=max(x.repeats for x in loose),
+            shared=max(x.largest for x in shared),
+            shared_open=max(x.open for x in shared),
+            own=max(x.largest for x in own),
+            own_open=max(x.open for x in own),
+            own_repeats=min(x.repeats for x in own),
+            share=PERIODIC,
+            periodic=periodic,
         ),
     )
 
