@@ -8,6 +8,7 @@ from typing import Any
 
 from ckc_pin.simulation.scene import load_scene
 from scripts.experiments.chart import COLOURS, chart, save
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.cost import EPSILONS, METHODS, Cost, Search, cheapest, study
 from scripts.experiments.paper.experiment import Problem
@@ -41,62 +42,40 @@ def cost_claim(found: Found, figures: Path) -> Claim:
         for costs in found.values()
         for epsilon in PAPER
     )
-    sentences = [_sigma(found), *(_cheapest(name, costs) for name, costs in found.items()), _unaffordable(found)]
     return Claim(
         key="cost",
-        where="section III-B",
-        says=(
-            "a nonlinear solver will have to be employed at each step for the reduced model, while the SPF "
-            "does not involve this cost"
-        ),
-        found=" ".join(sentences).strip(),
         verdict=("holds" if saved else "holds with a condition") if literal else "does not hold",
         figures=(_draw(found, figures),),
         table=_table(found),
+        **_text(found),
     )
 
 
-def _sigma(found: Found) -> str:
+def _text(found: Found) -> dict[str, Any]:
     """Say what sigma adds to a right-hand side and epsilon to their number, from the first scene's explicit runs."""
     scene = next(iter(found))
-    costs = [c for c in found[scene] if c.method == METHODS[0]]
-    reduced, printed = (next(c for c in costs if c.formulation == name) for name in ("reduced", "eq. 8"))
+    explicit = [c for c in found[scene] if c.method == METHODS[0]]
+    reduced, printed = (next(c for c in explicit if c.formulation == name) for name in ("reduced", "eq. 8"))
     with_sigma, without = (1e6 * c.seconds / c.count("rhs") for c in (reduced, printed))
-    stiffest = min((c for c in costs if c.epsilon and not c.reason), key=lambda c: c.epsilon or 0.0)
-    step = SCENES[scene] / stiffest.count("steps") / (stiffest.epsilon or 1.0)
-    return (
-        f"True of σ itself: the reduced model makes {reduced.count('newton') / reduced.count('rhs'):.2f} Newton "
-        f"corrections a right-hand side ({METHODS[0]}), eq. 8 none; a right-hand side takes {with_sigma:.0f} against "
-        f"{without:.0f} µs. But ε makes eq. 8 stiff: {METHODS[0]}'s steps are {step:.1f} ε on average at ε = "
-        f"{stiffest.epsilon:.0e}, and an implicit method is itself a nonlinear solver at each step, on more unknowns. "
-        f"At equal error (≤ {Search().target:g} at the end; processor time in NumPy; SciPy's methods, Jacobians by "
-        "differences for all):"
+    stiffest = min((c for c in explicit if c.epsilon and not c.reason), key=lambda c: c.epsilon or 0.0)
+    asked = (("reduced", None), *(("eq. 8", epsilon) for epsilon in PAPER), ("DAE", None))
+    return said(
+        "claims/cost",
+        method=METHODS[0],
+        corrections=reduced.count("newton") / reduced.count("rhs"),
+        with_sigma=with_sigma,
+        without=without,
+        step=SCENES[scene] / stiffest.count("steps") / (stiffest.epsilon or 1.0),
+        epsilon=stiffest.epsilon,
+        target=Search().target,
+        cheapest={name: [cheapest(costs, *which) for which in asked] for name, costs in found.items()},
+        stopped=[
+            (name, cost)
+            for name, costs in found.items()
+            for cost in costs
+            if cost.reason and cost.outcome and cost.epsilon is not None
+        ],
     )
-
-
-def _cheapest(name: str, costs: Sequence[Cost]) -> str:
-    parts = [_words("reduced", cheapest(costs, "reduced"))]
-    parts += [_words(f"eq. 8 at ε = {epsilon:.0e}", cheapest(costs, "eq. 8", epsilon)) for epsilon in PAPER]
-    parts += [_words("DAE", cheapest(costs, "DAE"))]
-    return f"{name}, cheapest method each: {'; '.join(parts)}."
-
-
-def _words(what: str, cost: Cost) -> str:
-    numbers = {"rhs": "right-hand sides", "newton": "corrections of σ", "jacobians": "Jacobians"}
-    counts = ", ".join(f"{cost.count(key)} {words}" for key, words in numbers.items())
-    return (
-        f"{what} {1e3 * cost.seconds:.0f} ms ({cost.method}: {counts}, {cost.count('factorizations')} factorizations)"
-    )
-
-
-def _unaffordable(found: Found) -> str:
-    stopped = [
-        f"{name}, {cost.method}, ε = {cost.epsilon:.0e}: {cost.reason}"
-        for name, costs in found.items()
-        for cost in costs
-        if cost.reason and cost.outcome and cost.epsilon is not None
-    ]
-    return f"Runs that do not reach it: {'; '.join(stopped)}; nor, then, at smaller ε." if stopped else ""
 
 
 def _table(found: Found) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:

@@ -23,6 +23,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import LevelSet, force_of
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.simulate import simulate
+from scripts.experiments.pages import said
 from scripts.experiments.paper.along_eq21 import tracking
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import march
@@ -152,14 +153,10 @@ def _appendix() -> Claim:
     good = all(float(cell) < 1e-12 for row in rows for cell in row[2:])
     return Claim(
         key="appendix",
-        where="appendix, eqs. 23 to 26, Table I",
-        says="The terms of the open chains.",
-        commands=('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',),
-        found=f"Pinocchio's terms of the shipped URDFs against the printed equations at {STATES} random states: D' and "
-        "h' are the same; C' v' is once eq. 25's squares are dropped (see the errata: coriolis-power, coriolis-skew, "
-        "closure-angles and table-rows). Both readings of Table I are shipped.",
         verdict="holds with a condition" if good else "does not hold",
+        commands=('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',),
         table=(("mechanism", "rows of links 1 to 4", "D' (eq. 24)", "C' v' (eq. 25)", "h' (eq. 26)"), tuple(rows)),
+        **said("claims/appendix", states=STATES),
     )
 
 
@@ -168,14 +165,10 @@ def _equilibrium(run: Run) -> Claim:
     at = mechanism.kinematics(run.q_tree[0])
     h = float(np.abs(Terms(mechanism, at, np.zeros(4)).h).max())
     stiffness = np.linalg.eigvalsh(h_gradient(mechanism, at))
-    angles = ", ".join(f"{x:.8f}" for x in at.q_tree)
     return Claim(
         key="initial-equilibrium",
-        where="section III-B, Fig. 3a",
-        says="The initial configuration happens to be a stable equilibrium for the system.",
-        found=f"The one shipped for both scenes is: (theta_1 ... theta_4) = ({angles}), |h| = {h:.0e} N m there, "
-        f"eigenvalues of dh/dq {stiffness[0]:.4f} and {stiffness[1]:.4f} N m/rad. The numbers are not in the paper.",
         verdict="holds" if h < 1e-10 and stiffness[0] > 0 else "does not hold",
+        **said("claims/initial-equilibrium", angles=at.q_tree, h=h, stiffness=tuple(stiffness)),
     )
 
 
@@ -186,16 +179,10 @@ def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
     error = max(float(np.abs(run.q_tree[-1][[0, 2]] - target).max()) for run in runs)
     return Claim(
         key="figure-3",
-        where="section III-B, Fig. 3",
-        says="The controller stabilizes the system at the desired configuration, and the SPF follows the reduced model "
-        "closely throughout.",
-        commands=("./scripts/demo",),
-        found=f"From a consistent start they are one system. Eq. 8 as printed (epsilon = {spf.scene['epsilon']:g}) and "
-        f"the reduced model differ by {q:.0e} rad and {u:.0e} N m at most over the run, the integrations' errors. The "
-        f"error at {spf.t[-1]:g} s is {error:.0e} rad. The target of Fig. 3a is not in the text; chosen here: both "
-        "proximal links 45 degrees up.",
         verdict="holds" if q < 1e-6 and error < 1e-6 else "does not hold",
+        commands=("./scripts/demo",),
         figures=tuple(name for name in drawn if name == "set_point.png"),
+        **said("claims/figure-3", epsilon=spf.scene["epsilon"], q=q, u=u, t_end=spf.t[-1], error=error),
     )
 
 
@@ -203,15 +190,10 @@ def _figure_4(runs: list[Run], drawn: list[str]) -> Claim:
     q, u = _apart(runs)
     return Claim(
         key="figure-4",
-        where="section III-C, Fig. 4",
-        says="Although the system starts from a completely different configuration, the controller makes the desired "
-        "trajectory convergent; its q-space picture is a closed ellipse.",
-        commands=("./scripts/demo",),
-        found="Reproduced over one and a half cycles. Eq. 8 as printed "
-        f"(epsilon = {runs[1].scene['epsilon']:g}) and the reduced model differ by {q:.0e} rad and {u:.0e} N m at "
-        "most. For the error at the end see tracking-error-law.",
         verdict="holds" if q < 1e-6 and all(run.status == "done" for run in runs) else "does not hold",
+        commands=("./scripts/demo",),
         figures=tuple(name for name in drawn if name == "tracking.png"),
+        **said("claims/figure-4", epsilon=runs[1].scene["epsilon"], q=q, u=u),
     )
 
 
@@ -227,16 +209,13 @@ def _torques(cases: dict[str, list[Run]]) -> Claim:
     )
     return Claim(
         key="torques",
-        where="sections III-B and III-C",
-        says=f"The gains keep the control within {FIRST:g} N m at first, in tracking within {LATER:g} N m in steady "
-        "state.",
-        commands=("./scripts/demo",),
-        found="They do, with the gains of eqs. 20 and 22 and the set-point target chosen here.",
         verdict="holds" if good else "does not hold",
+        commands=("./scripts/demo",),
         table=(
             ("case", "formulation", "largest |u| (N m)", "at t (s)", f"largest from {STEADY:g} s on (N m)"),
             tuple(rows),
         ),
+        **said("claims/torques", first=FIRST, later=LATER),
     )
 
 
@@ -249,13 +228,6 @@ def _law(laws: list[Law]) -> Claim:
     rows = tuple((law.name, *(f"{x:.4e}" for x in law.error), f"{law.steady_u:.2f}") for law in laws)
     return Claim(
         key="tracking-error-law",
-        where="section III-C, Figs. 4c and 4d",
-        says="The controller is effective: tracking converges as the figures show.",
-        found="It does, but the error says nothing about the model: r of eq. 17 dies out fast and "
-        f"q_tilde_dot = -q_tilde is left, whatever the plant. At t = {AT} s the error is {ratios.min():.4f} to "
-        f"{ratios.max():.4f} times e^-t of the initial one; without gravity, or with all masses and inertias doubled, "
-        f"in plant and controller alike, it moves by {moved:.0e} rad while the torques differ. With a controller whose "
-        f"model differs from the plant it is {other:.1e} rad: that, and the torques, do test the dynamics.",
         verdict="holds with a condition" if np.abs(ratios - 1).max() < 0.01 and other > 1e-3 else "does not hold",
         table=(
             (
@@ -266,6 +238,7 @@ def _law(laws: list[Law]) -> Claim:
             ),
             rows,
         ),
+        **said("claims/tracking-error-law", t=AT, ratios=(ratios.min(), ratios.max()), moved=moved, other=other),
     )
 
 

@@ -16,6 +16,7 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
+from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.crossing import Crossing, cross
 from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED, Links, elbow_distance, links, wrap
@@ -105,27 +106,28 @@ def _type_1(found: dict[str, list[Locus]], figure: str) -> Claim:
     printed = [locus for locus in found[PRINTED] if locus.name == "type 1"]
     spread = max(float(np.ptp(locus.curve.q_tree[:, [0, 2]], axis=0).max()) for locus in ours)
     turn = min(float(np.abs(np.diff(np.unwrap(locus.curve.q_tree[:, 1]))).sum()) for locus in ours)
-    at = " and ".join(f"({locus.q[0][0]:.6f}, {locus.q[0][1]:.6f})" for locus in ours)
     lengths = links(load(PRINTED))
+    opening = abs(lengths.l2 - lengths.l4)
     small = [locus for locus in found[PRINTED] if locus.name == "type 1, opened"]
     apart = [elbow_distance(lengths, *locus.q.T) for locus in small]
-    gap = max((float(np.abs(x - abs(lengths.l2 - lengths.l4)).max()) for x in apart), default=float("nan"))
+    gap = max((float(np.abs(x - opening).max()) for x in apart), default=float("nan"))
     fold = min(abs(locus.point.fold) for locus in found[PRINTED])
     return Claim(
         key="singular-type-1",
-        where="section III-A, Fig. 2",
-        says="In the Type 1 singularity theta_1 and theta_3 get locked on to particular values, links 2 and 4 "
-        "degenerate into a pendulum; it is a single point of the chosen coordinates.",
-        found=f"`{FIVE_BAR}`: the solver finds {len(ours)} such points, (theta_1, theta_3) = {at}: elbows coincident "
-        f"above and below the base. Along the traced curve through each, links 2 and 4 turn by {turn:.4f} rad, back "
-        f"to the start, while theta_1 and theta_3 move by {spread:.0e} rad at most. `{PRINTED}`: it finds "
-        f"{len(printed)}. Coincident elbows need l2 = l4; with l2 = {lengths.l2:.4f} m and l4 = {lengths.l4:.4f} m "
-        f"they stay |l2 - l4| = {abs(lengths.l2 - lengths.l4):.4f} m apart (to {gap:.0e} m along the {len(small)} "
-        "curves found instead): each point opens into a closed curve around a small unreachable hole, where two "
-        f"branches meet. How sharply they meet, y . d2phi[v, v], is at least {fold:.5f} m there; locked angles "
-        "would need 0.",
         verdict="holds with a condition" if len(ours) == 2 and not printed else "does not hold",
         figures=(figure,),
+        **said(
+            "claims/singular-type-1",
+            points=[locus.q[0] for locus in ours],
+            turn=turn,
+            spread=spread,
+            printed=len(printed),
+            lengths=lengths,
+            opening=opening,
+            gap=gap,
+            curves=len(small),
+            fold=fold,
+        ),
     )
 
 
@@ -142,14 +144,10 @@ def _type_2(found: dict[str, list[Locus]], figure: str) -> Claim:
             rows.append((name, f"{len(locus.q)}", kind, f"{lengths.l2 + lengths.l4:.4f}", f"{miss:.0e}"))
     return Claim(
         key="singular-type-2",
-        where="section III-A, Fig. 2",
-        says="In the Type 2 singularity links 2 and 4 lock against each other, the mechanism becomes effectively a "
-        "4-bar, and theta_1 and theta_3 have a functional relationship represented by a closed curve.",
-        found=f"Traced by continuation from solved points: {len(rows)} curves, one on each reading of Table I, on "
-        "which the distance of the elbows is l2 + l4. The other side of each is unreachable.",
         verdict="holds" if good and len(rows) == 2 else "does not hold",
         figures=(figure,),
         table=(("mechanism", "points", "curve", "l2 + l4 (m)", "largest deviation (m)"), tuple(rows)),
+        **said("claims/singular-type-2", curves=len(rows)),
     )
 
 
@@ -164,25 +162,25 @@ def _freedoms(every: list[tuple[str, Locus]], crossings: Sequence[tuple[str, str
         ))  # fmt: skip
     kept = all(locus.point.freedoms == 2 and locus.sigma_min_J > 1e-3 for _, locus in every)
     passed = [c for _, _, c in crossings]
-    signs = sum(c.changes_sign for c in passed)
     return Claim(
         key="singular-freedoms",
-        where="section III-A",
-        says="In both these singularities the system ceases to have two DOFs and becomes a single DOF system.",
-        found=f"By the rank of J it keeps two everywhere on all {len(every)} curves of both readings "
-        f"(sigma_min(J) >= {min(locus.sigma_min_J for _, locus in every):.3f}); what fails is the chart: phi_z has "
-        "rank 1, and the allowed velocities move (theta_1, theta_3) in one direction only. Another pair of coordinates "
-        f"is a chart at every point (sigma_min of its phi_z >= {min(x.least_chart for _, x in every):.3f}). Falling "
-        f"freely as a DAE the mechanism passes through: started {abs(passed[0].t[0]):g} s before, it is at the "
-        f"singular configuration to {max(c.returned for c in passed):.0e} rad and goes on, its energy kept to "
-        f"{max(c.energy_drift for c in passed):.0e} J; det phi_z changes sign in {signs} of {len(passed)} passages. "
-        "The reduced model, the SPF and both controllers live in the chart and stop there.",
         verdict="does not hold" if kept else "holds",
         figures=(figure,),
         table=(
             ("mechanism", "singularity", "rank J, freedoms", "least sigma_min(J)", "rank phi_z", "rank of q-part",
              "a chart there: sigma_min", "least along curve"),
             tuple(rows),
+        ),
+        **said(
+            "claims/singular-freedoms",
+            curves=len(every),
+            sigma_min_J=min(locus.sigma_min_J for _, locus in every),
+            least_chart=min(locus.least_chart for _, locus in every),
+            half=abs(passed[0].t[0]),
+            returned=max(c.returned for c in passed),
+            drift=max(c.energy_drift for c in passed),
+            signs=sum(c.changes_sign for c in passed),
+            passages=len(passed),
         ),
     )  # fmt: skip
 

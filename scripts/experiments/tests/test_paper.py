@@ -72,7 +72,7 @@ def test_templates_ask_for_what_studies_give() -> None:
             template = known.parse(known.loader.get_source(known, f"{name}.md.j2")[0])
             assert meta.find_undeclared_variables(template) == {given.arg for given in call.keywords}, name
             named.add(name)
-    assert named >= {f"errata/{key}" for key in ERRATA}
+    assert named >= {*(f"claims/{key}" for key in KEYS), *(f"errata/{key}" for key in ERRATA)}
 
 
 def test_what_is_quick_still_has_its_committed_verdict(tmp_path: Path) -> None:
