@@ -6,7 +6,8 @@
 >>> run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
 
 Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and the three formulations),
-`control`, `simulation`, and side by side `formats`, `analysis` and `view`. README.md says where each equation lives.
+`control`, `generated` (terms written out for one mechanism), `simulation`, and side by side `formats`, `analysis` and
+`view`. README.md says where each equation lives.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ckc_pin.kinematics.point import Point
 from ckc_pin.mechanism import Mechanism
 
 if TYPE_CHECKING:
+    from ckc_pin.generated.symbolic import Symbolic
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, as_ivp, check, load_scene, simulate
 
@@ -46,6 +48,7 @@ __all__ = [
     "play",
     "simulate",
     "singularity_map",
+    "symbolic",
     "terms",
 ]
 
@@ -80,3 +83,10 @@ def singularity_map(mechanism: Mechanism | str | Path, **options: Any) -> Singul
     from ckc_pin.analysis.map import singularity_map as compute
 
     return compute(mechanism, **options)
+
+
+def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
+    """Write a mechanism's terms out as CasADi functions; see `ckc_pin.generated.symbolic`, which this loads."""
+    from ckc_pin.generated.symbolic import symbolic as write
+
+    return write(mechanism)

@@ -11,7 +11,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.tree import Array, BoolArray
 
-__all__ = ["Parameters", "constant", "numbers", "present", "values"]
+__all__ = ["Parameters", "constant", "labels", "numbers", "present", "values"]
 
 NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
 
@@ -62,6 +62,31 @@ def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:
 def values(given: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
     """Return the arguments, in the order of `Parameters.vector`."""
     return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in given.items()])
+
+
+def labels(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
+    """Name the arguments, in the same order: what carries them, what they are, and the axis."""
+    rows = [".".join(name) for name in mechanism.closure.names]
+    carriers = {
+        **{name: list(mechanism.tree.model.names) for name in ("offset", "mass", "centre", "inertia")},
+        **{name: list(mechanism.coordinates) for name in ("armature", "constant")},
+        **{name: list(mechanism.coordinates) for name in ("joint_stiffness", "joint_rest", "joint_damping")},
+        **dict.fromkeys(("length", "affine", "affine_offset"), rows),
+    }
+    found = []
+    for name, there in which.items():
+        for index in np.argwhere(there):
+            axes = "".join("xyz"[k] for k in index[1:]) if there.shape[1:] in ((3,), (3, 3)) else ""
+            if name == "gravity":
+                carrier, axes = "", "xyz"[index[0]]
+            elif name == "affine":
+                carrier, axes = carriers[name][index[0]], mechanism.coordinates[index[1]]
+            elif name in carriers:
+                carrier = carriers[name][index[0]]
+            else:
+                carrier, axes = "", ".".join([str(index[0]), *axes])
+            found.append(".".join(part for part in (carrier, name, axes) if part))
+    return found
 
 
 class Parameters:

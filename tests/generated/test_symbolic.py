@@ -1,0 +1,66 @@
+"""The CasADi functions that a person gets, against the reference's terms and CasADi's own derivatives."""
+
+from __future__ import annotations
+
+import casadi as cs
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, Terms, load, symbolic
+from ckc_pin.dynamics import dae_acceleration
+from tests.conftest import assert_close
+
+
+@pytest.mark.parametrize("name", ["five_bar", "slider_crank_spatial", "flyball", "stewart"])
+def test_functions_are_the_terms(name: str) -> None:
+    mechanism, found, random = load(name), symbolic(name), np.random.default_rng(5)
+    n, p = mechanism.n, found.values
+    assert (found.coordinates, len(found.parameters)) == (mechanism.coordinates, len(p))
+    for _ in range(5):
+        q = mechanism.tree.integrate(mechanism.q_tree, 0.2 * random.uniform(-1, 1, n))
+        v, u = random.uniform(-2, 2, n), random.uniform(-1, 1, n)
+        terms = Terms(mechanism, mechanism.kinematics(q), v)
+        D = np.triu(terms.D_tree) + np.triu(terms.D_tree, 1).T
+        for ours, theirs in (
+            (found.phi(q, p), terms.phi[:, None]),
+            (found.J(q, p), terms.at.J),
+            (found.J_dot_v(q, v, p), (terms.J_dot @ v)[:, None]),
+            (found.D_tree(q, p), D),
+            (found.bias_tree(q, v, p), terms.bias_tree[:, None]),
+            (found.damping(q, v, p), terms.damping_force[:, None]),
+            (found.kinetic(q, v, p) + found.potential(q, p), terms.energy),
+            (found.q_dot(q, v), mechanism.tree.configuration_rate(q, v)[:, None]),
+            (found.v_dot(q, v, u, p), dae_acceleration(terms, u)[:, None]),
+        ):
+            assert_close(np.array(ours), theirs, 1e-10 * max(1.0, float(np.abs(theirs).max(initial=0.0))))
+
+
+def test_derivatives_are_what_casadi_makes_of_them() -> None:
+    """J is that of phi; the power of gravity is the rate of the potential energy."""
+    found = symbolic("five_bar")
+    q = cs.SX.sym("q", 4)
+    gradient = cs.Function("gradient", [q], [cs.jacobian(found.phi(q, found.values), q)])
+    at = np.array([-1.2, 0.3, -1.9, -0.4])
+    assert_close(np.array(gradient(at)), np.array(found.J(at, found.values)), 1e-14)
+    h = cs.Function("h", [q], [cs.gradient(found.potential(q, found.values), q)])
+    assert_close(np.array(h(at)), np.array(found.bias_tree(at, np.zeros(4), found.values)), 1e-12)
+
+
+def test_numbers_are_arguments_by_name() -> None:
+    found = symbolic("five_bar")
+    named = dict(zip(found.parameters, found.values, strict=True))
+    mechanism = load("five_bar")
+    k = mechanism.tree.model.getJointId("theta_2")
+    assert named["theta_2.mass"] == mechanism.tree.model.inertias[k].mass
+    assert named["gravity.y"] == -9.81
+    light = np.array(found.values)
+    light[[name.endswith(".mass") for name in found.parameters]] = 0.0
+    at = np.array(mechanism.q_tree)
+    assert float(found.potential(at, light)) == 0.0 != float(found.potential(at, found.values))
+
+
+def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "casadi", None)
+    with pytest.raises(InputError, match=r"pip install ckc_pin\[symbolic\]"):
+        ckc_pin.symbolic("five_bar")
