@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.analysis.gradient import bound_along, chart_step, explore_branch, gradient_bounds
+from ckc_pin.analysis.gradient import Bound, bound_along, chart_step, explore_branch, gradient_bounds
 from ckc_pin.analysis.walk import margin, margin_gradient
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
@@ -18,11 +18,17 @@ from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import Pair, assert_close
 
 
-@pytest.mark.parametrize(("s_min", "finer"), [(0.5, 1e-3), (0.1, 1e-4)])
-def test_bounds_are_the_extremes_on_the_border(five_bar: Pair, s_min: float, finer: float) -> None:
+@pytest.fixture(scope="module")
+def bounds(five_bar: Pair) -> dict[float, Bound]:
+    """On the own branch, by the least margin, of one exploration."""
     mechanism, _ = five_bar
-    step = chart_step(mechanism, 36)
-    (bound,) = gradient_bounds(mechanism, explore_branch(mechanism, mechanism.assembled, 36), [s_min], step)
+    explored, margins = explore_branch(mechanism, mechanism.assembled, 36), [0.5, 0.1]
+    return dict(zip(margins, gradient_bounds(mechanism, explored, margins, chart_step(mechanism, 36)), strict=True))
+
+
+@pytest.mark.parametrize(("s_min", "finer"), [(0.5, 1e-3), (0.1, 1e-4)])
+def test_bounds_are_the_extremes_on_the_border(bounds: dict[float, Bound], s_min: float, finer: float) -> None:
+    bound = bounds[s_min]
     border = [five_bar_gradient(q, finer) for q in five_bar_border(s_min, 600)]
     assert_close(bound.norm, max(np.linalg.norm(g, 2) for g in border), 1e-3, relative=True)
     assert_close(
