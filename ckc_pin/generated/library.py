@@ -22,6 +22,7 @@ from ckc_pin.generated.parameters import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
 
 __all__ = ["Library", "cache_folder", "compiled", "find"]
 
@@ -222,26 +223,15 @@ def _put(name: str, content: bytes) -> Path:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_ours(folder):
-            return _replace(folder / name, content)
-    except OSError:
+            return _written(folder / name, content)
+    except (OSError, InputError):
         pass
-    try:
-        return _replace(_own_folder() / name, content)
-    except OSError as error:
-        raise InputError(f"compiled terms cannot be written: {error.strerror}") from error
+    return _written(_own_folder() / name, content)
 
 
-def _replace(path: Path, content: bytes) -> Path:
-    import tempfile
-
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        try:
-            file.write(content)
-            file.close()
-            os.replace(file.name, path)
-        except OSError:
-            os.unlink(file.name)
-            raise
+def _written(path: Path, content: bytes) -> Path:
+    with written_whole(path) as file:
+        file.write(content)
     return path
 
 
