@@ -1,4 +1,4 @@
-"""What is there, before anything moves: list, check, terms."""
+"""What is there, before anything moves: list, check, terms; and terms compiled for what is to move."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ def compile_(mechanism: str, as_json: bool) -> None:
     from ckc_pin.generated.library import compiled, find
 
     loaded, started = ckc_pin.load(mechanism), perf_counter()
-    there = find(loaded) is not None
-    library = compiled(loaded)
+    there = find(loaded)
+    library = there or compiled(loaded)
     seconds = perf_counter() - started
     if as_json:
-        print_json({"mechanism": loaded.name, "file": library.path, "compiled": not there, "seconds": seconds})
+        print_json({"mechanism": loaded.name, "file": library.path, "compiled": there is None, "seconds": seconds})
     elif there:
         print(f"{loaded.name}: its terms were compiled before: {library.path}")
     else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -21,7 +22,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.generated.parameters import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.mechanism.whole_file import written_whole
 
 __all__ = ["Library", "cache_folder", "compiled", "find"]
@@ -58,7 +59,7 @@ def find(mechanism: Mechanism) -> Library | None:
     folder = cache_folder()
     if mechanism.n > MOST_COORDINATES or not folder.is_dir():
         return None
-    return _look(mechanism, folder, _compiler())
+    return _look(_Subject.of(mechanism), folder, _compiler())
 
 
 def compiled(mechanism: Mechanism) -> Library:
@@ -74,13 +75,27 @@ def compiled(mechanism: Mechanism) -> Library:
         raise InputError(
             f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {MOST_COORDINATES}"
         )
-    compiler = _compiler()
-    found = _look(mechanism, cache_folder(), compiler)
+    subject, compiler = _Subject.of(mechanism), _compiler()
+    found = _look(subject, cache_folder(), compiler)
     if found is not None:
         return found
     if compiler is None:
         raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
-    return _make(mechanism, compiler)
+    return _make(mechanism, subject, compiler)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What a mechanism's library is found by, and what its code takes."""
+
+    key: str
+    parameters: Array
+
+    @classmethod
+    def of(cls, mechanism: Mechanism) -> _Subject:
+        given = numbers(mechanism)
+        which = present(given)
+        return cls(_key(mechanism, which), values(given, which))
 
 
 @dataclass(frozen=True)
@@ -117,7 +132,7 @@ def _hash(what: object) -> str:
     return sha256(msgspec.json.encode(what, order="deterministic")).hexdigest()
 
 
-def _key(mechanism: Mechanism) -> str:
+def _key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
     """The hash of all that enters the code: our own text, the tree, the table of rows, and which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
     joints = [
@@ -139,9 +154,9 @@ def _key(mechanism: Mechanism) -> str:
     ]
     anchors = closure.anchors
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
-    which = {name: np.asarray(x).tolist() for name, x in present(numbers(mechanism)).items()}
+    there = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
-    return _hash((_own_text(), joints, groups, table, which, springs, mechanism.redundant, platform.machine()))[:32]
+    return _hash((_own_text(), joints, groups, table, there, springs, mechanism.redundant, platform.machine()))[:32]
 
 
 def _is_constant(group: object, name: str) -> bool:
@@ -154,15 +169,15 @@ def _own_text() -> str:
     return _hash([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
 
 
-def _look(mechanism: Mechanism, folder: Path, compiler: _Compiler | None) -> Library | None:
+def _look(subject: _Subject, folder: Path, compiler: _Compiler | None) -> Library | None:
     """A file of that key, of that compiler or, where there is none, of any."""
-    pattern = f"{_key(mechanism)}-{compiler.key if compiler else '*'}-*.so"
+    pattern = f"{subject.key}-{compiler.key if compiler else '*'}-*.so"
     try:
         if not _is_ours(folder):
             return None
         for path in sorted(folder.glob(pattern)):
             if path.stem.rpartition("-")[2] == sha256(path.read_bytes()).hexdigest()[:32]:
-                return Library(str(path), _values(mechanism))
+                return Library(str(path), subject.parameters)
     except OSError:
         return None
     return None
@@ -173,12 +188,7 @@ def _is_ours(folder: Path) -> bool:
     return stat.st_uid == os.getuid() and not stat.st_mode & 0o022
 
 
-def _values(mechanism: Mechanism) -> Array:
-    given = numbers(mechanism)
-    return values(given, present(given))
-
-
-def _make(mechanism: Mechanism, compiler: _Compiler) -> Library:
+def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Library:
     import tempfile
 
     from ckc_pin.generated.comparison import require_equal
@@ -186,10 +196,10 @@ def _make(mechanism: Mechanism, compiler: _Compiler) -> Library:
     with tempfile.TemporaryDirectory(prefix="ckc_pin-") as made:
         library = Path(made) / "terms.so"
         _compile(mechanism, compiler, Path(made) / "terms.c", library)
-        require_equal(mechanism, Library(str(library), _values(mechanism)))
+        require_equal(mechanism, Library(str(library), subject.parameters))
         content = library.read_bytes()
-        name = f"{_key(mechanism)}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
-        return Library(str(_put(name, content)), _values(mechanism))
+        name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
+        return Library(str(_put(name, content)), subject.parameters)
 
 
 def _compile(mechanism: Mechanism, compiler: _Compiler, text: Path, library: Path) -> None:
