@@ -10,14 +10,12 @@ from ckc_pin.generated.expressions import Expressions
 __all__ = ["acceleration"]
 
 
-def acceleration(terms: Expressions, kept: list[int], u: Any, correction: Any) -> tuple[Any, list[Any]]:
+def acceleration(terms: Expressions, u: Any, correction: Any) -> tuple[Any, list[Any]]:
     """Return v'_dot where u' acts, and what is left of the diagonals of D' and J D'^-1 J^T when they are eliminated.
 
     Parameters
     ----------
     terms : Expressions
-    kept : list of int
-        Rows that follow from no others.
     u : casadi.SX of n
         u'.
     correction : casadi.SX of rows
@@ -25,7 +23,7 @@ def acceleration(terms: Expressions, kept: list[int], u: Any, correction: Any) -
     """
     import casadi as cs
 
-    n, rows = terms.v.numel(), terms.rows
+    n, rows, kept = terms.v.numel(), terms.rows, terms.kept
     factor = SymmetricFactor(terms.D_tree)
     force = u - terms.bias_tree + terms.damping
     free = [x / pivot for x, pivot in zip(factor.half([force[k] for k in range(n)]), factor.pivots, strict=True)]

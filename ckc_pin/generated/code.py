@@ -34,7 +34,7 @@ def functions(mechanism: Mechanism) -> dict[str, Any]:
         "u": cs.SX.sym("u", mechanism.n),
         "correction": cs.SX.sym("correction", mechanism.closure.rows),
     }
-    results = _results(mechanism, terms, symbols)
+    results = _results(terms, symbols)
     parameters = terms.parameters.vector
     # what does not change with the state is computed once
     alike, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), parameters)
@@ -54,12 +54,11 @@ def _split(column: Any, sizes: list[int]) -> list[Any]:
     return list(cs.vertsplit(column, [0, *np.cumsum(sizes).tolist()]))
 
 
-def _results(mechanism: Mechanism, terms: Expressions, symbols: dict[str, Any]) -> dict[str, Any]:
+def _results(terms: Expressions, symbols: dict[str, Any]) -> dict[str, Any]:
     import casadi as cs
 
     rows = terms.rows
-    kept = [k for k, name in enumerate(mechanism.closure.names) if ".".join(name) not in mechanism.redundant]
-    found, shares = acceleration(terms, kept, symbols["u"], symbols["correction"])
+    found, shares = acceleration(terms, symbols["u"], symbols["correction"])
     return {
         name: cs.densify(x)
         for name, x in {

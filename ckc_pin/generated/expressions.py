@@ -31,6 +31,8 @@ class Expressions:
     damping : casadi.SX of n
         What dampers do.
     rows : RowTerms
+    kept : tuple of int
+        Rows that follow from no others.
     kinetic, potential : casadi.SX
         Energies, J; of gravity, springs and constant forces.
     """
@@ -43,6 +45,7 @@ class Expressions:
     bias_tree: Any
     damping: Any
     rows: RowTerms
+    kept: tuple[int, ...]
     kinetic: Any
     potential: Any
 
@@ -59,8 +62,19 @@ def expressions(mechanism: Mechanism) -> Expressions:
     D_tree, bias, potential = _inertia(mechanism, found, gravity, parameters)
     elastic, damping, stored = _springs(mechanism, found, q, v, parameters)
     rows = row_terms(mechanism.closure, found, q, v, q_dot, tree.place.tolist(), parameters)
-    kinetic = dot(v, times(D_tree, v)) / 2
-    return Expressions(q, v, parameters, q_dot, D_tree, bias - elastic, damping, rows, kinetic, potential + stored)
+    return Expressions(
+        q=q,
+        v=v,
+        parameters=parameters,
+        q_dot=q_dot,
+        D_tree=D_tree,
+        bias_tree=bias - elastic,
+        damping=damping,
+        rows=rows,
+        kept=tuple(k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant),
+        kinetic=dot(v, times(D_tree, v)) / 2,
+        potential=potential + stored,
+    )
 
 
 def _inertia(

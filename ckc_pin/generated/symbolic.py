@@ -92,8 +92,7 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     terms, given = expressions(mechanism), numbers(mechanism)
     q, v, p = terms.q, terms.v, terms.parameters.vector
     u = cs.SX.sym("u", mechanism.n)
-    kept = [k for k, name in enumerate(mechanism.closure.names) if ".".join(name) not in mechanism.redundant]
-    v_dot, _ = acceleration(terms, kept, u, np.zeros(mechanism.closure.rows))
+    v_dot, _ = acceleration(terms, u, np.zeros(mechanism.closure.rows))
 
     def function(name: str, result: Any, **of: Any) -> Any:
         return cs.Function(name, list(of.values()), [cs.densify(result)], list(of), [name])
