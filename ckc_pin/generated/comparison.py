@@ -1,4 +1,4 @@
-"""Calls terms against Pinocchio's and the reference's, before they are used."""
+"""Compiled terms against Pinocchio's and the reference's, before they are used."""
 
 from __future__ import annotations
 

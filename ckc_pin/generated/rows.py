@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import comb
 from typing import Any
 
 from ckc_pin.generated.bodies import MovingBody, cross, dot, times
@@ -172,7 +173,5 @@ def _series(coefficients: Sequence[float], x: Any) -> Any:
 
 
 # arcsin(x) / x in x^2; and c of Jlog(u) = 1 + [u] / 2 + c [u]^2 in |u|^2
-_ARCSINE = [1.0]
-for _k in range(1, 9):
-    _ARCSINE.append(_ARCSINE[-1] * (2 * _k - 1) ** 2 / (2 * _k * (2 * _k + 1)))
+_ARCSINE = [comb(2 * k, k) / (4**k * (2 * k + 1)) for k in range(9)]
 _LOG = [1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160]

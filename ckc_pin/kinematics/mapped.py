@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
@@ -190,5 +192,4 @@ class SingularityMap:
     @property
     def counts(self) -> IntArray:
         """How many aspects reach each cell, shape (n_1, n_2)."""
-        total: IntArray = sum(aspect.reached.astype(int) for aspect in self.aspects)  # type: ignore[assignment]
-        return total
+        return np.sum([aspect.reached for aspect in self.aspects], axis=0, dtype=np.intp)

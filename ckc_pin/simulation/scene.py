@@ -30,7 +30,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers replace anything finer
 
 Method = Literal["auto", "DOP853", "RK45", "Radau"]
-Terms = Literal["auto", "pinocchio", "generated"]
+TermsOf = Literal["auto", "pinocchio", "generated"]
 
 
 class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -62,7 +62,7 @@ class SolverSpec(_Spec, frozen=True):
     max_wall_s: Positive | None = None
     output_dt: Positive | None = None
     projection: bool = True
-    terms: Terms = "auto"
+    terms: TermsOf = "auto"
     baumgarte: tuple[NonNegative, NonNegative] | None = None
 
 
