@@ -136,7 +136,6 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   require(u_tree, core.n, "u_tree"), require(correction, core.rows.closure.rows, "correction");
   Vector acceleration(core.n);
-  if (core.written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return acceleration;
   core.set(q_tree, true), core.jacobian(), core.bias(v_tree);
   if (!core.dae_acceleration(u_tree, correction, acceleration))
     acceleration.setConstant(std::numeric_limits<double>::quiet_NaN());

@@ -20,7 +20,7 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       written(std::move(written_)),
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
-  q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
+  q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
@@ -157,30 +157,37 @@ void Core::reduced(In force, Out generalized) const {
   for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
 }
 
+void Core::set_velocity(In v) {
+  if (v_tree == v) return;
+  v_tree = v;
+  here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
+}
+
 // The tree's velocities, and from them the rows'.
 void Core::row_rates_of_tree() {
   if (has(row_rates)) return;
   set_tree();
-  bias_tree = tree.bias(q_tree, v_tree);
+  bias_without_springs_ = tree.bias(q_tree, v_tree);
   rows.rates(tree);
   here_ |= row_rates;
 }
 
 void Core::jacobian_rate(In v) {
   if (written) return written->jacobian_rate(q_tree, v, rows.J_dot);
-  if (!(v_tree == v)) v_tree = v, here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
+  set_velocity(v);
   row_rates_of_tree();
   rows.jacobian_dot(tree, tree.jacobian_rate(q_tree, v_tree));
 }
 
 void Core::bias(In v) {
-  if (has(bias_of_tree) && v_tree == v) return;
+  set_velocity(v);
+  if (has(bias_of_tree)) return;
   Profile::Entry entry(profile, Profile::bias_tree);
-  if (!(v_tree == v)) v_tree = v, here_ &= ~(row_rates | coriolis_of_tree);
   here_ |= bias_of_tree;
   if (written) return written->bias(q_tree, v_tree, bias_tree, J_dot_v, damping_tree);
   row_rates_of_tree();
   rows.bias(J_dot_v);
+  bias_tree = bias_without_springs_;
   if (springs.any) spring_forces(), bias_tree -= elastic_;
   if (!springs.any_damping) return;
   spring_lengths(), damping_tree.setZero();
@@ -202,10 +209,7 @@ void Core::spring_lengths() {
 void Core::coriolis() {
   if (has(coriolis_of_tree)) return;
   Profile::Entry entry(profile, Profile::C_tree);
-  if (written && !has(row_rates)) {
-    set_tree(), tree.bias(q_tree, v_tree), rows.rates(tree);
-    here_ |= row_rates;
-  }
+  row_rates_of_tree();
   C_tree = tree.coriolis(q_tree, v_tree);
   rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);

@@ -85,9 +85,9 @@ class Core {
   bool shortest_step(In residual, Out x);
   // Basis of the velocities that the loops allow, (n, n - rank); null where J has lost rank.
   const Matrix* tangent();
-  // Eq. 1 by projection on the tangent space of the closure; false where J has lost rank.
+  // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // Eq. 1 at any state, written out; false where there is no such code, or where it would have to pivot.
+  // The same at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
   bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 
  private:
@@ -98,7 +98,8 @@ class Core {
   bool has(Part part) const { return here_ & part; }
   const Matrix& D_tree() const { return written ? D_written_ : tree.D(); }
   void set_tree();
-  void row_rates_of_tree();
+  void set_velocity(In v);
+  void row_rates_of_tree();  // and bias_without_springs_
   void spring_lengths();
   void spring_forces();  // elastic_
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
@@ -116,7 +117,7 @@ class Core {
   Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
   Factor basis_;
   long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1
-  Vector x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
+  Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Matrix square_;
   Definite square_factor_;

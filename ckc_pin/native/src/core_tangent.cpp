@@ -145,6 +145,7 @@ const Matrix* Core::tangent() {
 }
 
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
+  if (written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
   residual_ = J_dot_v + correction;
   if (!tangent_basis(residual_, singular)) return false;
   tangent_inertia();

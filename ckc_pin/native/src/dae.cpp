@@ -71,9 +71,7 @@ bool Dae::rate(double t, In v, Out y_dot) {
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  if (!core.written_acceleration(core.q_tree, v, control.u_tree, residual_, y_dot.tail(n)) &&
-      !core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n)))
-    return fails(Trouble::rank);
+  if (!core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n))) return fails(Trouble::rank);
   return y_dot.allFinite() || fails(Trouble::infinite);
 }
 
