@@ -98,7 +98,10 @@ void Radau::guess(double h) {
 bool Radau::new_jacobian(double h) {
   for (double x : {ahead, 0.0}) {
     if (x > 0.0 && last_.h == 0.0) continue;
-    extrapolate(x, h, y_stage_);
+    if (x > 0.0)
+      extrapolate(x, h, y_stage_);
+    else
+      y_stage_ = step_.y;
     ++work_.jacobians;
     if (system_.jacobian(step_.t + x * h, y_stage_, J_, work_.rhs)) {
       J_known_ = J_fresh_ = true, factorized_ = 0.0;
