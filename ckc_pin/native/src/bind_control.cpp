@@ -75,7 +75,7 @@ std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& cor
     const auto K_P = get<Matrix>(table, "K_P"), K_V = get<Matrix>(table, "K_V");
     const auto q_d = get<Vector>(table, "q_d"), h_d = get<Vector>(table, "h_d");
     require_square(K_P, d, "K_P"), require_square(K_V, d, "K_V"), require(q_d, d, "q_d"), require(h_d, d, "h_d");
-    return std::make_unique<SetPoint>(K_P, K_V, q_d, h_d, get<double>(table, "potential"), core.q);
+    return std::make_unique<SetPoint>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
   }
   require(kind == "tracking", "controller: set_point, tracking or call");
   const auto Lambda = get<Matrix>(table, "Lambda"), K_D = get<Matrix>(table, "K_D");

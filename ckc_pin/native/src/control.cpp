@@ -4,13 +4,12 @@
 
 namespace ckc {
 
-SetPoint::SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d, Indices q)
+SetPoint::SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d)
     : K_P_(std::move(K_P)),
       K_V_(std::move(K_V)),
       q_d_(std::move(q_d)),
       h_d_(std::move(h_d)),
       potential_d_(potential_d),
-      own_(std::move(q)),
       e_(q_d_.size()),
       product_(q_d_.size()) {}
 
@@ -23,15 +22,9 @@ bool SetPoint::u(const Measured& at, Out u, Problem&) {
 }
 
 double SetPoint::lyapunov(const Measured& at, double potential_energy, In) {
-  double kinetic;
-  if (at.core.q == own_) {
-    at.core.inertia();
-    product_.noalias() = at.core.D * at.q_dot;
-    kinetic = 0.5 * at.q_dot.dot(product_);
-  } else {  // D is that of other coordinates
-    momentum_.resize(at.core.n);
-    kinetic = at.core.energy(at.v_tree, momentum_).kinetic;
-  }
+  at.core.inertia();
+  product_.noalias() = at.core.D * at.rate;  // in whichever coordinates the motion is
+  const double kinetic = 0.5 * at.rate.dot(product_);
   e_ = at.q - q_d_;
   const double fallen = potential_energy - potential_d_ - e_.dot(h_d_);
   product_.noalias() = K_P_ * e_;
@@ -159,7 +152,7 @@ Measured Control::in_own_q(const Measured& at) {
     q_(k) = at.core.q_tree(at.core.tree.place[own_[k]]);
     q_dot_(k) = at.v_tree(own_[k]);
   }
-  return {at.t, at.core, q_, q_dot_, at.v_tree};
+  return {at.t, at.core, q_, q_dot_, at.v_tree, at.rate};
 }
 
 bool Control::ask(const Measured& at, Out u) {

@@ -11,12 +11,13 @@
 
 namespace ckc {
 
-// The state that a controller sees: the core there, with D' and the bias, and q, q_dot of the core's partition.
+// The state that a controller sees: the core there, with D' and the bias, and q, q_dot of the user's partition.
 struct Measured {
   double t;
   Core& core;
   const Vector &q, &q_dot;
   const Vector& v_tree;  // what C takes its velocity from
+  const Vector& rate;    // q_dot of the core's partition
 };
 
 // Why a controller has no u, or its caller's exception.
@@ -40,7 +41,7 @@ class Controller {
 // Eq. 14.
 class SetPoint : public Controller {
  public:
-  SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d, Indices q);
+  SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d);
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
@@ -49,8 +50,7 @@ class SetPoint : public Controller {
   Matrix K_P_, K_V_;
   Vector q_d_, h_d_;
   double potential_d_;
-  const Indices own_;
-  Vector e_, product_, momentum_;
+  Vector e_, product_;
 };
 
 // Eq. 16. `model`: the controller's own idea of the plant, at the measured q' and at rho q_dot, or "actual".

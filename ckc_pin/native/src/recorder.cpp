@@ -39,7 +39,7 @@ bool Recorder::row(System& system, double t, In y, Out row) {
   put(system.velocity), put(system.control.u.head(d)), put(system.control.tau.head(actuators));
   put(core.rows.phi), put(system.w);
   row(at++) = energy.total();
-  row(at++) = system.control.lyapunov({t, core, system.q, system.q_dot, system.v_tree}, energy.potential, core.rows.phi);
+  row(at++) = system.control.lyapunov(system.measured(t), energy.potential, core.rows.phi);
   double open = 0.0, opening = 0.0;
   for (int i = 0; i < m; ++i) {
     open = std::max(open, std::abs(core.rows.phi(i) - system.w(i)));

@@ -94,7 +94,7 @@ class System {
 
   // Everything that acts at the core's state; false where a controller has no u.
   bool act(double t) { return control.act(measured(t)) || fails(Trouble::control); }
-  Measured measured(double t) { return {t, core, q, q_dot, v_tree}; }
+  Measured measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
 
  protected:
   bool fails(Trouble why) { return trouble = why, false; }
