@@ -173,7 +173,7 @@ def _look(subject: _Subject, folder: Path, compiler: _Compiler | None) -> Librar
     """A file of that key, of that compiler or, where there is none, of any."""
     pattern = f"{subject.key}-{compiler.key if compiler else '*'}-*.so"
     try:
-        if not _is_ours(folder):
+        if not (_is_ours(folder) and _executes(folder)):
             return None
         for path in sorted(folder.glob(pattern)):
             if path.stem.rpartition("-")[2] == sha256(path.read_bytes()).hexdigest()[:32]:
@@ -188,12 +188,21 @@ def _is_ours(folder: Path) -> bool:
     return stat.st_uid == os.getuid() and not stat.st_mode & 0o022
 
 
+def _executes(folder: Path) -> bool:
+    """Whether the file system lets programs be loaded from there."""
+    return not os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)  # a flag of Linux's
+
+
 def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Library:
     import tempfile
 
     from ckc_pin.generated.comparison import require_equal
 
-    with tempfile.TemporaryDirectory(prefix="ckc_pin-") as made:
+    places = (Path(tempfile.gettempdir()), cache_folder())
+    place = next((folder for folder in places if folder.is_dir() and _executes(folder)), None)
+    if place is None:
+        raise InputError(f"compiled terms cannot be loaded: neither {places[0]} nor {places[1]} allows programs")
+    with tempfile.TemporaryDirectory(prefix="ckc_pin-", dir=place) as made:
         library = Path(made) / "terms.so"
         _compile(mechanism, compiler, Path(made) / "terms.c", library)
         require_equal(mechanism, Library(str(library), subject.parameters))
@@ -232,7 +241,7 @@ def _put(name: str, content: bytes) -> Path:
     try:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_ours(folder):
+        if _is_ours(folder) and _executes(folder):
             return _written(folder / name, content)
     except (OSError, InputError):
         pass

@@ -15,7 +15,7 @@ from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
+from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
 __all__ = ["Check", "check"]
@@ -43,7 +43,7 @@ class Check:
         Relative singular values of the scaled J around the cut that the rank is.
     warnings : tuple of str
     terms : "pinocchio" or "generated"
-        Whose terms a run takes: the latter where they were compiled before.
+        Whose terms a run takes: the scene's choice; without one, "generated" where they were compiled before.
     desired : DesiredCheck or None
         For a scene with a controller.
     branches : (k, n) array or None
@@ -87,11 +87,12 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, None, [])
+        found = _mechanism_check(what, None, [], "auto")
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     desired = _desired(what, mechanism)
-    found = _mechanism_check(mechanism, desired, _desired_warnings(mechanism, desired))
+    warnings = _desired_warnings(mechanism, desired)
+    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms)
     return replace(found, branches=_branches(mechanism)) if branches else found
 
 
@@ -106,7 +107,9 @@ def _names_a_scene(name: str) -> bool:
     return "/" in name
 
 
-def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str]) -> Check:
+def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf) -> Check:
+    if terms == "auto":
+        terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
     values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
@@ -125,7 +128,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         cond_phi_z=float(values[0] / values[-1]) if values[-1] > 0 else float("inf"),
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
         warnings=(*mechanism.warnings, *warnings),
-        terms="generated" if find(mechanism) else "pinocchio",
+        terms=terms,
         desired=desired,
     )
 

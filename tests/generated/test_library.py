@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import stat
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -78,6 +80,39 @@ def test_where_nothing_can_be_written_the_process_keeps_its_own(folder: Path) ->
     folder.write_text("no folder")
     assert library.find(load(NAME)) is None
     assert simulate(NAME, {"t_end": 0.01, "solver.terms": "generated"}).stats["terms"] == "generated"
+
+
+def mounted_noexec(parts: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Report those folders as mounted without programs."""
+    statvfs = os.statvfs
+
+    def report(folder: Path) -> SimpleNamespace:
+        flags = statvfs(folder).f_flag
+        return SimpleNamespace(f_flag=flags | os.ST_NOEXEC if Path(folder) in parts else flags)
+
+    monkeypatch.setattr(os, "statvfs", report)
+
+
+def test_programs_are_loaded_from_where_that_is_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library.compiled(load(NAME))
+    mounted_noexec((folder,), monkeypatch)
+    assert library.find(load(NAME)) is None
+    assert Path(library.compiled(load(NAME)).path).parent != folder
+    monkeypatch.undo()
+    mounted_noexec((folder, Path(tempfile.gettempdir())), monkeypatch)
+    answer = ckc("compile", NAME)
+    assert answer.code == 2
+    assert "allows programs" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"), [("pinocchio", "pinocchio"), ("generated", "generated"), ("auto", "pinocchio")]
+)
+def test_a_check_of_a_scene_says_what_the_scene_asks_for(asked: str, told: str, folder: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "mine.scene.toml"
+    plain = f'mechanism = "{NAME}"\nformulation = "dae"\nt_end = 1.0\ninitial.at = "assembled"\n'
+    scene.write_text(f'{plain}solver.terms = "{asked}"\n')
+    assert check(scene).terms == told
 
 
 def test_without_a_compiler_there_is_the_general_core(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
