@@ -26,7 +26,7 @@ from scripts.experiments.fuzz.table import table
 
 __all__ = ["main", "one"]
 
-SHARE_REVERSED = 5  # every fifth is run backwards too
+SHARE_THOROUGH = 5  # every fifth is judged by a run back too
 
 
 @contextmanager
@@ -43,7 +43,7 @@ def one(seed: int, kind: str, name: str | None = None) -> Record:
     """Draw, run and judge one seed."""
     try:
         with drawn(seed, kind, name) as motion:
-            return run_motion(motion, reverse=seed % SHARE_REVERSED == 0)[0]
+            return run_motion(motion, thorough=seed % SHARE_THOROUGH == 0)[0]
     except CkcError as error:
         return Record(seed, name or kind, status="refused", message=str(error), verdict="refused")
     except Exception as error:  # while drawing: loading, sigma
@@ -59,7 +59,7 @@ def show(seed: int, kind: str, name: str | None, *, shrunk: bool = False) -> Non
         if kind == "random":
             for file in sorted(Path(motion.scene).iterdir()):
                 print(f"--- {file.name}\n{file.read_text(encoding='utf-8')}")
-        record, run = run_motion(motion, reverse=True)
+        record, run = run_motion(motion, thorough=True)
         for key, value in record.row().items():
             print(f"{key:12s} {value}")
         if run is not None:

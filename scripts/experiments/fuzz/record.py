@@ -16,6 +16,7 @@ from scripts.experiments.fuzz.joint_forces import Unlike, joint_forces
 from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
 from scripts.experiments.fuzz.read import NoJudge, read
+from scripts.experiments.fuzz.reversal import reversal
 from scripts.experiments.fuzz.spatial import Array
 from scripts.experiments.fuzz.state import energy
 
@@ -25,7 +26,6 @@ ALLOWED, FLOOR = 1e3, 1e-9  # a piece of a run that is done may be off by ALLOWE
 OPEN = 1e-9  # of the mechanism's size: what a closure may be open, at most
 DOUBTFUL = 30.0  # times rtol: a piece off by more counts only if it does not magnify errors that much itself
 GROSS = 0.3  # of the largest coordinate or of the energy: no tolerance excuses it
-REVERSED = 0.05  # s
 
 
 @dataclass
@@ -75,8 +75,8 @@ class Record:
 FIELDS = [field.name for field in fields(Record)]
 
 
-def run_motion(motion: Motion, *, reverse: bool = False) -> tuple[Record, Run | None]:
-    """Run a motion and judge it; anything but a CkcError that comes out is a finding."""
+def run_motion(motion: Motion, *, thorough: bool = False) -> tuple[Record, Run | None]:
+    """Run a motion and judge it, thoroughly by further runs too; what comes out but a CkcError is a finding."""
     changes = motion.changes
     record = Record(
         motion.seed, motion.mechanism, motion.scene, changes["formulation"], changes.get("solver.method", "auto"),
@@ -98,14 +98,12 @@ def run_motion(motion: Motion, *, reverse: bool = False) -> tuple[Record, Run | 
     record.seconds, started = perf_counter() - started, perf_counter()
     record.status, record.message, record.t = run.status, run.message, float(run.t[-1])
     record.rhs = int(run.stats["rhs"])
-    _judge(record, run, motion)
-    if reverse and run.status == "done" and record.jump == record.jump:
-        record.reversal = _reversal(run, motion)
+    _judge(record, run, motion, thorough)
     record.judging = perf_counter() - started
     return record, run
 
 
-def _judge(record: Record, run: Run, motion: Motion) -> None:
+def _judge(record: Record, run: Run, motion: Motion, thorough: bool) -> None:
     mechanism = run.mechanism
     record.phi = run.max_phi
     finite = all(bool(np.isfinite(x).all()) for x in (run.q_tree, run.v_tree, run.energy))
@@ -118,7 +116,10 @@ def _judge(record: Record, run: Run, motion: Motion) -> None:
         wrong = f"open by {run.max_phi:.2g}"
     if finite and not run.w.any() and len(run.t) > 1:
         try:
-            wrong = _pieces(record, run, motion) or wrong
+            judge = Judge(read(run.texts))
+            wrong = _pieces(record, run, motion, judge) or wrong
+            if thorough:
+                wrong = wrong or _beyond_pieces(record, run, motion, judge)
         except NoJudge as error:
             record.why = f"no judge: {error}"
         except Unlike as error:
@@ -128,9 +129,8 @@ def _judge(record: Record, run: Run, motion: Motion) -> None:
     record.why = wrong or record.why
 
 
-def _pieces(record: Record, run: Run, motion: Motion) -> str:
+def _pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
     """Judge some pieces; what is wrong with them, if anything."""
-    judge = Judge(read(run.texts))
     model, rtol, controller = judge.model, record.rtol, motion.changes.get("controller")
     conservative = model.conservative and controller is None
     order = [run.coordinates.index(label) for label in model.labels]
@@ -174,34 +174,19 @@ def _pieces(record: Record, run: Run, motion: Motion) -> str:
     return wrong
 
 
+def _beyond_pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
+    """Judge the way back; what is wrong with it, if anything."""
+    order = [run.coordinates.index(label) for label in judge.model.labels]
+    if run.status == "done" and record.jump == record.jump:
+        record.reversal = reversal(run, motion, judge, order, DOUBTFUL)
+        if record.reversal > ALLOWED + FLOOR / record.rtol:
+            return f"the way back misses its past by {record.reversal * record.rtol:.2g}"
+    return ""
+
+
 def _choose(random: np.random.Generator, total: Array | None, v: Array) -> np.ndarray:
     """Up to eight pieces: where energy changes most, where v' does, and some others."""
     last = len(v) - 1
     by_v = np.argsort(-np.abs(np.diff(v, axis=0)).max(axis=1))[: 3 if total is not None else 5]
     by_energy = np.argsort(-np.abs(np.diff(total)))[:3] if total is not None else by_v
     return np.unique(np.concatenate([by_v, by_energy, random.integers(0, last, 2)]))
-
-
-def _reversal(run: Run, motion: Motion) -> float:
-    """Start at the end with the velocity turned around; how far the run's own past is missed, over rtol."""
-    back_to = int(np.searchsorted(run.t, run.t[-1] - REVERSED))
-    span = float(run.t[-1] - run.t[back_to])
-    if span <= 0:
-        return np.nan
-    changes = {key: value for key, value in motion.changes.items() if key != "event"}
-    at = {name: k for k, name in enumerate(run.coordinates)}
-    changes["initial"] = {
-        "q": {name: float(run.q_tree[-1, k]) for name, k in at.items()},
-        "q_dot": {name: -float(run.v_tree[-1, at[name]]) for name in run.independent},
-    }
-    changes |= {"t_end": span, "event": [], "solver.output_dt": span}
-    try:
-        back = ckc_pin.simulate(motion.scene, changes)
-    except CkcError:
-        return np.nan
-    if back.status != "done":
-        return np.nan
-    right_q, right_v = run.q_tree[back_to], -run.v_tree[back_to]
-    of_q = np.abs(back.q_tree[-1] - right_q).max() / max(1.0, np.abs(right_q).max())
-    of_v = np.abs(back.v_tree[-1] - right_v).max() / max(1.0, np.abs(right_v).max())
-    return float(max(of_q, of_v) / motion.changes["solver.rtol"])

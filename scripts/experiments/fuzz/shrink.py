@@ -20,7 +20,7 @@ MOST_TRIALS = 300
 
 def shrink(motion: Motion) -> Motion:
     """The smallest motion found whose run fails as this one's does; the motion itself if it does not fail."""
-    record, run = run_motion(motion)
+    record, run = run_motion(motion, thorough=True)
     wanted, trials = _kind(record), 0
     again = record.verdict != "done" or record.gross
     while again and trials < MOST_TRIALS:
@@ -28,7 +28,7 @@ def shrink(motion: Motion) -> Motion:
         for changes in _smaller(motion.changes, record, run):
             trials += 1
             smaller = replace(motion, changes=changes)
-            found, its_run = run_motion(smaller)
+            found, its_run = run_motion(smaller, thorough=True)
             if _kind(found) == wanted:
                 motion, record, run, again = smaller, found, its_run, True
                 break

@@ -26,7 +26,8 @@ def table(records: Sequence[Record]) -> str:
         )
     for formulation in sorted({record.formulation for record in records}):
         lines.append(_line("all", formulation, [r for r in records if r.formulation == formulation]))
-    lines += [_line("all", "all", records), "", "stopped or refused, most frequent first:"]
+    lines += [_line("all", "all", records), ""]
+    lines += [_off("runs back", [r.reversal for r in records]), "", "stopped or refused, most frequent first:"]
     reasons = Counter((r.verdict, _reason(r.message)) for r in records if r.verdict in ("stopped", "refused"))
     lines += [f"  {count:4d}  {verdict}: {reason}" for (verdict, reason), count in reasons.most_common(12)]
     bad = [r for r in records if r.verdict in ("RAW", "WRONG")]
@@ -36,8 +37,7 @@ def table(records: Sequence[Record]) -> str:
     gross = [r for r in records if r.gross and r not in bad]
     lines += ["", f"gross, though within {ALLOWED:g} rtol: {len(gross)}", *map(_of, gross[:10])]
     lines += ["", "the worst by error over rtol:"]
-    worst = sorted((r for r in records if r.worst == r.worst), key=lambda r: -r.worst)
-    lines += [_of(r) for r in worst[:10]]
+    lines += [_of(r) for r in sorted((r for r in records if r.worst == r.worst), key=lambda r: -r.worst)[:10]]
     return "\n".join(lines)
 
 
@@ -52,6 +52,13 @@ def _line(name: str, formulation: str, records: Sequence[Record]) -> str:
         f" {sum(r.off for r in records):4d} {count['refused']:4d}"
         f" {sum(r.unresolved for r in records):5d} {p[0]:9.2g} {p[1]:9.2g} {p[2]:9.2g} {p[3]:9.2g} {rhs:8d}"
     )
+
+
+def _off(what: str, numbers: Sequence[float]) -> str:
+    known = np.array([x for x in numbers if x == x])
+    if not len(known):
+        return f"{what}: none"
+    return f"{what}: {len(known)}, off by {np.median(known):.2g} rtol in the median, {known.max():.2g} at most"
 
 
 def _of(record: Record) -> str:

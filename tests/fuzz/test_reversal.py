@@ -1,0 +1,36 @@
+"""The verdict on the way back: a right run passes, a tampered one does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scripts.experiments.fuzz.judge import Judge
+from scripts.experiments.fuzz.motions import Motion
+from scripts.experiments.fuzz.read import read
+from scripts.experiments.fuzz.record import ALLOWED, DOUBTFUL, run_motion
+from scripts.experiments.fuzz.reversal import INSTANTS, reversal
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
+def test_a_motion_goes_back_along_its_past(formulation: str) -> None:
+    changes = {
+        "formulation": formulation,
+        "t_end": 0.6,
+        "solver.rtol": 1e-7,
+        "solver.output_dt": 0.004,
+        "initial": {"q": {"theta_1": -1.0, "theta_3": 1.5}, "q_dot": {"theta_1": 1.0, "theta_3": 3.0}},
+        "controller": None,
+    }
+    motion = Motion(0, "five_bar", "five_bar/swing", changes)
+    record, run = run_motion(motion, thorough=True)
+    assert run is not None
+    assert (record.verdict, record.why) == ("done", "")
+    assert record.reversal < 30
+    judge = Judge(read(run.texts))
+    order = [run.coordinates.index(label) for label in judge.model.labels]
+    faster = np.where(np.arange(len(run.t)) == len(run.t) - 1 - INSTANTS, 1.01, 1.0)
+    other = replace(run, v_tree=run.v_tree * faster[:, None])
+    assert reversal(other, motion, judge, order, DOUBTFUL) > ALLOWED
