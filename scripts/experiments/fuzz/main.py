@@ -26,7 +26,7 @@ from scripts.experiments.fuzz.table import table
 
 __all__ = ["main", "one"]
 
-SHARE_THOROUGH = 5  # every fifth is judged by a run back too
+SHARE_THOROUGH = 5  # every fifth is judged by runs back and beside a turn too
 
 
 @contextmanager

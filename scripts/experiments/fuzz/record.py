@@ -12,6 +12,7 @@ import numpy as np
 import ckc_pin
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation import Run
+from scripts.experiments.fuzz.events import beside_a_turn, between_rows, located
 from scripts.experiments.fuzz.joint_forces import Unlike, joint_forces
 from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
@@ -41,6 +42,8 @@ class Record:
     t_end: float = np.nan
     control: bool = False
     events: int = 0
+    met: int = 0
+    event_off: float = np.nan
     status: str = ""
     message: str = ""
     t: float = np.nan
@@ -97,7 +100,7 @@ def run_motion(motion: Motion, *, thorough: bool = False) -> tuple[Record, Run |
         return record, None
     record.seconds, started = perf_counter() - started, perf_counter()
     record.status, record.message, record.t = run.status, run.message, float(run.t[-1])
-    record.rhs = int(run.stats["rhs"])
+    record.rhs, record.met = int(run.stats["rhs"]), len(run.events)
     _judge(record, run, motion, thorough)
     record.judging = perf_counter() - started
     return record, run
@@ -114,12 +117,13 @@ def _judge(record: Record, run: Run, motion: Motion, thorough: bool) -> None:
     allowed = max(10 * mechanism.tolerance, OPEN * max(1.0, mechanism.size))
     if finite and not run.max_phi <= allowed:
         wrong = f"open by {run.max_phi:.2g}"
+    if finite:
+        wrong = wrong or between_rows(run, motion.changes.get("event", []))
     if finite and not run.w.any() and len(run.t) > 1:
         try:
             judge = Judge(read(run.texts))
             wrong = _pieces(record, run, motion, judge) or wrong
-            if thorough:
-                wrong = wrong or _beyond_pieces(record, run, motion, judge)
+            wrong = wrong or _beyond_pieces(record, run, motion, judge, thorough)
         except NoJudge as error:
             record.why = f"no judge: {error}"
         except Unlike as error:
@@ -174,14 +178,21 @@ def _pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
     return wrong
 
 
-def _beyond_pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
-    """Judge the way back; what is wrong with it, if anything."""
+def _beyond_pieces(record: Record, run: Run, motion: Motion, judge: Judge, thorough: bool) -> str:
+    """Judge events, and thoroughly the way back and values beside a turn; what is wrong with them, if anything."""
     order = [run.coordinates.index(label) for label in judge.model.labels]
-    if run.status == "done" and record.jump == record.jump:
+    allowed = ALLOWED + FLOOR / record.rtol
+    if not record.control:
+        record.event_off, t = located(run, judge, order, record.rtol, DOUBTFUL)
+        if record.event_off > allowed:
+            return f"an event off by {record.event_off * record.rtol:.2g} at t = {t:.4g}"
+    if not (thorough and run.status == "done"):
+        return ""
+    if record.jump == record.jump:
         record.reversal = reversal(run, motion, judge, order, DOUBTFUL)
-        if record.reversal > ALLOWED + FLOOR / record.rtol:
+        if record.reversal > allowed:
             return f"the way back misses its past by {record.reversal * record.rtol:.2g}"
-    return ""
+    return beside_a_turn(motion, run.coordinates)
 
 
 def _choose(random: np.random.Generator, total: Array | None, v: Array) -> np.ndarray:

@@ -27,7 +27,8 @@ def table(records: Sequence[Record]) -> str:
     for formulation in sorted({record.formulation for record in records}):
         lines.append(_line("all", formulation, [r for r in records if r.formulation == formulation]))
     lines += [_line("all", "all", records), ""]
-    lines += [_off("runs back", [r.reversal for r in records]), "", "stopped or refused, most frequent first:"]
+    lines += [_off("events located", [r.event_off for r in records]), _off("runs back", [r.reversal for r in records])]
+    lines += ["", "stopped or refused, most frequent first:"]
     reasons = Counter((r.verdict, _reason(r.message)) for r in records if r.verdict in ("stopped", "refused"))
     lines += [f"  {count:4d}  {verdict}: {reason}" for (verdict, reason), count in reasons.most_common(12)]
     bad = [r for r in records if r.verdict in ("RAW", "WRONG")]

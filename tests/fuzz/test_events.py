@@ -1,0 +1,96 @@
+"""Verdicts on events: right runs pass, tampered ones do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import pytest
+
+import ckc_pin
+from ckc_pin.simulation import Run
+from scripts.experiments.fuzz.events import beside_a_turn, between_rows, located, on_both_sides
+from scripts.experiments.fuzz.judge import Judge
+from scripts.experiments.fuzz.motions import Motion
+from scripts.experiments.fuzz.read import read
+from scripts.experiments.fuzz.record import ALLOWED, DOUBTFUL
+
+RTOL = 1e-7
+CHANGES: dict[str, Any] = {
+    "formulation": "reduced",
+    "t_end": 0.6,
+    "solver.rtol": RTOL,
+    "solver.output_dt": 0.004,
+    "initial": {"q": {"theta_1": -1.0, "theta_3": 1.5}, "q_dot": {"theta_1": 1.0, "theta_3": 3.0}},
+    "controller": None,
+}
+ASKED = [{"of": "q", "coordinate": "theta_2", "value": 1.0}, {"of": "q_dot", "coordinate": "theta_1", "value": 0.0}]
+
+
+@cache
+def seen() -> Run:
+    """A motion with crossings of an angle and of a rate, both ways."""
+    run = ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": ASKED})
+    assert {(e["of"], e["direction"]) for e in run.events} == {("q", -1), ("q", 1), ("q_dot", -1), ("q_dot", 1)}
+    return run
+
+
+def judge_of(run: Run) -> tuple[Judge, list[int]]:
+    judge = Judge(read(run.texts))
+    return judge, [run.coordinates.index(label) for label in judge.model.labels]
+
+
+def test_rows_tell_which_crossings_there_are() -> None:
+    run = seen()
+    assert between_rows(run, ASKED) == ""
+    for k, event in enumerate(run.events):
+        lost = [*run.events[:k], *run.events[k + 1 :]]
+        turned = [*run.events[:k], {**event, "direction": -event["direction"]}, *run.events[k + 1 :]]
+        for events in (lost, turned, [*run.events, event]):
+            assert event["coordinate"] in between_rows(replace(run, events=events), ASKED)
+
+
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_rows_tell_of_crossings_one_way(direction: int) -> None:
+    asked = [{**event, "direction": direction} for event in ASKED]
+    met = [event for event in seen().events if event["direction"] == direction]
+    assert between_rows(replace(seen(), events=met), asked) == ""
+    assert between_rows(replace(seen(), events=[*met, *met]), [*asked, *asked]) == ""
+    for k in range(len(met)):
+        assert between_rows(replace(seen(), events=met[:k] + met[k + 1 :]), asked)
+
+
+def test_events_are_where_the_judge_is_on_their_value() -> None:
+    run = seen()
+    off, _ = located(run, *judge_of(run), RTOL, DOUBTFUL)
+    assert off < 10
+    late = [{**event, "t": event["t"] + 2e-4 * (k == 2)} for k, event in enumerate(run.events)]
+    off, t = located(replace(run, events=late), *judge_of(run), RTOL, DOUBTFUL)
+    assert off > ALLOWED
+    assert t == late[2]["t"]
+
+
+def test_a_value_short_of_a_turn_is_crossed_twice_and_one_beyond_it_never() -> None:
+    first = next(event["t"] for event in seen().events if event["of"] == "q_dot")
+    stop = [{**ASKED[1], "stop": True}]
+    turn = float(ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": stop}).q_tree[-1, 0])
+    inner, outer = turn - 1e-8, turn + 1e-8
+    asked = [{"of": "q", "coordinate": "theta_1", "value": value} for value in (inner, outer)]
+    run = ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": [ASKED[1], *asked]})
+    assert on_both_sides(run, "theta_1", first, inner, outer) == ""
+    beside = [event for event in run.events if event["of"] == "q" and event["t"] < 0.1]
+    assert len(beside) == 2
+    for event in beside:
+        missed = [other for other in run.events if other is not event]
+        assert on_both_sides(replace(run, events=missed), "theta_1", first, inner, outer)
+    grazed = [*run.events, {**beside[0], "value": outer}]
+    assert on_both_sides(replace(run, events=grazed), "theta_1", first, inner, outer)
+    assert on_both_sides(replace(run, events=beside), "theta_1", first, inner, outer)
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
+@pytest.mark.parametrize("seed", range(4))
+def test_values_beside_a_turn(formulation: str, seed: int) -> None:
+    motion = Motion(seed, "five_bar", "five_bar/swing", {**CHANGES, "formulation": formulation})
+    assert beside_a_turn(motion, seen().coordinates) == ""
