@@ -69,7 +69,14 @@ class Sigma:
     reason: str = ""
 
 
-def sigma(mechanism: Mechanism, q: Array, start: Kinematics | None = None, w: Array | float = 0.0) -> Sigma:
+def sigma(
+    mechanism: Mechanism,
+    q: Array,
+    start: Kinematics | None = None,
+    w: Array | float = 0.0,
+    *,
+    anywhere: bool = True,
+) -> Sigma:
     """Return q' = sigma(q), eq. 4, on the assembly branch of `start` (default: as assembled).
 
     Parameters
@@ -81,6 +88,8 @@ def sigma(mechanism: Mechanism, q: Array, start: Kinematics | None = None, w: Ar
         Closed.
     w : (rows,) array or 0.0
         The level set.
+    anywhere : bool
+        Where the straight way to q ends early, whether to look for q from other starts.
 
     Raises
     ------
@@ -96,7 +105,7 @@ def sigma(mechanism: Mechanism, q: Array, start: Kinematics | None = None, w: Ar
         numbers = mechanism.tree.to_coordinates(start.q_tree)
         numbers[mechanism.partition.q] = q
         step = mechanism.tree.difference(start.q_tree, mechanism.tree.from_coordinates(numbers))[mechanism.partition.q]
-    return move(start, step, w, mechanism.tolerance)
+    return move(start, step, w, mechanism.tolerance, anywhere=anywhere)
 
 
 def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:

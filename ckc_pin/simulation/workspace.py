@@ -54,20 +54,22 @@ def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> Desi
     return _closest(mechanism, desired, way)
 
 
-def _move(mechanism: Mechanism, at: Kinematics, desired: Desired, t: float) -> Kinematics | None:
+def _move(
+    mechanism: Mechanism, at: Kinematics, desired: Desired, t: float, *, anywhere: bool = True
+) -> Kinematics | None:
     try:
         q = desired(t)[0]
     except NumericalError:  # a point's path has no q outside the workspace
         return None
-    outcome = sigma(mechanism, q, at)
+    outcome = sigma(mechanism, q, at, anywhere=anywhere)
     return outcome.at if outcome.verdict == "converged" else None
 
 
 def _leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: float, outside: float) -> DesiredCheck:
-    """Bisect for the last instant that can be reached."""
+    """Bisect for the last instant that can be reached, along the way: within a sample nothing is behind a gap."""
     for _ in range(REFINEMENTS):
         middle = 0.5 * (inside + outside)
-        moved = _move(mechanism, at, desired, middle)
+        moved = _move(mechanism, at, desired, middle, anywhere=False)
         if moved is None:
             outside = middle
         else:
