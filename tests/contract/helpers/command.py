@@ -1,4 +1,4 @@
-"""The `ckc` command in this process: what it prints, where, and its exit code."""
+"""A command line in this process: what it prints, where, and its exit code."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import json
 import signal
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 from unittest import mock
@@ -35,17 +36,22 @@ class Outcome:
 
 
 def ckc(*words: str) -> Outcome:
-    """Run `ckc WORDS...` in this process."""
+    """Run `ckc WORDS...`."""
+    return called(cli.main, "ckc", *words)
+
+
+def called(main: Callable[[], object], *line: str) -> Outcome:
+    """Call what a program starts with, on a command line."""
     out, err = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     code: Any = None
     try:
         with (
-            mock.patch.object(sys, "argv", ["ckc", *words]),
+            mock.patch.object(sys, "argv", list(line)),
             contextlib.redirect_stdout(out),
             contextlib.redirect_stderr(err),
         ):
-            cli.main()
+            main()
     except SystemExit as stop:
         code = stop.code
     finally:
