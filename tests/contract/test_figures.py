@@ -38,6 +38,21 @@ def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
     return run("five_bar/swing")
 
 
+@pytest.fixture(scope="module")
+def fig_4(tracking):
+    return draw(tracking)
+
+
+@pytest.fixture(scope="module")
+def fig_3(set_point):
+    return draw(set_point)
+
+
+@pytest.fixture(scope="module")
+def motion(swing):
+    return draw(swing)
+
+
 def lines(ax, colour=None, style=None):
     """Lines of an axes with their (x, y), by colour and line style."""
     found = [
@@ -52,8 +67,8 @@ def lines(ax, colour=None, style=None):
 # --- Fig. 4 --------------------------------------------------------------------------------------
 
 
-def test_fig_4_has_the_papers_panels(tracking):
-    figure = draw(tracking)["tracking"]
+def test_fig_4_has_the_papers_panels(fig_4):
+    figure = fig_4["tracking"]
     space, torques, angles, velocities = figure.axes
     assert [ax.get_title(loc="left")[:2] for ax in figure.axes] == ["a)", "b)", "c)", "d)"]
     assert (space.get_xlabel(), space.get_ylabel()) == (r"$\theta_{1}$, rad", r"$\theta_{3}$, rad")
@@ -62,8 +77,8 @@ def test_fig_4_has_the_papers_panels(tracking):
     assert velocities.get_ylabel() == r"$\dot q$, rad/s"
 
 
-def test_desired_ellipse_and_dots_are_equation_21(tracking):
-    space, _, angles, velocities = draw(tracking)["tracking"].axes
+def test_desired_ellipse_and_dots_are_equation_21(fig_4):
+    space, _, angles, velocities = fig_4["tracking"].axes
     (ellipse,) = lines(space, "black", ":")
     theta_1, theta_3 = ellipse
     np.testing.assert_allclose((theta_1 / (np.pi / 3)) ** 2 + ((np.pi / 4 - theta_3) / (np.pi / 4)) ** 2, 1, atol=1e-12)
@@ -75,9 +90,9 @@ def test_desired_ellipse_and_dots_are_equation_21(tracking):
     np.testing.assert_allclose(rates_3[1], np.pi / 4 * np.sin(rates_3[0]), atol=1e-12)
 
 
-def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking):
+def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking, fig_4):
     spf, reduced = tracking
-    ax = draw(tracking)["tracking"].axes[2]
+    ax = fig_4["tracking"].axes[2]
     drawn = [line for line in ax.get_lines() if line.get_linestyle() != "None"]
     assert [line.get_linestyle() for line in drawn] == ["-", "-", "--", "--"]  # later ones lie on earlier ones
     assert [to_rgb(line.get_color()) for line in drawn] == [BLUE, VERMILLION, BLUE, VERMILLION]
@@ -85,8 +100,8 @@ def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking):
         np.testing.assert_array_equal(line.get_ydata(), run.q_tree[:, column])
 
 
-def test_torque_maxima_stand_beside_the_papers(tracking):
-    ax = draw(tracking)["tracking"].axes[1]
+def test_torque_maxima_stand_beside_the_papers(fig_4):
+    ax = fig_4["tracking"].axes[1]
     title = ax.get_title(loc="left")
     assert "24.8 N m (paper: at most 30)" in title
     assert "1.35 N m (paper: at most 5)" in title
@@ -95,8 +110,8 @@ def test_torque_maxima_stand_beside_the_papers(tracking):
     assert 1.3 < top < 1.5
 
 
-def test_legend_covers_no_panel(tracking, set_point, swing):
-    for name, figure in draw([*tracking, set_point, swing]).items():
+def test_legend_covers_no_panel(fig_4, fig_3, motion):
+    for name, figure in {**fig_4, **fig_3, **motion}.items():
         figure.draw_without_rendering()
         if not figure.legends:  # snapshots of one run
             continue
@@ -146,8 +161,8 @@ def elbows_and_tip(theta_1: float, theta_3: float) -> np.ndarray:
     [(BLUE, (-1.43430851, -1.70733217)), (VERMILLION, (np.pi / 4, np.pi / 4))],
     ids=["initial", "desired"],
 )
-def test_linkages_of_fig_3a(set_point, colour, angles):
-    ax = draw(set_point)["set_point"].axes[0]
+def test_linkages_of_fig_3a(fig_3, colour, angles):
+    ax = fig_3["set_point"].axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x, m", "y, m")
     ends = np.hstack(lines(ax, colour)).T
     for joint in [[0.0, 0.0], [BASE, 0.0], *elbows_and_tip(*angles)]:
@@ -156,15 +171,15 @@ def test_linkages_of_fig_3a(set_point, colour, angles):
     np.testing.assert_allclose(sorted(lengths), [L_PROXIMAL, L_PROXIMAL, L_DISTAL, L_DISTAL], atol=1e-12)
 
 
-def test_fig_3_errors_are_q_minus_q_d(set_point):
-    _, _, errors, rates = draw(set_point)["set_point"].axes
+def test_fig_3_errors_are_q_minus_q_d(set_point, fig_3):
+    _, _, errors, rates = fig_3["set_point"].axes
     assert errors.get_ylabel() == "$q - q_d$, rad"
     np.testing.assert_array_equal(lines(errors, BLUE)[0][1], set_point.q_tree[:, 0] - np.pi / 4)
     np.testing.assert_array_equal(lines(rates, VERMILLION)[0][1], set_point.v_tree[:, 2])
 
 
-def test_checks_show_residual_energy_and_lyapunov_function(set_point):
-    residual, forces, energy, lyapunov = draw(set_point)["set_point_checks"].axes
+def test_checks_show_residual_energy_and_lyapunov_function(set_point, fig_3):
+    residual, forces, energy, lyapunov = fig_3["set_point_checks"].axes
     assert residual.get_yscale() == lyapunov.get_yscale() == "log"
     drawn = lines(residual)[0][1]
     expected = np.abs(set_point.phi - set_point.w).max(axis=1)
@@ -180,18 +195,17 @@ def test_checks_show_residual_energy_and_lyapunov_function(set_point):
 # --- anything else -------------------------------------------------------------------------------
 
 
-def test_motion_without_control(swing):
-    figures = draw(swing)
-    assert list(figures) == ["motion", "motion_snapshots"]
-    joints, rates, drift, residual = figures["motion"].axes
+def test_motion_without_control(swing, motion):
+    assert list(motion) == ["motion", "motion_snapshots"]
+    joints, rates, drift, residual = motion["motion"].axes
     assert len(lines(joints)) == len(lines(rates)) == 4
     power = int(drift.get_ylabel().split("{")[1].split("}")[0])
     np.testing.assert_allclose(lines(drift)[0][1] * 10.0**power, swing.energy - swing.energy[0], rtol=1e-12)
     assert residual.get_yscale() == "log"
 
 
-def test_snapshots_are_poses_at_equal_times(swing):
-    poses, forces, colours = draw(swing)["motion_snapshots"].axes
+def test_snapshots_are_poses_at_equal_times(swing, motion):
+    poses, forces, colours = motion["motion_snapshots"].axes
     assert colours.get_ylabel() == "t, s"
     assert forces.get_ylabel() == r"$|\lambda|$, N"
     ends = np.hstack([line for line in lines(poses, style="-") if line.shape == (2, 2)]).T
@@ -253,7 +267,7 @@ lift = 0.1
     assert "torques and forces" in efforts.get_title(loc="left")
     assert errors.get_ylabel() == "$q - q_d$, rad or m"
     assert len(lines(linkage, VERMILLION, "-")) == 4  # a, b, c to its centre of mass, and the slide's way
-    written = plot(run, tmp_path / "out", ("png", "svg"))  # the residual of no loop is zero: no logarithm
+    written = plot(run, tmp_path / "out")  # the residual of no loop is zero: no logarithm
     assert {path.stem for path in written} == {"set_point", "set_point_checks", "set_point_snapshots"}
 
 
