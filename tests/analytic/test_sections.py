@@ -33,7 +33,7 @@ def stack():
     done = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loci, "STEP", 0.15)  # curves of fewer points, as exact
-        found = workspace_sections("delta", count=2, cells=24, progress=done.append)
+        found = workspace_sections("delta", count=2, cells=16, progress=done.append)
     assert (done[0], done[-1]) == (0.0, 1.0)
     assert done == sorted(done)
     return found
@@ -41,7 +41,7 @@ def stack():
 
 def test_sections_reach_what_the_closed_form_does():
     """Also three corners at the top that hang together only below."""
-    sections = Stack(ckc_pin.load("delta"), None, ("x", "y")).sections(4, 24)
+    sections = Stack(ckc_pin.load("delta"), None, ("x", "y")).sections(4, 16)
     for grid in sections:
         x, y = np.meshgrid(*(axis.values for axis in grid.domain.axes), indexing="ij")
         (height,) = np.unique(grid.given[grid.reached, 2].round(12))
