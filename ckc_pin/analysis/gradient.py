@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -160,6 +161,7 @@ def _crossing(mechanism: Mechanism, a: Kinematics, b: Kinematics, s_min: float) 
 
     straight = way(mechanism, a, b)
 
+    @cache  # both ends are asked for again
     def gap(fraction: float) -> float:
         return margin(follow(mechanism, a, fraction * straight)[0]) - s_min
 

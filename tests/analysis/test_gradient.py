@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ckc_pin import load
+from ckc_pin import Mechanism, load
 from ckc_pin.analysis.gradient import Bound, bound_along, chart_step, explore_branch, gradient_bounds
 from ckc_pin.analysis.walk import margin, margin_gradient
 from ckc_pin.control.desired import Harmonics
@@ -13,17 +13,25 @@ from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from tests.analysis.set_point import five_bar_border, five_bar_gradient, pendulum
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import Pair, assert_close
+
+DIVISIONS = 28
+
+
+def bounds_on(mechanism: Mechanism, branch: Kinematics, margins: list[float]) -> list[Bound]:
+    explored = explore_branch(mechanism, branch, DIVISIONS)
+    return gradient_bounds(mechanism, explored, margins, chart_step(mechanism, DIVISIONS))
 
 
 @pytest.fixture(scope="module")
 def bounds(five_bar: Pair) -> dict[float, Bound]:
     """On the own branch, by the least margin, of one exploration."""
     mechanism, _ = five_bar
-    explored, margins = explore_branch(mechanism, mechanism.assembled, 36), [0.5, 0.1]
-    return dict(zip(margins, gradient_bounds(mechanism, explored, margins, chart_step(mechanism, 36)), strict=True))
+    margins = [0.5, 0.1]
+    return dict(zip(margins, bounds_on(mechanism, mechanism.assembled, margins), strict=True))
 
 
 @pytest.mark.parametrize(("s_min", "finer"), [(0.5, 1e-3), (0.1, 1e-4)])
@@ -39,15 +47,14 @@ def test_bounds_are_the_extremes_on_the_border(bounds: dict[float, Bound], s_min
         assert value <= np.linalg.norm(five_bar_gradient(q, finer), 2) * (1 + 1e-5)
 
 
-def test_the_other_branch_is_the_mirror_image(five_bar: Pair) -> None:
+def test_the_other_branch_is_the_mirror_image(five_bar: Pair, bounds: dict[float, Bound]) -> None:
     """Reflected in the base line gravity points up: dh/dq changes its sign."""
     mechanism, _ = five_bar
-    own, other = assembly_branches(mechanism)
-    step = chart_step(mechanism, 20)
-    bounds = [gradient_bounds(mechanism, explore_branch(mechanism, at, 20), [0.6], step)[0] for at in (own, other)]
-    assert_close(bounds[1].norm, bounds[0].norm, 2e-3, relative=True)
-    assert_close(bounds[1].low, -bounds[0].norm, 2e-3, relative=True)  # the norm is a positive eigenvalue's
-    assert bounds[0].low > bounds[1].low + 1
+    _, other = assembly_branches(mechanism)
+    (mirrored,), own = bounds_on(mechanism, other, [0.5]), bounds[0.5]
+    assert_close(mirrored.norm, own.norm, 2e-3, relative=True)
+    assert_close(mirrored.low, -own.norm, 2e-3, relative=True)  # the norm is a positive eigenvalue's
+    assert own.low > mirrored.low + 1
 
 
 def test_bound_along_a_trajectory(five_bar: Pair) -> None:
