@@ -106,13 +106,13 @@ def test_programs_are_loaded_from_where_that_is_allowed(folder: Path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"), [("pinocchio", "pinocchio"), ("generated", "generated"), ("auto", "pinocchio")]
+    ("asked", "terms"), [("pinocchio", "pinocchio"), ("generated", "generated"), ("auto", "pinocchio")]
 )
-def test_a_check_of_a_scene_says_what_the_scene_asks_for(asked: str, told: str, folder: Path, tmp_path: Path) -> None:
+def test_a_check_of_a_scene_says_what_the_scene_asks_for(asked: str, terms: str, folder: Path, tmp_path: Path) -> None:
     scene = tmp_path / "mine.scene.toml"
     plain = f'mechanism = "{NAME}"\nformulation = "dae"\nt_end = 1.0\ninitial.at = "assembled"\n'
     scene.write_text(f'{plain}solver.terms = "{asked}"\n')
-    assert check(scene).terms == told
+    assert check(scene).terms == terms
 
 
 def test_without_a_compiler_there_is_the_general_core(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
