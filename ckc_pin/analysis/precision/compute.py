@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin.analysis.precision import mujoco
 from ckc_pin.analysis.precision.advice import Advice, advise
-from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move, on_span
+from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move, no_motion, on_span
 from ckc_pin.analysis.precision.reference import Reference, find_reference
 from ckc_pin.analysis.precision.settings import changed, off_manifold, settings
 from ckc_pin.errors import InputError
@@ -152,16 +152,16 @@ def _ours(
         progress(k / len(every))
         left = deadline - perf_counter()
         if setting.family in spent:
-            motion = _none(mechanism, *spent[setting.family])
+            motion = no_motion(*spent[setting.family])
         elif left <= 0:
-            motion = _none(mechanism, *LATE)
+            motion = no_motion(*LATE)
         else:
             limited = {**setting.changes(scene), **span, "solver.max_wall_s": min(limit, max(left, 0.01))}
             motion, _ = move(changed(scene, limited), min(limit, left))
             if motion.status == "refused":
                 spent[setting.family] = ("refused", motion.reason)
             elif "max_wall_s" in motion.reason and left < limit:  # too late, not too slow
-                motion = _none(mechanism, *LATE)
+                motion = no_motion(*LATE)
             elif "max_wall_s" in motion.reason:
                 spent[setting.family] = "not tried", f"at rtol {setting.rtol:.0e} it took more than {limit:.2g} s"
         found.rows.append(
@@ -231,11 +231,6 @@ def _judged(
     )
 
 
-def _none(mechanism: Mechanism, status: str, reason: str) -> Motion:
-    none = np.empty((0, mechanism.n))
-    return Motion(status, reason, none, none)
-
-
 def _without_w(found: WorkPrecision, scene: Scene, mechanism: Mechanism, reference: Reference) -> None:
     """Tell how far the motion with w = 0 is from the SPF's: a difference of models, which is in no row's error."""
     changes = {
@@ -244,7 +239,7 @@ def _without_w(found: WorkPrecision, scene: Scene, mechanism: Mechanism, referen
         "formulation": "reduced",
         "solver.rtol": 1e-10,
     }
-    motion, _ = move(changed(scene, changes), 1.0, once=True)
+    motion, _ = move(changed(scene, changes), 1.0, most=1)
     found.notes.append("the scene starts off phi = 0, where only the SPF can: compared with the SPF's own flow")
     if motion.status == "done":
         found.model_difference = float(apart(mechanism.tree, motion, reference.motion).scaled.max())

@@ -17,7 +17,7 @@ from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.simulate import run_prepared
 
-__all__ = ["INSTANTS", "Apart", "Motion", "PrecisionRow", "apart", "move", "on_span", "without_place"]
+__all__ = ["INSTANTS", "Apart", "Motion", "PrecisionRow", "apart", "move", "no_motion", "on_span"]
 
 INSTANTS = 20  # at which motions are compared, the end among them
 REPEATS, ENOUGH = 20, 0.05  # runs and s: repeated up to whichever comes first
@@ -52,6 +52,11 @@ class Motion:
     rhs: int | None = None
     steps: int | None = None
     used: str = ""
+
+
+def no_motion(status: str, reason: str, n: int = 0) -> Motion:
+    """Return what is known of n coordinates where a setting was not run, or failed."""
+    return Motion(status, reason, np.empty((0, n)), np.empty((0, n)))
 
 
 @dataclass(frozen=True)
@@ -128,10 +133,17 @@ def on_span(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
     return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
 
 
-def move(scene: Scene, limit: float, *, once: bool = False) -> tuple[Motion, Run | None]:
+def move(scene: Scene, limit: float, *, fewest: int = 1, most: int = REPEATS) -> tuple[Motion, Run | None]:
     """Run a scene, each run for no more than a limit in s; short runs are repeated, the fastest counts.
 
     KeyboardInterrupt: a signal stopped a run.
+
+    Parameters
+    ----------
+    scene : Scene
+    limit : float
+    fewest, most : int
+        Runs; of two, the first one warms up.
     """
     began, walls = perf_counter(), list[float]()
     try:
@@ -142,18 +154,18 @@ def move(scene: Scene, limit: float, *, once: bool = False) -> tuple[Motion, Run
             if run.status == "interrupted":  # the comparison is, not only this run
                 raise KeyboardInterrupt(*(["SIGTERM"] if "SIGTERM" in run.message else []))
             walls.append(float(run.stats["wall_s"]))
-            if once or run.status != "done" or len(walls) >= REPEATS or sum(walls) > min(ENOUGH, limit):
+            enough = len(walls) >= fewest and sum(walls) > min(ENOUGH, limit)
+            if run.status != "done" or enough or len(walls) >= most:
                 break
     except CkcError as error:
-        none = np.empty((0, 0))
-        return Motion("refused", str(error), none, none), None
+        return no_motion("refused", str(error)), None
     stats = run.stats
-    reason = "" if run.status == "done" else without_place(run.message)
+    reason = "" if run.status == "done" else _without_place(run.message)
     return Motion(
         run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["rhs"], stats["steps"], stats["method"]
     ), run
 
 
-def without_place(message: str) -> str:
+def _without_place(message: str) -> str:
     """Shorten a message by its configuration, which may be a line of 81 coordinates."""
     return re.sub(r" near [^:]*:", ":", message)

@@ -11,20 +11,20 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion
+from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.analysis.precision.settings import off_manifold
+from ckc_pin.analysis.precision.stepping import Stepper
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["Joints", "missing", "rows"]
+__all__ = ["Joints", "missing", "model_of", "rows", "set_up", "stepper"]
 
 SAME = 1e-6  # relative: how well mass matrix and bias agree where both programs have one mechanism
 COARSEST, STEPS = 1e-2, 9  # of the span or of 2 s, and how many halves
 INTEGRATORS = ("implicitfast", "RK4")
 STIFFNESSES = ("default", "solref 2 dt")  # as MuJoCo has them, and as stiff as its manual lets them be
-TRIAL, REPEATS = 50, 3
 UNUSED = ("AUTORESET", "CONTACT", "LIMIT", "FRICTIONLOSS", "SENSOR")  # a run that blew up is not to start again
 
 
@@ -52,88 +52,84 @@ def rows(
     deadline : float
         By `perf_counter`; what would end later is not tried.
     """
-    import mujoco
-
-    mujoco.set_mju_user_warning(_silent)  # by default they go to a file in the current folder
     try:
-        model = mujoco.MjModel.from_xml_string(_bare(mjcf))
+        model = model_of(mjcf)
     except ValueError as error:
         return f"it refuses the model: {' '.join(str(error).split())}"
     start = find_start(mechanism, scene)
     state = start.at.q_tree, start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
-    joints, data = Joints(mechanism, model), mujoco.MjData(model)
-    off = _difference(mechanism, joints, model, data, state)
+    off = _difference(mechanism, model, state)
     if not off <= SAME:
         return f"its mass matrix or its forces at the start differ by {off:.1e}"
-    return _steps(model, data, joints, state, mechanism.n, t, deadline)
+    return _steps(model, stepper(model, mechanism, state), t, deadline)
 
 
-def _steps(
-    model: Any, data: Any, joints: Joints, state: tuple[Array, Array], n: int, t: Array, deadline: float
-) -> Iterator[tuple[str, float, Motion]]:
-    import mujoco
-
-    for unused in UNUSED:
-        model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
+def _steps(model: Any, program: Stepper, t: Array, deadline: float) -> Iterator[tuple[str, float, Motion]]:
     solref, solimp = model.eq_solref.copy(), model.eq_solimp.copy()
-    none, between, instants, slow = np.empty((0, n)), float(t[1]), len(t) - 1, set[str]()
+    between, instants, slow = float(t[1]), len(t) - 1, set[str]()
     for k, (integrator, stiffness) in product(range(STEPS), product(INTEGRATORS, STIFFNESSES)):
         many = max(1, round(between / (COARSEST * min(2.0, float(t[-1])) / 2**k)))
         method, dt = f"{integrator}, {stiffness}", between / many
-        model.opt.timestep = dt
-        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
         model.eq_solref[:], model.eq_solimp[:] = solref, solimp
-        if stiffness != "default":
-            model.eq_solref[:], model.eq_solimp[:] = [2 * dt, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
-        foreseen = np.inf if method in slow else _foreseen(model, data, joints, state, many * instants)
-        if foreseen > deadline - perf_counter():
+        set_up(model, integrator, stiffness, dt)
+        if method in slow or program.foreseen(many, instants) > deadline - perf_counter():
             slow.add(method)
-            yield method, dt, Motion("not tried", "the budget was used up before; give a larger one", none, none)
+            yield method, dt, no_motion("not tried", "the budget was used up before; give a larger one")
             continue
-        yield method, dt, _run(model, data, joints, state, many, instants)
+        yield method, dt, program.run(many, instants)
 
 
-def _foreseen(model: Any, data: Any, joints: Joints, state: tuple[Array, Array], steps: int) -> float:
+def model_of(mjcf: str) -> Any:
+    """Return the model of a mechanism, without shapes and what a mechanism has not, so that nothing else takes time.
+
+    ValueError: MuJoCo refuses it.
+    """
     import mujoco
 
-    _reset(model, data, joints, state)
-    trial = min(TRIAL, steps)
-    began = perf_counter()
-    mujoco.mj_step(model, data, nstep=trial)
-    return (perf_counter() - began) / trial * steps
+    mujoco.set_mju_user_warning(_silent)  # by default they go to a file in the current folder
+    root = ElementTree.fromstring(mjcf)
+    for body in root.iter():
+        for shape in body.findall("geom"):  # nothing collides, and placing them takes time
+            body.remove(shape)
+    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+    for unused in UNUSED:
+        model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
+    return model
 
 
-def _run(model: Any, data: Any, joints: Joints, state: tuple[Array, Array], many: int, instants: int) -> Motion:
-    """Step from instant to instant; reading the states out is not timed."""
+def set_up(model: Any, integrator: str, stiffness: str, dt: float) -> None:
+    """Set integrator, step and stiffness of the loops: "default", or their time constant as "solref 2 dt".
+
+    Two steps are the shortest one that the manual allows.
+    """
     import mujoco
 
-    walls: list[float] = []
-    while len(walls) < REPEATS and sum(walls) < 1.0:
-        _reset(model, data, joints, state)
-        states, wall = [joints.state(data)], 0.0
-        for _ in range(instants):
-            began = perf_counter()
-            mujoco.mj_step(model, data, nstep=many)
-            wall += perf_counter() - began
-            states.append(joints.state(data))
-        walls.append(wall)
-    q_tree, v_tree = (np.array(each) for each in zip(*states, strict=True))
-    return Motion("done", "", q_tree, v_tree, min(walls), None, None, many * instants, "fixed step")
+    model.opt.timestep = dt
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    if stiffness != "default":
+        model.eq_solref[:] = [float(stiffness.split()[1]) * dt, 1.0]
+        model.eq_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 
-def _reset(model: Any, data: Any, joints: Joints, state: tuple[Array, Array]) -> None:
+def stepper(model: Any, mechanism: Mechanism, state: tuple[Array, Array]) -> Stepper:
+    """Return the program at a start, Pinocchio's q_tree and v_tree."""
     import mujoco
 
-    mujoco.mj_resetData(model, data)
-    joints.put(data, *state)
+    data, joints = mujoco.MjData(model), Joints(mechanism, model)
+
+    def reset() -> None:
+        mujoco.mj_resetData(model, data)
+        joints.put(data, *state)
+
+    return Stepper(reset, lambda many: mujoco.mj_step(model, data, nstep=many), lambda: joints.state(data))
 
 
-def _difference(mechanism: Mechanism, joints: Joints, model: Any, data: Any, state: tuple[Array, Array]) -> float:
+def _difference(mechanism: Mechanism, model: Any, state: tuple[Array, Array]) -> float:
     """How far D', and without a free root also the bias, are from Pinocchio's at the start, relative."""
     import mujoco
 
-    tree, (q_tree, v_tree) = mechanism.tree, state
-    to = joints.put(data, q_tree, v_tree)
+    tree, (q_tree, v_tree), data = mechanism.tree, state, mujoco.MjData(model)
+    to = Joints(mechanism, model).put(data, q_tree, v_tree)
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
@@ -189,15 +185,6 @@ class Joints:
             v_tree[joint.idx_v : joint.idx_v + 3] = rotation.T @ data.qvel[v_at : v_at + 3]
             v_tree[joint.idx_v + 3 : joint.idx_v + 6] = data.qvel[v_at + 3 : v_at + 6]
         return tree.to_coordinates(q_tree), v_tree
-
-
-def _bare(mjcf: str) -> str:
-    """Take the shapes out: nothing collides, and placing them takes time."""
-    root = ElementTree.fromstring(mjcf)
-    for body in root.iter():
-        for shape in body.findall("geom"):
-            body.remove(shape)
-    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _silent(message: str) -> None:

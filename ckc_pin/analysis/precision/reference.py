@@ -102,7 +102,7 @@ def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Refere
         left = deadline - perf_counter()
         if left <= 0 or (best and best[0] == INSTANTS and best[1] <= GOOD):
             break
-        motion, run = move(_tight(scene, formulation, method, t_end, min(left, seconds / 3)), left, once=True)
+        motion, run = move(_tight(scene, formulation, method, t_end, min(left, seconds / 3)), left, most=1)
         if motion.status != "done":
             failures.append(f"{formulation}, {method}: {motion.reason}")
         if run is None:
@@ -158,7 +158,7 @@ def _end(scene: Scene, seconds: float) -> tuple[float, str]:
         return t_end, ""
     formulation = "spf, w" if off_manifold(scene) else "dae"
     own = {"event": scene.plain()["event"]}
-    _, run = move(_tight(scene, formulation, "auto", t_end, seconds / 3, **own), seconds, once=True)
+    _, run = move(_tight(scene, formulation, "auto", t_end, seconds / 3, **own), seconds, most=1)
     met = [event for event in run.events if event["stop"]] if run is not None else []
     if not met or not met[-1]["t"] > 0:
         return t_end, ""

@@ -40,7 +40,7 @@ LEAN = 1.2  # rad: squares lean, so that at rest they are no equilibrium
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "dae": {"formulation": "dae"},
     "reduced": {"formulation": "reduced"},
-    "spf, eq. 8": {"formulation": "spf", "epsilon": 1e-2, "spf_coordinates": "z"},
+    "spf, z": {"formulation": "spf", "epsilon": 1e-2, "spf_coordinates": "z"},
 }
 BUDGET = 60.0  # s for a counted run
 STATES, SPACING = 20, 1e-4  # of the motion that a right-hand side is timed at: how many, and s between them

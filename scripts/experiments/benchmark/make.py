@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 from joblib import Memory
 
+from ckc_pin.analysis.precision.motion import no_motion
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import load_scene
@@ -133,13 +134,13 @@ def rows_of(work: Work, quick: bool, memory: Memory, others: Sequence[Peer], bud
     """Measure a work: this program first. What used up its budget at one tolerance is not tried with a tighter one."""
     run = memory.cache(_run, ignore=["work", "peer", "exact"])
     own, exact = work_stamp(work), exact_of(work, memory)
-    spent: dict[str, str] = {}
+    spent: dict[tuple[str, str], str] = {}
     for setting in ours.settings(quick):
+        name = ours.name_of(setting)
         if setting.family in spent:
-            motion = ours.refused(work, spent[setting.family])
-            yield judged(work, ours.PROGRAM, setting.name, motion, exact())
+            yield judged(work, ours.PROGRAM, name, no_motion("refused", spent[setting.family]), exact())
             continue
-        row = run(own, ours.PROGRAM, setting.name, budget.own, work, None, exact)
+        row = run(own, ours.PROGRAM, name, budget.own, work, None, exact)
         if ours.used_up(row):
             spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
         yield row
@@ -161,7 +162,7 @@ def _run(
     """Run one work by one program and setting, and judge it; `own` tells what the rest depends on."""
     _tell(f"{work.key}: {program}, {setting}")
     if peer is None:
-        motion = ours.compute(work, ours.setting_of(setting).changes, budget)
+        motion = ours.compute(work, ours.setting_of(setting), budget)
     else:
         motion = peer.compute(work, setting, budget)
     return judged(work, program, setting, motion, exact())

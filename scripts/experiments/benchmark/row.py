@@ -6,39 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.analysis.precision.motion import Motion
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.reference import Reference
 from scripts.experiments.benchmark.work import Work
 
-__all__ = ["Motion", "Row", "judged"]
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What a program made of a work.
-
-    Attributes
-    ----------
-    status : str
-        "done", or how it ended otherwise.
-    reason : str
-    q_tree, v_tree : (m, n) arrays
-        By coordinate, at the first m of the work's instants.
-    wall_s, setup_s : float
-        Time of the integration, the least of its repeats, and of everything before it.
-    steps, rhs : int or None
-        Counted where the program counts them.
-    """
-
-    status: str
-    reason: str
-    q_tree: Array
-    v_tree: Array
-    wall_s: float
-    setup_s: float
-    steps: int | None = None
-    rhs: int | None = None
+__all__ = ["Row", "judged"]
 
 
 @dataclass(frozen=True)
@@ -54,8 +27,8 @@ class Row:
     error_max: float | None
     closure: float | None
     energy_drift: float | None
-    wall_s: float
-    setup_s: float
+    wall_s: float | None
+    setup_s: float | None
     steps: int | None
     rhs: int | None
 

@@ -22,8 +22,8 @@ def found(*rows: tuple[str, str, str, float, float], status: str = "done", accur
 
 
 def test_a_setting_becomes_columns() -> None:
-    row = found(("w", OWN, "spf, eq. 8, auto, rtol 1e-06", 1e-7, 1.0)).rows.iloc[0]
-    assert (row.family, row.formulation, row.method, row.rtol) == ("spf, eq. 8, auto", "spf, eq. 8", "auto", 1e-6)
+    row = found(("w", OWN, "spf, z, auto, rtol 1e-06", 1e-7, 1.0)).rows.iloc[0]
+    assert (row.family, row.formulation, row.method, row.rtol) == ("spf, z, auto", "spf, z", "auto", 1e-6)
     other = found(("w", "Other", "RK4, rtol 1e-06", 1e-7, 1.0)).rows.iloc[0]
     assert other.kind == "packaged"
     assert pd.isna(other.family)
@@ -59,7 +59,7 @@ def test_programs_of_a_kind_are_compared_where_they_get_to() -> None:
 def test_eq_8_pays_where_it_takes_less_than_the_reduced_model() -> None:
     rows = found(
         ("a", OWN, "reduced, auto, rtol 1e-06", 1e-7, 2.0),
-        ("a", OWN, "spf, eq. 8, auto, rtol 1e-06", 1e-7, 1.0),
+        ("a", OWN, "spf, z, auto, rtol 1e-06", 1e-7, 1.0),
         ("b", OWN, "reduced, auto, rtol 1e-06", 1e-4, 2.0),
     ).rows
     ratios = eq_8(rows)

@@ -13,12 +13,14 @@ import pytest
 from joblib import Memory
 from scipy.integrate import solve_ivp
 
+from ckc_pin.analysis.precision.motion import Motion, no_motion
+from ckc_pin.analysis.precision.settings import Setting, changed
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.simulate import simulate
 from scripts.experiments.benchmark import make, ours
 from scripts.experiments.benchmark.peers import peers
 from scripts.experiments.benchmark.reference import Reference, reference
-from scripts.experiments.benchmark.row import Motion, judged
+from scripts.experiments.benchmark.row import judged
 from scripts.experiments.benchmark.stamp import work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
 from tests.analytic.five_bar import FIVE_BAR, Q
@@ -95,8 +97,8 @@ def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> N
 
 def test_a_repeated_run_is_the_same_run() -> None:
     """What is measured, warm and from a loop that has run before, is what a user's run computes."""
-    setting = ours.Setting("reduced", "DOP853", 1e-6)
-    motion = ours.compute(SHORT, setting.changes, 60.0)
+    setting = Setting("reduced", "DOP853", 1e-6)
+    motion = ours.compute(SHORT, setting, 60.0)
     run = simulate(SHORT.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6))
     assert np.array_equal(motion.q_tree, run.q_tree)
     assert np.array_equal(motion.v_tree, run.v_tree)
@@ -105,8 +107,8 @@ def test_a_repeated_run_is_the_same_run() -> None:
 
 
 def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
-    setting = ours.Setting("dae", "auto", 1e-8)
-    row = judged(SHORT, ours.PROGRAM, setting.name, ours.compute(SHORT, setting.changes, 60.0), exact)
+    setting = Setting("dae", "auto", 1e-8)
+    row = judged(SHORT, ours.PROGRAM, ours.name_of(setting), ours.compute(SHORT, setting, 60.0), exact)
     assert row.error_max is not None
     assert row.error_max < 1e-7
     assert row.energy_drift is not None
@@ -138,26 +140,27 @@ def test_others_are_set_up_as_the_same_tree(work: str) -> None:
 
 
 def test_every_formulation_is_measured_by_every_method() -> None:
+    scene = SHORT.load()
     quick, full = (list(ours.settings(quick=how)) for how in (True, False))
     for every in (quick, full):
-        assert len({setting.name for setting in every}) == len(every)
+        assert len({ours.name_of(setting) for setting in every}) == len(every)
     assert len(quick) == 4 * len(ours.QUICK_TOLERANCES)
     assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.FEW))
-    assert {setting.changes["solver.method"] for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
-    assert {setting.changes.get("spf_coordinates") for setting in full} == {None, "w", "z"}
+    assert {setting.method for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
+    assert {setting.changes(scene).get("spf_coordinates") for setting in full} == {None, "w", "z"}
     for setting in full:
-        assert SHORT.load(**{name.replace(".", "__"): x for name, x in setting.changes.items()})
+        assert changed(scene, setting.changes(scene))
 
 
 def test_a_setting_is_read_back_from_its_name() -> None:
     for setting in ours.settings(quick=False):
-        assert ours.setting_of(setting.name) == setting
+        assert ours.setting_of(ours.name_of(setting)) == setting
 
 
 def test_a_reason_is_no_list_of_coordinates() -> None:
     """The reduced model of squares in a row stops where they lie flat, and says near which coordinates."""
     flat = replace(EVERY["n_four_bar_4"], t_end=2.0)
-    stopped = ours.compute(flat, ours.Setting("reduced", "DOP853", 1e-6).changes, 60.0)
+    stopped = ours.compute(flat, Setting("reduced", "DOP853", 1e-6), 60.0)
     assert stopped.status == "stopped"
     assert not any(name in stopped.reason for name in flat.mechanism.coordinates)
 
@@ -230,7 +233,7 @@ class Breaks:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         self.runs += 1
-        return Motion("failed", "it fell, over a comma", np.empty((0, 4)), np.empty((0, 4)), 0.0, 0.0)
+        return no_motion("failed", "it fell, over a comma")
 
 
 def test_what_was_measured_is_not_measured_again(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-from scripts.experiments.benchmark.row import Motion
+from ckc_pin.analysis.precision.motion import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Peer", "peers"]

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.analysis.precision.motion import Motion
+from ckc_pin.analysis.precision.stepping import Stepper
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer_loops import in_one_plane
 from ckc_pin.mechanism.frames import Frame
@@ -17,7 +19,6 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Drake"]
@@ -110,7 +111,7 @@ class Drake:
         def state() -> tuple[Array, Array]:
             return plant.state(running["simulator"].get_context())
 
-        motion = stepped(work, dt, reset, step, state, budget)
+        motion = stepped(work, dt, Stepper(reset, step, state), budget)
         if discrete or motion.status != "done":
             return motion
         return replace(motion, steps=running["simulator"].get_integrator().get_num_steps_taken())

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.analysis.precision.motion import Motion
+from ckc_pin.analysis.precision.stepping import Stepper
 from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.exudyn_plane import Plane, in_plane
 from scripts.experiments.benchmark.peers.exudyn_steps import Steps
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Exudyn"]
@@ -82,7 +83,7 @@ class Exudyn:
             q_tree, v_tree = running["system"].state()
             return q_tree, v_tree
 
-        return stepped(work, dt, reset, step, state, budget)
+        return stepped(work, dt, Stepper(reset, step, state), budget)
 
 
 class _System(Steps):

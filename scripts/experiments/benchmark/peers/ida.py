@@ -12,21 +12,20 @@ both levels. mu is zero but for errors. Of redundant rows those are taken that d
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib import metadata
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from ckc_pin.analysis.precision.motion import Motion, no_motion
+from ckc_pin.analysis.precision.stepping import REPEATS, SHORT
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import Dae, as_ivp
 from scripts.experiments.benchmark import ours
-from scripts.experiments.benchmark.peers.stepping import REPEATS, SHORT
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Ida", "Stabilised"]
@@ -82,13 +81,13 @@ class Ida:
                 try:
                     at = ida.step(t, tstop=work.t_end)
                 except TimeoutError as error:
-                    return ours.refused(work, str(error))
+                    return no_motion("refused", str(error))
                 if not at.success:
-                    return replace(ours.refused(work, str(at.message)), status="failed")
+                    return no_motion("failed", str(at.message))
                 states.append(np.array(at.y[: 2 * n]))
             walls.append(perf_counter() - began)
         q_tree, v_tree = np.split(np.array(states), 2, axis=1)
-        return Motion("done", "", q_tree, v_tree, min(walls), 0.0, rhs=form.count)
+        return Motion("done", "", q_tree, v_tree, min(walls), rhs=form.count)
 
 
 class Stabilised:

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib import metadata
-from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.mujoco import Joints
+from ckc_pin.analysis.precision.motion import Motion
+from ckc_pin.analysis.precision.mujoco import Joints, model_of, set_up, stepper
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.mechanism import Mechanism
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Mujoco"]
@@ -44,7 +42,7 @@ class Mujoco:
         if work.controlled:
             return CONTROLLED
         try:
-            _model(work.mechanism)
+            model_of(_text(work.mechanism))
         except (InputError, ValueError) as error:
             return str(error)
         return None
@@ -66,7 +64,7 @@ class Mujoco:
 
         tree = work.mechanism.tree
         q_tree, v_tree = start_of(work)
-        model = _model(work.mechanism)
+        model = model_of(_text(work.mechanism))
         data = mujoco.MjData(model)
         joints = Joints(work.mechanism, model)
         to = joints.put(data, q_tree, v_tree)
@@ -85,28 +83,10 @@ class Mujoco:
         return said
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
-        import mujoco
-
         integrator, stiffness, step = setting.split(", ")
-        dt = float(step.removeprefix("dt "))
-        model = _model(work.mechanism)
-        model.opt.timestep = divided(work, dt)
-        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-        if stiffness != DEFAULT:  # two steps are the shortest time constant that the manual allows; and no softness
-            model.eq_solref[:] = [float(stiffness.split()[1]) * model.opt.timestep, 1.0]
-            model.eq_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-        for unused in ("AUTORESET", "CONTACT", "LIMIT", "FRICTIONLOSS", "SENSOR"):
-            model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{unused}")
-        data, joints = mujoco.MjData(model), Joints(work.mechanism, model)
-        q_tree, v_tree = start_of(work)
-
-        def reset() -> None:
-            mujoco.mj_resetData(model, data)
-            joints.put(data, q_tree, v_tree)
-
-        return stepped(
-            work, dt, reset, lambda k: mujoco.mj_step(model, data, nstep=k), lambda: joints.state(data), budget
-        )
+        dt, model = float(step.removeprefix("dt ")), model_of(_text(work.mechanism))
+        set_up(model, integrator, stiffness, divided(work, dt))
+        return stepped(work, dt, stepper(model, work.mechanism, start_of(work)), budget)
 
 
 def _installed() -> bool:
@@ -119,19 +99,4 @@ def _installed() -> bool:
 
 @lru_cache(maxsize=1)
 def _text(mechanism: Mechanism) -> str:
-    root = ElementTree.fromstring(export(mechanism, "mjcf").text)
-    for body in root.iter():
-        for shape in body.findall("geom"):  # nothing collides, and placing them takes time
-            body.remove(shape)
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _model(mechanism: Mechanism) -> Any:
-    import mujoco
-
-    mujoco.set_mju_user_warning(_silent)  # by default they go to a file in the current folder
-    return mujoco.MjModel.from_xml_string(_text(mechanism))
-
-
-def _silent(message: str) -> None:
-    """Pass over a warning: a run that became unstable is told by its numbers."""
+    return export(mechanism, "mjcf").text

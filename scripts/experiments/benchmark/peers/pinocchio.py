@@ -9,11 +9,12 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.analysis.precision.motion import Motion
+from ckc_pin.analysis.precision.stepping import Stepper
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Pinocchio", "closed", "not_closed"]
@@ -76,7 +77,7 @@ class Pinocchio:
         def read() -> tuple[Array, Array]:
             return mechanism.tree.to_coordinates(state["q"]), state["v"]
 
-        return stepped(work, dt, reset, step, read, budget)
+        return stepped(work, dt, Stepper(reset, step, read), budget)
 
 
 def not_closed(work: Work) -> str | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -17,7 +18,6 @@ from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.compiled import program, version
 from scripts.experiments.benchmark.peers.pinocchio import closed, not_closed
 from scripts.experiments.benchmark.peers.stepping import start_of
-from scripts.experiments.benchmark.row import Motion
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["PinocchioLoop"]
@@ -70,18 +70,18 @@ class PinocchioLoop:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         gain, mu, iterations, tolerance = (float(part.split()[1]) for part in setting.split(", "))
-        tree, none = work.mechanism.tree, np.empty((0, work.mechanism.n))
+        tree = work.mechanism.tree
         try:
             given = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
         except subprocess.TimeoutExpired:
-            return Motion("refused", f"takes longer than the budget, {budget:.0f} s", none, none, 0.0, 0.0)
+            return no_motion("refused", f"takes longer than the budget, {budget:.0f} s")
         except subprocess.CalledProcessError as error:
             said = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
-            return Motion("failed", said, none, none, 0.0, 0.0)
+            return no_motion("failed", said)
         states = np.array(given["state"])
         q_tree = np.array([tree.to_coordinates(state) for state in states[:, : tree.model.nq]])
         wall, steps, rhs = given["cost"][0]
-        return Motion("done", "", q_tree, states[:, tree.model.nq :], wall, 0.0, steps=int(steps), rhs=int(rhs))
+        return Motion("done", "", q_tree, states[:, tree.model.nq :], wall, steps=int(steps), rhs=int(rhs))
 
 
 def _answer(problem: str, budget: float | None) -> Answer:
