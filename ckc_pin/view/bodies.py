@@ -16,7 +16,7 @@ from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.gaps import opening_loops
 from ckc_pin.view.meshes import load_surface
-from ckc_pin.view.skeleton import Motion, Stick, sticks
+from ckc_pin.view.skeleton import Placements, Stick, sticks
 from ckc_pin.view.visuals import Colour, Visual, visuals
 
 __all__ = ["ACROSS", "GHOST", "SOLID", "Look", "body_path", "draw_bodies", "draw_gaps", "draw_loop_frames", "gap_path",
@@ -60,13 +60,13 @@ def body_path(mechanism: Mechanism, root: str, joint: int) -> str:
 
 
 def draw_bodies(
-    mechanism: Mechanism, root: str, moved: Motion, look: Look, meshes: Path | None = None
+    mechanism: Mechanism, root: str, moved: Placements, look: Look, meshes: Path | None = None
 ) -> Iterator[Command]:
     """Draw the links as their URDF shows them, and those of which it shows nothing as sticks; a ghost has no base.
 
     Parameters
     ----------
-    moved : Motion
+    moved : Placements
         How far slides go, whose rails are drawn.
     meshes : Path, optional
         Folder of the mesh files, where it is not the mechanism's own.
@@ -105,7 +105,7 @@ def _shape(shape: Visual, path: str, look: dict[str, Any], folder: Path | None) 
 
 
 def _sticks(
-    mechanism: Mechanism, root: str, moved: Motion, drawn: set[int], colours: list[Colour], look: Look
+    mechanism: Mechanism, root: str, moved: Placements, drawn: set[int], colours: list[Colour], look: Look
 ) -> Iterator[Command]:
     """Draw bodies that have no shapes of their own as rods with a ball at their joint, and rails of slides thinner."""
     thick = 0.03 * mechanism.size
@@ -125,7 +125,7 @@ def _sticks(
             yield commands.body(path, "cylinder", size, _along(start, end), look.of(colours[stick.joint]))
 
 
-def _rail(stick: Stick, moved: Motion) -> tuple[Array, Array]:
+def _rail(stick: Stick, moved: Placements) -> tuple[Array, Array]:
     """Ends of the line on which a slide moves, in the axes of the body that carries it."""
     ways = moved.of(stick.end_joint, stick.end) - moved.translation[:, stick.joint]
     points = np.vstack([stick.start, np.einsum("kji,kj->ki", moved.rotation[:, stick.joint], ways)])

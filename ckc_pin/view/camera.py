@@ -11,7 +11,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
-from ckc_pin.view.skeleton import Motion, is_planar, sticks, upward, viewpoint
+from ckc_pin.view.skeleton import Placements, is_planar, sticks, upward, viewpoint
 
 __all__ = ["WORLD", "extent_of_motions", "extent_of_reach", "surroundings"]
 
@@ -59,7 +59,7 @@ def surroundings(mechanism: Mechanism, extent: tuple[Array, Array]) -> list[Comm
     ]
 
 
-def extent_of_motions(mechanism: Mechanism, motions: Sequence[Motion]) -> tuple[Array, Array]:
+def extent_of_motions(mechanism: Mechanism, motions: Sequence[Placements]) -> tuple[Array, Array]:
     """Bounds of every stick along the whole of the motions, in the viewer's axes."""
     ends = [
         moved.of(joint, point)
@@ -71,7 +71,7 @@ def extent_of_motions(mechanism: Mechanism, motions: Sequence[Motion]) -> tuple[
     return seen.min(axis=0), seen.max(axis=0)
 
 
-def extent_of_reach(mechanism: Mechanism, now: Motion) -> tuple[Array, Array]:
+def extent_of_reach(mechanism: Mechanism, now: Placements) -> tuple[Array, Array]:
     """Bounds of a motion that is not known yet: where it is now, and the longest link's length around that."""
     low, high = extent_of_motions(mechanism, [now])
     longest = max((float(np.linalg.norm(s.end - s.start)) for s in sticks(mechanism) if s.joint == s.end_joint),

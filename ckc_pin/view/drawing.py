@@ -22,7 +22,7 @@ from ckc_pin.view.commands import Command, Track
 from ckc_pin.view.desired import desired_poses
 from ckc_pin.view.gaps import gaps
 from ckc_pin.view.labels import run_labels
-from ckc_pin.view.skeleton import Motion, configurations, placements
+from ckc_pin.view.skeleton import Placements, configurations, placements
 from ckc_pin.view.visuals import Colour
 
 __all__ = ["body_tracks", "run_path", "scene"]
@@ -74,7 +74,7 @@ def run_path(runs: Sequence[Run], k: int) -> str:
     return f"{WORLD}/{k + 1}: {bodies.safe(run_labels(runs)[k])}"
 
 
-def body_tracks(mechanism: Mechanism, root: str, t: Array, moved: Motion) -> Iterator[Track]:
+def body_tracks(mechanism: Mechanism, root: str, t: Array, moved: Placements) -> Iterator[Track]:
     """Yield the ways of all bodies."""
     for joint in range(1, mechanism.tree.model.njoints):
         turned = _quaternions(moved.rotation[:, joint])
@@ -100,7 +100,9 @@ def _with_ghost(
     return drawing, tracks
 
 
-def _gap_tracks(mechanism: Mechanism, root: str, t: Array, q_tree: Array, moved: Motion, gap: float) -> Iterator[Track]:
+def _gap_tracks(
+    mechanism: Mechanism, root: str, t: Array, q_tree: Array, moved: Placements, gap: float
+) -> Iterator[Track]:
     """Stretch each loop's rod from frame B over its gap, so many times larger."""
     ends = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
     for loop, way in gaps(mechanism, q_tree).items():

@@ -16,7 +16,7 @@ from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.desired import DesiredPath
 from ckc_pin.view.labels import plain, run_labels, symbol, units
-from ckc_pin.view.skeleton import Motion, placements, sticks, viewpoint
+from ckc_pin.view.skeleton import Placements, placements, sticks, viewpoint
 
 __all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "loop_forces", "rates",
            "scalar", "snapshots"]  # fmt: skip
@@ -286,7 +286,7 @@ def snapshots(ax: Any, group: Group) -> Any:
     return shades
 
 
-def _draw_linkage(ax: Any, mechanism: Mechanism, at: Motion, view: Array, colour: Any) -> None:
+def _draw_linkage(ax: Any, mechanism: Mechanism, at: Placements, view: Array, colour: Any) -> None:
     for stick in sticks(mechanism):
         ends = view @ np.vstack([at.of(stick.joint, stick.start), at.of(stick.end_joint, stick.end)]).T
         base = stick.joint == stick.end_joint == 0

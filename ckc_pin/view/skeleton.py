@@ -12,7 +12,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Motion", "Stick", "configurations", "is_planar", "placements", "sticks", "upward", "viewpoint"]
+__all__ = ["Placements", "Stick", "configurations", "is_planar", "placements", "sticks", "upward", "viewpoint"]
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
 
@@ -28,7 +28,7 @@ class Stick:
 
 
 @dataclass(frozen=True)
-class Motion:
+class Placements:
     """Placements of the bodies: rotation (m, joints, 3, 3) and translation (m, joints, 3); joint 0 is the world."""
 
     rotation: Array
@@ -39,10 +39,10 @@ class Motion:
         return np.asarray(self.rotation[:, joint] @ local + self.translation[:, joint])
 
 
-def placements(mechanism: Mechanism, q_tree: Array) -> Motion:
+def placements(mechanism: Mechanism, q_tree: Array) -> Placements:
     """Return the placements at configurations of the tree (m, nq), Pinocchio's q."""
     poses = [Pose(mechanism.tree, mechanism.closure.anchors, q) for q in q_tree]
-    return Motion(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
+    return Placements(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
 
 
 def configurations(run: Run, rows: IntArray | slice = slice(None)) -> Array:
