@@ -1,49 +1,150 @@
-"""Eq. 1's acceleration as one expression: D' and J D'^-1 J^T eliminated as they are."""
+"""Eq. 1 as expressions: D' and J D'^-1 J^T eliminated as they are, the acceleration, and its derivatives."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from ckc_pin.generated.elimination import SymmetricFactor
 from ckc_pin.generated.expressions import Expressions
 
-__all__ = ["acceleration"]
+__all__ = ["ConstrainedInertia"]
+
+TRUSTED = 1e-4  # of a diagonal entry left by elimination without pivoting: four digits are lost then
 
 
-def acceleration(terms: Expressions, u: Any, correction: Any) -> tuple[Any, list[Any]]:
-    """Return v'_dot where u' acts, and what is left of the diagonals of D' and J D'^-1 J^T when they are eliminated.
+class ConstrainedInertia:
+    """The matrix [D', -J^T; J, 0] of eq. 1, eliminated: what a force and an acceleration of the loops make of the tree.
 
     Parameters
     ----------
     terms : Expressions
-    u : casadi.SX of n
-        u'.
-    correction : casadi.SX of rows
-        Added to J_dot v: Baumgarte's terms.
     """
+
+    def __init__(self, terms: Expressions) -> None:
+        import casadi as cs
+
+        self._terms, self._n = terms, terms.v.numel()
+        self._D = SymmetricFactor(terms.D_tree)
+        rows = [[terms.rows.J[i, k] for k in range(self._n)] for i in terms.kept]
+        self._halves = [_entries(self._D.half(row)) for row in rows]  # L^-1 J^T, by rows of J
+        self._scaled = [{k: x * self._D.inverses[k] for k, x in half.items()} for half in self._halves]
+        S = cs.SX(len(rows), len(rows))
+        for i, a in enumerate(self._halves):
+            for j, b in enumerate(self._scaled[: i + 1]):
+                common = [x * b[k] for k, x in a.items() if k in b]
+                if common:
+                    S[i, j] = S[j, i] = sum(common)
+        self._S = SymmetricFactor(S)
+
+    def solve(self, force: Sequence[Any], along: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        """Return a and the kept rows' multipliers: D' a = force + J^T multipliers, J a = along.
+
+        Parameters
+        ----------
+        force : sequence of n casadi.SX
+        along : sequence of casadi.SX, one a kept row
+        """
+        total = [x * inverse for x, inverse in zip(self._D.half(force), self._D.inverses, strict=True)]
+        left = [
+            x - sum(y * total[k] for k, y in half.items() if total[k].nnz())
+            for x, half in zip(along, self._halves, strict=True)
+        ]
+        multipliers = self._S.solve(left)
+        for half, multiplier in zip(self._scaled, multipliers, strict=True):
+            if multiplier.nnz():
+                for k, x in half.items():
+                    total[k] = total[k] + x * multiplier
+        return self._D.other_half(total), multipliers
+
+    def acceleration(self, u: Any, correction: Any) -> tuple[Any, Any]:
+        """Return v'_dot where u' acts, and the kept rows' multipliers.
+
+        Parameters
+        ----------
+        u : casadi.SX of n
+            u'.
+        correction : casadi.SX of rows
+            Added to J_dot v: Baumgarte's terms.
+        """
+        import casadi as cs
+
+        terms = self._terms
+        force = u - terms.bias_tree + terms.damping
+        along = [-(terms.rows.J_dot_v[i] + correction[i]) for i in terms.kept]
+        a, multipliers = self.solve([force[k] for k in range(self._n)], along)
+        return cs.vertcat(*a), cs.vertcat(*multipliers)
+
+    def closing_step(self, residual: Any) -> Any:
+        """Return the x with J x = -residual that is smallest in the metric of D'.
+
+        Parameters
+        ----------
+        residual : casadi.SX of rows
+        """
+        import casadi as cs
+
+        step, _ = self.solve([cs.SX(1, 1)] * self._n, [-residual[i] for i in self._terms.kept])
+        return cs.vertcat(*step)
+
+    def derivatives(self, u: Any) -> tuple[Any, Any]:
+        """Return derivatives of (q'_dot, v'_dot) by (q', v'), square of nq + n, and of v'_dot by u', (n, n).
+
+        Eq. 1 differentiated where its solution is known: one more elimination a column instead of a derivative through
+        each. A free root's quaternion counts by its part across itself: its length is one.
+
+        Parameters
+        ----------
+        u : casadi.SX of n
+            u'; nothing is corrected.
+        """
+        import casadi as cs
+
+        terms, n = self._terms, self._n
+        kept = list(terms.kept)
+        J, unknown = terms.rows.J[kept, :], cs.SX.sym("a", n)
+        multipliers = cs.SX.sym("l", len(kept))
+        left = cs.vertcat(
+            cs.mtimes(terms.D_tree, unknown) + terms.bias_tree - terms.damping - cs.mtimes(J.T, multipliers),
+            cs.mtimes(J, unknown) + terms.rows.J_dot_v[kept],
+        )
+        by_state = cs.horzcat(terms.angles.jacobian(left), cs.jacobian(left, terms.v))
+        by_state = cs.substitute(
+            by_state,
+            cs.vertcat(unknown, multipliers),
+            cs.vertcat(*self.acceleration(u, cs.SX(terms.rows.phi.numel(), 1))),
+        )
+        columns = [
+            self.solve([-by_state[i, j] for i in range(n)], [-by_state[n + i, j] for i in range(len(kept))])[0]
+            for j in range(by_state.shape[1])
+        ]
+        zero = cs.SX(1, 1)
+        by_u = [self.solve([cs.SX(1) if i == j else zero for i in range(n)], [zero] * len(kept))[0] for j in range(n)]
+        rates = cs.jacobian(terms.q_dot, cs.vertcat(terms.angles.q, terms.v))
+        found = cs.vertcat(rates, cs.horzcat(*(cs.vertcat(*x) for x in columns)))
+        return _across(found, terms), cs.horzcat(*(cs.vertcat(*x) for x in by_u))
+
+    def soundness(self) -> Any:
+        """Return a number that is positive where elimination had no need of pivots."""
+        import casadi as cs
+
+        left = [
+            pivot - TRUSTED * whole
+            for factor in (self._D, self._S)
+            for pivot, whole in zip(factor.pivots, factor.diagonal, strict=True)
+        ]
+        return cs.mmin(cs.vertcat(*left))
+
+
+def _across(by_state: Any, terms: Expressions) -> Any:
+    """Without what a change of the quaternions' lengths would do."""
     import casadi as cs
 
-    n, rows, kept = terms.v.numel(), terms.rows, terms.kept
-    factor = SymmetricFactor(terms.D_tree)
-    force = u - terms.bias_tree + terms.damping
-    free = [x / pivot for x, pivot in zip(factor.half([force[k] for k in range(n)]), factor.pivots, strict=True)]
-    halves = [factor.half([rows.J[i, k] for k in range(n)]) for i in kept]  # L^-1 J^T, by rows of J
-    scaled = [[x / pivot for x, pivot in zip(half, factor.pivots, strict=True)] for half in halves]
-    S = cs.SX(len(kept), len(kept))
-    for i, a in enumerate(halves):
-        for j in range(i + 1):
-            common = [a[k] * scaled[j][k] for k in range(n) if a[k].nnz() and scaled[j][k].nnz()]
-            if common:
-                S[i, j] = S[j, i] = sum(common)
-    wanted = [
-        -(rows.J_dot_v[i] + correction[i]) - sum(half[k] * free[k] for k in range(n) if half[k].nnz())
-        for i, half in zip(kept, halves, strict=True)
-    ]
-    closing = SymmetricFactor(S)
-    multipliers = closing.solve(wanted)
-    total = list(free)
-    for half, multiplier in zip(scaled, multipliers, strict=True):
-        for k in range(n):
-            if half[k].nnz():
-                total[k] = total[k] + half[k] * multiplier
-    return cs.vertcat(*factor.other_half(total)), [*factor.shares, *closing.shares]
+    for place in terms.quaternions:
+        x, at = terms.angles.q[place : place + 4], slice(place, place + 4)
+        by_state[:, at] = by_state[:, at] - cs.mtimes(cs.mtimes(by_state[:, at], x), x.T)
+    return by_state
+
+
+def _entries(column: Sequence[Any]) -> dict[int, Any]:
+    return {k: x for k, x in enumerate(column) if x.nnz()}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.parameters import Parameters, constant
 from ckc_pin.mechanism.tree import Tree
 
@@ -92,20 +93,22 @@ def times(a: Any, b: Any) -> Any:
     return cs.sparsify(cs.mtimes(a, b))
 
 
-def bodies(tree: Tree, q: Any, v: Any, parameters: Parameters) -> list[MovingBody]:
+def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[MovingBody]:
     """Return the body of each of Pinocchio's joints, the world first.
 
     Parameters
     ----------
     tree : Tree
-    q, v : casadi.SX of nq and n
-        Pinocchio's q', a free root's quaternion of unit length; v'.
+    angles : Angles
+        Pinocchio's q', a free root's quaternion of unit length.
+    v : casadi.SX of n
+        v'.
     parameters : Parameters
         Takes the offsets of the joints.
     """
     import casadi as cs
 
-    model, none = tree.model, cs.SX(3, 1)
+    model, none, q = tree.model, cs.SX(3, 1), angles.q
     found = [MovingBody(cs.SX.eye(3), none, none, none, none, none, ())]
     for k in range(1, model.njoints):
         joint, placement, parent = model.joints[k], model.jointPlacements[k], found[model.parents[k]]
@@ -117,7 +120,7 @@ def bodies(tree: Tree, q: Any, v: Any, parameters: Parameters) -> list[MovingBod
             continue
         local, turns = tree.axis(k)
         a = times(stands, constant(local))
-        R = times(stands, _turn(local, q[at_q])) if turns else stands
+        R = times(stands, _turn(local, *angles.turn(at_q))) if turns else stands
         d = d if turns else d + a * q[at_q]
         found.append(_moved(parent, R, d, a * v[at_v], at_v, turns, a))
     return found
@@ -160,12 +163,11 @@ def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> M
     )
 
 
-def _turn(axis: Any, angle: Any) -> Any:
-    """Rotation about an axis of unit length, by Rodrigues' formula."""
+def _turn(axis: Any, c: Any, s: Any) -> Any:
+    """Rotation about an axis of unit length by an angle of that cosine and sine: Rodrigues' formula."""
     import casadi as cs
 
     a = constant(axis)
-    c, s = cs.cos(angle), cs.sin(angle)
     along = constant(np.outer(axis, axis))
     return cs.sparsify(along + c * constant(np.eye(3) - np.outer(axis, axis)) + s * cs.skew(a))
 

@@ -10,6 +10,7 @@ import numpy as np
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.expressions import kept_rows
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
@@ -20,7 +21,11 @@ __all__ = ["Calls", "require_equal"]
 
 STATES = 25  # on the closure, and as many off it
 EQUAL = 1e-11  # relative to the largest entry
-SOUND = 1e-3  # of a diagonal left by elimination, from which the acceleration is compared: with less digits are lost
+SOUND = (
+    1e-3  # of J D'^-1 J^T's scaled eigenvalues, from which solutions of eq. 1 are compared: with less digits are lost
+)
+DIFFERENCE = 1e-5  # rad, or of the mechanism's size, and of v' in their multiples a second
+ALIKE = 1e-6  # derivatives and differences, relative
 SPREAD = 0.5  # rad, or of the mechanism's size: how far states are from the assembled one
 
 
@@ -38,6 +43,9 @@ class Calls:
         self._numbers = np.zeros(0)
         (self._numbers,) = self.call("numbers", library.parameters)
 
+    def __contains__(self, name: str) -> bool:
+        return hasattr(self._library, name)
+
     def call(self, name: str, *arguments: Array) -> list[Array]:
         """Return a function's results, vectors by columns of what they are."""
         sizes = getattr(self._library, f"{name}_sparsity_out")
@@ -47,7 +55,8 @@ class Calls:
         results = [np.zeros(sizes(k)[0] * sizes(k)[1]) for k in range(count())]
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
         if name != "numbers":
-            given.append(self._numbers)
+            q = given[0]
+            given = [q, np.concatenate([np.cos(q), np.sin(q)]), *given[1:], self._numbers]
         getattr(self._library, name)(self._pointers(given), self._pointers(results), None, None, 0)
         return results
 
@@ -70,37 +79,91 @@ def require_equal(mechanism: Mechanism, library: Library) -> None:
         if closed and mechanism.closure.rows:
             v = v - np.linalg.pinv(at.J, rcond=1e-9) @ (at.J @ v)
         terms = Terms(mechanism, at, v)
-        q = at.q_tree
-        found = dict(zip(("phi", "J"), code.call("place", q), strict=True))
-        found["D_tree"] = code.call("inertia", q)[0]
-        found |= zip(("bias_tree", "J_dot_v", "damping"), code.call("bias", q, v), strict=True)
-        found["J_dot"] = code.call("jacobian_rate", q, v)[0]
-        found["potential"] = code.call("potential_energy", q)[0]
-        D = np.triu(terms.D_tree)
-        right = {
-            "phi": at.phi, "J": at.J, "D_tree": D + np.triu(D, 1).T, "bias_tree": terms.bias_tree,
-            "J_dot_v": terms.J_dot @ v, "damping": terms.damping_force, "J_dot": terms.J_dot,
-            "potential": np.array([terms.potential_energy]),
-        }  # fmt: skip
-        fast, J = float(np.abs(v).max()), float(np.abs(at.J).max(initial=0.0))
-        scale = {  # of what they are sums of
-            "phi": mechanism.size, "J_dot": J * fast, "J_dot_v": J * fast**2, "bias_tree": float(D.max()) * fast**2,
-            "potential": float(np.abs(terms.h_tree).max()) * max(1.0, mechanism.size),
-        }  # fmt: skip
-        for name, wanted in right.items():
-            _compare(mechanism, name, found[name], np.ravel(wanted, order="F"), scale.get(name, 0.0))
+        _compare_terms(terms, code, random.uniform(-1, 1, mechanism.n))
         if mechanism.redundant and not closed:
             continue  # redundant rows contradict each other there
-        u = random.uniform(-1, 1, mechanism.n)
-        acceleration, share = code.call("acceleration", q, v, u, np.zeros(mechanism.closure.rows))
-        if share[0] > SOUND:
-            try:
-                _compare(mechanism, "acceleration", acceleration, dae_acceleration(terms, u), 0.0)
-                compared += 1
-            except NumericalError:
-                continue
+        compared += _compare_solutions(terms, code, *random.uniform(-1, 1, (2, mechanism.n)))
     if not compared:
         raise InputError(f"{mechanism.name}: its acceleration would have to be eliminated with pivoting everywhere")
+
+
+def _compare_terms(terms: Terms, code: Calls, x: Array) -> None:
+    mechanism, at, q, v = terms.mechanism, terms.at, terms.q_tree, terms.v_tree
+    found = dict(zip(("phi", "J"), code.call("place", q), strict=True))
+    found["D_tree"] = code.call("inertia", q)[0]
+    found |= zip(("bias_tree", "J_dot_v", "damping"), code.call("bias", q, v), strict=True)
+    found["J_dot"] = code.call("jacobian_rate", q, v)[0]
+    found["h_tree"] = code.call("rest", q)[0]
+    found["potential"] = code.call("potential_energy", q)[0]
+    D = np.triu(terms.D_tree)
+    right = {
+        "phi": at.phi, "J": at.J, "D_tree": D + np.triu(D, 1).T, "bias_tree": terms.bias_tree,
+        "J_dot_v": terms.J_dot @ v, "damping": terms.damping_force, "J_dot": terms.J_dot, "h_tree": terms.h_tree,
+        "potential": np.array([terms.potential_energy]),
+    }  # fmt: skip
+    if "coriolis" in code:
+        found["C' x"], right["C' x"] = code.call("coriolis", q, v, x)[0], terms.C_tree @ x
+    fast, J = float(np.abs(v).max()), float(np.abs(at.J).max(initial=0.0))
+    scale = {  # of what they are sums of
+        "phi": mechanism.size, "J_dot": J * fast, "J_dot_v": J * fast**2, "bias_tree": float(D.max()) * fast**2,
+        "C' x": float(D.max()) * fast, "potential": float(np.abs(terms.h_tree).max()) * max(1.0, mechanism.size),
+    }  # fmt: skip
+    for name, wanted in right.items():
+        _compare(mechanism, name, found[name], np.ravel(wanted, order="F"), scale.get(name, 0.0))
+
+
+def _compare_solutions(terms: Terms, code: Calls, u: Array, x: Array) -> bool:
+    """Of eq. 1, its derivatives, and the step that closes the loops; False where that would lose digits."""
+    mechanism, at, q, v = terms.mechanism, terms.at, terms.q_tree, terms.v_tree
+    if not _sound(terms):
+        return False
+    try:
+        wanted = dae_acceleration(terms, u)
+    except NumericalError:
+        return False
+    _compare(mechanism, "acceleration", code.call("acceleration", q, v, u, np.zeros(len(at.phi)))[0], wanted)
+    residual = at.J @ x
+    _compare(mechanism, "closing_step", code.call("closing_step", q, residual)[0], _closing_step(terms, residual), 1.0)
+    if "jacobian" in code:
+        _compare_derivatives(mechanism, code, q, v, u)
+    return True
+
+
+def _constraint(terms: Terms) -> Array:
+    """J D'^-1 J^T of the rows that follow from no others."""
+    J = terms.at.J[kept_rows(terms.mechanism)]
+    return J @ np.linalg.solve(terms.D_tree, J.T)
+
+
+def _sound(terms: Terms) -> bool:
+    S = _constraint(terms)
+    units = 1 / np.sqrt(np.diag(S))
+    return not S.size or float(np.linalg.eigvalsh(S * np.outer(units, units))[0]) > SOUND
+
+
+def _closing_step(terms: Terms, residual: Array) -> Array:
+    kept = kept_rows(terms.mechanism)
+    multipliers = np.linalg.solve(_constraint(terms), residual[kept])
+    return np.asarray(-np.linalg.solve(terms.D_tree, terms.at.J[kept].T @ multipliers))
+
+
+def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, u: Array) -> None:
+    """Of the acceleration, along every coordinate, rate and force."""
+    tree, none = mechanism.tree, np.zeros(mechanism.closure.rows)
+    flat, flat_by_u, _ = code.call("jacobian", q, v, u)
+    by_state = flat.reshape(tree.nq + tree.n, -1, order="F")[tree.nq :]
+    by_u = flat_by_u.reshape(tree.n, -1, order="F")
+    size = float(np.abs(by_state).max())
+    for k in range(tree.n):
+        h = DIFFERENCE * tree.reach[k]
+        along = np.eye(tree.n)[k]
+        for name, found, at in (
+            ("q'", by_state[:, : tree.nq] @ tree.configuration_rate(q, along), lambda x: (tree.integrate(q, x), v, u)),
+            ("v'", by_state[:, tree.nq + k], lambda x: (q, v + x, u)),
+            ("u'", by_u[:, k], lambda x: (q, v, u + x)),
+        ):
+            ahead, behind = (code.call("acceleration", *at(sign * h * along), none)[0] for sign in (1, -1))
+            _compare(mechanism, f"the acceleration by {name}", found, (ahead - behind) / (2 * h), size, ALIKE)
 
 
 def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:
@@ -117,8 +180,10 @@ def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterat
                 yield found.at, True
 
 
-def _compare(mechanism: Mechanism, name: str, found: Array, wanted: Array, scale: float) -> None:
+def _compare(
+    mechanism: Mechanism, name: str, found: Array, wanted: Array, scale: float = 0.0, equal: float = EQUAL
+) -> None:
     largest = max(scale, float(np.abs(wanted).max(initial=0.0)), 1e-300)
     off = float(np.abs(found - wanted).max(initial=0.0)) / largest
-    if not off <= EQUAL:
+    if not off <= equal:
         raise InputError(f"{mechanism.name}: {name} as compiled is not what Pinocchio gives: off by {off:.1e}")

@@ -21,10 +21,11 @@ class SymmetricFactor:
 
     Attributes
     ----------
-    pivots : list of casadi.SX
-        By coordinate.
-    shares : list of casadi.SX
-        What elimination has left of each diagonal entry, 1 to 0: digits are lost as it goes to 0, whatever the units.
+    diagonal, pivots : list of casadi.SX
+        By coordinate: A's own, and what elimination has left of it. Digits are lost as their ratio goes to 0, whatever
+        the units.
+    inverses : list of casadi.SX
+        Of the pivots: a division costs as much as ten products.
     """
 
     def __init__(self, A: Any) -> None:
@@ -38,13 +39,14 @@ class SymmetricFactor:
                 if A.sparsity().has_nz(i, j):
                     rows[i][j] = A[i, j]
         self.pivots: list[Any] = [cs.SX(1, 1)] * n
-        self.shares: list[Any] = [cs.SX(1)] * n
+        self.inverses: list[Any] = [cs.SX(1, 1)] * n
+        self.diagonal = [A[k, k] for k in range(n)]
         self._l: list[dict[int, Any]] = [{} for _ in range(n)]  # L^T's rows: l[k][i] multiplies x_i, i < k
         for k in range(n - 1, -1, -1):
             self.pivots[k] = rows[k][k]
-            self.shares[k] = rows[k][k] / A[k, k]
+            self.inverses[k] = 1 / rows[k][k]
             for i in [i for i in rows[k] if i < k]:
-                self._l[k][i] = rows[k][i] / self.pivots[k]
+                self._l[k][i] = rows[k][i] * self.inverses[k]
             for i, factor in self._l[k].items():
                 for j in [j for j in rows[k] if j <= i]:
                     rows[i][j] = rows[i].get(j, cs.SX(1, 1)) - factor * rows[k][j]
@@ -68,4 +70,4 @@ class SymmetricFactor:
 
     def solve(self, b: Sequence[Any]) -> list[Any]:
         """Solve A x = b."""
-        return self.other_half([x / pivot for x, pivot in zip(self.half(b), self.pivots, strict=True)])
+        return self.other_half([x * inverse for x, inverse in zip(self.half(b), self.inverses, strict=True)])

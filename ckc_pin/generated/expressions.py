@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
 from ckc_pin.generated.parameters import Parameters, numbers, present
 from ckc_pin.generated.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Expressions", "expressions"]
+__all__ = ["Expressions", "expressions", "kept_rows"]
 
 
 @dataclass(frozen=True)
@@ -19,10 +20,14 @@ class Expressions:
 
     Attributes
     ----------
-    q, v : casadi.SX of nq and n
-        Pinocchio's q', a free root's quaternion of unit length; v'.
+    angles : Angles
+        Pinocchio's q', a free root's quaternion of unit length.
+    v : casadi.SX of n
+        v'.
     parameters : Parameters
         Masses, centres of mass, inertias, offsets, stiffnesses, lengths, gravity.
+    quaternions : tuple of int
+        Where the quaternions of free roots begin in q'.
     q_dot : casadi.SX of nq
         The rate of q' at v'.
     D_tree : casadi.SX, (n, n)
@@ -37,9 +42,10 @@ class Expressions:
         Energies, J; of gravity, springs and constant forces.
     """
 
-    q: Any
+    angles: Angles
     v: Any
     parameters: Parameters
+    quaternions: tuple[int, ...]
     q_dot: Any
     D_tree: Any
     bias_tree: Any
@@ -50,28 +56,34 @@ class Expressions:
     potential: Any
 
 
+def kept_rows(mechanism: Mechanism) -> list[int]:
+    """Return the rows that follow from no others, as the mechanism's rank found them."""
+    return [k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant]
+
+
 def expressions(mechanism: Mechanism) -> Expressions:
     """Write a mechanism's terms out."""
     import casadi as cs
 
     tree, parameters = mechanism.tree, Parameters(present(numbers(mechanism)))
-    q, v = cs.SX.sym("q", tree.nq), cs.SX.sym("v", tree.n)
-    found = bodies(tree, q, v, parameters)
+    angles, v = Angles(tree.nq), cs.SX.sym("v", tree.n)
+    q, found = angles.q, bodies(tree, angles, v, parameters)
     gravity = parameters.column("gravity")
     q_dot = _configuration_rate(mechanism, q, v)
     D_tree, bias, potential = _inertia(mechanism, found, gravity, parameters)
     elastic, damping, stored = _springs(mechanism, found, q, v, parameters)
-    rows = row_terms(mechanism.closure, found, q, v, q_dot, tree.place.tolist(), parameters)
+    rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), parameters)
     return Expressions(
-        q=q,
+        angles=angles,
         v=v,
         parameters=parameters,
+        quaternions=tuple(at_q + 3 for at_q, _ in tree.free),
         q_dot=q_dot,
         D_tree=D_tree,
         bias_tree=bias - elastic,
         damping=damping,
         rows=rows,
-        kept=tuple(k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant),
+        kept=tuple(kept_rows(mechanism)),
         kinetic=dot(v, times(D_tree, v)) / 2,
         potential=potential + stored,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import comb
 from typing import Any
 
+from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.bodies import MovingBody, cross, dot, times
 from ckc_pin.generated.parameters import Parameters, constant
 from ckc_pin.mechanism.closure import Closure
@@ -47,7 +48,7 @@ class _Moving:
 def row_terms(
     closure: Closure,
     bodies: Sequence[MovingBody],
-    q: Any,
+    angles: Angles,
     v: Any,
     q_dot: Any,
     place: Sequence[int],
@@ -59,8 +60,10 @@ def row_terms(
     ----------
     closure : Closure
     bodies : sequence of MovingBody
-    q, v, q_dot : casadi.SX
-        Pinocchio's q', v', and the rate of q' at v'.
+    angles : Angles
+        Pinocchio's q'.
+    v, q_dot : casadi.SX
+        v', and the rate of q' at it.
     place : sequence of int
         Where the coordinates of joints of one freedom stand in q'.
     parameters : Parameters
@@ -95,14 +98,14 @@ def row_terms(
             case Affine():
                 for out in group.out:
                     row = cs.horzcat(*(parameters.number("affine", out, k) for k in range(n)))
-                    value = times(row, cs.vertcat(*(q[k] for k in place)))
+                    value = times(row, cs.vertcat(*(angles.q[k] for k in place)))
                     put(int(out), (value - parameters.number("affine_offset", out), row, 0))
             case RelativeLog():
                 for k in range(len(group.joint_a)):
                     a, b = bodies[group.joint_a[k]], bodies[group.joint_b[k]]
                     found = _parallel(a, b, constant(group.rotation_a[k]), constant(group.rotation_b[k]), n)
                     rate = times(found[1], v)
-                    along = cs.jtimes(rate, q, q_dot)
+                    along = angles.along(rate, q_dot)
                     for i in range(3):
                         put(int(group.out[3 * k + i]), (found[0][i], found[1][i, :], along[i]))
             case _:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.generated.acceleration import acceleration
+from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.expressions import expressions
 from ckc_pin.generated.parameters import labels, numbers, present, values
 from ckc_pin.kinematics.loading import load
@@ -90,12 +90,12 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     if not isinstance(mechanism, Mechanism):
         mechanism = load(mechanism)
     terms, given = expressions(mechanism), numbers(mechanism)
-    q, v, p = terms.q, terms.v, terms.parameters.vector
+    q, v, p = terms.angles.q, terms.v, terms.parameters.vector
     u = cs.SX.sym("u", mechanism.n)
-    v_dot, _ = acceleration(terms, u, np.zeros(mechanism.closure.rows))
+    v_dot, _ = ConstrainedInertia(terms).acceleration(u, np.zeros(mechanism.closure.rows))
 
     def function(name: str, result: Any, **of: Any) -> Any:
-        return cs.Function(name, list(of.values()), [cs.densify(result)], list(of), [name])
+        return cs.Function(name, list(of.values()), [cs.densify(terms.angles.in_q(result))], list(of), [name])
 
     return Symbolic(
         coordinates=mechanism.coordinates,

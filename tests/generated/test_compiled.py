@@ -75,7 +75,7 @@ RUNS: list[tuple[str, dict[str, Any]]] = [
     ("five_bar/swing", {"formulation": "spf", "epsilon": 1e-2, "initial.w": [0.01, -0.02]}),
     ("five_bar/swing", {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-2, "t_end": 0.5}),
     ("five_bar/swing", {"formulation": "dae", "event": [{"of": "q_dot", "coordinate": "theta_1", "value": 1.0}]}),
-    ("five_bar/tracking", {"t_end": 1.0}),
+    ("five_bar/tracking", {"t_end": 2.0}),
     ("five_bar/tracking", {"formulation": "dae", "t_end": 1.0, "controller.sample_time": 1e-3}),
     ("five_bar/set_point", {"t_end": 1.0}),
     ("flyball", {"formulation": "dae", "t_end": 0.2}),
@@ -89,7 +89,8 @@ def test_runs_end_where_they_did(scene: str, changes: dict[str, Any]) -> None:
     ours, theirs = (simulate(scene, {**changes, "solver.terms": terms}) for terms in ("generated", "pinocchio"))
     assert (ours.stats["terms"], theirs.stats["terms"]) == ("generated", "pinocchio")
     assert (ours.status, len(ours.t), len(ours.events)) == (theirs.status, len(theirs.t), len(theirs.events))
-    assert abs(ours.stats["rhs"] - theirs.stats["rhs"]) <= 0.1 * theirs.stats["rhs"]
+    assert abs(ours.stats["steps"] - theirs.stats["steps"]) <= 0.1 * theirs.stats["steps"]
+    assert ours.stats["rhs"] <= 1.1 * theirs.stats["rhs"]  # an exact Jacobian takes none
     allowed = 10 * ours.scene["solver"]["rtol"]
     for a, b in ((ours.q_tree, theirs.q_tree), (ours.v_tree, theirs.v_tree), (ours.energy, theirs.energy)):
         assert np.abs(a - b).max() <= allowed * max(1.0, np.abs(b).max())

@@ -121,7 +121,7 @@ void View::put(const Measured& at) {
 
 nb::object View::term(long stamp, const std::string& name) {
   if (!seen_ || stamp != stamp_) return nb::none();
-  seen_->core.bias(seen_->v_tree);
+  seen_->core.set_velocity(seen_->v_tree);
   return term_of(seen_->core, name);
 }
 

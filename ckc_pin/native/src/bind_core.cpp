@@ -5,6 +5,7 @@
 
 #include "checks.hpp"
 #include "core.hpp"
+#include "written.hpp"
 
 namespace ckc {
 
@@ -106,7 +107,7 @@ namespace {
 // Everything at one state, for comparison.
 nb::dict terms(Core& core, Given q_tree, Given v_tree) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-  core.set(q_tree), core.inertia(), core.bias(v_tree), core.coriolis();
+  core.set(q_tree), core.inertia(), core.set_velocity(v_tree), core.bias(), core.coriolis();
   nb::dict found;
   for (const char* name : {"phi", "J", "rho", "D_tree", "D", "bias_tree", "C_tree", "h_tree", "C", "rho_dot", "h"})
     found[name] = term_of(core, name);
@@ -124,7 +125,7 @@ Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree,
   require(q_tree, core.tree.nq, "q_tree"), require(q_dot, core.d, "q_dot");
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
   Vector q_ddot(core.d);
-  core.set(q_tree), core.inertia(), core.bias(v_tree);
+  core.set(q_tree), core.set_velocity(v_tree);
   if (actual)
     core.actual_acceleration(u_tree, q_dot, q_ddot);
   else
@@ -136,7 +137,7 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   require(u_tree, core.n, "u_tree"), require(correction, core.rows.closure.rows, "correction");
   Vector acceleration(core.n);
-  core.set(q_tree, true), core.jacobian(), core.bias(v_tree);
+  core.set(q_tree, true), core.set_velocity(v_tree);
   if (!core.dae_acceleration(u_tree, correction, acceleration))
     acceleration.setConstant(std::numeric_limits<double>::quiet_NaN());
   return acceleration;
@@ -149,7 +150,7 @@ nb::object term_of(Core& core, const std::string& name) {
   if (name == "J") return core.jacobian(), nb::cast(core.rows.J);
   if (name == "rho") return core.reduce(), nb::cast(core.rho);
   if (name == "D") return core.inertia(), nb::cast(core.D);
-  if (name == "bias_tree") return nb::cast(core.bias_tree);
+  if (name == "bias_tree") return core.bias(), nb::cast(core.bias_tree);
   if (name == "potential_energy") return nb::cast(core.potential_energy());
   if (name == "D_tree") {
     core.tree_inertia();
@@ -158,7 +159,11 @@ nb::object term_of(Core& core, const std::string& name) {
     return nb::cast(D_tree);
   }
   core.reduce(), core.tree_inertia(), core.coriolis();
-  if (name == "C_tree") return nb::cast(core.C_tree);
+  if (name == "C_tree") {
+    Matrix C_tree(core.n, core.n);
+    for (int k = 0; k < core.n; ++k) core.C_tree_times(Vector::Unit(core.n, k), C_tree.col(k));
+    return nb::cast(C_tree);
+  }
   if (name == "h_tree") return nb::cast(core.h_tree);
   Vector x(core.d);
   if (name == "h") return core.reduced(core.h_tree, x), nb::cast(x);

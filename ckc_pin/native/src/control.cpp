@@ -63,10 +63,9 @@ bool Tracking::u(const Measured& at, Out u, Problem& problem) {
     core.reduce();
     core.velocity(at.q_dot, v_model_);
     if (actual_) v_model_ = at.v_tree;
-    core.bias(v_model_);
+    core.set_velocity(v_model_);
   }
-  core.inertia();
-  core.coriolis();
+  core.inertia(), core.coriolis();
   core.C_times(v_, product_);
   core.reduced(core.h_tree, u);
   u += product_;
@@ -153,6 +152,22 @@ Measured Control::in_own_q(const Measured& at) {
     q_dot_(k) = at.v_tree(own_[k]);
   }
   return {at.t, at.core, q_, q_dot_, at.v_tree, at.rate};
+}
+
+bool SetPoint::slopes(Matrix& by_q, Matrix& by_q_dot) const { return by_q = -K_P_, by_q_dot = -K_V_, true; }
+
+// Where an actuator is at its limit, it does not answer.
+bool Control::slopes(Matrix& by_q, Matrix& by_v) {
+  const auto n = static_cast<int>(u_tree.size());
+  by_q.setZero(n, n), by_v.setZero(n, n);
+  if (!feedback()) return true;
+  if (!actuation_.direct || !law->slopes(slope_, slope_dot_)) return false;
+  for (size_t i = 0; i < own_.size(); ++i) {
+    if (actuation_.limited(tau, static_cast<Eigen::Index>(i))) continue;
+    for (size_t k = 0; k < own_.size(); ++k)
+      by_q(actuation_.at[i], own_[k]) = slope_(i, k), by_v(actuation_.at[i], own_[k]) = slope_dot_(i, k);
+  }
+  return true;
 }
 
 bool Control::ask(const Measured& at, Out u) {

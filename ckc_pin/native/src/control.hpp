@@ -2,6 +2,7 @@
 // through actuators with limits.
 #pragma once
 
+#include <cmath>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -36,6 +37,8 @@ class Controller {
   virtual double lyapunov(const Measured&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it looks at terms of q's own partition, or at q and q_dot alone.
   virtual bool needs_terms() const { return true; }
+  // d u / d q and d u / d q_dot where they are known; false where not.
+  virtual bool slopes(Matrix&, Matrix&) const { return false; }
 };
 
 // Eq. 14.
@@ -45,6 +48,7 @@ class SetPoint : public Controller {
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
+  bool slopes(Matrix& by_q, Matrix& by_q_dot) const override;
 
  private:
   Matrix K_P_, K_V_;
@@ -76,6 +80,7 @@ class Actuation {
   void apply(Core& core, Out u, Out tau, Out u_tree);
   const Indices at;
   const bool direct;  // u is what the actuators do
+  bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= limit_(k); }
 
  private:
   Vector limit_;  // infinite where there is none
@@ -111,6 +116,10 @@ class Control {
   // Whether the motion has to stay in the coordinates q that u is of: the law, or who steps, looks at terms in them, or
   // eq. 6's force has no other meaning.
   bool needs_own_partition() const { return acts() && !(law && !law->needs_terms() && actuation_.direct); }
+  // Whether what acts between samples takes more of the state than q and q_dot.
+  bool needs_terms() const { return acts() && !(actuation_.direct && !(feedback() && law->needs_terms())); }
+  // d u' / d q' and d u' / d v', joints of one freedom alone, where u' was found last; false where that is not known.
+  bool slopes(Matrix& by_q, Matrix& by_v);
   // Whether u follows the state between samples.
   bool feedback() const { return law && !sampling; }
   bool act(const Measured& at);
@@ -123,6 +132,7 @@ class Control {
   Actuation actuation_;
   const Indices own_;  // q, whatever the coordinates of the motion are
   Vector sampled_, q_, q_dot_;
+  Matrix slope_, slope_dot_;
 };
 
 }  // namespace ckc

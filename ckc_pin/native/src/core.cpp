@@ -1,4 +1,5 @@
 #include "core.hpp"
+#include "written.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -21,7 +22,7 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
-  C_tree.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
+  C_tree_.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
   square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
@@ -30,6 +31,8 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
   for (const Indices& above : tree.ancestors) entries += 2 * above.size();
   dense_ = n > small && static_cast<double>(entries) > crowded * n * n;
 }
+
+Core::~Core() = default;
 
 void Core::split(Indices q_, Indices z_) {
   q = std::move(q_), z = std::move(z_);
@@ -57,6 +60,12 @@ void Core::set(In q_tree_, bool with_inertia) {
     tree.set(q_tree);
   here_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
   rows.set(tree, q_tree);
+}
+
+void Core::set_velocity(In v) {
+  if (v_tree == v) return;
+  v_tree = v;
+  here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
 }
 
 // For what is not written out.
@@ -157,12 +166,6 @@ void Core::reduced(In force, Out generalized) const {
   for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
 }
 
-void Core::set_velocity(In v) {
-  if (v_tree == v) return;
-  v_tree = v;
-  here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
-}
-
 // The tree's velocities, and from them the rows'.
 void Core::row_rates_of_tree() {
   if (has(row_rates)) return;
@@ -179,8 +182,7 @@ void Core::jacobian_rate(In v) {
   rows.jacobian_dot(tree, tree.jacobian_rate(q_tree, v_tree));
 }
 
-void Core::bias(In v) {
-  set_velocity(v);
+void Core::bias() {
   if (has(bias_of_tree)) return;
   Profile::Entry entry(profile, Profile::bias_tree);
   here_ |= bias_of_tree;
@@ -209,12 +211,23 @@ void Core::spring_lengths() {
 void Core::coriolis() {
   if (has(coriolis_of_tree)) return;
   Profile::Entry entry(profile, Profile::C_tree);
+  here_ |= coriolis_of_tree;
+  if (written && written->has_coriolis()) {
+    written->jacobian_rate(q_tree, v_tree, rows.J_dot);
+    return written->rest(q_tree, h_tree);
+  }
   row_rates_of_tree();
-  C_tree = tree.coriolis(q_tree, v_tree);
+  C_tree_ = tree.coriolis(q_tree, v_tree);
   rows.jacobian_dot(tree, tree.jacobian_dot());
   h_tree = tree.gravity(q_tree);
   if (springs.any) spring_forces(), h_tree -= elastic_;
-  here_ |= coriolis_of_tree;
+}
+
+void Core::C_tree_times(In x, Out product) {
+  if (written && written->has_coriolis())
+    written->coriolis(q_tree, v_tree, x, product);
+  else
+    product.noalias() = C_tree_ * x;
 }
 
 void Core::rho_dot_times(In x, Out product) {
@@ -229,11 +242,13 @@ void Core::C_times(In x, Out product) {
   rho_dot_times(x, x_);
   D_times(x_, y_);
   velocity(x, x_);
-  y_.noalias() += C_tree * x_;
+  C_tree_times(x_, moved_);
+  y_ += moved_;
   reduced(y_, product);
 }
 
 void Core::reduced_acceleration(In u_tree, Out q_ddot) {
+  inertia(), bias();
   residual_ = -J_dot_v;
   phi_z.solve(residual_, z_);  // J rho = 0 differentiated
   rho_dot_q_dot_.setZero();
@@ -250,7 +265,7 @@ void Core::tree_acceleration(In q_ddot, Out a) const {
 }
 
 void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
-  coriolis();
+  inertia(), bias(), coriolis();
   C_times(q_dot, d_);
   x_ = u_tree - h_tree + damping_tree;
   for (int k = 0; k < d; ++k) d_(k) = rho.col(k).dot(x_) - d_(k);

@@ -10,9 +10,10 @@
 #include "rows.hpp"
 #include "springs.hpp"
 #include "profile.hpp"
-#include "written.hpp"
 
 namespace ckc {
+
+class Written;
 
 struct Energy {
   double kinetic, potential;  // of gravity and springs, J
@@ -27,7 +28,8 @@ struct Scales {
 class Core {
  public:
   Core(const std::string& model, Indices place, Closure closure, SpringTable springs, int rank, Scales scales,
-       std::unique_ptr<Written> written = {});
+       std::unique_ptr<Written> written);
+  ~Core();
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
@@ -59,15 +61,16 @@ class Core {
   double potential_energy();
   Energy energy(In v, Out momentum);
 
-  // --- at a velocity, which is that of what follows ---
-  void bias(In v_tree);       // C'v + h' less springs, J_dot v
-  void coriolis();            // after `bias`: C', J_dot and h' less springs
+  // --- at a velocity ---
+  void set_velocity(In v_tree);  // that of what follows
+  void bias();                // C'v + h' less springs, J_dot v
+  void coriolis();            // C', J_dot and h' less springs
   void jacobian_rate(In v_tree);  // rows.J_dot alone
   Vector v_tree, bias_tree, h_tree, J_dot_v;
   Vector damping_tree;        // what dampers do, zero without
-  Matrix C_tree;
   void velocity(In q_dot, Out v) const;           // rho q_dot
   void reduced(In force, Out generalized) const;  // rho^T force
+  void C_tree_times(In x, Out product);           // C' x, after coriolis
   void rho_dot_times(In x, Out product);          // after coriolis
   void C_times(In x, Out product);                // after coriolis
 
@@ -98,7 +101,6 @@ class Core {
   bool has(Part part) const { return here_ & part; }
   const Matrix& D_tree() const { return written ? D_written_ : tree.D(); }
   void set_tree();
-  void set_velocity(In v);
   void row_rates_of_tree();  // and bias_without_springs_
   void spring_lengths();
   void spring_forces();  // elastic_
@@ -112,7 +114,7 @@ class Core {
 
   bool dense_;          // whether D' is
   unsigned here_ = 0;  // parts that are those of q_tree and v_tree
-  Matrix D_written_, D_rho_, tangent_, D_tangent_;
+  Matrix C_tree_, D_written_, D_rho_, tangent_, D_tangent_;
   Indices free_;  // the coordinates that the tangent basis' columns are of
   Indices basis_q_, basis_z_, pivots_;  // the partition that the tangent basis is of, whichever is good here
   Factor basis_;

@@ -3,12 +3,12 @@
 #include <cmath>
 
 #include "core.hpp"
+#include "written.hpp"
 
 namespace ckc {
 
 // Relative size of the last pivot of J at which its rank counts as lost; and below which the metric of D' is given up.
 constexpr double singular = 1e-12, weak = 1e-3;
-constexpr double trusted = 1e-4;  // of a diagonal entry left by elimination without pivoting: four digits are lost then
 // Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
 constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
 
@@ -122,6 +122,7 @@ void Core::z_step(In residual, Out x) {
 }
 
 bool Core::closing_step(In residual, Out x) {
+  if (written && written->closing_step(q_tree, residual, x)) return true;
   if (!tangent_basis(residual, weak)) return shortest_step(residual, x);
   tangent_inertia();
   D_times(x_, y_);
@@ -146,6 +147,7 @@ const Matrix* Core::tangent() {
 
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   if (written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
+  bias();
   residual_ = J_dot_v + correction;
   if (!tangent_basis(residual_, singular)) return false;
   tangent_inertia();
@@ -156,7 +158,7 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
 }
 
 bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
-  return written && written->acceleration(q_tree, v, u_tree, correction, acceleration) > trusted;
+  return written && written->acceleration(q_tree, v, u_tree, correction, acceleration);
 }
 
 }  // namespace ckc

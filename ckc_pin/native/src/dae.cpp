@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include "written.hpp"
+
 namespace ckc {
 
 constexpr int most_steps = 10;
@@ -18,7 +20,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       beta_(beta),
       projects_(projects) {
   crosses = projects;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), unmoved_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), uncorrected_.setZero(core.rows.closure.rows), unforced_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
@@ -39,40 +41,63 @@ bool Dae::place(In y) {
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {
-  if (!y.allFinite()) return fails(Trouble::infinite);
-  if (core.written && !control.acts() && alpha_ == 0.0 && beta_ == 0.0) {  // no term is needed but the acceleration
+  if (!finite(y)) return fails(Trouble::infinite);
+  const auto v = y.tail(core.n);
+  if (core.written && !control.needs_terms() && !stabilised()) {  // no term but the acceleration is needed
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
-    residual_.setZero();
-    if (core.written_acceleration(q_tree_, y.tail(core.n), unmoved_, residual_, y_dot.tail(core.n))) {
+    const bool acts = control.acts();
+    if (acts && !forces(t, q_tree_, v)) return false;
+    if (core.written_acceleration(q_tree_, v, acts ? control.u_tree : unforced_, uncorrected_, y_dot.tail(core.n))) {
       counts.factorizations += 2;
-      core.tree.configuration_rate(q_tree_, y.tail(core.n), y_dot.head(core.tree.nq));
-      return y_dot.allFinite() || fails(Trouble::infinite);
+      core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
+      return finite(y_dot) || fails(Trouble::infinite);
     }
   }
   place(y);
-  return rate(t, y.tail(core.n), y_dot);
+  return rate(t, v, y_dot);
 }
 
-void Dae::independent(In v) {
-  for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
+bool Dae::forces(double t, In q_tree, In v) {
+  independent(q_tree, v);
+  v_tree = v;
+  return act(t);
+}
+
+void Dae::independent(In q_tree, In v) {
+  for (int k = 0; k < core.d; ++k) q(k) = q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
 }
 
 bool Dae::rate(double t, In v, Out y_dot) {
   const int n = core.n;
-  core.bias(v);
-  independent(v);
-  v_tree = v;
-  if (!act(t)) return false;
+  core.set_velocity(v);
+  if (!forces(t, core.q_tree, v)) return false;
   residual_.setZero();
-  if (alpha_ != 0.0 || beta_ != 0.0) {
+  if (stabilised()) {
     residual_.noalias() = core.rows.J * core.v_tree;
     residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
   if (!core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n))) return fails(Trouble::rank);
-  return y_dot.allFinite() || fails(Trouble::infinite);
+  return finite(y_dot) || fails(Trouble::infinite);
+}
+
+// Exact where the terms are written out and what acts is known to depend on joints of one freedom alone, or not at all.
+bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  const int n = core.n, nq = core.tree.nq;
+  if (!core.written || stabilised() || (control.feedback() && nq != n) || !finite(y))
+    return System::jacobian(t, y, jacobian, evaluations);
+  q_tree_ = y.head(nq);
+  core.tree.normalize(q_tree_);
+  const auto v = y.tail(n);
+  if (control.needs_terms()) place(y);
+  if (!forces(t, q_tree_, v)) return false;
+  if (!control.slopes(by_q_, by_v_) || !core.written->jacobian(q_tree_, v, control.u_tree, jacobian, by_u_))
+    return System::jacobian(t, y, jacobian, evaluations);
+  for (int k : core.tree.single) jacobian.col(core.tree.place[k]).tail(n) += by_u_ * by_q_.col(k);
+  jacobian.bottomRightCorner(n, n) += by_u_ * by_v_;
+  return jacobian.allFinite();
 }
 
 // Stiff control would answer to any change of what it sees: where one acts, z alone is moved, unless that takes steps
@@ -109,7 +134,7 @@ bool Dae::project(In y) {
 
 bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   const int n = core.n;
-  if (!y.allFinite()) return false;
+  if (!finite(y)) return false;
   q_tree_ = y.head(core.tree.nq);
   core.tree.normalize(q_tree_);
   set(q_tree_, false);
@@ -157,7 +182,7 @@ bool Dae::exact(double, In y) {
     velocity = y.tail(n);
   }
   v_tree = velocity;
-  independent(velocity);
+  independent(core.q_tree, velocity);
   return true;
 }
 

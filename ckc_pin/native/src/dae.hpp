@@ -18,6 +18,7 @@ class Dae : public System {
   Accepted accept(double t, Out y, double margin) override;
   void rates(std::vector<std::pair<int, int>>& of) const override;
   bool conserves() const override { return projects_; }
+  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   bool modes(In y, Matrix& jacobian) override;
   bool tree_acceleration(In f, Out a) const override { return a = f.tail(core.n), true; }
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
@@ -25,7 +26,9 @@ class Dae : public System {
 
  private:
   void set(In q_tree, bool with_inertia = true);  // the core at a configuration, with J
-  void independent(In v);                         // q of the core's configuration, and q_dot
+  void independent(In q_tree, In v);              // q, q_dot
+  bool forces(double t, In q_tree, In v);         // what acts there
+  bool stabilised() const { return alpha_ != 0.0 || beta_ != 0.0; }
   bool rate(double t, In v, Out y_dot);           // at the core's configuration
   // Into core.q_tree and velocity. Where nothing is controlled, by the shortest steps in the metric of the inertia: the
   // correction with the least work on the motion.
@@ -35,7 +38,8 @@ class Dae : public System {
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
-  Vector q_tree_, step_, z_step_, residual_, unmoved_;
+  Vector q_tree_, step_, z_step_, residual_, uncorrected_, unforced_;
+  Matrix by_u_, by_q_, by_v_;
 };
 
 }  // namespace ckc

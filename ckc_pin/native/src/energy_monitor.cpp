@@ -22,7 +22,7 @@ double EnergyMonitor::at(System& system, double rtol, double atol) {
   to_ = energy(system);
   if (std::isnan(from_) || std::isnan(to_)) return 0.0;
   Core& core = system.core;
-  core.bias(system.velocity);
+  core.set_velocity(system.velocity), core.bias();
   double allowed = rounding * size_;
   for (int k = 0; k < core.n; ++k)
     allowed += std::abs(momentum_(k)) * (atol + rtol * std::abs(system.velocity(k))) +

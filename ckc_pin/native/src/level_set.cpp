@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "written.hpp"
+
 namespace ckc {
 
 constexpr double max_step = 0.5;  // rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
@@ -25,7 +27,7 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
       alarm_(switch_margin),
       predictor_(core, epsilon) {
   const int m = core.rows.closure.rows;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), w0_.setZero(m), z_.setZero(core.z.size());
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), uncorrected_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m), z_.setZero(core.z.size());
 }
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
@@ -127,29 +129,57 @@ double LevelSet::unclosed() {
 
 bool LevelSet::rhs(double t, In y, Out y_dot) {
   const int d = core.d;
-  if (!y.allFinite()) return fails(Trouble::infinite);
+  if (!finite(y)) return fails(Trouble::infinite);
   if (!state(t, y, refusals_ || to_rounding_ ? tolerance_ : std::max(tolerance_, slack_))) return fails(Trouble::open);
-  core.inertia();
-  core.bias(v_tree);
+  core.set_velocity(v_tree);
   if (!act(t)) return false;
   counts.factorizations += 2;  // phi_z and D
   if (chart_.plain())
     y_dot.head(d) = q_dot;
   else
     chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
-  if (actual_ && !on_manifold_)
+  // On the manifold eq. 6 is eq. 1 at rho q_dot.
+  written_ = on_manifold_ && core.written_acceleration(core.q_tree, v_tree, control.u_tree, uncorrected_, a_tree_);
+  if (written_)
+    for (int k = 0; k < d; ++k) y_dot(d + k) = a_tree_(core.q[k]);
+  else if (actual_ && !on_manifold_)
     core.actual_acceleration(control.u_tree, q_dot, y_dot.tail(d));
   else
     core.reduced_acceleration(control.u_tree, y_dot.tail(d));
-  return y_dot.allFinite() || fails(Trouble::infinite);
+  return finite(y_dot) || fails(Trouble::infinite);
 }
 
-// What the slack of the loops leaves open is far more than a difference moves.
 bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  to_rounding_ = true;
+  if (core.written && on_manifold_ && core.tree.roots.empty() && exact_jacobian(t, y, jacobian)) return true;
+  to_rounding_ = true;  // what the slack of the loops leaves open is far more than a difference moves
   const bool exists = System::jacobian(t, y, jacobian, evaluations);
   to_rounding_ = false;
   return exists;
+}
+
+// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot, d v' / d q_dot = rho.
+bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
+  const int d = core.d, n = core.n;
+  if (!finite(y) || !state(t, y, tolerance_)) return false;
+  core.set_velocity(v_tree);
+  if (!act(t) || !control.slopes(by_q_, by_v_)) return false;
+  if (!core.written->jacobian(core.q_tree, v_tree, control.u_tree, by_state_, by_u_)) return false;
+  by_state_.bottomLeftCorner(n, n) += by_u_ * by_q_, by_state_.bottomRightCorner(n, n) += by_u_ * by_v_;
+  core.jacobian_rate(v_tree);
+  rho_dot_.setZero(n, d);
+  for (int k = 0; k < d; ++k) {
+    residual_.noalias() = -core.rows.J_dot * core.rho.col(k);
+    core.solve_z(residual_, z_);
+    for (size_t i = 0; i < core.z.size(); ++i) rho_dot_(core.z[i], k) = z_(i);
+  }
+  jacobian.setZero(2 * d, 2 * d);
+  jacobian.topRightCorner(d, d).setIdentity();
+  for (int k = 0; k < d; ++k) {
+    const auto row = by_state_.row(n + core.q[k]);
+    jacobian.row(d + k).head(d) = row.head(n) * core.rho + row.tail(n) * rho_dot_;
+    jacobian.row(d + k).tail(d) = row.tail(n) * core.rho;
+  }
+  return jacobian.allFinite();
 }
 
 void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
@@ -161,7 +191,10 @@ void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
 
 bool LevelSet::tree_acceleration(In f, Out a) const {
   if (!on_manifold_) return false;
-  core.tree_acceleration(f.tail(core.d), a);
+  const auto q_ddot = f.tail(core.d);
+  if (!written_) return core.tree_acceleration(q_ddot, a), true;
+  a = a_tree_;  // at another q_ddot than f's, which an implicit method asks for
+  for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
   return true;
 }
 
@@ -183,7 +216,7 @@ void LevelSet::whole(In f, Out x, Out x_dot) const {
   core.tree.configuration_rate(core.q_tree, velocity, x_dot.head(core.tree.nq));
   if (on_manifold_) {
     x << core.q_tree, velocity;
-    core.tree_acceleration(f.tail(core.d), x_dot.tail(core.n));
+    tree_acceleration(f, x_dot.tail(core.n));
   } else {
     x << core.q_tree, q_dot;
     x_dot.tail(core.d) = f.tail(core.d);

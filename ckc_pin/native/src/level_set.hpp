@@ -40,6 +40,7 @@ class LevelSet : public System {
   bool state(double t, In y, double tolerance);
   bool newton(double tolerance);
   double unclosed();
+  bool exact_jacobian(double t, In y, Matrix& jacobian);
   bool move_to(const Partition& partition, double t, Out y);
   void chart_numbers(Out y);
 
@@ -59,6 +60,9 @@ class LevelSet : public System {
   Predictor predictor_;
   Vector anchor_, arrived_;  // configurations of the last accepted state, and of the one that may be next
   Vector w0_, q_tree_, residual_, z_, step_;
+  bool written_ = false;  // whether a_tree_ is that of the last right-hand side
+  Vector a_tree_, uncorrected_;
+  Matrix by_state_, by_u_, by_q_, by_v_, rho_dot_;
 };
 
 }  // namespace ckc

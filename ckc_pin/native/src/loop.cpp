@@ -129,7 +129,7 @@ void Loop::back() {
 // What is sampled sees the state, and what is due acts from here on.
 std::optional<Stop> Loop::sample() {
   if (!system->exact(now.t, now.y)) return trouble();
-  system->core.inertia(), system->core.bias(system->v_tree);
+  system->core.set_velocity(system->v_tree);
   constant_before_ = control->constant;
   if (!control->sample(system->measured(now.t))) return trouble();
   if (control->constant != constant_before_) jump();

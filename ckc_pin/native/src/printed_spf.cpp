@@ -47,8 +47,7 @@ bool PrintedSpf::rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!y.allFinite()) return fails(Trouble::infinite);
   place(t, y);
-  core.inertia();
-  core.bias(v_tree);
+  core.set_velocity(v_tree);
   if (!act(t)) return false;
   counts.factorizations += 2;
   y_dot.head(d) = q_dot;

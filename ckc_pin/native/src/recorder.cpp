@@ -30,7 +30,7 @@ bool Recorder::row(System& system, double t, In y, Out row) {
   const auto actuators = system.control.tau.size();
   if (!system.exact(t, y)) return false;
   const Energy energy = core.energy(system.v_tree, momentum_);
-  core.bias(system.v_tree);
+  core.set_velocity(system.v_tree);
   if (!system.act(t)) return false;
   Eigen::Index at = 0;
   const auto put = [&](In part) { row.segment(at, part.size()) = part, at += part.size(); };

@@ -13,9 +13,11 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     numbers_.setZero(size("numbers_sparsity_out"));
     const double* from[] = {parameters.data()};
     double* to[] = {numbers_.data()};
-    code("numbers")(from, to, nullptr, nullptr, 0);
-    place_ = code("place"), inertia_ = code("inertia"), bias_ = code("bias"), jacobian_rate_ = code("jacobian_rate");
-    potential_energy_ = code("potential_energy"), acceleration_ = code("acceleration");
+    code("numbers", 1)(from, to, nullptr, nullptr, 0);
+    place_ = code("place", 3), inertia_ = code("inertia", 3), bias_ = code("bias", 4);
+    jacobian_rate_ = code("jacobian_rate", 4), rest_ = code("rest", 3), coriolis_ = perhaps("coriolis", 5);
+    potential_energy_ = code("potential_energy", 3), acceleration_ = code("acceleration", 6);
+    closing_step_ = code("closing_step", 4), jacobian_ = perhaps("jacobian", 5);
   } catch (...) {
     dlclose(library_);
     throw;
@@ -30,48 +32,89 @@ void* Written::symbol(const std::string& name) const {
   return found;
 }
 
+Written::Code Written::code(const char* name, int arguments) const {
+  if (reinterpret_cast<long long (*)()>(symbol(std::string(name) + "_n_in"))() != arguments)
+    throw std::runtime_error(std::string("another ") + name + " in the library of a mechanism's terms");
+  return reinterpret_cast<Code>(symbol(name));
+}
+
+Written::Code Written::perhaps(const char* name, int arguments) const {
+  return dlsym(library_, name) ? code(name, arguments) : nullptr;
+}
+
 long long Written::size(const char* of) const {
   return reinterpret_cast<const long long* (*)(long long)>(symbol(of))(0)[0];
 }
 
 void Written::place(In q, Out phi, Matrix& J) const {
-  const double* from[] = {q.data(), numbers_.data()};
+  const double* from[] = {q.data(), trig(q), numbers_.data()};
   double* to[] = {phi.data(), J.data()};
   place_(from, to, nullptr, nullptr, 0);
 }
 
 void Written::inertia(In q, Matrix& D_tree) const {
-  const double* from[] = {q.data(), numbers_.data()};
+  const double* from[] = {q.data(), trig(q), numbers_.data()};
   double* to[] = {D_tree.data()};
   inertia_(from, to, nullptr, nullptr, 0);
 }
 
 void Written::bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const {
-  const double* from[] = {q.data(), v.data(), numbers_.data()};
+  const double* from[] = {q.data(), trig(q), v.data(), numbers_.data()};
   double* to[] = {bias_tree.data(), J_dot_v.data(), damping_tree.data()};
   bias_(from, to, nullptr, nullptr, 0);
 }
 
 void Written::jacobian_rate(In q, In v, Matrix& J_dot) const {
-  const double* from[] = {q.data(), v.data(), numbers_.data()};
+  const double* from[] = {q.data(), trig(q), v.data(), numbers_.data()};
   double* to[] = {J_dot.data()};
   jacobian_rate_(from, to, nullptr, nullptr, 0);
 }
 
+void Written::rest(In q, Out h_tree) const {
+  const double* from[] = {q.data(), trig(q), numbers_.data()};
+  double* to[] = {h_tree.data()};
+  rest_(from, to, nullptr, nullptr, 0);
+}
+
+void Written::coriolis(In q, In v, In x, Out product) const {
+  const double* from[] = {q.data(), trig(q), v.data(), x.data(), numbers_.data()};
+  double* to[] = {product.data()};
+  coriolis_(from, to, nullptr, nullptr, 0);
+}
+
 double Written::potential_energy(In q) const {
   double value = 0.0;
-  const double* from[] = {q.data(), numbers_.data()};
+  const double* from[] = {q.data(), trig(q), numbers_.data()};
   double* to[] = {&value};
   potential_energy_(from, to, nullptr, nullptr, 0);
   return value;
 }
 
-double Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
-  double share = 0.0;
-  const double* from[] = {q.data(), v.data(), u_tree.data(), correction.data(), numbers_.data()};
-  double* to[] = {acceleration.data(), &share};
+bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
+  double sound = 0.0;
+  const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), correction.data(), numbers_.data()};
+  double* to[] = {acceleration.data(), &sound};
   acceleration_(from, to, nullptr, nullptr, 0);
-  return share;
+  return sound > 0.0;
+}
+
+bool Written::closing_step(In q, In residual, Out x) const {
+  double sound = 0.0;
+  const double* from[] = {q.data(), trig(q), residual.data(), numbers_.data()};
+  double* to[] = {x.data(), &sound};
+  closing_step_(from, to, nullptr, nullptr, 0);
+  return sound > 0.0;
+}
+
+bool Written::jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const {
+  if (!jacobian_) return false;
+  const auto size = q.size() + v.size();
+  by_state.resize(size, size), by_u.resize(v.size(), v.size());
+  double sound = 0.0;
+  const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), numbers_.data()};
+  double* to[] = {by_state.data(), by_u.data(), &sound};
+  jacobian_(from, to, nullptr, nullptr, 0);
+  return sound > 0.0;
 }
 
 }  // namespace ckc

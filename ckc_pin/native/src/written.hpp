@@ -3,7 +3,7 @@
 
 #include <string>
 
-#include "types.hpp"
+#include "trig.hpp"
 
 namespace ckc {
 
@@ -18,19 +18,32 @@ class Written {
   void inertia(In q, Matrix& D_tree) const;
   void bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const;
   void jacobian_rate(In q, In v, Matrix& J_dot) const;
+  void rest(In q, Out h_tree) const;  // h' less what springs do
+  // C' x; only of trees whose joints have one freedom each: of a free root's twist there are several C'.
+  void coriolis(In q, In v, In x, Out product) const;
+  bool has_coriolis() const { return coriolis_; }
   double potential_energy(In q) const;
-  // Eq. 1, by elimination without pivoting; the least share of a diagonal entry that it leaves.
-  double acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
+  // Eq. 1 by elimination without pivoting; false where it would have to pivot.
+  bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
+  // The x with J x = -residual that is smallest in the metric of D'; false as above.
+  bool closing_step(In q, In residual, Out x) const;
+  // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
+  bool jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const;
 
  private:
   using Code = int (*)(const double**, double**, long long*, double*, int);
   void* symbol(const std::string& name) const;
-  Code code(const char* name) const { return reinterpret_cast<Code>(symbol(name)); }
+  Code code(const char* name, int arguments) const;     // of so many
+  Code perhaps(const char* name, int arguments) const;  // null where there is none
   long long size(const char* of) const;
+
+  // Cosines and sines of q, which most functions of one state share.
+  const double* trig(In q) const { return trig_.of(q); }
 
   void* library_;
   Vector numbers_;  // the parameters, and what follows from them alone
-  Code place_, inertia_, bias_, jacobian_rate_, potential_energy_, acceleration_;
+  mutable Trig trig_;
+  Code place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
 };
 
 }  // namespace ckc
