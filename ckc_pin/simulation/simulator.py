@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.native import _core
 from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller
@@ -26,7 +26,7 @@ from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["Simulator", "State"]
 
-T = TypeVar("T")
+AT_WORK = "this simulator is at work on another call; it takes one at a time, and none from an event's function"
 
 
 class State:
@@ -36,19 +36,34 @@ class State:
     ----------
     t : float
         Time, s.
-    v_tree : (n,) array
-        Rates by coordinate; off its manifold the SPF's z_dot differs from what q_dot implies.
-    w : (rows,) array
-        What phi is: zero but for the SPF started off its manifold.
     """
 
     def __init__(self, mechanism: Mechanism, t: float, numbers: Array, q: list[int], z: list[int]) -> None:
-        n, nq = mechanism.n, mechanism.tree.nq
-        self._mechanism, self._q, self._z = mechanism, q, z
+        self._mechanism, self._numbers, self._q, self._z = mechanism, numbers, q, z
         self.t = t
         numbers.setflags(write=False)
-        self._q_tree, self.v_tree = numbers[:nq], numbers[nq : nq + n]
-        self._v_terms, self.w = numbers[nq + n : nq + 2 * n], numbers[nq + 2 * n :]
+
+    @cached_property
+    def _q_tree(self) -> Array:
+        return self._numbers[: self._mechanism.tree.nq]
+
+    @cached_property
+    def v_tree(self) -> Array:
+        """Rates by coordinate, shape (n,); off its manifold the SPF's z_dot differs from what q_dot implies."""
+        return self._part(0)
+
+    @cached_property
+    def _v_terms(self) -> Array:
+        return self._part(1)
+
+    @cached_property
+    def w(self) -> Array:
+        """What phi is, shape (rows,): zero but for the SPF started off its manifold."""
+        return self._numbers[self._mechanism.tree.nq + 2 * self._mechanism.n :]
+
+    def _part(self, k: int) -> Array:
+        start = self._mechanism.tree.nq + k * self._mechanism.n
+        return self._numbers[start : start + self._mechanism.n]
 
     @cached_property
     def terms(self) -> Terms:
@@ -135,7 +150,10 @@ class Simulator:
         self.mechanism = self._ready.mechanism
         self.controller: Controller | None = scene_controller(scene, self.mechanism)
         self._none = np.zeros(self.mechanism.d)
-        self._gate, self._at_work = Lock(), False
+        gate = _core.Gate(InputError)  # the loop has one state
+        self._step, self._reset, self._events, self._stats = (
+            gate.turn(f"{what}: {AT_WORK}") for what in ("step", "reset", "events", "stats")
+        )
         self.reset()
 
     @property
@@ -146,12 +164,14 @@ class Simulator:
     @property
     def events(self) -> list[dict[str, Any]]:
         """Events met since the last reset."""
-        return [self._ready.events[k].met(t, direction) for t, k, direction in self._alone("events", self._loop.met)]
+        with self._events:
+            return [self._ready.events[k].met(t, direction) for t, k, direction in self._loop.met()]
 
     @property
     def stats(self) -> dict[str, Any]:
         """What was evaluated since the last reset, by the names of `Run.stats`."""
-        return dict(self._alone("stats", self._loop.stats))
+        with self._stats:
+            return dict(self._loop.stats())
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state; what was before has no influence on what follows.
@@ -171,17 +191,14 @@ class Simulator:
         InputError, NumericalError
             A state of another mechanism, out of reach or singular; a step is under way.
         """
-        return self._alone("reset", lambda: self._reset(state))
-
-    def _reset(self, state: State | Mapping[str, Any] | None) -> State:
-        if isinstance(state, State):
-            self._ready.begin(self._start(state), state.t)
-            numbers = np.concatenate([state._q_tree, state.v_tree, state._v_terms, state.w])
-            self._state = State(self.mechanism, state.t, numbers, state._q, state._z)
-        else:
-            self._ready.begin(None if state is None else self._initial(state))
-            self._state = self._present()
-        return self._state
+        with self._reset:
+            if isinstance(state, State):
+                self._ready.begin(self._start(state), state.t)
+                self._state = State(self.mechanism, state.t, state._numbers, state._q, state._z)
+            else:
+                self._ready.begin(None if state is None else self._initial(state))
+                self._state = self._present()
+            return self._state
 
     def step(self, u: Any, dt: float) -> State:
         """Hold u for dt seconds.
@@ -206,37 +223,26 @@ class Simulator:
             The numerics stopped within the step; `state` is the last one that was reached.
         """
         applied = self._none if u is None else require_u(u, self.mechanism, "u")
-        return self._alone("step", lambda: self._step(applied, dt))
-
-    def _step(self, u: Array, dt: float) -> State:
         until = self._state.t + self._require_dt(dt)
-        loop = self._loop
-        if not loop.hold(u):
-            raise InputError(f"u is not finite: {u.tolist()}")
-        try:
-            while (stop := loop.advance(until, False, PAUSE, math.inf))[0] == "pause":
-                pass
-        finally:  # a caller's function may raise, and Ctrl-C
-            self._state = self._present()
-        if stop[0] not in ("end", "event"):
-            raise explain(Stop(*stop), loop, self.mechanism, self._ready.scene.spec.solver, self._ready.events)
-        return self._state
+        with self._step:
+            return self._go(applied, until)
 
-    def _alone(self, what: str, act: Callable[[], T]) -> T:
-        """Do something with the loop, which has one state, unless something is being done with it."""
-        mine = False
+    def _go(self, u: Array, until: float) -> State:
         try:
-            with self._gate:  # held for no longer than it takes to look
-                if self._at_work:
-                    raise InputError(
-                        f"{what}: this simulator is at work on another call; it takes one at a time, and none from an "
-                        "event's function"
-                    )
-                self._at_work = mine = True
-            return act()
-        finally:
-            if mine:
-                self._at_work = False
+            while (found := self._loop.step(u, until, PAUSE)) is not None and found[0][0] == "pause":
+                pass
+        except BaseException:  # a caller's function may raise, and Ctrl-C
+            self._state = self._present()
+            raise
+        if found is None:
+            raise InputError(f"u is not finite: {u.tolist()}")
+        stop, reached = found
+        if reached is not None:
+            self._state = State(self.mechanism, *reached)
+        if stop[0] not in ("end", "event"):
+            loop, solver = self._loop, self._ready.scene.spec.solver
+            raise explain(Stop(*stop), loop, self.mechanism, solver, self._ready.events)
+        return self._state
 
     def _present(self) -> State:
         reached = self._loop.state()

@@ -95,7 +95,7 @@ void record(Run& run, Given instants, Rows rows) {
 }
 
 // (why, t, value, event, filled rows)
-nb::tuple advance(Run& run, double until, bool final, double pause, double budget) {
+nb::object advance(Run& run, double until, bool final, double pause, double budget) {
   Stop stop;
   {
     nb::gil_scoped_release released;
@@ -106,6 +106,14 @@ nb::tuple advance(Run& run, double until, bool final, double pause, double budge
     std::rethrow_exception(std::exchange(run.view->raised, nullptr));
   }
   return nb::make_tuple(reasons[stop.why], stop.t, stop.value, stop.which, run.loop->recorder.filled);
+}
+
+bool hold(Run& run, nb::handle u) {
+  Vector constant(run.core->d);
+  require(read(u, constant), "u: an array of d doubles is needed");
+  if (!finite(constant)) return false;
+  run.loop->hold(constant);
+  return true;
 }
 
 // The present state, closed: (t, an array of q', velocity, v' of the terms and w, q, z); none where that does not exist.
@@ -121,6 +129,13 @@ nb::object state(Run& run) {
   for (const Vector* x : parts) place = std::copy(x->data(), x->data() + x->size(), place);
   run.places.are(*run.core);
   return nb::make_tuple(loop.t(), numbers, run.places.q, run.places.z);
+}
+
+// Hold u and advance: what `advance` returns, and the state there; none where u is not finite.
+nb::object step(Run& run, nb::handle u, double until, double pause) {
+  if (!hold(run, u)) return nb::none();
+  nb::object stop = advance(run, until, false, pause, std::numeric_limits<double>::infinity());
+  return nb::make_tuple(std::move(stop), state(run));
 }
 
 // Why no step could be made: (trouble, what a controller says, its u, phi_z's least singular value and that over |J|,
@@ -209,15 +224,7 @@ void bind_loop(nb::module_& m) {
   nb::class_<Run> loop(m, "Loop");
   loop.def("__init__", &make, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a)
       .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
-      .def("hold",
-           [](Run& run, nb::handle u) {
-             Vector constant(run.core->d);
-             require(read(u, constant), "u: an array of d doubles is needed");
-             const bool finite = constant.allFinite();
-             if (finite) run.loop->hold(constant);
-             return finite;
-           },
-           "u"_a)
+      .def("step", &step, "u"_a, "until"_a, "pause"_a)
       .def("record", &record, "instants"_a, "rows"_a)
       .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
       .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)

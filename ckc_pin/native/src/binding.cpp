@@ -8,4 +8,5 @@ NB_MODULE(_core, m) {
   m.attr("chart_margin") = ckc::chart_margin;
   ckc::bind_core(m);
   ckc::bind_loop(m);
+  ckc::bind_gate(m);
 }
