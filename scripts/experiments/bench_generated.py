@@ -1,0 +1,127 @@
+"""What terms written out for one mechanism cost and save: each figure with Pinocchio's terms beside it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import partial
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from timeit import repeat
+from typing import Any
+
+import numpy as np
+
+from ckc_pin import Simulator, load, load_scene
+from ckc_pin.generated.library import compiled
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.simulate import run_prepared
+
+Measured = tuple[float, float]  # with terms written out, with Pinocchio's
+
+RHS_NS = (("five_bar/swing", 150), ("andrews", 300), ("bricard", 350), ("delta", 900))
+SWING_MS = ((1e-3, 0.12), (1e-6, 0.2), (1e-9, 0.35))
+TERMS = ("generated", "pinocchio")
+
+
+def _loop(scene: str, terms: str, changes: dict[str, Any]) -> Any:
+    ready = prepare(load_scene(scene, {**changes, "solver.terms": terms}))
+    ready.begin()
+    return ready.loop
+
+
+def rhs_ns(scene: str) -> Measured:
+    """A right-hand side as the loop calls it, at the start and near it."""
+    found = []
+    for terms in TERMS:
+        loop = _loop(scene, terms, {"formulation": "dae"})
+        near = loop.y + 1e-3 * np.random.default_rng(0).standard_normal((20, len(loop.y)))
+        states = np.column_stack([np.zeros(20), near])
+        found.append(1e9 * loop.seconds(states, 2000))
+    return found[0], found[1]
+
+
+def jacobian() -> Measured:
+    """The five-bar's Jacobian in right-hand sides, what calling from Python costs taken off."""
+    found = []
+    for terms in TERMS:
+        loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
+        y = loop.y
+        alone = loop.seconds(np.append(0.0, y)[np.newaxis], 20000)
+        call, whole = (
+            min(repeat(what, repeat=20, number=1000)) / 1000
+            for what in (partial(loop.rhs, 0.0, y), partial(loop.jacobian, 0.0, y))
+        )
+        found.append((whole - (call - alone)) / alone)
+    return found[0], found[1]
+
+
+def compile_seconds(name: str) -> Measured:
+    """Expressions, C, compiling and comparing, into an empty cache; and finding it there."""
+    mechanism, kept = load(name), os.environ.get("XDG_CACHE_HOME")
+    with TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        times = []
+        for _ in range(2):
+            began = perf_counter()
+            compiled(mechanism)
+            times.append(perf_counter() - began)
+        if kept is None:
+            del os.environ["XDG_CACHE_HOME"]
+        else:
+            os.environ["XDG_CACHE_HOME"] = kept
+    return times[0], times[1]
+
+
+def run_ms(scene: str, changes: dict[str, Any]) -> Measured:
+    """The loop's own time, the least of several runs."""
+    found = []
+    for terms in TERMS:
+        ready = prepare(load_scene(scene, {**changes, "solver.terms": terms}))
+        found.append(1e3 * min(float(run_prepared(ready).stats["wall_s"]) for _ in range(9)))
+    return found[0], found[1]
+
+
+def step_us() -> Measured:
+    """A step of 1 ms whose u is another one each time."""
+    found = []
+    for terms in TERMS:
+        simulator = Simulator("five_bar/swing", {"solver.terms": terms})
+        us = [np.array([0.1 * np.sin(k), 0.0]) for k in range(200)]
+
+        def steps(simulator: Simulator = simulator, us: list[Any] = us) -> None:
+            simulator.reset()
+            for u in us:
+                simulator.step(u, 1e-3)
+
+        found.append(1e6 * min(repeat(steps, timer=process_time, repeat=15, number=1)) / len(us))
+    return found[0], found[1]
+
+
+def rows() -> Iterator[tuple[str, Any, float, str]]:
+    """What is measured, how, at most, in which unit."""
+    for scene, most in RHS_NS:
+        yield f"DAE right-hand side, {scene.partition('/')[0]}", partial(rhs_ns, scene), most, "ns"
+    yield "its Jacobian, five_bar", jacobian, 3, "right-hand sides"
+    for name, most in (("five_bar", 2), ("delta", 10)):
+        yield f"compiling {name}, and finding it", partial(compile_seconds, name), most, "s"
+    for rtol, least in SWING_MS:
+        tight = {"solver.rtol": rtol, "solver.atol": rtol, "solver.output_dt": 2.0}
+        yield f"swing 2 s to {rtol:g}, its end alone", partial(run_ms, "five_bar/swing", tight), least, "ms"
+    sampled = {"controller.sample_time": 1e-3, "t_end": 9.5}
+    yield "tracking with sample_time = 1e-3, 9.5 s", partial(run_ms, "five_bar/tracking", sampled), 60, "ms"
+    yield "Simulator.step of 1 ms, five_bar", step_us, 6, "us"
+
+
+def main(only: str = "") -> int:
+    """Print a Markdown table of the lines with some words; return 1 when a bound is missed."""
+    print("| terms written out | measured | at most | with Pinocchio's |\n|---|---|---|---|")
+    missed = 0
+    for what, measure, bound, unit in rows():
+        if only not in what:
+            continue
+        ours, theirs = measure()
+        missed += ours > bound
+        says = ", missed" if ours > bound else ""
+        print(f"| {what} | {ours:.4g} {unit} | {bound:g} {unit}{says} | {theirs:.4g} {unit} |", flush=True)
+    return 1 if missed else 0
