@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from ckc_pin import Mechanism, Run, load, simulate
+from ckc_pin.generated.library import compiled
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
 settings.register_profile(
@@ -46,6 +49,25 @@ def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache of terms written out for the mechanisms that behaviour is tested with."""
+    folder = tmp_path_factory.mktemp("compiled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        for name in ("five_bar", "four_bar", "n_four_bar", "slider_crank"):
+            compiled(load(name))
+    return folder
+
+
+@pytest.fixture(params=["pinocchio", "generated"])
+def either_terms(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Whose terms runs take, each provider in turn."""
+    if request.param == "generated":
+        monkeypatch.setenv("XDG_CACHE_HOME", str(request.getfixturevalue("compiled_cache")))
+    return str(request.param)
+
+
 @pytest.fixture(scope="session", params=REFERENCES)
 def pair(request: pytest.FixtureRequest) -> Pair:
     """A shipped five-bar, and the same in numpy: each reading of Table I in turn."""
@@ -64,7 +86,8 @@ def run() -> Callable[..., Run]:
     done: dict[tuple[Any, ...], Run] = {}
 
     def run(scene: str, **changes: Any) -> Run:
-        key = (scene, *sorted((name, repr(value)) for name, value in changes.items()))
+        terms = os.environ["XDG_CACHE_HOME"]  # what is compiled there
+        key = (terms, scene, *sorted((name, repr(value)) for name, value in changes.items()))
         if key not in done:
             done[key] = simulate(scene, {name.replace("__", "."): value for name, value in changes.items()})
         return done[key]

@@ -12,6 +12,8 @@ from ckc_pin import Event, Simulator, Terms, load_scene, simulate
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.simulate import run_prepared
 
+pytestmark = pytest.mark.usefixtures("either_terms")
+
 SCENES = [
     ("five_bar/set_point", {"formulation": "reduced", "t_end": 0.2}),
     ("five_bar/set_point", {"formulation": "dae", "t_end": 0.2}),

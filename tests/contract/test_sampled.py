@@ -16,6 +16,8 @@ from tests.analytic.five_bar import FIVE_BAR, Array, Controller, Q, set_point, t
 from tests.conftest import assert_close
 from tests.contract.helpers.bad import Bad, expect
 
+pytestmark = pytest.mark.usefixtures("either_terms")
+
 FORMULATIONS = ["reduced", "spf", "dae"]
 TARGET = np.full(2, np.pi / 4)
 LAWS = {"set_point": set_point(FIVE_BAR, TARGET), "tracking": tracking(FIVE_BAR)}

@@ -14,6 +14,8 @@ from ckc_pin.simulation.simulator import State
 from tests.conftest import assert_close
 from tests.regression.test_reference_cases import first_top_pin
 
+pytestmark = pytest.mark.usefixtures("either_terms")
+
 Array = NDArray[np.float64]
 FORMULATIONS = ["reduced", "spf", "dae"]
 TIGHT = {"solver.rtol": 1e-10}

@@ -12,6 +12,8 @@ from ckc_pin import Run
 from tests.conftest import REFERENCES, assert_close
 from tests.regression.reference import FORMULATIONS, trajectory
 
+pytestmark = pytest.mark.usefixtures("either_terms")
+
 readings = pytest.mark.parametrize("file", ["swing", "swing_as_printed"])
 formulations = pytest.mark.parametrize("formulation", FORMULATIONS)
 
