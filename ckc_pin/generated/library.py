@@ -62,8 +62,14 @@ def find(mechanism: Mechanism) -> Library | None:
     return _look(_Subject.of(mechanism), folder, _compiler())
 
 
-def compiled(mechanism: Mechanism) -> Library:
+def compiled(mechanism: Mechanism, most: int = MOST_COORDINATES) -> Library:
     """Return the mechanism's terms, from the cache or compiled now.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    most : int
+        Coordinates, above which terms are not written out.
 
     Raises
     ------
@@ -71,9 +77,9 @@ def compiled(mechanism: Mechanism) -> Library:
         A tree with too many coordinates, no CasADi, no C compiler or one that fails, no place to write, or code whose
         results are not those of Pinocchio.
     """
-    if mechanism.n > MOST_COORDINATES:
+    if mechanism.n > most:
         raise InputError(
-            f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {MOST_COORDINATES}"
+            f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {most}"
         )
     subject, compiler = _Subject.of(mechanism), _compiler()
     found = _look(subject, cache_folder(), compiler)

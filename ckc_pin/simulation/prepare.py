@@ -119,6 +119,7 @@ def prepare(
     *,
     free: bool = False,
     profile: bool = False,
+    library: Library | None = None,
 ) -> Prepared:
     """Build everything that a scene needs before its first step.
 
@@ -132,6 +133,8 @@ def prepare(
         No controller at all: the caller says what acts.
     profile : bool
         Count which terms are evaluated.
+    library : Library, optional
+        The mechanism's terms, compiled, in the place of those that the scene's solver.terms says.
 
     Raises
     ------
@@ -162,7 +165,7 @@ def prepare(
     if controller is not None or free:
         actuation.require_transmission(start.at)
     loop = _core.Loop(
-        core_table(mechanism, _library(mechanism, scene.spec.solver.terms)),
+        core_table(mechanism, library or _library(mechanism, scene.spec.solver.terms)),
         _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),

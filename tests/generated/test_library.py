@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ckc_pin import InputError, check, load, simulate
+from ckc_pin import InputError, check, load, load_scene, simulate
 from ckc_pin.generated import library
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.simulate import run_prepared
 from tests.contract.helpers.command import ckc
 
 NAME = "slider_crank"
@@ -170,3 +172,12 @@ def test_the_command_tells_what_it_did(folder: Path) -> None:
     too_large = ckc("compile", "talos")
     assert too_large.code == 2
     assert "trees of up to" in too_large.err
+
+
+def test_a_caller_says_another_limit(folder: Path) -> None:
+    mechanism = load(NAME)
+    with pytest.raises(InputError, match="3 coordinates; terms are written out for trees of up to 2"):
+        library.compiled(mechanism, most=2)
+    made = library.compiled(mechanism, most=3)
+    ready = prepare(load_scene(NAME, {"solver.terms": "pinocchio"}), library=made)
+    assert run_prepared(ready).stats["terms"] == "generated"
