@@ -140,6 +140,22 @@ def swing_up(out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "images"
     raise typer.Exit(swing_up.main(out))
 
 
+@app.command("generated_sizes")
+def generated_sizes(
+    mechanisms: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="MECHANISM", show_default=False, help="shipped name, N squares in a row, ring_n"),
+    ] = None,
+) -> None:
+    """Up to which size compiled terms pay.
+
+    Prints text, times and gain by size.
+    """
+    from scripts.experiments import generated_sizes
+
+    generated_sizes.main(mechanisms or ())
+
+
 @app.command()
 def benchmark(
     quick: Annotated[bool, typer.Option("--quick", help="fewer motions, methods and tolerances: minutes")] = False,

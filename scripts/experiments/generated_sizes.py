@@ -1,0 +1,174 @@
+"""Up to which size terms written out for one mechanism pay: text, time to compile, gain, and runs that repay it.
+
+Rows of squares have 2 N + 1 coordinates in branches of two at most; shipped mechanisms have longer ones; a ring of n
+hinges in space, which is one branch, is the longest text that n coordinates can have. Times are a processor's but for
+right-hand sides, which are the least of many.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from typing import Any
+
+from ckc_pin.errors import InputError
+from ckc_pin.generated.code import functions, source
+from ckc_pin.generated.library import Library, compiled
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.simulation.prepare import prepare, scene_mechanism
+from ckc_pin.simulation.scene import load_scene
+from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, written
+
+__all__ = ["NAMES", "Size", "main", "measure"]
+
+SQUARES = ("1", "2", "4", "8", "11", "16", "24", "32", "48", "64")
+NAMES = (
+    *SQUARES,
+    "five_bar",
+    "two_ur5",
+    "delta",
+    "stewart",
+    "talos",
+    "ring_12",
+    "ring_24",
+    "ring_36",
+    "ring_40",
+    "ring_48",
+)
+REPEATS = 5
+ANY = 10**6  # coordinates: no limit
+SIDE, AXES = 0.2, ("0 0 1", "1 0 0", "0 1 0")  # of the ring: a link's length, m; about what its hinges turn
+
+
+@dataclass(frozen=True)
+class Size:
+    """A mechanism.
+
+    Attributes
+    ----------
+    name : str
+        Or the number N of squares, or ring_n.
+    n, operations, bytes : int
+        Coordinates; operations of an acceleration; of the C text.
+    expressions_s, compile_s : float
+        To write the text; for all that `ckc compile` does.
+    written_s, general_s : float
+        A right-hand side of the DAE with terms written out, with Pinocchio's.
+    reason : str
+        Why there are no times.
+    """
+
+    name: str
+    n: int
+    operations: int
+    bytes: int
+    expressions_s: float
+    compile_s: float
+    written_s: float = 0.0
+    general_s: float = 0.0
+    reason: str = ""
+
+    @property
+    def repaid(self) -> float:
+        """Right-hand sides from which compiling costs less than it saves."""
+        return self.compile_s / (self.general_s - self.written_s)
+
+    def row(self) -> str:
+        """The line of a Markdown table."""
+        start = (
+            f"| {self.name} | {self.n} | {self.operations:,} | {self.bytes / 1e3:,.0f} | {self.expressions_s:.2f} | "
+            f"{self.compile_s:.1f} |"
+        )
+        if self.reason:
+            return f"{start} {self.reason} | | | |"
+        gain = self.general_s / self.written_s
+        return f"{start} {1e6 * self.written_s:.2f} | {1e6 * self.general_s:.2f} | {gain:.1f} | {self.repaid:.1e} |"
+
+
+def measure(name: str) -> Size:
+    """Write, compile and time one mechanism: a shipped name, a number of squares, or ring_n."""
+    with tempfile.TemporaryDirectory() as folder, _empty_cache(Path(folder)):
+        scene = _scene(name, Path(folder))
+        mechanism = scene_mechanism(load_scene(scene))
+        began = _spent()
+        found = functions(mechanism)
+        text = source(found)
+        expressions_s, began = _spent() - began, _spent()
+        reason, library = "", None
+        try:
+            library = compiled(mechanism, most=ANY)
+        except InputError as error:
+            reason = str(error)
+        about = (mechanism.n, found["acceleration"].n_instructions(), len(text), expressions_s, _spent() - began)
+        if library is None:
+            return Size(name, *about, reason=reason)
+        return Size(name, *about, _rhs_s(scene, library), _rhs_s(scene, None))
+
+
+def _scene(name: str, folder: Path) -> str:
+    if name.isdigit():
+        return str(written(Case(int(name), int(name)), folder))
+    kind, _, number = name.partition("_")
+    return str(ring(int(number), folder)) if kind == "ring" and number.isdigit() else f"{name}/default"
+
+
+def ring(n: int, folder: Path) -> Path:
+    """Write a ring of n links, a regular polygon, whose hinges turn about z, x, y in turn; return its scene."""
+    inertia = '<inertia ixx="0.01" iyy="0.011" izz="0.012" ixy="0.001" ixz="0.0005" iyz="0.0007"/>'
+    parts = ['<link name="base"/>']
+    for k in range(n):
+        parent, at, turn = ("base", 0.0, 0.0) if k == 0 else (f"link_{k - 1}", SIDE, 2 * pi / n)
+        parts.append(
+            f'<link name="link_{k}"><inertial><origin xyz="0.1 0.01 0.02"/><mass value="1"/>{inertia}</inertial></link>'
+            f'<joint name="hinge_{k}" type="continuous"><parent link="{parent}"/><child link="link_{k}"/>'
+            f'<origin xyz="{at} 0 0" rpy="0 0 {turn}"/><axis xyz="{AXES[k % 3]}"/></joint>'
+        )
+    (folder / "ring.urdf").write_text(f'<robot name="ring">{"".join(parts)}</robot>', encoding="utf-8")
+    (folder / "mechanism.toml").write_text(
+        f'name = "ring_{n}"\nurdf = "ring.urdf"\n[[loop]]\nname = "closes"\ntype = "point"\n'
+        f'frame_a = {{link = "link_{n - 1}", xyz = [{SIDE}, 0.0, 0.0]}}\nframe_b = "world"\n',
+        encoding="utf-8",
+    )
+    scene = folder / "ring.scene.toml"
+    text = 'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\ninitial.at = "assembled"\n'
+    scene.write_text(text, encoding="utf-8")
+    return scene
+
+
+def _rhs_s(scene: str, library: Library | None) -> float:
+    changes: dict[str, Any] = {"formulation": "dae", "solver.method": "DOP853", "solver.terms": "pinocchio"}
+    ready = prepare(load_scene(scene, changes), free=True, library=library)
+    ready.begin()
+    states = motion(ready.loop)
+    return min(float(ready.loop.seconds(states, ROUNDS)) for _ in range(REPEATS))
+
+
+def _spent() -> float:
+    """Processor time of this process and of the compilers that have ended, s."""
+    return sum(os.times()[:4])
+
+
+@contextmanager
+def _empty_cache(folder: Path) -> Iterator[None]:
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+    try:
+        yield
+    finally:
+        del os.environ["XDG_CACHE_HOME"]
+        if before is not None:
+            os.environ["XDG_CACHE_HOME"] = before
+
+
+def main(names: Sequence[str] = ()) -> None:
+    """Print the table of shipped names, numbers of squares and rings."""
+    print("| N or name | n | operations | text, kB | expressions, s | compiled, s | written, µs | general, µs | gain |"
+          " repaid after |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")  # fmt: skip
+    with one_blas_thread():
+        for name in names or NAMES:
+            print(measure(name).row(), flush=True)
