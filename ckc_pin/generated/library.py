@@ -29,7 +29,7 @@ __all__ = ["Library", "cache_folder", "compiled", "find"]
 
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler
-MOST_COORDINATES = 24  # of a tree that is written out: text grows with their square, compilers take longer still
+MOST_COORDINATES = 40  # of a tree that is written out: a minute of the compiler where all are in one branch
 
 
 @dataclass(frozen=True)

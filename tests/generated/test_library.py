@@ -15,6 +15,7 @@ from ckc_pin import InputError, check, load, load_scene, simulate
 from ckc_pin.generated import library
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.simulate import run_prepared
+from scripts.experiments.benchmark.growth import Case, written
 from tests.contract.helpers.command import ckc
 
 NAME = "slider_crank"
@@ -165,13 +166,14 @@ def _make(name: str) -> str:
     return library.compiled(load(name)).path
 
 
-def test_the_command_tells_what_it_did(folder: Path) -> None:
+def test_the_command_tells_what_it_did(folder: Path, tmp_path: Path) -> None:
     first, again = ckc("compile", NAME, "--json"), ckc("compile", NAME, "--json")
     assert (first.code, first.json["compiled"], again.json["compiled"]) == (0, True, False)
     assert first.json["file"] == again.json["file"]
-    too_large = ckc("compile", "talos")
+    written(Case(20, 20), tmp_path)
+    too_large = ckc("compile", str(tmp_path / "mechanism.toml"))
     assert too_large.code == 2
-    assert "trees of up to" in too_large.err
+    assert "41 coordinates; terms are written out for trees of up to 40" in too_large.err
 
 
 def test_a_caller_says_another_limit(folder: Path) -> None:
