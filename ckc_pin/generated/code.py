@@ -27,7 +27,7 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
-LARGEST_JACOBIAN = 1e5  # operations of the acceleration times n, about twice those of its derivatives: above, none
+LARGEST_JACOBIAN = 3e4  # operations of the acceleration times n, about twice those of its derivatives: above, none
 
 
 def functions(mechanism: Mechanism) -> dict[str, Any]:

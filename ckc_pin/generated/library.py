@@ -25,7 +25,7 @@ from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.mechanism.whole_file import written_whole
 
-__all__ = ["Library", "cache_folder", "compiled", "find"]
+__all__ = ["MOST_COORDINATES", "Library", "cache_folder", "compiled", "find"]
 
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.generated.library import MOST_COORDINATES
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import Check
 from ckc_pin.simulation.run import Run
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_plain", "terms_table", "to_json"]
 
 MOST_EVENTS = 10  # in a table for people
+LONG = 10.0  # s: what compiling a mechanism's terms takes at most, as a rule
 TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
 
 
@@ -125,10 +127,19 @@ def run_table(run: Run) -> Table:
     stats = run.stats
     steps = ", ".join(f"{name} {count} steps" for name, count in stats["steps_by_method"].items())
     table.add_row("method", f"{steps or stats['method']}, {stats['rejected']} rejected")
+    table.add_row("terms", stats["terms"] + _would_pay(run))
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
     called = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
     table.add_row("work", f"{work}, {stats['factorizations']} factorizations{called}, {stats['wall_s']:.2g} s")
     return table
+
+
+def _would_pay(run: Run) -> str:
+    """Say of a long run that compiled terms would have made it a short one."""
+    general = run.stats["terms"] == "pinocchio" and len(run.coordinates) <= MOST_COORDINATES
+    if not general or run.stats["wall_s"] < LONG:
+        return ""
+    return "; compiled ones are several times faster: ckc compile"
 
 
 def _formulation(run: Run) -> str:
