@@ -21,6 +21,9 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("five_bar/tracking", {"solver.method": "DOP853"}),  # "auto" asks now and then whether it is stiff, and that does
     ("five_bar/tracking", {"solver.method": "Radau"}),
     ("five_bar/tracking", {"controller.sample_time": 1e-3}),
+    ("five_bar/swing", {"solver.terms": "generated"}),
+    ("five_bar/swing", {"solver.terms": "generated", "solver.method": "Radau"}),
+    ("five_bar/swing", {"solver.terms": "generated", "solver.method": "Radau", "formulation": "reduced"}),
     ("flyball", {}),
     ("three_rrr/default", {"formulation": "reduced"}),
     ("n_four_bar", {"mechanism.N": 20, "formulation": "dae", "solver.rtol": 1e-11}),

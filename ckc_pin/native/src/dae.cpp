@@ -95,8 +95,10 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if (!forces(t, q_tree_, v)) return false;
   if (!control.slopes(by_q_, by_v_) || !core.written->jacobian(q_tree_, v, control.u_tree, jacobian, by_u_))
     return System::jacobian(t, y, jacobian, evaluations);
-  for (int k : core.tree.single) jacobian.col(core.tree.place[k]).tail(n) += by_u_ * by_q_.col(k);
-  jacobian.bottomRightCorner(n, n) += by_u_ * by_v_;
+  if (control.feedback()) {  // joints of one freedom alone
+    jacobian.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
+    jacobian.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
+  }
   return jacobian.allFinite();
 }
 

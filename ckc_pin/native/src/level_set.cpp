@@ -164,7 +164,10 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   core.set_velocity(v_tree);
   if (!act(t) || !control.slopes(by_q_, by_v_)) return false;
   if (!core.written->jacobian(core.q_tree, v_tree, control.u_tree, by_state_, by_u_)) return false;
-  by_state_.bottomLeftCorner(n, n) += by_u_ * by_q_, by_state_.bottomRightCorner(n, n) += by_u_ * by_v_;
+  if (control.feedback()) {
+    by_state_.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
+    by_state_.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
+  }
   core.jacobian_rate(v_tree);
   rho_dot_.setZero(n, d);
   for (int k = 0; k < d; ++k) {
@@ -176,8 +179,9 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   jacobian.topRightCorner(d, d).setIdentity();
   for (int k = 0; k < d; ++k) {
     const auto row = by_state_.row(n + core.q[k]);
-    jacobian.row(d + k).head(d) = row.head(n) * core.rho + row.tail(n) * rho_dot_;
-    jacobian.row(d + k).tail(d) = row.tail(n) * core.rho;
+    jacobian.row(d + k).head(d).noalias() = row.head(n) * core.rho;
+    jacobian.row(d + k).head(d).noalias() += row.tail(n) * rho_dot_;
+    jacobian.row(d + k).tail(d).noalias() = row.tail(n) * core.rho;
   }
   return jacobian.allFinite();
 }

@@ -42,7 +42,8 @@ void Predictor::predict(double t, In numbers, const Chart& chart, const Core& co
   double least = 0.0;
   for (int k = 0; k < count_; ++k) {
     chart.step(core, points_[k].q_tree, numbers, far_);
-    const double far = far_.lpNorm<Eigen::Infinity>();
+    double far = 0.0;  // one by one, as they were written
+    for (int i = 0; i < core.d; ++i) far = std::max(far, std::abs(far_(i)));
     if (k == 0 || far < least) nearest = k, least = far, dq_ = far_;
   }
   Point& base = points_[nearest];

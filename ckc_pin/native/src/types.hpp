@@ -4,6 +4,8 @@
 #include <Eigen/Core>
 #include <Eigen/Geometry>
 
+#include <cmath>
+#include <limits>
 #include <vector>
 
 namespace ckc {
@@ -18,11 +20,11 @@ using Indices = std::vector<int>;
 using In = const Eigen::Ref<const Vector>&;
 using Out = Eigen::Ref<Vector>;
 
-// Eigen's own compares each number twice and ends at the first, which keeps it from taking several at once.
+// Eigen's own ends at the first that is not, which keeps it from taking several at once.
 inline bool finite(In x) {
-  double none = 0.0;
-  for (Eigen::Index k = 0; k < x.size(); ++k) none += 0.0 * x(k);
-  return none == 0.0;
+  unsigned none = 0;
+  for (Eigen::Index k = 0; k < x.size(); ++k) none |= !(std::abs(x(k)) <= std::numeric_limits<double>::max());
+  return !none;
 }
 
 }  // namespace ckc
