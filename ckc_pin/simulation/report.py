@@ -127,7 +127,8 @@ def run_table(run: Run) -> Table:
     stats = run.stats
     steps = ", ".join(f"{name} {count} steps" for name, count in stats["steps_by_method"].items())
     table.add_row("method", f"{steps or stats['method']}, {stats['rejected']} rejected")
-    table.add_row("terms", stats["terms"] + _would_pay(run))
+    terms = stats.get("terms", "pinocchio")  # a file may be from before there were others
+    table.add_row("terms", terms + (_would_pay(run) if terms == "pinocchio" else ""))
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
     called = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
     table.add_row("work", f"{work}, {stats['factorizations']} factorizations{called}, {stats['wall_s']:.2g} s")
@@ -136,8 +137,7 @@ def run_table(run: Run) -> Table:
 
 def _would_pay(run: Run) -> str:
     """Say of a long run that compiled terms would have made it a short one."""
-    general = run.stats["terms"] == "pinocchio" and len(run.coordinates) <= MOST_COORDINATES
-    if not general or run.stats["wall_s"] < LONG:
+    if len(run.coordinates) > MOST_COORDINATES or run.stats["wall_s"] < LONG:
         return ""
     return "; compiled ones are several times faster: ckc compile"
 

@@ -66,6 +66,7 @@ class _Stats(msgspec.Struct):
     steps_by_method: dict[str, int]
     python_calls: int
     wall_s: float
+    terms: Literal["pinocchio", "generated"] = "pinocchio"  # of files from before there were others
 
 
 class _Controller(msgspec.Struct):
