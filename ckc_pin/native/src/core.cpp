@@ -213,7 +213,7 @@ void Core::coriolis() {
   Profile::Entry entry(profile, Profile::C_tree);
   here_ |= coriolis_of_tree;
   if (written && written->has_coriolis()) {
-    written->jacobian_rate(q_tree, v_tree, rows.J_dot);
+    jacobian_rate(v_tree);
     return written->rest(q_tree, h_tree);
   }
   row_rates_of_tree();

@@ -71,7 +71,7 @@ class Core {
   void velocity(In q_dot, Out v) const;           // rho q_dot
   void reduced(In force, Out generalized) const;  // rho^T force
   void C_tree_times(In x, Out product);           // C' x, after coriolis
-  void rho_dot_times(In x, Out product);          // after coriolis
+  void rho_dot_times(In x, Out product);          // after coriolis, or jacobian_rate
   void C_times(In x, Out product);                // after coriolis
 
   // --- accelerations ---

@@ -169,11 +169,10 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
     by_state_.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
   }
   core.jacobian_rate(v_tree);
-  rho_dot_.setZero(n, d);
+  rho_dot_.resize(n, d);
   for (int k = 0; k < d; ++k) {
-    residual_.noalias() = -core.rows.J_dot * core.rho.col(k);
-    core.solve_z(residual_, z_);
-    for (size_t i = 0; i < core.z.size(); ++i) rho_dot_(core.z[i], k) = z_(i);
+    unit_.setUnit(d, k);
+    core.rho_dot_times(unit_, rho_dot_.col(k));
   }
   jacobian.setZero(2 * d, 2 * d);
   jacobian.topRightCorner(d, d).setIdentity();
