@@ -179,7 +179,7 @@ def _look(subject: _Subject, folder: Path, compiler: _Compiler | None) -> Librar
     """A file of that key, of that compiler or, where there is none, of any."""
     pattern = f"{subject.key}-{compiler.key if compiler else '*'}-*.so"
     try:
-        if not (_is_ours(folder) and _executes(folder)):
+        if not _is_usable(folder):
             return None
         for path in sorted(folder.glob(pattern)):
             if path.stem.rpartition("-")[2] == sha256(path.read_bytes()).hexdigest()[:32]:
@@ -189,9 +189,10 @@ def _look(subject: _Subject, folder: Path, compiler: _Compiler | None) -> Librar
     return None
 
 
-def _is_ours(folder: Path) -> bool:
+def _is_usable(folder: Path) -> bool:
+    """Whether nobody else writes there, and programs are loaded from there."""
     stat = folder.stat()
-    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022
+    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022 and _executes(folder)
 
 
 def _executes(folder: Path) -> bool:
@@ -247,7 +248,7 @@ def _put(name: str, content: bytes) -> Path:
     try:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_ours(folder) and _executes(folder):
+        if _is_usable(folder):
             return _written(folder / name, content)
     except (OSError, InputError):
         pass
