@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter, process_time
+from time import perf_counter
 from timeit import repeat
 from typing import Any
 
 import numpy as np
 
-from ckc_pin import Simulator, load, load_scene
+from ckc_pin import Simulator, load
 from ckc_pin.generated.library import compiled
-from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.simulate import run_prepared
+from scripts.experiments.bench import least, ready
+from scripts.experiments.generated_sizes import empty_cache
 
 Measured = tuple[float, float]  # with terms written out, with Pinocchio's
 
@@ -25,9 +26,9 @@ TERMS = ("generated", "pinocchio")
 
 
 def _loop(scene: str, terms: str, changes: dict[str, Any]) -> Any:
-    ready = prepare(load_scene(scene, {**changes, "solver.terms": terms}))
-    ready.begin()
-    return ready.loop
+    prepared = ready(scene, {**changes, "solver.terms": terms})
+    prepared.begin()
+    return prepared.loop
 
 
 def rhs_ns(scene: str) -> Measured:
@@ -58,18 +59,12 @@ def jacobian() -> Measured:
 
 def compile_seconds(name: str) -> Measured:
     """Expressions, C, compiling and comparing, into an empty cache; and finding it there."""
-    mechanism, kept = load(name), os.environ.get("XDG_CACHE_HOME")
-    with TemporaryDirectory() as folder:
-        os.environ["XDG_CACHE_HOME"] = folder
-        times = []
+    mechanism, times = load(name), []
+    with TemporaryDirectory() as folder, empty_cache(Path(folder)):
         for _ in range(2):
             began = perf_counter()
             compiled(mechanism)
             times.append(perf_counter() - began)
-        if kept is None:
-            del os.environ["XDG_CACHE_HOME"]
-        else:
-            os.environ["XDG_CACHE_HOME"] = kept
     return times[0], times[1]
 
 
@@ -77,8 +72,8 @@ def run_ms(scene: str, changes: dict[str, Any]) -> Measured:
     """The loop's own time, the least of several runs."""
     found = []
     for terms in TERMS:
-        ready = prepare(load_scene(scene, {**changes, "solver.terms": terms}))
-        found.append(1e3 * min(float(run_prepared(ready).stats["wall_s"]) for _ in range(9)))
+        prepared = ready(scene, {**changes, "solver.terms": terms})
+        found.append(1e3 * min(float(run_prepared(prepared).stats["wall_s"]) for _ in range(9)))
     return found[0], found[1]
 
 
@@ -94,7 +89,7 @@ def step_us() -> Measured:
             for u in us:
                 simulator.step(u, 1e-3)
 
-        found.append(1e6 * min(repeat(steps, timer=process_time, repeat=15, number=1)) / len(us))
+        found.append(1e6 * least(steps, 15) / len(us))
     return found[0], found[1]
 
 
@@ -105,9 +100,9 @@ def rows() -> Iterator[tuple[str, Any, float, str]]:
     yield "its Jacobian, five_bar", jacobian, 3, "right-hand sides"
     for name, most in (("five_bar", 2), ("delta", 10)):
         yield f"compiling {name}, and finding it", partial(compile_seconds, name), most, "s"
-    for rtol, least in SWING_MS:
+    for rtol, bound in SWING_MS:
         tight = {"solver.rtol": rtol, "solver.atol": rtol, "solver.output_dt": 2.0}
-        yield f"swing 2 s to {rtol:g}, its end alone", partial(run_ms, "five_bar/swing", tight), least, "ms"
+        yield f"swing 2 s to {rtol:g}, its end alone", partial(run_ms, "five_bar/swing", tight), bound, "ms"
     sampled = {"controller.sample_time": 1e-3, "t_end": 9.5}
     yield "tracking with sample_time = 1e-3, 9.5 s", partial(run_ms, "five_bar/tracking", sampled), 60, "ms"
     yield "Simulator.step of 1 ms, five_bar", step_us, 6, "us"

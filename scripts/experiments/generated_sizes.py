@@ -92,7 +92,7 @@ class Size:
 
 def measure(name: str) -> Size:
     """Write, compile and time one mechanism: a shipped name, a number of squares, or ring_n."""
-    with tempfile.TemporaryDirectory() as folder, _empty_cache(Path(folder)):
+    with tempfile.TemporaryDirectory() as folder, empty_cache(Path(folder) / "cache"):
         scene = _scene(name, Path(folder))
         mechanism = scene_mechanism(load_scene(scene))
         began = _spent()
@@ -154,9 +154,10 @@ def _spent() -> float:
 
 
 @contextmanager
-def _empty_cache(folder: Path) -> Iterator[None]:
+def empty_cache(folder: Path) -> Iterator[None]:
+    """Keep compiled terms in a folder that is not there yet, instead of in the user's cache."""
     before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+    os.environ["XDG_CACHE_HOME"] = str(folder)
     try:
         yield
     finally:
