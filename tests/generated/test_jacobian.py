@@ -12,10 +12,10 @@ from ckc_pin import load, simulate
 from ckc_pin.generated.library import compiled
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import FIVE_BAR
+from tests.generated.test_compiled import COUPLED, FREE
 from tests.native.loops import started
 
 STEP = 1e-30  # of a complex step, which takes no differences
-FREE, COUPLED = 18, 14  # random mechanisms: a free root on a damped spring; redundant rows, a coupling
 K_P, K_V = 30.0, 4.0
 
 
