@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from ckc_pin import Event, InputError, Run, Terms, load, load_scene, simulate
+from ckc_pin import Event, InputError, Run, Simulator, Terms, load, load_scene, simulate
 from ckc_pin.native import _core
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
@@ -294,3 +294,27 @@ def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
     assert event["direction"] in (-1, 1)
     run = simulate("five_bar/swing", {"t_end": 0.3, "event": [{"coordinate": "theta_2", "value": 0.5}]})
     assert Run.load(run.save(tmp_path / "run.npz")).events == answer.json["events"]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_events_between_a_simulators_steps(formulation: str) -> None:
+    """One that stops ends the step early, and does not happen again at once."""
+    changes = {
+        "solver.rtol": 1e-10,
+        "formulation": formulation,
+        "t_end": 0.5,
+        "event": [{"coordinate": "theta_2", "value": 0.5}],
+    }
+    bell = Event(lambda t, terms: t - 0.1, stop=True, name="bell")
+    wanted = simulate("five_bar/swing", changes, events=[Event(lambda t, terms: t - 0.1)]).events
+    simulator = Simulator("five_bar/swing", changes, events=[bell])
+    stops = []
+    while simulator.state.t < 0.5:
+        end = min(simulator.state.t + 0.03, 0.5)
+        if simulator.step(None, 0.03).t < end - 1e-9:
+            stops.append(simulator.state.t)
+    assert stops == [pytest.approx(0.1, abs=1e-11)]
+    assert_close([event["t"] for event in simulator.events][: len(wanted)], [event["t"] for event in wanted], 1e-8)
+    simulator.reset()
+    assert simulator.events == []
+    assert simulator.step(None, 0.2).t == pytest.approx(0.1, abs=1e-11)

@@ -1,20 +1,16 @@
-"""Figures: what is drawn where, against closed forms; manners towards the user's matplotlib and disk."""
+"""Figures: what is drawn where, against closed forms."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
 import ckc_pin
-from ckc_pin.errors import InputError
 from ckc_pin.view.figures import draw, plot
 from ckc_pin.view.labels import run_labels, symbol
 from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
@@ -31,11 +27,6 @@ def tracking(run: Callable[..., ckc_pin.Run]) -> list[ckc_pin.Run]:
 @pytest.fixture(scope="session")
 def set_point(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
     return run("five_bar/set_point")
-
-
-@pytest.fixture(scope="session")
-def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
-    return run("five_bar/swing")
 
 
 @pytest.fixture(scope="module")
@@ -317,43 +308,3 @@ def test_run_labels_tell_runs_apart(tracking, swing):
     assert run_labels([reduced, spf]) == ["reduced", "SPF, ε = 10⁻⁴"]
     assert run_labels([reduced, swing]) == ["five_bar/tracking: reduced", "five_bar/swing: DAE"]
     assert run_labels([reduced, reduced]) == ["1. reduced", "2. reduced"]
-
-
-# --- manners -------------------------------------------------------------------------------------
-
-
-def test_files_are_the_same_whatever_the_user_has_set(swing, tmp_path):
-    formats = ("png", "svg")
-    plain = [path.read_bytes() for path in plot(swing, tmp_path / "plain", formats)]
-    assert plain[0].startswith(b"\x89PNG")
-    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
-        before = dict(mpl.rcParams)
-        styled = [path.read_bytes() for path in plot(swing, tmp_path / "styled", formats)]
-        assert dict(mpl.rcParams) == before
-    assert styled == plain
-
-
-def test_pyplot_stays_out(tmp_path):
-    code = (
-        "import sys, ckc_pin; from ckc_pin.view.figures import plot\n"
-        "run = ckc_pin.simulate('five_bar/swing', {'t_end': 0.05})\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        f"plot(run, {str(tmp_path)!r}, ('png', 'svg', 'pdf'))\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        f"motion{more}.{suffix}" for more in ("", "_snapshots") for suffix in ("pdf", "png", "svg")
-    ]
-
-
-def test_bad_input(swing, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="no run given"):
-        plot([], tmp_path)
-    with pytest.raises(InputError, match="format 'gif'; valid: png, svg, pdf"):
-        plot(swing, tmp_path, ("png", "gif"))
-    with pytest.raises(InputError, match="format 'missing'"):
-        plot(swing, tmp_path, ())
-    with pytest.raises(InputError, match=r"file.*cannot be written"):
-        plot(swing, tmp_path / "file")

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from ckc_pin import Event, InputError, NumericalError, Simulator, Terms, as_ivp, load_scene, simulate
+from ckc_pin import InputError, NumericalError, Simulator, Terms, as_ivp, load_scene, simulate
 from ckc_pin.simulation.simulator import State
 from tests.conftest import assert_close
 from tests.regression.test_reference_cases import first_top_pin
@@ -321,28 +321,6 @@ def test_limits_of_torque_hold() -> None:
     free = Simulator("five_bar/tracking", {"formulation": "reduced"})
     limited = Simulator("five_bar/tracking", {"formulation": "reduced", "controller.torque_limit": 2.0})
     assert_same(limited.step([9.0, -9.0], 0.01), free.step([2.0, -2.0], 0.01), 1e-13)
-
-
-# --- events --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_events_on_the_way(formulation: str) -> None:
-    """One that stops ends the step early, and does not happen again at once."""
-    changes = {**TIGHT, "formulation": formulation, "t_end": 0.5, "event": [{"coordinate": "theta_2", "value": 0.5}]}
-    bell = Event(lambda t, terms: t - 0.1, stop=True, name="bell")
-    wanted = simulate("five_bar/swing", changes, events=[Event(lambda t, terms: t - 0.1)]).events
-    simulator = Simulator("five_bar/swing", changes, events=[bell])
-    stops = []
-    while simulator.state.t < 0.5:
-        end = min(simulator.state.t + 0.03, 0.5)
-        if simulator.step(None, 0.03).t < end - 1e-9:
-            stops.append(simulator.state.t)
-    assert stops == [pytest.approx(0.1, abs=1e-11)]
-    assert_close([event["t"] for event in simulator.events][: len(wanted)], [event["t"] for event in wanted], 1e-8)
-    simulator.reset()
-    assert simulator.events == []
-    assert simulator.step(None, 0.2).t == pytest.approx(0.1, abs=1e-11)
 
 
 def test_a_scene_is_complete() -> None:
