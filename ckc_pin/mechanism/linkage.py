@@ -8,6 +8,7 @@ import pinocchio as pin
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
+from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.springs import Springs
@@ -36,7 +37,7 @@ class Linkage:
 
     Attributes
     ----------
-    tree, closure, frames, springs : Tree, Closure, Frames, Springs
+    tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
     points : dict of str to Frame
     size : float
         Characteristic length, metres.
@@ -58,6 +59,7 @@ class Linkage:
         for coupling in [*spec.coupling, *mimic]:
             builder.add_coupling(coupling)
         self.closure: Closure = builder.build()
+        self.joints = Joints(self.tree, spec.joint)
         self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
         if len(self.points) < len(spec.point):

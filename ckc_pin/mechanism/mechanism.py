@@ -48,6 +48,7 @@ class Mechanism:
         Coordinates of the tree; freedoms of the mechanism.
     coordinates, independent, dependent, actuated : tuple of str
     tree, closure, frames : Tree, Closure, Frames
+    joints, springs : Joints, Springs
     partition : Partition
     q_tree : (nq,) array
         The assembled configuration (Pinocchio's q).
@@ -63,7 +64,8 @@ class Mechanism:
     def __init__(self, linkage: Linkage, q_tree: Array, residual: float, tolerance: float, freedoms: Freedoms) -> None:
         self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
-        self.springs, self.points, self.size = linkage.springs, linkage.points, linkage.size
+        self.joints, self.springs = linkage.joints, linkage.springs
+        self.points, self.size = linkage.points, linkage.size
         self.coordinates, self.n = self.tree.coordinates, self.tree.n
         self.q_tree, self.residual, self.tolerance = q_tree, residual, tolerance
         self.freedoms = freedoms

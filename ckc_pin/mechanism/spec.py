@@ -10,6 +10,7 @@ __all__ = [
     "CouplingSpec",
     "ForceSpec",
     "FrameSpec",
+    "JointSpec",
     "LoopSpec",
     "LoopType",
     "MechanismSpec",
@@ -97,6 +98,17 @@ class ForceSpec(_Spec, frozen=True):
     value: float
 
 
+class JointSpec(_Spec, frozen=True):
+    """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s (N s/m)."""
+
+    name: Name
+    armature: NonNegative | None = None
+    damping: NonNegative | None = None
+    friction: NonNegative | None = None
+    stops: bool = False
+    restitution: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
+
+
 class PointSpec(_Spec, frozen=True):
     """A point to report and to trace."""
 
@@ -118,6 +130,7 @@ class MechanismSpec(_Spec, frozen=True):
     coupling: list[CouplingSpec] = []
     spring: list[SpringSpec] = []
     force: list[ForceSpec] = []
+    joint: list[JointSpec] = []
     point: list[PointSpec] = []
 
     def plain(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from ckc_pin.mechanism.spec import (
     CouplingSpec,
     ForceSpec,
     FrameSpec,
+    JointSpec,
     LoopSpec,
     LoopType,
     MechanismSpec,
@@ -36,9 +37,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
 
 # in the order of the page
-SPECS = [MechanismSpec, TreeSpec, LoopSpec, FrameSpec, CouplingSpec, SpringSpec, ForceSpec, PointSpec, SceneSpec,
-         GeneratorSpec, InitialSpec, SolverSpec, EventSpec, SetPointSpec, TrackingSpec, HarmonicsSpec, PointPathSpec,
-         CircleSpec, LineSpec]  # fmt: skip
+SPECS = [MechanismSpec, TreeSpec, LoopSpec, FrameSpec, CouplingSpec, SpringSpec, ForceSpec, JointSpec, PointSpec,
+         SceneSpec, GeneratorSpec, InitialSpec, SolverSpec, EventSpec, SetPointSpec, TrackingSpec, HarmonicsSpec,
+         PointPathSpec, CircleSpec, LineSpec]  # fmt: skip
 
 
 @cache

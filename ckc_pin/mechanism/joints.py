@@ -1,0 +1,74 @@
+"""What a joint itself does: rotor inertia, viscous damping, dry friction, stops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ckc_pin.errors import MechanismError
+from ckc_pin.mechanism.spec import JointSpec
+from ckc_pin.mechanism.tree import Tree
+
+__all__ = ["Joints"]
+
+
+class Joints:
+    """Dry friction and stops by coordinate; armature and damping go into the tree's model.
+
+    What the URDF says holds where the mechanism's file says nothing; its limits are walls only where asked for.
+
+    Parameters
+    ----------
+    tree : Tree
+        Its model takes the armature and the damping.
+    specs : sequence of JointSpec
+
+    Raises
+    ------
+    MechanismError
+        No such joint, a joint named twice, stops without limits.
+
+    Attributes
+    ----------
+    friction : (n,) array
+        Largest force or torque of dry friction, N or N m.
+    lower, upper : (n,) array
+        Where the stops are, infinite where there is none.
+    restitution : (n,) array
+        Of an impact at a stop: speed after over speed before.
+    """
+
+    def __init__(self, tree: Tree, specs: Sequence[JointSpec]) -> None:
+        model, n = tree.model, tree.n
+        self.friction = np.array(model.friction, dtype=float)
+        self.lower, self.upper = np.full(n, -np.inf), np.full(n, np.inf)
+        self.restitution = np.zeros(n)
+        lower, upper = tree.limits()
+        armature, damping = np.array(model.armature), np.array(model.damping)
+        seen = set[str]()
+        for spec in specs:
+            at = tree.one_freedom(spec.name, "joint")
+            if spec.name in seen:
+                raise MechanismError(f"joint: {spec.name!r} is given twice")
+            seen.add(spec.name)
+            if spec.armature is not None:
+                armature[at] = spec.armature
+            if spec.damping is not None:
+                damping[at] = spec.damping
+            if spec.friction is not None:
+                self.friction[at] = spec.friction
+            if spec.stops:
+                if not (np.isfinite(lower[at]) or np.isfinite(upper[at])):
+                    raise MechanismError(f"joint {spec.name!r}: stops = true, but its URDF gives no limits")
+                self.lower[at], self.upper[at] = lower[at], upper[at]
+                self.restitution[at] = spec.restitution
+            elif spec.restitution:
+                raise MechanismError(f"joint {spec.name!r}: a restitution goes with stops = true")
+        model.armature, model.damping, model.friction = armature, damping, self.friction
+        self.stopped = np.isfinite(self.lower) | np.isfinite(self.upper)
+
+    @property
+    def any(self) -> bool:
+        """Whether a joint has dry friction or stops, so that the motion has events."""
+        return bool(self.friction.any() or self.stopped.any())
