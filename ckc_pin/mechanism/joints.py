@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.spec import JointSpec
-from ckc_pin.mechanism.tree import Tree
+from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Joints"]
 
@@ -68,7 +68,10 @@ class Joints:
         model.armature, model.damping, model.friction = armature, damping, self.friction
         self.stopped = np.isfinite(self.lower) | np.isfinite(self.upper)
 
-    @property
-    def any(self) -> bool:
-        """Whether a joint has dry friction or stops, so that the motion has events."""
-        return bool(self.friction.any() or self.stopped.any())
+    def has_events(self, smoothing: float | None) -> bool:
+        """Whether joints stick or touch, friction being smoothed or not (None)."""
+        return bool(self.stopped.any()) or (smoothing is None and bool(self.friction.any()))
+
+    def smooth_friction(self, v_tree: Array, smoothing: float) -> Array:
+        """Return -F tanh(v / smoothing), N or N m, shape (n,)."""
+        return -self.friction * np.tanh(v_tree / smoothing)

@@ -17,7 +17,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["closure_table", "core_table"]
 
 
-def core_table(mechanism: Mechanism, library: Library | None = None) -> dict[str, Any]:
+def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: float | None = None) -> dict[str, Any]:
     """Return what a native core of a mechanism is made of; each has a workspace of its own.
 
     Parameters
@@ -25,6 +25,9 @@ def core_table(mechanism: Mechanism, library: Library | None = None) -> dict[str
     mechanism : Mechanism
     library : Library, optional
         Its terms, compiled; absent, they are Pinocchio's.
+    smoothing : float, optional
+        Of a core that moves: the rate over which dry friction grows, rad/s or m/s; zero where joints stick. Absent,
+        joints neither rub nor stop.
     """
     rows, columns = scales(mechanism.tree, mechanism.closure)
     written = {} if library is None else {"written": (library.path, library.parameters)}
@@ -34,6 +37,7 @@ def core_table(mechanism: Mechanism, library: Library | None = None) -> dict[str
         "place": mechanism.tree.place.tolist(),
         "closure": closure_table(mechanism.closure, mechanism.n),
         "springs": _springs(mechanism.springs),
+        "joints": _joints(mechanism, smoothing),
         "rank": mechanism.rank,
         "q": mechanism.partition.q.tolist(),
         "z": mechanism.partition.z.tolist(),
@@ -77,6 +81,19 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
         "point_local": _matrix(anchors.point_local, 3),
         "direction_joint": anchors.direction_joint.tolist(),
         "direction_local": _matrix(anchors.direction_local, 3),
+    }
+
+
+def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
+    joints, n = mechanism.joints, mechanism.n
+    acts = smoothing is not None
+    return {
+        "friction": joints.friction if acts else np.zeros(n),
+        "lower": joints.lower if acts else np.full(n, -np.inf),
+        "upper": joints.upper if acts else np.full(n, np.inf),
+        "restitution": joints.restitution,
+        "reach": mechanism.tree.reach,
+        "smoothing": smoothing or 0.0,
     }
 
 

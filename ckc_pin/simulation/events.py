@@ -18,7 +18,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.loop_terms import event_call
 from ckc_pin.simulation.scene import EventSpec
 
-__all__ = ["Event", "EventFunction", "event_functions"]
+__all__ = ["Event", "EventFunction", "event_functions", "events_met"]
 
 FLOOR = 1e-12  # rad, m, rad/s, m/s: what a coordinate or a rate is on the value within
 OF = {"q": 0, "q_dot": 1, "sigma_min_phi_z": 2, "sigma_min_J": 3, "function": 4}  # as the loop numbers them
@@ -105,6 +105,18 @@ def event_functions(specs: Sequence[EventSpec], own: Sequence[Event], mechanism:
         call = event_call(event.function, name, mechanism)
         found.append(EventFunction(label, (OF["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)))
     return found
+
+
+def events_met(functions: Sequence[EventFunction], mechanism: Mechanism, loop: Any) -> list[dict[str, Any]]:
+    """Return what a loop has met, in order of time: crossings, and what joints did."""
+    found = [functions[k].met(t, direction) for t, k, direction in loop.met()]
+    for t, k, what, direction in loop.joint_changes():
+        of, value = "friction", 0.0
+        if what not in ("sticks", "slides"):
+            of, value = "stop", float((mechanism.joints.lower if direction < 0 else mechanism.joints.upper)[k])
+        label = {"name": f"{mechanism.coordinates[k]} {what}", "of": of, "coordinate": mechanism.coordinates[k]}
+        found.append({"t": t, **label, "value": value, "direction": direction, "stop": False})
+    return sorted(found, key=lambda event: float(event["t"]))
 
 
 def _of_scene(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:

@@ -90,7 +90,7 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     Raises
     ------
     InputError, MechanismError
-        The scene cannot be run as written, or its controller is sampled.
+        The scene cannot be run as written, its controller is sampled, or its joints stick or stop.
     NumericalError
         Its start is singular.
 
@@ -108,9 +108,17 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     spec, mechanism = scene.spec, scene_mechanism(scene)
     if spec.controller is not None and spec.controller.sample_time is not None:
         raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")
+    smoothing = spec.friction_smoothing
+    if mechanism.joints.has_events(smoothing):
+        raise InputError(
+            f"as_ivp: joints of {mechanism.name} stick or stop, which is no function of t and y; without stops give "
+            "friction_smoothing"
+        )
     start = find_start(mechanism, scene)
     limit = spec.controller.torque_limit if spec.controller else None
     force = force_of(scene_controller(scene, mechanism), Actuation(mechanism, limit))
+    if smoothing is not None:
+        force = _with_friction(force, mechanism, smoothing)
     span = (0.0, spec.t_end)
     if spec.formulation == "dae":
         return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, span)
@@ -127,6 +135,10 @@ def force_of(controller: Controller | None, actuation: Actuation) -> Force:
     if controller is None:
         return lambda t, terms: actuation.none.u_tree
     return lambda t, terms: actuation.apply(terms, controller.u(t, terms)).u_tree
+
+
+def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:
+    return lambda t, terms: force(t, terms) + mechanism.joints.smooth_friction(terms.v_tree, smoothing)
 
 
 @dataclass

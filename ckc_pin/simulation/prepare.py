@@ -37,6 +37,7 @@ __all__ = ["Prepared", "prepare", "scene_controller", "scene_mechanism"]
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
 CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a collocation step, or the branches do not meet
+AT_STOP = 1e-11  # rad, or of the mechanism's size: a start so far beyond a stop is at it
 UNLIMITED = 2**62
 OUTPUTS = 500  # instants when a scene gives no output_dt
 MAX_OUTPUTS = 1_000_000
@@ -160,12 +161,15 @@ def prepare(
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     functions = event_functions(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
+    _require_within_stops(mechanism, start)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     if controller is not None or free:
         actuation.require_transmission(start.at)
     loop = _core.Loop(
-        core_table(mechanism, library or _library(mechanism, scene.spec.solver.terms)),
+        core_table(
+            mechanism, library or _library(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
+        ),
         _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
@@ -207,13 +211,23 @@ def _formulation(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarray[Any
         "epsilon": spec.epsilon if spec.formulation == "spf" else 1.0,
         "actual": spec.formulation == "spf" and spec.coriolis_velocity == "actual",
     }
+    sticks = mechanism.joints.has_events(spec.friction_smoothing)
     if spec.formulation == "spf" and spec.spf_coordinates == "z":
         if mechanism.tree.free:
             raise InputError(
                 'spf_coordinates = "z": eq. 8 as printed integrates q and z as numbers, and the rotation of a free '
                 'root is none; take "w"'
             )
+        if sticks:
+            raise InputError(
+                f'{mechanism.name}: spf_coordinates = "z" leaves the loops open by its tolerance, and joints that '
+                'stick or touch are rows of their closure; take "w"'
+            )
         return {"kind": "printed", **table}
+    if sticks and spec.initial.w is not None and any(spec.initial.w):
+        raise InputError(
+            f"initial.w: off phi = 0 the joints of {mechanism.name} that stick or touch cannot be held; leave it out"
+        )
     # heavy links turn what a light one's closure is off by into accelerations
     evenness = min(1.0, UNEVEN * float(inertias.min()) / float(inertias.max()))
     return {"kind": "level_set", **table, "slack": SLACK * spec.solver.rtol * mechanism.size * evenness}
@@ -232,6 +246,18 @@ def _solver(mechanism: Mechanism, spec: SceneSpec, profile: bool) -> dict[str, A
         "closed": max(CLOSED * mechanism.size, 10 * mechanism.tolerance),
         "profile": profile,
     }
+
+
+def _require_within_stops(mechanism: Mechanism, start: Start) -> None:
+    joints = mechanism.joints
+    numbers = mechanism.tree.to_coordinates(start.at.q_tree)
+    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
+    worst = int(np.argmax(off))
+    if off[worst] > AT_STOP:
+        raise InputError(
+            f"initial: {mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
+            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}"
+        )
 
 
 def _refuse_massless(terms: Terms) -> None:

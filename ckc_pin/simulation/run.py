@@ -45,11 +45,14 @@ class Run:
         Kinetic and potential energy, J.
     lyapunov : (m,) array or None
         The controller's Lyapunov function.
+    dissipated : (m,) array or None
+        Energy that dry friction and impacts have taken since the start, J.
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict
         Events that were met, in order of time: t, name, of, coordinate, value, direction (1 rising, -1 falling; of
-        "limit" 1 is leaving, -1 coming back), stop.
+        "limit" 1 is leaving, -1 coming back), stop. Beside a scene's: where a joint sticks or slides (of "friction"),
+        touches a stop, leaves it or bounces off it (of "stop").
     stats : dict
         rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (of a
         caller's controller and events), terms, wall_s.
@@ -75,6 +78,7 @@ class Run:
     w: Array
     energy: Array
     lyapunov: Array | None
+    dissipated: Array | None
     max_phi: float
     max_phi_dot: float
     events: list[dict[str, Any]]
@@ -163,6 +167,7 @@ class Run:
             "max_phi_dot": self.max_phi_dot,
             "energy_start": float(self.energy[0]),
             "energy_end": float(self.energy[-1]),
+            "dissipated": None if self.dissipated is None else float(self.dissipated[-1]),
             "formulation": self.scene["formulation"],
             "epsilon": self.scene["epsilon"] if self.scene["formulation"] == "spf" else None,
             "events": self.events,
@@ -202,7 +207,7 @@ class Run:
             coordinates, arrays, meta = read_run(path)
         except InputError as error:
             raise InputError(f"{error}; ckc run SCENE --out DIR writes a new one") from None
-        rest: dict[str, Any] = {"lyapunov": None, **arrays} | {name: getattr(meta, name) for name in META}
+        rest: dict[str, Any] = {**dict.fromkeys(OPTIONAL), **arrays} | {name: getattr(meta, name) for name in META}
         for name in ("max_phi", "max_phi_dot"):
             rest[name] = np.nan if rest[name] is None else rest[name]
         return cls(coordinates=coordinates, **rest)

@@ -23,7 +23,7 @@ MAX_BYTES = 2**31  # of a run, expanded
 MAX_META = 2**27  # of what it holds beside its arrays: as Python's objects that takes many times as much
 MAX_HEADER = 10_000  # of an array's header; NumPy's own limit
 ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
-OPTIONAL = ("lyapunov",)
+OPTIONAL = ("lyapunov", "dissipated")
 OTHERS = ("coordinates", "meta")
 
 
@@ -175,8 +175,8 @@ def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Ar
     rows = len(arrays["t"]) if arrays["t"].ndim == 1 else 0
     closure = arrays["phi"].shape[1:]
     n = (len(coordinates),)
-    wanted = {"t": (), "energy": (), "lyapunov": (), "phi": closure, "w": closure, "q_tree": n, "v_tree": n,
-              "u": (len(meta.independent),), "tau": (len(meta.actuated),)}  # fmt: skip
+    wanted = {"t": (), "energy": (), "lyapunov": (), "dissipated": (), "phi": closure, "w": closure, "q_tree": n,
+              "v_tree": n, "u": (len(meta.independent),), "tau": (len(meta.actuated),)}  # fmt: skip
     for name, array in arrays.items():
         if array.shape != (rows, *wanted[name]) or array.dtype != np.float64 or not rows:
             raise InputError(f"{path}: damaged: {name} is {array.shape} {array.dtype}, which does not fit the rest")

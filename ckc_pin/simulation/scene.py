@@ -83,6 +83,7 @@ class SceneSpec(_Spec, frozen=True):
     """The whole file.
 
     `spf_coordinates`: the SPF in the coordinates of eq. 17, exact in w, or with z as eq. 8 is printed.
+    `friction_smoothing`: the rate over which dry friction grows as tanh, rad/s or m/s, instead of joints that stick.
     """
 
     mechanism: str | GeneratorSpec
@@ -91,6 +92,7 @@ class SceneSpec(_Spec, frozen=True):
     epsilon: Positive = 1e-3
     spf_coordinates: Literal["w", "z"] = "w"
     coriolis_velocity: Literal["rho", "actual"] = "rho"
+    friction_smoothing: Positive | None = None
     initial: InitialSpec = InitialSpec()
     solver: SolverSpec = SolverSpec()
     controller: ControllerSpec | None = None

@@ -14,7 +14,7 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.events import Event
+from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
@@ -26,7 +26,7 @@ __all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
-SCALARS = ("t", "energy", "lyapunov", "max_phi", "max_phi_dot")
+SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
 
 
 def simulate(
@@ -88,14 +88,14 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
     rows = np.empty((len(times) + 1, loop.width))
     if rows.nbytes > MAX_BYTES:
         raise InputError(
-            f"solver.output_dt: {len(times)} output instants of {loop.width - 3} numbers each; a run has at most "
+            f"solver.output_dt: {len(times)} output instants of {loop.width - 4} numbers each; a run has at most "
             f"{MAX_BYTES // 2**20} MiB"
         )
     ready.begin()
     loop.record(times, rows)
     status, message, filled = _drive(ready, rows, progress, on_output)
     parts = _parts(ready, rows[:filled])
-    lyapunov = parts.pop("lyapunov")
+    lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
     run = Run(
         status=status,
         message=message,
@@ -103,9 +103,10 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
         independent=mechanism.independent,
         actuated=mechanism.actuated,
         lyapunov=_lyapunov(ready, lyapunov, parts),
+        dissipated=dissipated if mechanism.joints.has_events(scene.spec.friction_smoothing) else None,
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
-        events=[ready.events[k].met(t, direction) for t, k, direction in loop.met()],
+        events=events_met(ready.events, mechanism, loop),
         stats={**loop.stats(), "wall_s": perf_counter() - started},
         scene_name=scene.name,
         scene=scene.plain(),
@@ -159,7 +160,7 @@ def _parts(ready: Prepared, rows: Array) -> dict[str, Array]:
     mechanism = ready.mechanism
     n, m = mechanism.n, mechanism.closure.rows
     widths = {"t": 1, "q_tree": n, "v_tree": n, "u": mechanism.d, "tau": len(mechanism.actuated), "phi": m, "w": m,
-              "energy": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
+              "energy": 1, "dissipated": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
     parts: dict[str, Array] = {}
     at = 0
     for name, width in widths.items():

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
-from ckc_pin.simulation.events import Event
+from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller
 from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
@@ -165,7 +165,7 @@ class Simulator:
     def events(self) -> list[dict[str, Any]]:
         """Events met since the last reset."""
         with self._events:
-            return [self._ready.events[k].met(t, direction) for t, k, direction in self._loop.met()]
+            return events_met(self._ready.events, self._ready.mechanism, self._loop)
 
     @property
     def stats(self) -> dict[str, Any]:

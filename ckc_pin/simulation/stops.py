@@ -64,6 +64,13 @@ def explain(
             )
         case "control":
             return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
+        case "joints":
+            return NumericalError(
+                "which joints stick, slide or touch from here on cannot be told: they change again and again at this "
+                "instant, or the quadratic program that decides has no solution",
+                t=loop.t,
+                q_tree=where,
+            )
         case "function":
             return NumericalError(f"the event {events[stop.event].label['name']!r} is {stop.value}", t=loop.t)
     small = f"the step fell below min_step = {solver.min_step:g} s"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from ckc_pin import InputError, as_ivp, simulate
+from ckc_pin import InputError, as_ivp, load, simulate
 from ckc_pin.analysis.precision.settings import FORMULATIONS
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.simulation.scene import catalogue
@@ -17,6 +17,7 @@ ALLOWED = 100  # tolerances of a step: what a run adds up to
 # s: NumPy takes a millisecond a right-hand side; and what is chaotic forgets its tolerance later
 SPANS = {"andrews": 0.01, "delta": 0.1, "stewart": 0.05, "talos": 0.01, "two_ur5": 0.1}
 SPAN = 0.3
+SMOOTH = 0.1  # rad/s: joints that stick are no function of t and y
 
 
 def off(scene: str, changes: dict[str, Any]) -> tuple[float, str]:
@@ -44,11 +45,12 @@ def main() -> int:
         for name, _, scenes in catalogue():
             for scene in scenes:
                 cells = []
+                smooth = {"friction_smoothing": SMOOTH} if load(name).joints.friction.any() else {}
                 for changes in FORMULATIONS.values():
                     span = SPANS.get(name, SPAN)
                     try:
                         error, method = off(
-                            f"{name}/{scene}", {**changes, "t_end": span, "solver.output_dt": span / 20}
+                            f"{name}/{scene}", {**changes, **smooth, "t_end": span, "solver.output_dt": span / 20}
                         )
                     except InputError:
                         cells.append("refused")

@@ -39,7 +39,7 @@ RUNS = [
     ("n_four_bar/default", {**REDUCED, "t_end": 0.3}),
     ("stewart/default", {**REDUCED, "t_end": 0.05}),
     ("stewart/wave", {**REDUCED, "t_end": 0.05}),
-    ("talos/default", {**DAE, "t_end": 0.02}),
+    ("talos/default", {**DAE, "t_end": 0.02, "friction_smoothing": 0.1}),
     ("three_rrr/circle", {**REDUCED, "t_end": 0.2}),
     ("three_rrr/default", {"t_end": 0.3}),
     ("two_ur5/default", {**DAE, "t_end": 0.2}),

@@ -82,6 +82,11 @@ SpringTable springs_of(const nb::dict& table) {
   return s;
 }
 
+JointTable joints_of(const nb::dict& table) {
+  return {get<Vector>(table, "friction"),    get<Vector>(table, "lower"), get<Vector>(table, "upper"),
+          get<Vector>(table, "restitution"), get<Vector>(table, "reach"), get<double>(table, "smoothing")};
+}
+
 }  // namespace
 
 std::unique_ptr<Core> core_of(const nb::dict& table) {
@@ -93,7 +98,8 @@ std::unique_ptr<Core> core_of(const nb::dict& table) {
   }
   auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
                                      closure_of(nb::cast<nb::dict>(table["closure"])),
-                                     springs_of(nb::cast<nb::dict>(table["springs"])), get<int>(table, "rank"), scales,
+                                     springs_of(nb::cast<nb::dict>(table["springs"])),
+                                     joints_of(nb::cast<nb::dict>(table["joints"])), get<int>(table, "rank"), scales,
                                      std::move(written));
   require(core->scales.rows, core->rows.closure.rows, "row_scale"), require(core->scales.columns, core->n, "column_scale");
   const auto q = get<Indices>(table, "q"), z = get<Indices>(table, "z");

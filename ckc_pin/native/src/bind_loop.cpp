@@ -16,8 +16,9 @@ namespace {
 
 using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
+constexpr const char* changes[] = {"sticks", "slides", "touches", "leaves", "bounces"};
 constexpr const char* reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
-                                   "rank", "chart", "energy",  "control",    "function",    "output",   "raised"};
+                                   "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
 constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague"};
 constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
@@ -176,6 +177,14 @@ nb::list met(const Run& run) {
   return found;
 }
 
+// What joints did: (t, coordinate, what, direction).
+nb::list joint_changes(const Run& run) {
+  nb::list found;
+  for (const JointChange& change : run.core->joints.changes)
+    found.append(nb::make_tuple(change.t, change.coordinate, changes[change.what], change.direction));
+  return found;
+}
+
 nb::dict profile(const Run& run) {
   nb::dict found;
   const Profile& profile = run.core->profile;
@@ -232,7 +241,8 @@ void bind_loop(nb::module_& m) {
       .def("trouble", &trouble)
       .def("stats", &stats)
       .def("met", &met)
-      .def("forget_met", [](Run& run) { run.loop->events.met.clear(); })
+      .def("joint_changes", &joint_changes)
+      .def("forget_met", [](Run& run) { run.loop->events.met.clear(), run.core->joints.changes.clear(); })
       .def("crossings", [](const Run& run) { return run.loop->crossings; })
       .def("profile", &profile)
       .def("rhs", &rhs, "t"_a, "y"_a)

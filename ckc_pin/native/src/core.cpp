@@ -9,11 +9,12 @@ namespace ckc {
 constexpr int small = 12;        // coordinates
 constexpr double crowded = 0.2;  // share of D' that is not zero, from which a product with all of it costs less
 
-Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, int rank_, Scales scales_,
-           std::unique_ptr<Written> written_)
+Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, JointTable joint_table,
+           int rank_, Scales scales_, std::unique_ptr<Written> written_)
     : tree(model, std::move(place)),
       rows(tree, std::move(closure)),
       springs(tree, std::move(table)),
+      joints(std::move(joint_table), tree.n),
       n(tree.n),
       rank(rank_),
       scales(std::move(scales_)),

@@ -6,6 +6,7 @@
 
 #include <Eigen/QR>
 
+#include "joints.hpp"
 #include "linear.hpp"
 #include "rows.hpp"
 #include "springs.hpp"
@@ -27,8 +28,8 @@ struct Scales {
 
 class Core {
  public:
-  Core(const std::string& model, Indices place, Closure closure, SpringTable springs, int rank, Scales scales,
-       std::unique_ptr<Written> written);
+  Core(const std::string& model, Indices place, Closure closure, SpringTable springs, JointTable joints, int rank,
+       Scales scales, std::unique_ptr<Written> written);
   ~Core();
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
@@ -36,6 +37,7 @@ class Core {
   Tree tree;
   Rows rows;
   Springs springs;
+  Joints joints;
   const int n, rank;
   const Scales scales;
   int d;
@@ -90,7 +92,9 @@ class Core {
   const Matrix* tangent();
   // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // The same at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
+  // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
+  bool responses(const Indices& at, Matrix& columns);
+  // The same as `dae_acceleration` at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
   bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 
  private:

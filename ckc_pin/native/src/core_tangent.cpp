@@ -157,6 +157,18 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   return true;
 }
 
+bool Core::responses(const Indices& at, Matrix& columns) {
+  columns.resize(n, static_cast<Eigen::Index>(at.size()));
+  residual_.setZero();
+  if (!tangent_basis(residual_, singular)) return false;
+  tangent_inertia();
+  for (size_t k = 0; k < at.size(); ++k) {
+    y_.setUnit(at[k]);
+    with_force(y_, columns.col(k));
+  }
+  return true;
+}
+
 bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
   return written && written->acceleration(q_tree, v, u_tree, correction, acceleration);
 }

@@ -43,12 +43,12 @@ bool Dae::place(In y) {
 bool Dae::rhs(double t, In y, Out y_dot) {
   if (!finite(y)) return fails(Trouble::infinite);
   const auto v = y.tail(core.n);
-  if (core.written && !control.needs_terms() && !stabilised()) {  // no term but the acceleration is needed
+  if (core.written && core.joints.locked.empty() && !control.needs_terms() && !stabilised()) {  // no term but the acceleration is needed
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
-    const bool acts = control.acts();
+    const bool acts = control.acts() || core.joints.acts();
     if (acts && !forces(t, q_tree_, v)) return false;
-    if (core.written_acceleration(q_tree_, v, acts ? control.u_tree : unforced_, uncorrected_, y_dot.tail(core.n))) {
+    if (core.written_acceleration(q_tree_, v, acts ? acting(v) : unforced_, uncorrected_, y_dot.tail(core.n))) {
       counts.factorizations += 2;
       core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
       return finite(y_dot) || fails(Trouble::infinite);
@@ -79,21 +79,24 @@ bool Dae::rate(double t, In v, Out y_dot) {
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  if (!core.dae_acceleration(control.u_tree, residual_, y_dot.tail(n))) return fails(Trouble::rank);
+  if (!core.dae_acceleration(acting(v), residual_, y_dot.tail(n))) return fails(Trouble::rank);
+  if (!core.joints.locked.empty() && !hold(y_dot.tail(n))) return false;
   return finite(y_dot) || fails(Trouble::infinite);
 }
 
-// Exact where the terms are written out and what acts is known to depend on joints of one freedom alone, or not at all.
+// Exact where the terms are written out, no joint is held, and what acts is known to depend on joints of one freedom
+// alone, or not at all.
 bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const int n = core.n, nq = core.tree.nq;
-  if (!core.written || stabilised() || (control.feedback() && nq != n) || !finite(y))
+  const Joints& joints = core.joints;
+  if (!core.written || !joints.locked.empty() || joints.smooth() || stabilised() || (control.feedback() && nq != n) || !finite(y))
     return System::jacobian(t, y, jacobian, evaluations);
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
   if (control.needs_terms()) place(y);
   if (!forces(t, q_tree_, v)) return false;
-  if (!control.slopes(by_q_, by_v_) || !core.written->jacobian(q_tree_, v, control.u_tree, jacobian, by_u_))
+  if (!control.slopes(by_q_, by_v_) || !core.written->jacobian(q_tree_, v, acting(v), jacobian, by_u_))
     return System::jacobian(t, y, jacobian, evaluations);
   if (control.feedback()) {  // joints of one freedom alone
     jacobian.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;

@@ -21,6 +21,8 @@ class Dae : public System {
   bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   bool modes(In y, Matrix& jacobian) override;
   bool tree_acceleration(In f, Out a) const override { return a = f.tail(core.n), true; }
+  void push(Out y, In v) const override { y.tail(core.n) += v; }
+  void shift(Out y, In step) const override { core.tree.integrate(y.head(core.tree.nq), step); }
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
   bool rate_on_closure(double t, In y, Out y_dot);
 

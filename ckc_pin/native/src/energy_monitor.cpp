@@ -8,7 +8,8 @@ constexpr double rounding = 1e-13;  // of kinetic and potential energy
 
 double EnergyMonitor::energy(System& system) {
   Core& core = system.core;
-  if (!system.conserves() || system.control.acts() || core.springs.any_damping) return std::nan("");
+  const bool dissipates = core.springs.any_damping || core.joints.acts();
+  if (!system.conserves() || system.control.acts() || dissipates) return std::nan("");
   const Energy energy = core.energy(system.velocity, momentum_);
   size_ = energy.kinetic + std::abs(energy.potential);
   return energy.total();

@@ -13,6 +13,7 @@ constexpr double near_zero = 0.25;    // of the function's range in the step: an
 constexpr double t_tolerance = 1e-12; // s
 constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
 constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
+constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
 constexpr double uncertain = 3.0;     // times how far two interpolations of different order are apart
 
 namespace {
@@ -135,6 +136,7 @@ bool walk(const Gap& gap, double from, double to, In values, int sign, double fl
 Events::Events(System& system, Step& step, std::vector<Event> events)
     : system_(system), step_(step), events_(std::move(events)), places_(walk_places()) {
   const Core& core = system.core;
+  add_own();
   const auto count = static_cast<Eigen::Index>(events_.size());
   for (End* end : {&start_, &end_}) end->q.setZero(core.n), end->v.setZero(core.n), end->a.setZero(core.n);
   walks_.resize(events_.size());
@@ -142,10 +144,46 @@ Events::Events(System& system, Step& step, std::vector<Event> events)
   begin();
 }
 
+void Events::add_own() {
+  const Joints& joints = system_.core.joints;
+  const auto add = [&](Event::Of of, int k, double value) {
+    Event event;
+    event.of = of, event.coordinate = k, event.value = value, event.stop = event.own = true;
+    events_.push_back(event);
+  };
+  for (int k = 0; k < system_.core.n; ++k) {
+    if (joints.rubs && joints.table.friction(k) != 0.0) add(Event::q_dot, k, 0.0);
+    for (double stop : {joints.table.lower(k), joints.table.upper(k)})
+      if (std::isfinite(stop)) add(Event::q, k, stop);
+  }
+  if (joints.any()) add(Event::holding, 0, 0.0);
+}
+
 void Events::begin() {
-  met.clear();
-  signs_.assign(events_.size(), 0);
+  met.clear(), changing.clear();
+  signs_.assign(events_.size(), 0), active_.assign(events_.size(), 1);
   jump();
+}
+
+// What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located.
+void Events::watch_joints(In coordinates, In velocity) {
+  const Joints& joints = system_.core.joints;
+  changing.clear();
+  for (size_t i = 0; i < events_.size(); ++i) {
+    Event& event = events_[i];
+    if (!event.own) continue;
+    const int k = event.coordinate;
+    double here = 0.0;
+    if (event.of == Event::q_dot) {
+      signs_[i] = joints.sign[k], active_[i] = joints.sign[k] != 0, here = velocity(k);
+    } else if (event.of == Event::q) {
+      const int side = event.value == joints.table.lower(k) ? -1 : 1;
+      signs_[i] = -side, active_[i] = joints.touch[k] != side, here = coordinates(k) - event.value;
+    } else {
+      signs_[i] = 1, active_[i] = !joints.locked.empty();
+    }
+    event.floor = here * signs_[i] > least_known ? 0.0 : 2.0 * std::abs(here);
+  }
 }
 
 void Events::jump() {
@@ -219,6 +257,10 @@ bool Events::value(int k, double t, double& gap) {
       break;
     case Event::function:
       if (!event.call(t, system_, gap)) return false;
+      break;
+    case Event::holding:
+      if (!system_.acceleration(t, coordinates_)) return false;
+      gap = core.joints.margin();
   }
   gap *= event.sign;
   if (std::isfinite(gap)) return true;
@@ -248,12 +290,12 @@ bool Events::sample(Interpolant& motion) {
   return true;
 }
 
-bool Events::check(Interpolant& motion, bool last, double& halt) {
+bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   halt = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
   wanted_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k)
-    if (!signs_[k] || !ruled_out(events_[k])) wanted_.push_back(k);
+    if (active_[k] && !(silent && !events_[k].own) && (!signs_[k] || !ruled_out(events_[k]))) wanted_.push_back(k);
   if (!wanted_.empty() && !(sample(motion) && find(motion, last, halt))) return false;
   values_at_ = step_.t_new;
   std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
@@ -270,7 +312,7 @@ bool Events::find(Interpolant& motion, bool last, double& halt) {
     const auto gap = [&](double t, double& value_there) { return at(motion, t) && value(k, t, value_there); };
     if (!walk(std::cref(gap), step_.t, step_.t_new, values_.col(k), signs_[k], events_[k].floor, walks_[k])) return false;
     Walk& walked = walks_[k];
-    if (last && walked.on_zero && walked.sign) walked.found.emplace_back(step_.t_new, -walked.sign);
+    if (last && walked.on_zero && walked.sign && !events_[k].own) walked.found.emplace_back(step_.t_new, -walked.sign);
     for (const auto& [t, direction] : walked.found) {
       if (events_[k].direction != 0 && events_[k].direction != direction) continue;
       found_.push_back({t, k, direction});
@@ -280,8 +322,15 @@ bool Events::find(Interpolant& motion, bool last, double& halt) {
   std::sort(found_.begin(), found_.end(), [](const Crossed& a, const Crossed& b) {
     return a.t != b.t ? a.t < b.t : a.event < b.event;
   });
-  for (const Crossed& crossed : found_)
-    if (crossed.t <= halt) met.push_back(crossed);
+  changing.clear(), halted_ = false;
+  for (const Crossed& crossed : found_) {
+    if (crossed.t > halt) break;
+    const Event& event = events_[crossed.event];
+    if (event.own)
+      changing.push_back(event);
+    else
+      met.push_back(crossed), halted_ |= event.stop;
+  }
   for (int k : wanted_) {
     if (!std::isfinite(halt)) {
       signs_[k] = walks_[k].sign;

@@ -16,7 +16,7 @@
 namespace ckc {
 
 struct Event {
-  enum Of { q, q_dot, sigma_min_phi_z, sigma_min_J, function };
+  enum Of { q, q_dot, sigma_min_phi_z, sigma_min_J, function, holding };
   Of of;
   int coordinate = 0;
   double value = 0.0, sign = 1.0;  // it crosses where sign (its function - value) crosses zero
@@ -25,6 +25,8 @@ struct Event {
   double floor = 0.0;              // what counts as zero
   // Of a caller's own: the value at (t, the core's state); false where it raised.
   std::function<bool(double, System&, double&)> call;
+  // Of the loop's own: a joint comes to rest, reaches a stop, or what holds those at rest gives way.
+  bool own = false;
 };
 
 struct Crossed {
@@ -58,13 +60,18 @@ class Events {
   void jump();   // it goes on from a state that is not the last step's end
   void arrived();  // the core is where the step just made ends, as the right-hand side left it
   // Locate events in the step just made; `halt`: when the first one that stops happens, else infinite. `last`: the
-  // motion ends with this step. False where a function has no value: `failed` and the system's problem say which.
-  bool check(Interpolant& motion, bool last, double& halt);
+  // motion ends with this step; `silent`: only the loop's own are looked for. False where a function has no value:
+  // `failed` and the system's problem say which.
+  bool check(Interpolant& motion, bool last, bool silent, double& halt);
+  // Joints slide, stick and touch as they do from now on; where they are, and how they move.
+  void watch_joints(In coordinates, In velocity);
 
   std::vector<Crossed> met;
+  std::vector<Event> changing;  // the loop's own that were met where the last check halted
   int failed = -1;
   double failed_value = 0.0;
   bool any() const { return !events_.empty(); }
+  bool halted() const { return halted_; }  // whether one that is not the loop's own was what the last check halted at
 
  private:
   struct End {  // of a step: what is known there without interpolation
@@ -77,13 +84,16 @@ class Events {
   void take_end(End& end);
   bool sample(Interpolant& motion);
   bool find(Interpolant& motion, bool last, double& halt);
+  void add_own();
 
   System& system_;
   Step& step_;
   std::vector<Event> events_;
   std::vector<int> signs_, wanted_;
+  std::vector<char> active_;
   const Vector& places_;
   End start_, end_;
+  bool halted_ = false;
   bool known_ = false;        // whether start_ is that of the step
   double values_at_ = 0.0;    // when the last values were taken
   std::vector<double> last_;  // and what they are; NaN where they were not

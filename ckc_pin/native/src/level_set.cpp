@@ -139,18 +139,22 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
   else
     chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
   // On the manifold eq. 6 is eq. 1 at rho q_dot.
-  written_ = on_manifold_ && core.written_acceleration(core.q_tree, v_tree, control.u_tree, uncorrected_, a_tree_);
+  const Vector& force = acting(v_tree);
+  const bool locked = !core.joints.locked.empty();
+  if (locked && !(core.dae_acceleration(force, uncorrected_, a_tree_) && hold(a_tree_))) return fails(Trouble::rank);
+  written_ = locked || (on_manifold_ && core.written_acceleration(core.q_tree, v_tree, force, uncorrected_, a_tree_));
   if (written_)
     for (int k = 0; k < d; ++k) y_dot(d + k) = a_tree_(core.q[k]);
   else if (actual_ && !on_manifold_)
-    core.actual_acceleration(control.u_tree, q_dot, y_dot.tail(d));
+    core.actual_acceleration(force, q_dot, y_dot.tail(d));
   else
-    core.reduced_acceleration(control.u_tree, y_dot.tail(d));
+    core.reduced_acceleration(force, y_dot.tail(d));
   return finite(y_dot) || fails(Trouble::infinite);
 }
 
 bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  if (core.written && on_manifold_ && core.tree.roots.empty() && exact_jacobian(t, y, jacobian)) return true;
+  const bool free = core.joints.locked.empty() && !core.joints.smooth();
+  if (core.written && on_manifold_ && free && core.tree.roots.empty() && exact_jacobian(t, y, jacobian)) return true;
   to_rounding_ = true;  // what the slack of the loops leaves open is far more than a difference moves
   const bool exists = System::jacobian(t, y, jacobian, evaluations);
   to_rounding_ = false;
@@ -163,7 +167,7 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   if (!finite(y) || !state(t, y, tolerance_)) return false;
   core.set_velocity(v_tree);
   if (!act(t) || !control.slopes(by_q_, by_v_)) return false;
-  if (!core.written->jacobian(core.q_tree, v_tree, control.u_tree, by_state_, by_u_)) return false;
+  if (!core.written->jacobian(core.q_tree, v_tree, acting(v_tree), by_state_, by_u_)) return false;
   if (control.feedback()) {
     by_state_.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
     by_state_.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
@@ -199,6 +203,21 @@ bool LevelSet::tree_acceleration(In f, Out a) const {
   a = a_tree_;  // at another q_ddot than f's, which an implicit method asks for
   for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
   return true;
+}
+
+void LevelSet::push(Out y, In v) const {
+  for (int k = 0; k < core.d; ++k) y(core.d + k) += v(core.q[k]);
+}
+
+void LevelSet::shift(Out y, In step) const {
+  if (!chart_.plain()) return;
+  for (int k = 0; k < core.d; ++k) y(k) += step(core.q[k]);
+}
+
+void LevelSet::go_on(double t, Out y) {
+  begin(core.q_tree);
+  chart_numbers(y);
+  accepted_ = t;
 }
 
 bool LevelSet::return_to_accepted() {

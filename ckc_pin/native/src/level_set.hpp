@@ -25,6 +25,9 @@ class LevelSet : public System {
   double decay() const override { return -1.0 / epsilon_; }
   double layer() const override { return on_manifold_ ? System::layer() : epsilon_; }
   bool tree_acceleration(In f, Out a) const override;
+  void push(Out y, In v) const override;
+  void shift(Out y, In step) const override;
+  void go_on(double t, Out y) override;
   bool conserves() const override { return on_manifold_; }
   bool return_to_accepted() override;
   // (q', v'), off the manifold (q', q_dot), while a step resolves how w decays.

@@ -12,6 +12,10 @@ using Clock = std::chrono::steady_clock;
 constexpr double fine_rtol = 1e-7;
 constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
 constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
+constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
+constexpr double longer = 1.5;      // times the bounce that follows: the step from there
+constexpr long most_changes = 200;  // of joints at one instant
+constexpr double least_rise = 1e-13;  // rad, or of the mechanism's size, of a bounce
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
@@ -30,7 +34,8 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
       energy_(system->core),
-      crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed) {
+      crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed),
+      joint_changes_(*system, std::max(options_.atol, least_rise)) {
   for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
 
@@ -41,6 +46,7 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   system->counts = {}, system->trouble = Trouble::none;
   control->problem = {};
   control->begin();
+  begin_joints();
   system->start(t, q_tree, v_tree, w, now.y);
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
   steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0;
@@ -51,10 +57,34 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   events.begin();
 }
 
+void Loop::begin_joints() {
+  system->core.joints.begin();
+  joint_changes_.begin();
+  joints_known_ = !system->core.joints.any(), joints_often_ = 0;
+}
+
+std::optional<Stop> Loop::change_joints() {
+  const double within = located + of_step * std::max(now.t - now.t_old, 0.0);
+  joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
+  joints_at_ = now.t;
+  if (joints_often_ > most_changes || !joint_changes_.decide(now.t, now.y, events.changing, within)) {
+    const Stop stop = trouble();
+    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::joints, now.t} : stop;
+  }
+  Vector coordinates(system->core.n);
+  system->core.tree.to_coordinates(system->core.q_tree, coordinates);
+  events.watch_joints(coordinates, system->velocity);
+  joints_known_ = true, begun_ = f_known_ = false;
+  // A step that is far longer than what happens next would not see that.
+  now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);
+  return {};
+}
+
 void Loop::jump() {
   back();
   unchanged_ = 0;
   f_known_ = false, jumped_ = true;
+  joints_known_ = !system->core.joints.any();
   if (method_) method_->forget();
 }
 
@@ -138,6 +168,8 @@ std::optional<Stop> Loop::sample() {
 
 // Everything that has to be known before a step.
 std::optional<Stop> Loop::begin(double bound) {
+  if (!joints_known_)
+    if (const auto stop = change_joints()) return stop;
   if (!begun_) {
     if (!system->at_start(now.t, now.y)) return trouble();
     end_ = monitor_.at(*system);
@@ -221,7 +253,7 @@ std::optional<Stop> Loop::finish(const Made& step, double bound, bool last) {
     return method_->retry(0.5 * h), std::nullopt;
   }
   ++steps[number()];
-  if (ordinary) return length_ = h, check_stiffness(bound);
+  if (ordinary) return length_ = h, begun_ ? check_stiffness(bound) : std::nullopt;
   method_->forget();
   crossings.push_back(step.met);
   return {};
@@ -245,17 +277,19 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
 
 // Look at what happened in the step just made, and make its end the present state.
 std::optional<Stop> Loop::keep(const Made& step, bool last) {
-  if (!silent_) {
+  if (!silent_ || system->core.joints.any()) {
     Interpolant& motion = *step.motion;
     double halt;
     if (const auto stop = look(motion, last, halt)) return stop;
-    if (const auto stop = outputs(motion, std::min(now.t_new, halt))) return stop;
+    if (!silent_)
+      if (const auto stop = outputs(motion, std::min(now.t_new, halt))) return stop;
     if (std::isfinite(halt)) {
       if (halt < now.t_new && !motion.between(halt, y_out_)) return unknown();
       now.t_old = now.t, now.y_old = now.y;
       now.y = halt < now.t_new ? y_out_ : now.y_new, now.t = halt;
       begun_ = false;
       jump(), events.jump();
+      if (!events.halted()) return {};  // joints go on in another way
       if (!record_now()) return trouble();
       return Stop{Stop::event, now.t};
     }
@@ -267,11 +301,16 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
   f_known_ = accepted == Accepted::kept;
   if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, step.margin};
   if (accepted == Accepted::restarted) method_->forget();
+  if (!system->core.joints.locked.empty()) {
+    bool changed;
+    if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
+    if (changed) f_known_ = false;
+  }
   return {};
 }
 
 std::optional<Stop> Loop::look(Interpolant& motion, bool last, double& halt) {
-  if (events.check(motion, last, halt)) return {};
+  if (events.check(motion, last, silent_, halt)) return {};
   if (events.failed >= 0) return Stop{Stop::function, now.t, events.failed_value, events.failed};
   return unknown();
 }
@@ -299,6 +338,7 @@ bool Loop::record_now() { return recorder.add(*system, t(), y()); }
 // Come to the present time once more from the start, with the finer tolerance.
 std::optional<Stop> Loop::redo() {
   const double until = now.t;
+  begin_joints();
   system->start(begin_.t, begin_.q_tree, begin_.v_tree, begin_.w, now.y);
   now.t = now.t_old = begin_.t, now.h = (until - now.t) / 10;
   begun_ = f_known_ = false, length_ = 0.0;

@@ -7,6 +7,7 @@
 #include "energy_monitor.hpp"
 #include "events.hpp"
 #include "explicit.hpp"
+#include "joint_changes.hpp"
 #include "radau.hpp"
 #include "recorder.hpp"
 
@@ -34,6 +35,7 @@ struct Stop {
     control,      // a controller has no u
     function,     // an event's function has no finite value
     output,       // the state has no terms
+    joints,       // which joints slide, stick or touch cannot be told
     raised,       // a caller's function did
   } why;
   double t = 0.0, value = 0.0;  // when; least singular value, or what a function gave
@@ -99,6 +101,9 @@ class Loop {
   Stop trouble();
   Stop unknown();
   void jump();
+  // Which joints slide, stick and touch from the present state on.
+  std::optional<Stop> change_joints();
+  void begin_joints();
   void choose(double bound);      // a method, at the start
   void choose_again(double bound);  // of the explicit ones, for another segment
   bool is_stiff(double duration);
@@ -113,10 +118,14 @@ class Loop {
   RankMonitor monitor_;
   EnergyMonitor energy_;
   Crossing crossing_;
+  JointChanges joint_changes_;
   RankMonitor::Rank end_;     // at the present state
   double length_ = 0.0;       // of the last step
   bool begun_ = false;        // whether the present state was accepted, and end_ is known
   bool f_known_ = false;
+  bool joints_known_ = true;  // how they go on from the present state
+  double joints_at_ = 0.0;    // when that was found last,
+  long joints_often_ = 0;     // and how often within what events are located to
   bool jumped_ = false;       // something has changed since the start that a second try would not know
   bool silent_ = false;       // nothing is recorded, no event is looked for
   long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never

@@ -22,7 +22,7 @@ void Loop::take_implicit() {
 
 // "auto": implicit where damping or a controller makes the motion stiff.
 void Loop::choose(double bound) {
-  const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping);
+  const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping || system->core.joints.smooth());
   if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound - now.t))) {
     take_implicit();
   } else {

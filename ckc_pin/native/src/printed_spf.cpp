@@ -51,10 +51,11 @@ bool PrintedSpf::rhs(double t, In y, Out y_dot) {
   if (!act(t)) return false;
   counts.factorizations += 2;
   y_dot.head(d) = q_dot;
+  const Vector& force = acting(v_tree);
   if (actual_)
-    core.actual_acceleration(control.u_tree, q_dot, y_dot.segment(d, d));
+    core.actual_acceleration(force, q_dot, y_dot.segment(d, d));
   else
-    core.reduced_acceleration(control.u_tree, y_dot.segment(d, d));
+    core.reduced_acceleration(force, y_dot.segment(d, d));
   y_dot.tail(z_dot_.size()) = z_dot_;
   return y_dot.allFinite() || fails(Trouble::infinite);
 }

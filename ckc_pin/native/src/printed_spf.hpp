@@ -21,6 +21,8 @@ class PrintedSpf : public System {
   }
   double decay() const override { return -1.0 / epsilon_; }
   bool tree_acceleration(In, Out) const override { return false; }
+  void push(Out, In) const override {}  // joints of such a motion neither rub nor stop
+  void shift(Out, In) const override {}
 
  private:
   void place(double t, In y);  // the core at the state; z_dot_ with phi as it is

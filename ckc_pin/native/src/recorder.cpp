@@ -7,7 +7,7 @@ namespace ckc {
 
 static int width_of(const System& system) {
   const Core& core = system.core;
-  return 5 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows;
+  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows;
 }
 
 Recorder::Recorder(const System& system) : width(width_of(system)) { momentum_.setZero(system.core.n); }
@@ -39,6 +39,7 @@ bool Recorder::row(System& system, double t, In y, Out row) {
   put(system.velocity), put(system.control.u.head(d)), put(system.control.tau.head(actuators));
   put(core.rows.phi), put(system.w);
   row(at++) = energy.total();
+  row(at++) = core.joints.dissipated(row.segment(1, n));
   row(at++) = system.control.lyapunov(system.measured(t), energy.potential, core.rows.phi);
   double open = 0.0, opening = 0.0;
   for (int i = 0; i < m; ++i) {

@@ -9,7 +9,8 @@ class Recorder {
  public:
   explicit Recorder(const System& system);
 
-  // t, q', velocity, u, tau, phi, w, energy, Lyapunov function, largest |phi - w|, largest |phi_dot - w_dot|
+  // t, q', velocity, u, tau, phi, w, energy, energy that friction and impacts took, Lyapunov
+  // function, largest |phi - w|, largest |phi_dot - w_dot|
   const int width;
 
   void begin(Vector instants, double* rows, Eigen::Index most);  // rows: most by width

@@ -10,6 +10,45 @@ constexpr double difference = 1.5e-8;  // step of forward differences, relative,
 System::System(Core& core_, Control& control_, int size_) : core(core_), control(control_), size(size_) {
   velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.rows.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
+  acting_.setZero(core.n), uncorrected_.setZero(core.rows.closure.rows), drift_.setZero(core.n), back_.setZero(core.n);
+}
+
+const Vector& System::acting(In v) {
+  if (!core.joints.acts()) return control.u_tree;
+  acting_ = control.u_tree;
+  core.joints.add_friction(v, acting_);
+  return acting_;
+}
+
+bool System::hold(Out a) {
+  if (!core.responses(core.joints.locked, responses_)) return fails(Trouble::rank);
+  core.joints.hold(responses_, a);
+  return true;
+}
+
+bool System::acceleration(double t, Out a) {
+  core.set_velocity(velocity);
+  if (!act(t)) return false;
+  if (!core.dae_acceleration(acting(velocity), uncorrected_, a)) return fails(Trouble::rank);
+  return core.joints.locked.empty() || hold(a);
+}
+
+bool System::keep_locked(Out y, double tolerance, bool& changed) {
+  Joints& joints = core.joints;
+  changed = false;
+  core.tree.to_coordinates(core.q_tree, drift_);
+  drift_ -= joints.place;
+  double off = 0.0, rate = 0.0;
+  for (int k : joints.locked) {
+    off = std::max(off, std::abs(drift_(k)) / joints.table.reach(k));
+    rate = std::max(rate, std::abs(velocity(k)) / joints.table.reach(k));
+  }
+  if (!(off > tolerance) && !(rate > tolerance)) return true;
+  if (!core.responses(joints.locked, responses_)) return false;
+  changed = true;
+  joints.back(responses_, drift_, back_), shift(y, back_);
+  joints.back(responses_, velocity, back_), push(y, back_);
+  return y.allFinite();
 }
 
 double System::phi_z_margin() {

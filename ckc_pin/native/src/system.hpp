@@ -79,6 +79,22 @@ class System {
   // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).
   virtual void whole(In, Out, Out) const {}
 
+  // --- dry friction and stops ---
+  // What acts on the tree where its motion is v: the controller's forces, and friction of what slides.
+  const Vector& acting(In v);
+  // From an acceleration of the tree without what holds the joints that stick or touch to the one with it.
+  bool hold(Out a);
+  // That at the core's state, which is exact.
+  bool acceleration(double t, Out a);
+  // Take back what locked joints have drifted by more than `tolerance`, and their rates, at the core's state, that of y;
+  // false where that cannot be.
+  bool keep_locked(Out y, double tolerance, bool& changed);
+  // Add to the velocities, and to the coordinates, in y.
+  virtual void push(Out y, In v) const = 0;
+  virtual void shift(Out y, In step) const = 0;
+  // The motion goes on from y, where the core is, with another velocity: what is remembered of former states is no more.
+  virtual void go_on(double, Out) {}
+
   Core& core;
   Control& control;
   const int size;         // of y
@@ -102,7 +118,8 @@ class System {
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_, rate_here_;
+  Vector moved_, rate_, rate_here_, acting_, uncorrected_, drift_, back_;
+  Matrix responses_;
 };
 
 }  // namespace ckc

@@ -1,0 +1,189 @@
+#include "joint_changes.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+#include <Eigen/Eigenvalues>
+
+#include "box.hpp"
+
+namespace ckc {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr double rounding = 1e-11;  // of the largest velocity: a joint is at rest; rad, or of the size: it is at a stop
+constexpr double gives = 1e-6;      // of the largest force: what holds no more is taken to be so much weaker
+constexpr double negligible = 1e-6; // of what friction alone would accelerate
+constexpr double exactly = 1e-9;    // of the largest acceleration: none
+
+JointChanges::JointChanges(System& system, double rise)
+    : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise) {
+  const int n = core_.n;
+  for (Vector* x : {&coordinates_, &v_, &a_, &rest_, &step_}) x->setZero(n);
+  near_.assign(n, 0);
+}
+
+void JointChanges::begin() { known_ = false; }
+
+bool JointChanges::take_state(double t, In y) {
+  if (!system_.exact(t, y)) return false;
+  core_.tree.to_coordinates(core_.q_tree, coordinates_);
+  v_ = system_.velocity;
+  return true;
+}
+
+bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
+  if (!take_state(t, y)) return false;
+  const Vector& reach = joints_.table.reach;
+  joints_.account(coordinates_);
+  // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
+  rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
+  if (known_ && within > 0.0) {
+    if (!system_.acceleration(t, a_)) return false;
+    rest_ += within * a_.cwiseAbs();
+  }
+  near_ = joints_.touch;
+  slips_ = false, flight = infinity;
+  for (int k = 0; k < core_.n; ++k)
+    for (int side : {-1, 1}) {
+      const double off = std::abs(coordinates_(k) - joints_.stop_at(k, side));
+      if (off <= rounding * reach(k) + within * std::abs(v_(k))) near_[k] = side;
+    }
+  for (const Event& event : met) {
+    const int k = event.coordinate;
+    if (event.of == Event::q_dot) rest_(k) = infinity;
+    if (event.of == Event::q) near_[k] = event.value == joints_.table.lower(k) ? -1 : 1;
+    slips_ |= event.of == Event::holding;
+  }
+  for (int k : joints_.locked) rest_(k) = infinity;
+  if (!impact(t, y) || !grip(t, y)) return false;
+  known_ = true;
+  return true;
+}
+
+// The velocity nearest to the one before, in the metric of D', that leads no joint into a stop, and off it at
+// `restitution` times the speed it came with. As each lost v'^T D' v' / 2 is (1 - e) of something positive, energy falls.
+bool JointChanges::impact(double t, Out y) {
+  Indices at;
+  bool into = false;
+  for (int k = 0; k < core_.n; ++k)
+    if (near_[k]) {
+      at.push_back(k);
+      into |= near_[k] * v_(k) > 0.0 && !rests(k);
+    }
+  if (!into) return true;
+  const auto m = static_cast<Eigen::Index>(at.size());
+  const Indices locked = std::exchange(joints_.locked, {});
+  const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
+  if (!system_.acceleration(t, a_) || !core_.responses(at, responses_)) return false;
+  A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.setZero(m), high_.setConstant(m, infinity);
+  Vector back(m);  // speeds off the stops
+  for (Eigen::Index i = 0; i < m; ++i) {
+    const int k = at[i], side = near_[k];
+    const double speed = std::max(side * v_(k), 0.0), after = joints_.table.restitution(k) * speed;
+    const double towards = side * a_(k), rise = towards > 0.0 ? after * after / (2 * towards) : infinity;
+    back(i) = rise > rise_ * joints_.table.reach(k) ? after : 0.0;
+    if (towards > 0.0 && back(i) > 0.0) flight = std::min(flight, 2 * after / towards);
+    scale_(i) = 1.0 / std::sqrt(responses_(k, i));
+    b_(i) = scale_(i) * (-side * v_(k) - back(i));
+    for (Eigen::Index j = 0; j < m; ++j)
+      A_(i, j) = scale_(i) / std::sqrt(responses_(at[j], j)) * side * near_[at[j]] * responses_(k, j);
+  }
+  const double size = b_.lpNorm<Eigen::Infinity>();
+  if (!least_in_box(A_, b_ / size, low_, high_, x_)) return false;
+  step_.setZero();
+  double change = 0.0;
+  for (Eigen::Index i = 0; i < m; ++i) {
+    x_(i) *= -near_[at[i]] * scale_(i) * size;  // an impulse
+    step_ += x_(i) * responses_.col(i);
+  }
+  for (Eigen::Index i = 0; i < m; ++i) {
+    const int k = at[i];
+    // who is pushed off a stop by what happens at another one, or comes to rest at it
+    const double off = -near_[k] * (v_(k) + step_(k)), towards = near_[k] * a_(k);
+    const bool slow = towards > 0.0 && off * off / (2 * towards) <= rise_ * joints_.table.reach(k);
+    if (slow || off <= exactly * std::max(std::abs(v_(k)), std::abs(step_(k)))) joints_.touch[k] = near_[k];
+    change += x_(i) * (v_(k) + 0.5 * step_(k));
+  }
+  joints_.impact_loss -= change;
+  const Vector before = v_;
+  system_.push(y, step_);
+  if (!take_state(t, y)) return false;
+  const Vector& reach = joints_.table.reach;
+  const double fastest = std::max(before.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(),
+                                  step_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>());
+  rest_ = 10 * rounding * fastest * reach;
+  for (int k : at) {
+    if (joints_.touch[k]) rest_(k) = infinity;
+    if (joints_.touch[k] && !touched[k]) note(t, k, JointChange::touches, near_[k]);
+    if (!joints_.touch[k]) note(t, k, touched[k] ? JointChange::leaves : JointChange::bounces, near_[k]);
+    near_[k] = joints_.touch[k];
+  }
+  return true;
+}
+
+// Gauss' principle: of the accelerations that the loops and the stops allow, the one nearest in the metric of D' to that
+// without what holds, less what friction takes, which is the problem of least forces between their bounds.
+bool JointChanges::grip(double t, Out y) {
+  Indices at, locked;
+  const Indices sign = joints_.sign, touch = joints_.touch, before = std::exchange(joints_.locked, {});
+  for (int k = 0; k < core_.n; ++k) {
+    const bool rubs = joints_.rubs && joints_.table.friction(k) != 0.0;
+    const bool touches = near_[k] && rests(k);
+    joints_.touch[k] = touches ? near_[k] : 0;
+    joints_.sign[k] = rubs && !rests(k) ? (v_(k) > 0.0 ? 1 : -1) : 0;
+    if (touches || (rubs && rests(k))) at.push_back(k);
+  }
+  const auto m = static_cast<Eigen::Index>(at.size());
+  if (m) {
+    if (!system_.acceleration(t, a_) || !core_.responses(at, responses_)) return false;
+    A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.resize(m), high_.resize(m);
+    for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(at[i], i));
+    for (Eigen::Index i = 0; i < m; ++i) {
+      b_(i) = scale_(i) * a_(at[i]);
+      for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
+    }
+    double size = std::max(b_.lpNorm<Eigen::Infinity>(), 1e-300);
+    for (Eigen::Index i = 0; i < m; ++i)  // beside what friction can do, what is less is rounding
+      size = std::max(size, negligible * joints_.table.friction(at[i]) / scale_(i));
+    const double weaker = slips_ ? gives : 0.0;
+    b_ /= size;
+    // rows that follow from others have accelerations that do, to the last digit
+    const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
+    for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k)
+      b_ -= eigen.eigenvectors().col(k) * eigen.eigenvectors().col(k).dot(b_);
+    for (Eigen::Index i = 0; i < m; ++i) {
+      const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
+      const double less = std::min(weaker, 0.5 * (high - low));
+      low_(i) = low + less, high_(i) = high - less;
+    }
+    if (!least_in_box(A_, b_, low_, high_, x_)) return false;
+    const Vector row = A_ * x_ + b_;  // accelerations
+    for (Eigen::Index i = 0; i < m; ++i) {
+      const int k = at[i];
+      const double room = row(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);  // or it: one of them is zero
+      if (!(std::abs(row(i)) > std::max(exactly, room))) {
+        locked.push_back(k);
+        continue;
+      }
+      joints_.touch[k] = 0;
+      if (joints_.rubs && joints_.table.friction(k) != 0.0) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
+    }
+  }
+  for (int k = 0; k < core_.n; ++k) {
+    const bool holds = std::find(locked.begin(), locked.end(), k) != locked.end();
+    const bool held = std::find(before.begin(), before.end(), k) != before.end();
+    if (joints_.touch[k] && !touch[k]) note(t, k, JointChange::touches, joints_.touch[k]);
+    if (!joints_.touch[k] && touch[k]) note(t, k, JointChange::leaves, touch[k]);
+    if (joints_.sign[k] && joints_.sign[k] != sign[k]) note(t, k, JointChange::slides, joints_.sign[k]);
+    if (holds && !held && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
+  }
+  joints_.lock(locked, coordinates_);
+  bool changed;
+  if (!locked.empty() && !system_.keep_locked(y, 0.0, changed)) return false;
+  if (!take_state(t, y)) return false;
+  system_.go_on(t, y);
+  return true;
+}
+
+}  // namespace ckc

@@ -1,0 +1,41 @@
+// Which joints slide, stick and touch from an instant on, and what an impact there does: two convex problems in the
+// metric of D', over velocities and over accelerations.
+#pragma once
+
+#include "events.hpp"
+
+namespace ckc {
+
+class JointChanges {
+ public:
+  // `rise`: rad, or of the mechanism's size: a bounce that would rise no further is none.
+  JointChanges(System& system, double rise);
+
+  void begin();  // a motion begins
+  // Decide, at the core's exact state, that of y, from what was met there; `within`: s, how closely events are located.
+  // A velocity that jumps is changed in y. False where that cannot be: the system's trouble says why, or none does.
+  bool decide(double t, Out y, const std::vector<Event>& met, double within);
+  double flight = 0.0;  // s: how long the first bounce from there will last, infinite where there is none
+
+ private:
+  bool take_state(double t, In y);
+  bool impact(double t, Out y);
+  bool grip(double t, Out y);
+  bool rests(int k) const { return std::abs(v_(k)) <= rest_(k); }
+  void note(double t, int k, JointChange::What what, int direction) {
+    joints_.changes.push_back({t, k, what, direction});
+  }
+
+  System& system_;
+  Core& core_;
+  Joints& joints_;
+  const double rise_;
+  bool known_ = false;  // whether a decision was made since the begin
+  Vector coordinates_, v_, a_, rest_, step_;
+  Indices near_;        // (n): the stop that a joint is at, as `touch`
+  bool slips_ = false;  // what holds has given way
+  Matrix responses_, A_;
+  Vector b_, low_, high_, scale_, x_;
+};
+
+}  // namespace ckc

@@ -1,0 +1,162 @@
+"""Dry friction against closed forms: what slides when, and where it sticks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, linprog
+
+from ckc_pin import Run, Terms, load, simulate
+from tests.conftest import assert_close
+from tests.joints.conftest import FORMULATIONS, Make, slide
+
+TIGHT = {"solver.rtol": 1e-12}
+
+
+def named(run: Run, name: str) -> list[float]:
+    """When something happened."""
+    return [float(event["t"]) for event in run.events if event["name"] == name]
+
+
+def oscillator(scene_of: Make, mass: float, stiffness: float, friction: float, x: float, t_end: float) -> Path:
+    joint = f'[[joint]]\nname = "x"\nfriction = {friction!r}\n'
+    spring = f'[[spring]]\njoint = "x"\nstiffness = {stiffness!r}\n'
+    return scene_of(slide("x", "base", "block", mass), spring + joint, f"q = {{x = {x!r}}}\n", t_end)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_coulomb_damped_oscillator_turns_every_half_period(scene_of: Make, formulation: str, seed: int) -> None:
+    """Each half swing is a cosine about a shifted centre, and 2 F / k shorter than the one before."""
+    rng = np.random.default_rng(seed)
+    mass, stiffness = float(rng.uniform(0.1, 10.0)), float(rng.uniform(1.0, 1e3))
+    start = float(rng.uniform(0.5, 2.0) * rng.choice([-1, 1]))
+    friction = float(stiffness * abs(start) / rng.uniform(2.5, 12.0))
+    half = np.pi * np.sqrt(mass / stiffness)
+    turns, x = [0.0], start
+    while abs(stiffness * x) > friction:
+        x = -np.sign(x) * (abs(x) - 2 * friction / stiffness)
+        turns.append(turns[-1] + half)
+    scene = oscillator(scene_of, mass, stiffness, friction, start, turns[-1] + half)
+    run = simulate(scene, {**TIGHT, "formulation": formulation})
+    assert run.status == "done"
+    assert_close(named(run, "x slides"), turns[:-1], 1e-10)
+    assert_close(named(run, "x sticks"), turns[-1:], 1e-10)
+    assert_close(run.q_tree[-1], [x], 1e-10)
+    assert_close(run.v_tree[-1], [0.0], 1e-15)
+    assert run.dissipated is not None
+    travelled = sum(abs(start) * 2 - (2 * k + 1) * 2 * friction / stiffness for k in range(len(turns) - 1))
+    assert_close(run.dissipated[-1], friction * travelled, 1e-10)
+    assert_close(run.energy + run.dissipated, np.full(len(run.t), run.energy[0]), 1e-9 * run.energy[0])
+
+
+def test_it_stays_where_friction_holds_it(scene_of: Make) -> None:
+    scene = oscillator(scene_of, 1.0, 100.0, 10.0, 0.0999, 2.0)
+    run = simulate(scene, TIGHT)
+    assert [event["name"] for event in run.events] == ["x sticks"]
+    assert np.all(run.q_tree == 0.0999)
+    moved = simulate(scene, {**TIGHT, "initial.q.x": 0.1001})
+    assert [event["name"] for event in moved.events] == ["x slides", "x sticks"]
+    assert_close(moved.q_tree[-1], [0.0999], 1e-12)  # half a period of 1e-4 about 0.1
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_block_on_a_belt_sticks_and_slips(scene_of: Make, formulation: str) -> None:
+    """A belt of finite mass, so that the whole is two cosines stuck together; its phases solved here by themselves."""
+    m, M, k, F, speed = 1.3, 40.0, 55.0, 6.0, 0.7
+    urdf = slide("belt", "base", "b", M) + slide("x", "b", "block", m)
+    spring = '[[spring]]\nframe_a = "block"\nframe_b = {link = "base", xyz = [-50.0, 0.0, 0.0]}\nrest_length = 50.0\n'
+    mechanism = f'{spring}stiffness = {k}\n[[joint]]\nname = "x"\nfriction = {F}\n'
+    scene = scene_of(urdf, mechanism, f"q = {{belt = 0.0, x = 0.0}}\nq_dot = {{belt = {speed}, x = 0.0}}\n", 12.0)
+    run = simulate(scene, {**TIGHT, "formulation": formulation})
+    slips, sticks = belt_phases(m, M, k, F, speed, 12.0)
+    assert len(slips) > 3
+    assert_close(named(run, "x slides"), slips, 1e-10)
+    assert_close(named(run, "x sticks"), [0.0, *sticks], 1e-10)
+
+
+def belt_phases(m: float, M: float, k: float, F: float, speed: float, t_end: float) -> tuple[list[float], list[float]]:
+    """When the block begins to slip on the belt, and when it sticks to it again."""
+    slips, sticks = [], []
+    t, x, v = 0.0, 0.0, speed  # the block's, of the world
+    while True:
+        together = np.sqrt(k / (m + M))  # stuck: one body on the spring, until the belt's pull on the block is F
+        size, phase = np.hypot(x, v / together), np.arctan2(v / together, x)
+        most = F * (m + M) / (k * M)
+        if size <= most:
+            return slips, sticks
+        wait = (phase - np.arccos(most / size)) / together
+        if x > most or wait < 0:
+            raise AssertionError("the phases do not follow each other as this test thinks")
+        t, x, v = t + wait, most, -size * together * np.sin(together * wait - phase)
+        if t > t_end:
+            return slips, sticks
+        slips.append(t)
+        alone = np.sqrt(k / m)  # slipping: pulled on with F, which slows the belt down
+        a, b = x - F / k, v / alone
+        belt = v
+
+        def gap(s: float, a: float = a, b: float = b, belt: float = belt, w: float = alone) -> float:
+            return float(w * (b * np.cos(w * s) - a * np.sin(w * s)) - (belt - F / M * s))
+
+        low = 0.05 / alone
+        while gap(low) > 0 or gap(low + 0.05 / alone) <= 0:
+            low += 0.05 / alone
+        s = brentq(gap, low, low + 0.05 / alone, xtol=1e-15, rtol=1e-14)
+        t, x, v = t + s, F / k + a * np.cos(alone * s) + b * np.sin(alone * s), belt - F / M * s
+        if t > t_end:
+            return slips, sticks
+        sticks.append(t)
+
+
+def test_smoothed_friction_is_an_ode(scene_of: Make) -> None:
+    """tanh(v / v_s), integrated by SciPy."""
+    scene = oscillator(scene_of, 2.0, 200.0, 30.0, 1.0, 1.2)
+    run = simulate(scene, {"solver.rtol": 1e-9, "friction_smoothing": 1e-2})
+    assert run.events == []
+    assert run.dissipated is None
+    other = solve_ivp(
+        lambda _, y: [y[1], (-200 * y[0] - 30 * np.tanh(y[1] / 1e-2)) / 2],
+        (0, 1.2), [1.0, 0.0], "Radau", rtol=1e-10, atol=1e-12, t_eval=run.t,
+    )  # fmt: skip
+    assert_close(run.q_tree[:, 0], other.y[0], 1e-7)
+
+
+def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Path]) -> None:
+    """All four joints of a five-bar stick, with two freedoms: it lets go when no forces within their bounds hold it.
+
+    That is a linear program in the forces, whose value is one when it does.
+    """
+    friction = np.array([0.2, 0.5, 0.35, 0.4])
+    names = ("theta_1", "theta_2", "theta_3", "theta_4")
+    folder = with_joints("five_bar", {name: {"friction": float(f)} for name, f in zip(names, friction, strict=True)})
+    push = np.array([1.7, -0.9])
+
+    class Ramp:
+        def u(self, t: float, terms: Terms) -> np.ndarray:
+            return np.asarray(t * push)
+
+    run = simulate(folder / "set_point.scene.toml", {**TIGHT, "t_end": 0.8}, controller=Ramp())
+    assert [event["name"] for event in run.events[:4]] == [f"{name} sticks" for name in names]
+    assert {event["t"] for event in run.events[:4]} == {0.0}
+    mechanism = load(folder)
+    terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[0])), np.zeros(4))
+    resting = run.t < run.events[4]["t"]
+    assert_close(run.q_tree[resting], np.tile(run.q_tree[0], (resting.sum(), 1)), 1e-13)
+
+    def load_factor(t: float) -> float:
+        """The least part of all friction that holds it."""
+        needed = t * push - terms.rho.T @ terms.h_tree
+        found = linprog(
+            [0, 0, 0, 0, 1],
+            A_ub=np.vstack([np.c_[np.eye(4), -friction], np.c_[-np.eye(4), -friction]]), b_ub=np.zeros(8),
+            A_eq=np.c_[terms.rho.T, np.zeros(2)], b_eq=-needed, bounds=[(None, None)] * 4 + [(0, None)],
+        )  # fmt: skip
+        return float(found.x[4])
+
+    assert load_factor(0.0) < 1.0
+    assert_close(run.events[4]["t"], brentq(lambda t: load_factor(t) - 1.0, 0.0, 0.8, xtol=1e-12), 1e-8)

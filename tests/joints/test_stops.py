@@ -1,0 +1,105 @@
+"""Stops against closed forms: when a joint meets one, and how it goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+from ckc_pin import Run, simulate
+from tests.conftest import assert_close
+from tests.joints.conftest import FORMULATIONS, Make, slide
+
+TIGHT = {"solver.rtol": 1e-12}
+G = 9.81
+
+PENDULUM = """<link name="rod"><inertial><origin xyz="0 0 -0.6"/><mass value="1.7"/>
+    <inertia ixx="0.05" iyy="0.08" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="theta" type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="9" effort="1" velocity="1"/></joint>"""
+
+
+def bounces(run: Run) -> list[float]:
+    return [float(event["t"]) for event in run.events if event["name"].endswith("bounces")]
+
+
+def stop(joint: str, restitution: float) -> str:
+    return f'[[joint]]\nname = "{joint}"\nstops = true\nrestitution = {restitution!r}\n'
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("restitution", [0.3, 0.7])
+def test_a_pendulum_bounces_at_its_lowest(scene_of: Make, formulation: str, restitution: float) -> None:
+    """Between two impacts half a period passes, by an elliptic integral; e shortens sin(amplitude / 2)."""
+    start = 2.1
+    scene = scene_of(PENDULUM, stop("theta", restitution), f"q = {{theta = {start}}}\n", 6.0)
+    run = simulate(scene, {**TIGHT, "formulation": formulation})
+    rate = np.sqrt(1.7 * G * 0.6 / (0.08 + 1.7 * 0.36))
+    k = np.sin(start / 2)
+    t, wanted = ellipk(k**2) / rate, []
+    while t < 6.0 and len(wanted) < 12:
+        wanted.append(t)
+        k *= restitution
+        t += 2 * ellipk(k**2) / rate
+    found = bounces(run)[: len(wanted)]
+    assert len(found) >= 5
+    assert_close(found, wanted[: len(found)], 1e-10)
+    assert run.dissipated is not None
+    assert_close(run.energy + run.dissipated, np.full(len(run.t), run.energy[0]), 1e-9)
+    assert run.q_tree.min() > -1e-11
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_bounces_that_die_out_end_in_contact(scene_of: Make, formulation: str) -> None:
+    """Of infinitely many bounces within finite time those are made that rise more than atol; then the stop carries."""
+    scene = scene_of(
+        slide("x", "base", "ball", 2.0, 0.0), "gravity = [-9.81, 0, 0]\n" + stop("x", 0.5), "q = {x = 1.0}\n", 3.0
+    )
+    run = simulate(scene, {"solver.rtol": 1e-10, "formulation": formulation})
+    flight = np.sqrt(2 / G)
+    ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 60)])
+    found = bounces(run)
+    assert_close(found, ends[: len(found)], 1e-10)
+    rise = 0.25 ** (len(found) + 1)
+    assert rise < 1e-12 < 4 * rise
+    touches = [event for event in run.events if event["name"] == "x touches"]
+    assert len(touches) == 1
+    assert ends[len(found) - 1] < touches[0]["t"] < ends[-1]
+    resting = run.t > touches[0]["t"]
+    assert_close(run.q_tree[resting], np.zeros((resting.sum(), 1)), 1e-12)
+    assert run.stats["rhs"] < 1000
+    without = simulate(scene, {"solver.rtol": 1e-10, "t_end": 0.4})
+    assert without.events == []
+
+
+def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
+    """A block on a stop, pulled by a spring whose other end swings away: contact ends when its force is zero."""
+    urdf = slide("x", "base", "block", 1.0, 0.0) + slide("far", "base", "swing", 50.0)
+    mechanism = (
+        '[[spring]]\nframe_a = "block"\nframe_b = {link = "swing", xyz = [10.0, 0.0, 0.0]}\nrest_length = 10.0\n'
+        'stiffness = 20.0\n[[force]]\njoint = "x"\nvalue = -4.0\n' + stop("x", 0.0)
+    )
+    scene = scene_of(urdf, mechanism, "q = {x = 0.0, far = 0.0}\nq_dot = {x = 0.0, far = 0.5}\n", 1.0)
+    run = simulate(scene, TIGHT)
+    assert [event["name"] for event in run.events] == ["x touches", "x leaves"]
+    rate = np.sqrt(20.0 / 50.0)  # the far mass on the spring, the block at rest
+    assert_close(run.events[1]["t"], np.arcsin(4.0 / 20.0 / 0.5 * rate) / rate, 1e-10)
+
+
+def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
+    """Newton's cradle on two stops: three blocks whose gaps are joints, thrown at a wall together."""
+    urdf = (
+        slide("a", "base", "one", 1.0, 0.0) + slide("b", "one", "two", 1.0, 0.0) + slide("c", "two", "three", 1.0, 0.0)
+    )
+    joints = stop("a", 0.6) + stop("b", 0.6) + stop("c", 0.6)
+    start = "q = {a = 1.0, b = 0.0, c = 0.0}\nq_dot = {a = -1.0, b = 0.0, c = 0.0}\n"
+    run = simulate(scene_of(urdf, joints, start, 4.0), TIGHT)
+    assert run.status == "done"
+    assert run.q_tree.min() > -1e-12
+    assert run.dissipated is not None
+    assert np.all(np.diff(run.dissipated) >= -1e-14)
+    assert_close(run.energy + run.dissipated, np.full(len(run.t), 1.5), 1e-12)
+    # the stack meets the wall at t = 1: by the law of one impact, least change of velocity in the masses' metric
+    after = run.v_tree[run.t > 1.0][0]
+    assert after[0] >= 0.6 - 1e-12
+    assert np.all(after >= -1e-12)
