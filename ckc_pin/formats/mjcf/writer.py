@@ -41,6 +41,7 @@ def mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
         sites.add(name, frame)
     differs += add_loops(mechanism, root, sites)
     add_springs(mechanism, root, sites)
+    differs += _soft_joints(mechanism)
     _draw(mechanism, bodies, sites)
     _motors(mechanism, root)
     key = SubElement(root, "keyframe")
@@ -92,8 +93,28 @@ def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
     if springs.joint_stiffness[at]:
         element.set("stiffness", numbers(springs.joint_stiffness[at]))
         element.set("springref", numbers(springs.joint_rest[at]))
-    if model.armature[at]:
-        element.set("armature", numbers(model.armature[at]))
+    joints, (lower, upper) = mechanism.joints, mechanism.tree.limits()
+    for key, value in (("armature", model.armature[at]), ("frictionloss", joints.friction[at])):
+        if value:
+            element.set(key, numbers(value))
+    if np.isfinite(lower[at]) and lower[at] < upper[at]:
+        element.set("range", numbers(np.array([lower[at], upper[at]])))
+        element.set("limited", str(bool(joints.stopped[at])).lower())
+
+
+def _soft_joints(mechanism: Mechanism) -> list[str]:
+    """Say which joints have friction or stops, which give way in MuJoCo."""
+    joints, labels = mechanism.joints, np.array(mechanism.coordinates)
+    says = []
+    if joints.friction.any():
+        rubbing = ", ".join(labels[joints.friction > 0])
+        says.append(f"dry friction lets joints creep there: {rubbing}; set their solreffriction and solimpfriction")
+    if joints.stopped.any():
+        stopped = ", ".join(labels[joints.stopped])
+        says.append(f"stops are soft springs there: {stopped}; set their solreflimit and solimplimit")
+    if joints.restitution.any():
+        says.append(f"stops do not rebound there: {', '.join(labels[joints.restitution > 0])}")
+    return says
 
 
 def _inertials(mechanism: Mechanism, bodies: list[Element]) -> list[str]:
