@@ -56,7 +56,7 @@ def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[i
     children: dict[int, list[int]] = {}
     for joint in range(1, model.njoints):
         children.setdefault(int(model.parents[joint]), []).append(joint)
-    names, bodies, order = _body_names(mechanism), {0: world}, []
+    names, bodies, order = mechanism.frames.bodies, {0: world}, []
     waiting = children.get(0, [])[::-1]
     while waiting:
         joint = waiting.pop()
@@ -67,16 +67,6 @@ def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[i
         order.append(joint)
         waiting += children.get(joint, [])[::-1]
     return [bodies[joint] for joint in range(model.njoints)], order
-
-
-def _body_names(mechanism: Mechanism) -> dict[int, str]:
-    """Name each body by the link that its joint carries, or by the joint where fixed joints made several one."""
-    names: dict[int, str] = {}
-    for link, frame in mechanism.frames.links.items():
-        if np.allclose(frame.rotation, np.eye(3)) and not frame.translation.any():
-            names.setdefault(frame.joint, link)
-    model = mechanism.tree.model
-    return {joint: names.get(joint, model.names[joint]) for joint in range(1, model.njoints)}
 
 
 def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
