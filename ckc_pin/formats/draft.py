@@ -23,6 +23,7 @@ from ckc_pin.mechanism.spec import (
     ForceSpec,
     Frame,
     FrameSpec,
+    JointSpec,
     LoopSpec,
     MechanismSpec,
     PointSpec,
@@ -52,7 +53,7 @@ class Draft:
         What it was made from, for the head of the file.
     robot : Element
         The tree as a URDF's <robot>.
-    loops, couplings, springs, forces, points : list of (spec, comment)
+    loops, couplings, springs, forces, joints, points : list of (spec, comment)
     independent, actuated : list of str, or None
         None leaves it to the program.
     why_independent : str
@@ -72,6 +73,7 @@ class Draft:
     couplings: Noted[CouplingSpec] = field(default_factory=list)
     springs: Noted[SpringSpec] = field(default_factory=list)
     forces: Noted[ForceSpec] = field(default_factory=list)
+    joints: Noted[JointSpec] = field(default_factory=list)
     points: Noted[PointSpec] = field(default_factory=list)
     independent: list[str] | None = None
     actuated: list[str] | None = None
@@ -104,6 +106,7 @@ class Draft:
             coupling=[spec for spec, _ in self.couplings],
             spring=[spec for spec, _ in self.springs],
             force=[spec for spec, _ in self.forces],
+            joint=[spec for spec, _ in self.joints],
             point=[spec for spec, _ in self.points],
         )
 

@@ -60,6 +60,7 @@ def mechanism_text(draft: Draft) -> str:
         "coupling": draft.couplings,
         "spring": draft.springs,
         "force": draft.forces,
+        "joint": draft.joints,
         "point": draft.points,
     }
     for table, noted in tables.items():
@@ -104,6 +105,8 @@ def _list(key: str, names: Iterable[str]) -> list[str]:
 def _value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, float | int):
         return repr(float(value))
     if isinstance(value, list | tuple):

@@ -29,6 +29,12 @@ class Frames:
 
     `getFrameId` of an unknown name returns `nframes` without an error, and raises when a link and a
     joint share a name; here links and joints are two dictionaries.
+
+    Attributes
+    ----------
+    links, joints : dict of str to Frame
+    bodies : list of str
+        By joint, the world first: the link that it carries, or the joint where fixed joints made several one.
     """
 
     def __init__(self, model: Any) -> None:
@@ -40,6 +46,10 @@ class Frames:
                 self.links[frame.name] = placed
             elif frame.type in (pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
                 self.joints[frame.name] = placed
+        self.bodies = list(model.names)
+        for link, placed in reversed(self.links.items()):
+            if np.allclose(placed.rotation, np.eye(3)) and not placed.translation.any():
+                self.bodies[placed.joint] = link
 
     def find(self, frame: str | FrameSpec, where: str) -> Frame:
         """Look a frame up.

@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.spec import JointSpec
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.mechanism.tree import Array, BoolArray, Tree
 
 __all__ = ["Joints"]
 
@@ -27,7 +27,7 @@ class Joints:
     Raises
     ------
     MechanismError
-        No such joint, a joint named twice, stops without limits.
+        No such joint, a joint named twice, stops without limits or without room between them.
 
     Attributes
     ----------
@@ -37,6 +37,8 @@ class Joints:
         Where the stops are, infinite where there is none.
     restitution : (n,) array
         Of an impact at a stop: speed after over speed before.
+    warnings : list of str
+        Limits that are no walls.
     """
 
     def __init__(self, tree: Tree, specs: Sequence[JointSpec]) -> None:
@@ -61,12 +63,15 @@ class Joints:
             if spec.stops:
                 if not (np.isfinite(lower[at]) or np.isfinite(upper[at])):
                     raise MechanismError(f"joint {spec.name!r}: stops = true, but its URDF gives no limits")
+                if not lower[at] < upper[at]:
+                    raise MechanismError(f"joint {spec.name!r}: stops = true, but both its limits are {lower[at]:g}")
                 self.lower[at], self.upper[at] = lower[at], upper[at]
                 self.restitution[at] = spec.restitution
             elif spec.restitution:
                 raise MechanismError(f"joint {spec.name!r}: a restitution goes with stops = true")
         model.armature, model.damping, model.friction = armature, damping, self.friction
         self.stopped = np.isfinite(self.lower) | np.isfinite(self.upper)
+        self.warnings = _open_limits(tree, (np.isfinite(lower) | np.isfinite(upper)) & ~self.stopped)
 
     def has_events(self, smoothing: float | None) -> bool:
         """Whether joints stick or touch, friction being smoothed or not (None)."""
@@ -75,3 +80,12 @@ class Joints:
     def smooth_friction(self, v_tree: Array, smoothing: float) -> Array:
         """Return -F tanh(v / smoothing), N or N m, shape (n,)."""
         return -self.friction * np.tanh(v_tree / smoothing)
+
+
+def _open_limits(tree: Tree, limited: BoolArray) -> list[str]:
+    """Say which limits a run may pass, and how to make walls of them."""
+    names = [tree.coordinates[k] for k in np.flatnonzero(limited)]
+    if not names:
+        return []
+    some = ", ".join(names if len(names) <= 6 else [*names[:5], f"{len(names) - 5} more"])
+    return [f"joint limits are no walls, a run may pass them: {some}; stops = true in their [[joint]] makes them walls"]

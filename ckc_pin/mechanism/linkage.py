@@ -66,7 +66,7 @@ class Linkage:
             raise MechanismError("point: two points have the same name")
         self.size = _size(self.tree, self.closure, sources.name)
         self.tree.measure(self.size)
-        self.warnings += self.tree.unmodelled()
+        self.warnings += self.joints.warnings
 
 
 def _tree_texts(spec: MechanismSpec, sources: Sources) -> list[TreeText]:

@@ -136,19 +136,6 @@ class Tree:
             pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
             return self._jacobian_dot.copy()
 
-    def unmodelled(self) -> list[str]:
-        """Say what the URDF has and the dynamics leave out: dry friction, and limits as walls."""
-        says = []
-        rubbing = [c for c, friction in zip(self.coordinates, self.model.friction, strict=True) if friction]
-        if rubbing:
-            says.append(f"dry friction is not modelled: {', '.join(rubbing)}")
-        lower, upper = self.limits()
-        limited = [c for k, c in enumerate(self.coordinates) if np.isfinite(lower[k]) or np.isfinite(upper[k])]
-        if limited:
-            names = ", ".join(limited if len(limited) <= 6 else [*limited[:5], f"{len(limited) - 5} more"])
-            says.append(f"joint limits are no walls, a run may pass them: {names}")
-        return says
-
     def limits(self) -> tuple[Array, Array]:
         """Lower and upper limits by coordinate, infinite where there is none, shape (n,) each."""
         lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)

@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
@@ -41,6 +44,12 @@ class Check:
     sigma_min_phi_z, cond_phi_z : float
     gap : (above, below)
         Relative singular values of the scaled J around the cut that the rank is.
+    mass : float
+        Of all bodies that move, kg.
+    inertia : (3, 3) array
+        Theirs as assembled, about their centre of mass, in the world's axes, kg m^2.
+    joints : dict of str to dict
+        Joints with armature, dry friction or stops: these, damping and restitution by name.
     warnings : tuple of str
     terms : "pinocchio" or "generated"
         Whose terms a run takes: the scene's choice; without one, "generated" where they were compiled before.
@@ -63,6 +72,9 @@ class Check:
     sigma_min_phi_z: float
     cond_phi_z: float
     gap: tuple[float, float]
+    mass: float
+    inertia: Array
+    joints: dict[str, dict[str, float]]
     warnings: tuple[str, ...]
     terms: str
     desired: DesiredCheck | None = None
@@ -87,11 +99,11 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, None, [], "auto")
+        found = _mechanism_check(what, None, _limits(what, what.q_tree, "the assembled configuration"), "auto")
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     desired = _desired(what, mechanism)
-    warnings = _desired_warnings(mechanism, desired)
+    warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
     found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms)
     return replace(found, branches=_branches(mechanism)) if branches else found
 
@@ -112,6 +124,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
     values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
+    mass, inertia = moving_mass(mechanism)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
     return Check(
         n=mechanism.n,
@@ -127,7 +140,10 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         sigma_min_phi_z=float(values[-1]),
         cond_phi_z=float(values[0] / values[-1]) if values[-1] > 0 else float("inf"),
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
-        warnings=(*mechanism.warnings, *warnings),
+        mass=mass,
+        inertia=inertia,
+        joints=acting_joints(mechanism),
+        warnings=(*mechanism.warnings, *findings(mechanism), *warnings),
         terms=terms,
         desired=desired,
     )
@@ -140,6 +156,22 @@ def _desired(scene: Scene, mechanism: Mechanism) -> DesiredCheck | None:
     if isinstance(controller, SetPoint):
         return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
     return None
+
+
+def _start_warnings(scene: Scene, mechanism: Mechanism) -> list[str]:
+    """Say what of the start is outside joint limits, or why there is no start."""
+    if not np.isfinite(mechanism.tree.limits()).any():
+        return []
+    try:
+        start = find_start(mechanism, scene)
+    except CkcError as error:
+        return [str(error)]
+    return _limits(mechanism, start.at.q_tree, "the start")
+
+
+def _limits(mechanism: Mechanism, q_tree: Array, what: str) -> list[str]:
+    outside = outside_limits(mechanism, q_tree)
+    return [f"{what} is outside joint limits: {', '.join(outside)}"] if outside else []
 
 
 def _desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None) -> list[str]:

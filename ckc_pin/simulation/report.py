@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
+from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ __all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_pl
 
 MOST_EVENTS = 10  # in a table for people
 LONG = 10.0  # s: what compiling a mechanism's terms takes at most, as a rule
+AXES = tuple(combinations_with_replacement(enumerate("xyz"), 2))
 TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
 
 
@@ -42,7 +44,8 @@ def _finite(value: Any) -> Any:
 def check_plain(found: Check) -> dict[str, Any]:
     """Return a check as JSON-ready data."""
     branches = None if found.branches is None else found.branches.tolist()
-    return {**asdict(found), "q_tree": found.q_tree.tolist(), "branches": branches}
+    arrays = {"q_tree": found.q_tree.tolist(), "inertia": found.inertia.tolist(), "branches": branches}
+    return asdict(found) | arrays
 
 
 def check_table(found: Check) -> Group:
@@ -63,6 +66,9 @@ def check_table(found: Check) -> Group:
     if found.det_phi_z is not None:
         table.add_row("det phi_z", f"{found.det_phi_z:.6g}")
     table.add_row("sigma_min(phi_z), cond", f"{found.sigma_min_phi_z:.6g}, {found.cond_phi_z:.4g}")
+    table.add_row("moving mass", f"{found.mass:.6g} kg")
+    about = "  ".join(f"i{a}{b} = {found.inertia[i, j]:.6g}" for (i, a), (j, b) in AXES)
+    table.add_row("its inertia", f"{about} kg m^2, as assembled, about its centre of mass")
     table.add_row("terms", found.terms)
     for k, numbers in enumerate(found.branches if found.branches is not None else ()):
         shown = "  ".join(f"{c} = {x:.6f}" for c, x in zip(found.coordinates, numbers, strict=True))
@@ -72,7 +78,18 @@ def check_table(found: Check) -> Group:
         table.add_row("desired", f"{closest}, sigma_min(phi_z) = {found.desired.sigma_min:.4g}")
     elif found.desired is not None:
         table.add_row("desired", f"leaves the workspace at t = {found.desired.leaves_at:.5f} s")
-    return Group(table, *(Text(f"warning: {warning}") for warning in found.warnings))
+    joints = [_joints_table(found)] if found.joints else []
+    return Group(table, *joints, *(Text(f"warning: {warning}") for warning in found.warnings))
+
+
+def _joints_table(found: Check) -> Table:
+    """Return what the joints themselves do, one a line."""
+    table = _plain_table("joint", "armature", "damping", "friction", "stops", "restitution")
+    for name, joint in found.joints.items():
+        stopped = math.isfinite(joint["lower"]) or math.isfinite(joint["upper"])
+        stops = (f"{joint['lower']:.6g} to {joint['upper']:.6g}", f"{joint['restitution']:g}") if stopped else ("", "")
+        table.add_row(name, *(f"{joint[key]:g}" for key in ("armature", "damping", "friction")), *stops)
+    return table
 
 
 def terms_plain(found: Terms) -> dict[str, Any]:

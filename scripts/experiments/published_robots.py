@@ -106,7 +106,10 @@ def row(name: str, path: Path) -> str:
     """Import and check one robot."""
     draft = read(path)
     motors = str(len(draft.actuated)) if draft.actuated else ""
-    remarks = _remarks(draft.guessed) + _remarks(draft.left_out)
+    joints = [spec for spec, _ in draft.joints]
+    counts = {"rotor": sum(spec.armature is not None for spec in joints), "stop": sum(spec.stops for spec in joints)}
+    counted = [f"{count} {what}{'s' * (count > 1)}" for what, count in counts.items() if count]
+    remarks = counted + _remarks(draft.guessed) + _remarks(draft.left_out)
     with tempfile.TemporaryDirectory() as folder:
         file, _ = write(draft, Path(folder))
         try:
@@ -126,13 +129,16 @@ SHORT = {
     "joints called spherical": "joints called spherical stay hinges",
     "ball joint": "ball joints as three hinges",
     "the three slides": "slides and a ball as a free root",
-    "armature": "armature left out",
+    "armature of ": "armature left out",
     "masses of shapes": "masses of meshes left out",
     "actuator ": "actuator on a tendon left out",
     "coupling ": "coupling of three joints left out",
     " follows '": "mimic of no joint left out",
     "robot.yaml: joint_name": "joint_name of no joint left out",
     "idle freedoms": "{n} idle",
+    "links that move without mass": "{n} without mass",
+    "from q_guess: ": "assembled far from the guess",
+    "outside joint limits": "{n} beyond limits",
     "the assembled configuration is singular": "singular where it is drawn",
     "the loops close to": "{first}",
 }

@@ -7,7 +7,9 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -16,6 +18,7 @@ from ckc_pin import InputError, as_ivp, load, load_scene, simulate
 from ckc_pin.analysis.precision import PrecisionRow, WorkPrecision, precision_plain, work_precision
 from ckc_pin.analysis.precision.advice import advise
 from ckc_pin.analysis.precision.motion import INSTANTS, Motion
+from ckc_pin.analysis.precision.mujoco import model_of
 from ckc_pin.analysis.precision.reference import Reference, confirm, find_reference
 from ckc_pin.analysis.precision.settings import settings
 from ckc_pin.formats.exporting import export
@@ -306,6 +309,20 @@ def test_mujoco_is_left_out_where_it_cannot() -> None:
     found = work_precision("five_bar/set_point", {"t_end": 0.05}, budget=1.0, mjcf=mjcf)
     assert {row.program for row in found.rows} == {"ckc_pin"}
     assert any(note.startswith("MuJoCo is not beside it: the scene's controller") for note in found.notes)
+
+
+def test_mujoco_has_the_friction_and_the_stops(table: Path) -> None:
+    """A row of its constraints each: what is compared is the same mechanism."""
+    mechanism = load(table / "mechanism.toml")
+    joint = mechanism.coordinates[0]
+    model = model_of(export(mechanism, "mjcf").text)
+    root = ElementTree.fromstring(export(mechanism, "mjcf").text)
+    root.find(f".//joint[@name='{joint}']").attrib.update(frictionloss="0.1", range="-9 -8", limited="true")
+    rubbing = model_of(ElementTree.tostring(root, encoding="unicode"))
+    for there, count in ((model, 0), (rubbing, 1)):
+        data = mujoco.MjData(there)
+        mujoco.mj_forward(there, data)
+        assert (data.nf, data.nl) == (count, count)
 
 
 def test_another_mechanism_in_mujoco_is_named(table: Path) -> None:

@@ -101,6 +101,63 @@ LOOPS = [
     _edit("point frame", 'frame = "tip_left"\n', 'frame = "x"\n', "point 'tip': no link 'x'", LINKS),
 ]
 
+
+def _joint(what: str, keys: str, *says: str) -> Bad:
+    return _add(what, f"[[joint]]\n{keys}", *says)
+
+
+LIMITED = ('"theta_1" type="continuous">', '"theta_1" type="revolute"><limit lower="0.5" upper="0.5"/>')
+
+JOINTS = [
+    _joint(
+        "negative armature", 'name = "theta_1"\narmature = -0.1', "joint[0].armature = -0.1: a number of at least 0"
+    ),
+    _joint(
+        "negative friction", 'name = "theta_1"\nfriction = -1.0', "joint[0].friction = -1.0: a number of at least 0"
+    ),
+    _joint("negative damping", 'name = "theta_1"\ndamping = -1.0', "joint[0].damping = -1.0: a number of at least 0"),
+    _joint("friction of nan", 'name = "theta_1"\nfriction = nan', "joint[0].friction = nan: a number of at least 0"),
+    _joint(
+        "restitution above 1",
+        'name = "theta_1"\nstops = true\nrestitution = 1.5',
+        "joint[0].restitution = 1.5: a number of at least 0 and at most 1 is needed",
+    ),
+    _joint(
+        "restitution below 0",
+        'name = "theta_1"\nstops = true\nrestitution = -0.5',
+        "joint[0].restitution = -0.5: a number of at least 0 and at most 1 is needed",
+    ),
+    _joint("stops in words", 'name = "theta_1"\nstops = "yes"', "joint[0].stops = 'yes': true or false is needed"),
+    _joint(
+        "stops without limits",
+        'name = "theta_1"\nstops = true',
+        "joint 'theta_1': stops = true, but its URDF gives no limits",
+    ),
+    Bad(
+        "stops without room",
+        CHECK,
+        ["joint 'theta_1': stops = true, but both its limits are 0.5"],
+        {
+            "five_bar.urdf": LIMITED,
+            "mechanism.toml": ("[[point]]", '[[joint]]\nname = "theta_1"\nstops = true\n[[point]]'),
+        },
+    ),
+    _joint(
+        "restitution without stops",
+        'name = "theta_1"\nrestitution = 0.5',
+        "joint 'theta_1': a restitution goes with stops = true",
+    ),
+    _joint(
+        "a joint twice",
+        'name = "theta_1"\nfriction = 1.0\n[[joint]]\nname = "theta_1"\narmature = 1.0',
+        "joint: 'theta_1' is given twice",
+    ),
+    _joint("an unknown joint", 'name = "x"\nfriction = 1.0', "joint: no joint of one freedom called 'x'", COORDINATES),
+    _joint("a fixed joint", 'name = "tip_left_fixed"', "no joint of one freedom called 'tip_left_fixed'", COORDINATES),
+    _joint("a joint without name", "friction = 1.0", "joint[0]: the key 'name' is missing"),
+    _joint("a joint's unknown key", 'name = "theta_1"\nfricton = 1.0', "unknown key 'fricton'", "mean 'friction'?"),
+]
+
 COORDINATE_CHOICES = [
     _edit("unknown independent", INDEPENDENT, '["theta_1", "x"]', "independent: no coordinate 'x'", COORDINATES),
     _edit("too few independent", INDEPENDENT, '["theta_1"]', "independent: 1 coordinates (theta_1)", "d = 2"),
@@ -142,7 +199,7 @@ frame_b = "world"
 ]
 
 
-@pytest.mark.parametrize("case", [*FILES, *LOOPS, *COORDINATE_CHOICES], ids=lambda case: case.what)
+@pytest.mark.parametrize("case", [*FILES, *LOOPS, *JOINTS, *COORDINATE_CHOICES], ids=lambda case: case.what)
 def test_bad_mechanism(case: Bad, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
     expect(case, bar)
     assert capfd.readouterr() == ("", "")

@@ -98,6 +98,7 @@ JOINTS = [
     ),
     _joint("effort in words", '<limit effort="much"/>', "<limit>: effort='much' is not a finite number"),
     _joint("negative damping", '<dynamics damping="-1"/>', "negative damping -1"),
+    _joint("negative friction", '<dynamics friction="-1"/>', "negative friction -1"),
     _joint("friction of nan", '<dynamics friction="nan"/>', "<dynamics>: friction='nan' is not a finite number"),
     _joint("mimic of nothing", "<mimic/>", "its <mimic> names no joint"),
     _joint("mimic by nan", '<mimic joint="j" multiplier="nan"/>', "multiplier='nan' is not a finite number"),

@@ -17,8 +17,11 @@ from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.library import shipped
 from tests.contract.helpers.command import ckc
 
-# flat trees, free roots, hinges, welds, redundant rows, couplings, massless links, constant forces, springs
+# flat trees, free roots, hinges, welds, redundant rows, couplings, massless links, constant forces, springs; of
+# "spatial" rotors, friction and stops too
 SHIPPED = ["five_bar", "andrews", "bricard", "stewart", "two_ur5", "slider_crank_spatial"]
+
+EXACT = 1e-12  # relative to the largest entry
 
 LINK = """<link name="{0}"><inertial><origin xyz="0.1 0.02 0.01"/><mass value="{1}"/>
 <inertia ixx="1e-3" iyy="2e-3" izz="2.5e-3" ixy="1e-4" ixz="0" iyz="-2e-4"/></inertial></link>"""
@@ -68,6 +71,19 @@ damping = 1.5
 [[force]]
 joint = "b"
 value = -0.7
+[[joint]]
+name = "a"
+armature = 0.04
+friction = 0.2
+[[joint]]
+name = "b"
+armature = 0.3
+stops = true
+restitution = 0.5
+[[joint]]
+name = "s"
+armature = 2.0
+damping = 0.4
 [[point]]
 name = "tip"
 frame = {link = "block", xyz = [0.2, 0, 0]}
@@ -132,7 +148,7 @@ def test_the_tree_is_the_same(mechanism: Mechanism) -> None:
         M = np.zeros((peer.model.nv, peer.model.nv))
         mujoco.mj_fullM(peer.model, peer.data, M)
         D = pin.crba(tree.model, tree.data, q_tree)
-        assert_same(to.T @ M @ to, np.triu(D) + np.triu(D, 1).T)
+        assert_same(to.T @ M @ to, np.triu(D) + np.triu(D, 1).T, EXACT)
         if tree.flat:  # a free root's axes turn, and the bias with them
             assert_same(to.T @ peer.data.qfrc_bias, pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree))
 
@@ -163,6 +179,26 @@ def test_points_are_sites_and_joints_have_motors(spatial: Mechanism) -> None:
         assert_same(peer.data.site("tip").xpos, spatial.point_positions(q_tree)["tip"])
     assert peer.model.actuator("a").trnid[0] == peer.model.joint("a").id
     assert_same(peer.model.opt.gravity, [1.0, 2.0, -9.0])
+
+
+def test_joints_have_their_rotors_friction_and_stops(spatial: Mechanism) -> None:
+    """A range without stops is there, and does not act."""
+    model = Peer(spatial).model
+    found = {name: (model.joint(name), model.joint(name).dofadr[0]) for name in spatial.coordinates}
+    assert {name: model.dof_armature[dof] for name, (_, dof) in found.items()} == {"a": 0.04, "b": 0.3, "s": 2, "w": 0}
+    assert {name: model.dof_frictionloss[dof] for name, (_, dof) in found.items()} == {"a": 0.2, "b": 0, "s": 0, "w": 0}
+    assert {name: bool(joint.limited[0]) for name, (joint, _) in found.items() if joint.range.any()} == {
+        "b": True,
+        "s": False,
+    }
+    assert model.joint("b").range.tolist() == model.joint("s").range.tolist() == [-9.0, 9.0]
+    said = export(spatial, "mjcf").differs
+    for words in (
+        "dry friction lets joints creep there: a;",
+        "stops are soft springs there: b;",
+        "not rebound there: b",
+    ):
+        assert any(words in difference for difference in said), said
 
 
 def test_a_swing_is_the_same_as_far_as_springs_can_close_loops() -> None:
@@ -216,6 +252,16 @@ def test_its_dynamics_come_back(there_and_back: tuple[Mechanism, Mechanism]) -> 
             forces.append(springs.elastic_force(q_tree) + springs.damping_force(q_tree, v_tree))
         for here, back in (masses, biases, forces):
             assert_same(back, here, 1e-10)
+
+
+def test_its_joints_come_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
+    """Rotors, friction, ranges and stops; but for what they rebound."""
+    here, back = there_and_back
+    for name in ("lower", "upper", "friction"):
+        assert np.array_equal(getattr(back.joints, name), getattr(here.joints, name)), name
+    assert np.array_equal(back.tree.model.armature, here.tree.model.armature)
+    assert np.array_equal(back.tree.limits(), here.tree.limits())
+    assert not back.joints.restitution.any()
 
 
 def test_its_closure_comes_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:

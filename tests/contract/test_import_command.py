@@ -15,7 +15,7 @@ from tests.contract.helpers.command import ckc
 ROBOTS = Path(__file__).resolve().parents[2].parent / "shared" / "robots"
 
 FOUR_BAR = """<mujoco model="linkage"><compiler angle="radian"/><worldbody>
-<body name="crank"><joint name="a" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
+<body name="crank"><joint name="a" axis="0 1 0" range="-2 2"/><geom type="box" size=".1 .1 .1"/>
   <body name="rod" pos="1 0 .5"><joint name="b" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/></body></body>
 <body name="rocker" pos="2 0 -1"><joint name="c" axis="0 1 0" armature="0.1"/><geom type="box" size=".1 .1 .1"/></body>
 </worldbody><equality><connect name="elbow" body1="rod" body2="rocker" anchor="1 0 -.5"/></equality></mujoco>
@@ -35,11 +35,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_import_then_check(folder: Path) -> None:
     done = ckc("import", "linkage.xml")
     assert (done.code, done.err) == (0, "")
-    for line in ("written: linkage/mechanism.toml", "written: linkage/linkage.urdf", "left out: armature"):
+    for line in ("written: linkage/mechanism.toml", "written: linkage/linkage.urdf", "guessed: ranges are hard stops"):
         assert line in done.out
     text = (folder / "linkage" / "mechanism.toml").read_text(encoding="utf-8")
     assert text.startswith("# Imported from linkage.xml, a MuJoCo model.")
-    assert "#   - armature, the inertia of rotors behind gears (kg m^2 or kg): c 0.1" in text
+    assert '[[joint]]\nname = "a"\nstops = true\n' in text
+    assert '[[joint]]\nname = "c"\narmature = 0.1\n' in text
     found = ckc("check", "linkage", "--json").json
     assert (found["n"], found["rows"], found["rank"], found["d"]) == (3, 3, 2, 1)
 
@@ -48,7 +49,8 @@ def test_the_json_of_an_import(folder: Path) -> None:
     found = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
     assert set(found) == {"status", "written", "left_out", "guessed", "check"}
     assert found["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
-    assert [note.split(",")[0] for note in found["left_out"]] == ["armature"]
+    assert found["left_out"] == []
+    assert found["guessed"] == ["ranges are hard stops without rebound here, MuJoCo's give way: a"]
     check = ckc("check", "there/deep", "--json").json
     assert found["check"] == {"status": "done", **check}
 

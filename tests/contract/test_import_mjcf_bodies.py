@@ -13,6 +13,7 @@ import pytest
 from ckc_pin.errors import InputError
 from ckc_pin.formats.importing import read
 from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.spec import JointSpec
 from tests.conftest import assert_close
 from tests.contract.helpers.models import TWO_ARMS, model, said, tetrahedron
 from tests.contract.helpers.mujoco_twin import Twin
@@ -110,8 +111,55 @@ def test_springs_armature_and_friction(tmp_path: Path) -> None:
     ((spring, _),) = draft.springs
     assert (spring.joint, spring.stiffness, spring.rest, spring.damping) == ("j", 30.0, 0.2, 0.0)
     assert draft.robot.find("joint[@name='j']/dynamics").attrib == {"damping": "1.0", "friction": "0.5"}
-    assert said(draft.left_out, "armature", "j 0.01")
-    assert said(draft.left_out, "dry friction", "j")
+    assert [spec for spec, _ in draft.joints] == [JointSpec(name="j", armature=0.01)]
+    assert draft.left_out == []
+
+
+def test_ranges_are_limits_and_stops_where_they_act(tmp_path: Path) -> None:
+    """As MuJoCo says: those that do not act are limits still; a ball's has no counterpart and is named."""
+    ranges = [("acts", "range='-1 2'"), ("rests", "range='-1 2' limited='false'"), ("none", "")]
+    bodies = "".join(f"<body name='b{k}'><joint name='{k}' {r}/><geom size='.1'/></body>" for k, r in ranges)
+    draft = model(
+        tmp_path, f"{bodies}<body name='c'><joint name='ball' type='ball' range='0 1'/><geom size='.1'/></body>"
+    )
+    assert [spec for spec, _ in draft.joints] == [JointSpec(name="acts", stops=True)]
+    mechanism = draft.mechanism()
+    found = dict(zip(mechanism.coordinates, np.transpose(mechanism.tree.limits()).tolist(), strict=True))
+    assert found["acts"] == found["rests"] == [-1.0, 2.0]
+    assert found["none"] == [-np.inf, np.inf]
+    assert (mechanism.joints.lower[0], mechanism.joints.upper[0], mechanism.joints.restitution[0]) == (-1.0, 2.0, 0.0)
+    assert np.isinf(mechanism.joints.lower[1:]).all()
+    assert draft.left_out == ["range of ball joint ball"]
+    assert draft.guessed[1:] == ["ranges are hard stops without rebound here, MuJoCo's give way: acts"]
+    assert mechanism.warnings == [
+        "joint limits are no walls, a run may pass them: rests; stops = true in their [[joint]] makes them walls"
+    ]
+
+
+@pytest.mark.parametrize("flag", ["frictionloss='disable'", "limit='disable'", "constraint='disable'"])
+def test_friction_and_ranges_that_are_switched_off(tmp_path: Path, flag: str) -> None:
+    """Named, as springs are; they act here until the file is corrected."""
+    joint = "<joint name='j' range='-1 2' frictionloss='0.5'/>"
+    draft = model(tmp_path, f"<body name='b'>{joint}<geom size='.1'/></body>", f"<option><flag {flag}/></option>")
+    off = {"dry friction": not flag.startswith("limit"), "ranges of joints": not flag.startswith("friction")}
+    for what, is_off in off.items():
+        assert said(draft.left_out, f"that the model switches its {what} off") is is_off
+
+
+def test_rotors_that_cannot_come_are_said(tmp_path: Path) -> None:
+    """On free and ball joints and on tendons; the actuator's on a ball too."""
+    bodies = """<body name='f'><joint name='free' type='free' armature='0.1'/><geom size='.1'/></body>
+      <body name='c'><joint name='ball' type='ball'/><geom size='.1'/></body>
+      <body name='d'><joint name='d'/><geom size='.1'/></body>"""
+    rest = """<tendon><fixed name='belt' armature='0.2'><joint joint='d' coef='2'/></fixed></tendon>
+      <actuator><motor name='turn' joint='ball' gear='3 0 0' armature='0.1'/>
+      <motor name='pull' tendon='belt' armature='0.1'/></actuator>"""
+    draft = model(tmp_path, bodies, rest)
+    assert not draft.joints
+    assert said(draft.left_out, "armature of free joint free")
+    assert said(draft.left_out, "armature of ball joint ball")
+    assert said(draft.left_out, "armature of tendon belt")
+    assert said(draft.left_out, "actuator pull on tendon belt, its armature too")
 
 
 def test_what_joints_and_tendons_have_beyond_springs_is_said(tmp_path: Path) -> None:

@@ -13,7 +13,16 @@ from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType, MechanismSpec, SpringSpec, TreeSpec
+from ckc_pin.mechanism.spec import (
+    CouplingSpec,
+    FrameSpec,
+    JointSpec,
+    LoopSpec,
+    LoopType,
+    MechanismSpec,
+    SpringSpec,
+    TreeSpec,
+)
 from tests.analytic.five_bar import Array
 from tests.property.worlds import Numbers, World, random_world, rotation, slope
 
@@ -24,6 +33,13 @@ SPRINGS = [
     SpringSpec(joint="b_j2", rest=-0.1, stiffness=20.0),
     SpringSpec(frame_a="a_4", frame_b=FrameSpec(link="b_4", xyz=(0.1, 0.2, 0.3)), rest_length=0.5, stiffness=30.0),
     SpringSpec(frame_a="world", frame_b="b_3", rest_length=0.2, stiffness=10.0, damping=1.5),
+]
+
+
+ROTORS = [
+    JointSpec(name="a_j2", armature=0.4),
+    JointSpec(name="b_j3", armature=0.2),
+    JointSpec(name="b_j4", armature=1),
 ]
 
 
@@ -63,7 +79,7 @@ class Closed:
 def closed_mechanism(
     kind: LoopType, seed: int, *, free: bool = True, redundant: bool = False, turn: Array | None = None
 ) -> Closed:
-    """A world with a loop between the links a_3 and b_3, a coupling, springs and dampers.
+    """A world with a loop between the links a_3 and b_3, a coupling, springs and dampers, rotors on joints.
 
     Parameters
     ----------
@@ -92,6 +108,7 @@ def closed_mechanism(
         loop=[loop, *(again if redundant else [])],
         coupling=[CouplingSpec(joint="a_j1", other="b_j4", ratio=0.7, offset=q["a_j1"] - 0.7 * q["b_j4"])],
         spring=SPRINGS,
+        joint=ROTORS,
     )
     texts = {prefix: world.urdf(prefix) for prefix in world.stands}
     return Closed(assembled(spec, Sources("a random world", None, texts)), world, q)

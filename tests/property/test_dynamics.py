@@ -13,7 +13,7 @@ from ckc_pin.mechanism import Kinematics
 from ckc_pin.mechanism.configuration import Partition
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
-from tests.property.mechanisms import Closed, along, closed_mechanism
+from tests.property.mechanisms import ROTORS, Closed, along, closed_mechanism
 from tests.property.strategies import TYPES, angles, seeds
 from tests.property.worlds import rotation, slope
 
@@ -26,12 +26,13 @@ many = settings(max_examples=25)
 @many
 @given(every_mechanism)
 def test_energy_is_that_of_the_bodies(closed: Closed) -> None:
-    """1/2 v D' v + V against a sum over bodies that are placed in numpy."""
+    """1/2 v D' v + V against a sum over bodies that are placed in numpy, and over rotors."""
     mechanism, world = closed.mechanism, closed.world
     q, v = world.configuration(), world.velocity()
     q_tree, v_tree = (np.array([x[name] for name in mechanism.coordinates]) for x in (q, v))
     terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q_tree)), v_tree)
-    assert_close(terms.energy - mechanism.springs.energy(terms.q_tree), world.energy(q, v), 1e-9)
+    rotors = sum((spec.armature or 0.0) * v[spec.name] ** 2 / 2 for spec in ROTORS)
+    assert_close(terms.energy - mechanism.springs.energy(terms.q_tree), world.energy(q, v) + rotors, 1e-9)
 
 
 @many

@@ -19,13 +19,13 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["Joints", "missing", "model_of", "rows", "set_up", "stepper"]
+__all__ = ["StateMap", "missing", "model_of", "rows", "set_up", "stepper"]
 
 SAME = 1e-6  # relative: how well mass matrix and bias agree where both programs have one mechanism
 COARSEST, STEPS = 1e-2, 9  # of the span or of 2 s, and how many halves
 INTEGRATORS = ("implicitfast", "RK4")
 STIFFNESSES = ("default", "solref 2 dt")  # as MuJoCo has them, and as stiff as its manual lets them be
-UNUSED = ("AUTORESET", "CONTACT", "LIMIT", "FRICTIONLOSS", "SENSOR")  # a run that blew up is not to start again
+UNUSED = ("AUTORESET", "CONTACT", "SENSOR")  # a run that blew up is not to start again
 
 
 def missing(scene: Scene) -> str:
@@ -115,7 +115,7 @@ def stepper(model: Any, mechanism: Mechanism, state: tuple[Array, Array]) -> Ste
     """Return the program at a start, Pinocchio's q_tree and v_tree."""
     import mujoco
 
-    data, joints = mujoco.MjData(model), Joints(mechanism, model)
+    data, joints = mujoco.MjData(model), StateMap(mechanism, model)
 
     def reset() -> None:
         mujoco.mj_resetData(model, data)
@@ -129,7 +129,7 @@ def _difference(mechanism: Mechanism, model: Any, state: tuple[Array, Array]) ->
     import mujoco
 
     tree, (q_tree, v_tree), data = mechanism.tree, state, mujoco.MjData(model)
-    to = Joints(mechanism, model).put(data, q_tree, v_tree)
+    to = StateMap(mechanism, model).put(data, q_tree, v_tree)
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
@@ -142,7 +142,7 @@ def _difference(mechanism: Mechanism, model: Any, state: tuple[Array, Array]) ->
     return off
 
 
-class Joints:
+class StateMap:
     """Pinocchio's states in MuJoCo's order and back."""
 
     def __init__(self, mechanism: Mechanism, model: Any) -> None:

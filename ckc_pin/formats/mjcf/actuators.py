@@ -31,7 +31,8 @@ class Actuators:
             name = compiled.name("actuator", k)
             if joint is None or joint not in tree.ref:
                 through = "a joint of several freedoms" if joint is not None else _target(compiled, k)
-                self.left_out.append(f"actuator {name} on {through}".replace("  ", " "))
+                rotor = ", its armature too" if joint is None and compiled.model.actuator_armature[k] else ""
+                self.left_out.append(f"actuator {name} on {through}{rotor}".replace("  ", " "))
             elif value := _constant(compiled, k):
                 spec = ForceSpec(joint=compiled.joints[joint], value=number(value))
                 self.forces.append((spec, f"actuator {name}, which takes no control".replace("  ", " ")))

@@ -37,6 +37,8 @@ class Joint:
     ref : float
         Its value in the reference pose, rad or m.
     limits : JointLimits
+    stops : bool
+        Whether they act.
     stiffness, rest, damping, friction, armature : float
         Damping and armature with those of the actuators on it.
     is_nonlinear : bool
@@ -51,6 +53,7 @@ class Joint:
     axis: Array
     ref: float
     limits: JointLimits
+    stops: bool
     stiffness: float
     rest: float
     damping: float
@@ -79,6 +82,7 @@ class Joint:
             axis=model.jnt_axis[at].copy(),
             ref=float(model.qpos0[qpos]) if kind in ("hinge", "slide") else 0.0,
             limits=_limits(compiled, at),
+            stops=bool(model.jnt_limited[at]),
             stiffness=float(model.jnt_stiffness[at]),
             rest=float(model.qpos_spring[qpos]),
             damping=damping,
@@ -95,7 +99,7 @@ class Joint:
             "stiffness": self.stiffness,
             "frictionloss": self.friction,
             "armature": self.armature,
-            "range": self.limits.upper is not None,
+            "range": self.stops,
         }
         return [key for key, value in acting.items() if value]
 
@@ -118,8 +122,8 @@ def is_free_root(joints: Sequence[Joint]) -> bool:
 
 def _limits(compiled: Compiled, at: int) -> JointLimits:
     model = compiled.model
-    if not model.jnt_limited[at]:
-        return UNLIMITED
     lower, upper = (number(float(x)) for x in model.jnt_range[at])
+    if not model.jnt_limited[at] and not lower < upper:
+        return UNLIMITED
     effort = float(np.abs(model.jnt_actfrcrange[at]).max()) if model.jnt_actfrclimited[at] else 0.0
     return JointLimits(lower, upper, effort)

@@ -52,6 +52,7 @@ def read_mjcf(text: str, path: Path) -> Draft:
         couplings=equalities.couplings,
         springs=tree.springs + springs,
         forces=actuators.forces,
+        joints=tree.joints,
         points=free_sites(compiled, tree),
         actuated=actuators.joints or None,
         gravity=vector((0.0, 0.0, 0.0) if "gravity" in off else model.opt.gravity),
@@ -77,5 +78,7 @@ def _switched_off(compiled: Compiled) -> list[str]:
         "springs": bits.mjDSBL_SPRING,
         "dampers": bits.mjDSBL_DAMPER,
         "equality constraints": bits.mjDSBL_EQUALITY | bits.mjDSBL_CONSTRAINT,
+        "dry friction": bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_CONSTRAINT,
+        "ranges of joints": bits.mjDSBL_LIMIT | bits.mjDSBL_CONSTRAINT,
     }
     return [what for what, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]

@@ -21,7 +21,7 @@ from ckc_pin.formats.mjcf.joints import Joint, is_free_root
 from ckc_pin.formats.mjcf.shapes import draw
 from ckc_pin.formats.orientation import from_quaternion, to_rpy
 from ckc_pin.formats.urdf.elements import UNLIMITED, Body, JointLimits, add_inertial, add_joint, add_link
-from ckc_pin.mechanism.spec import SpringSpec
+from ckc_pin.mechanism.spec import JointSpec, SpringSpec
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["MjcfTree", "Placed"]
@@ -60,6 +60,8 @@ class MjcfTree:
     q_guess : dict of str to float
         The reference pose, or the key frame that `ckc export` writes, by coordinate, where it is not zero.
     springs : list of (SpringSpec, comment)
+    joints : list of (JointSpec, comment)
+        Armature, and the ranges that act, which a URDF has no words for.
     guessed, left_out : list of str
     """
 
@@ -70,6 +72,7 @@ class MjcfTree:
     ref: dict[int, float] = field(default_factory=dict)
     q_guess: dict[str, float] = field(default_factory=dict)
     springs: list[tuple[SpringSpec, str]] = field(default_factory=list)
+    joints: list[tuple[JointSpec, str]] = field(default_factory=list)
     guessed: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -78,7 +81,6 @@ class MjcfTree:
         self._links, self._joints = {"world", *self.compiled.bodies}, set(self.compiled.joints)
         self._start = model.key_qpos[0] if model.nkey else model.qpos0
         self._elements = {"world": add_link(self.robot, "world")}
-        self._armature: dict[str, float] = {}
         self.bodies.append(Placed("world", pin.SE3.Identity()))
         for number_ in range(1, model.nbody):
             self._body(number_)
@@ -96,16 +98,14 @@ class MjcfTree:
 
     def _notes(self, undrawn: int) -> None:
         model, names = self.model, self.compiled.bodies
-        rubbing = [self.compiled.joints[j] for j in model.dof_jntid[model.dof_frictionloss != 0]]
         notes = {
             "masses of shapes unknown here; give the link an <inertial>": self.compiled.unweighed,
             "gravity compensation of bodies": [names[k] for k in np.flatnonzero(model.body_gravcomp)],
-            "armature, the inertia of rotors behind gears (kg m^2 or kg)": [
-                f"{name} {number(x):g}" for name, x in self._armature.items()
-            ],
-            "dry friction, which stands in the URDF and does not act": list(dict.fromkeys(rubbing)),
         }
         self.left_out += [f"{what}: {some(which)}" for what, which in notes.items() if which]
+        stopped = [spec.name for spec, _ in self.joints if spec.stops]
+        if stopped:
+            self.guessed.append(f"ranges are hard stops without rebound here, MuJoCo's give way: {some(stopped)}")
         for k in np.flatnonzero(model.body_mocapid >= 0):
             self.left_out.append(f"body {names[k]} is moved from outside (mocap): it stands still here")
         if undrawn:
@@ -126,6 +126,7 @@ class MjcfTree:
             pose = self._free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
         elif on_world and is_free_root(joints) and not self.used & {joint.number for joint in joints}:
             self.guessed.append(f"the three slides and the ball of body {name} are one free joint, 'root'")
+            self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.stops]
             values = self._start[joints[0].at_qpos :]
             moved = sum(((x - j.ref) * j.axis for x, j in zip(values[:3], joints, strict=False)), np.zeros(3))
             pose = self._free(
@@ -182,8 +183,8 @@ class MjcfTree:
             self.springs.append((spec, "the joint's stiffness"))
         if joint.is_nonlinear:
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {joint.name}")
-        if joint.armature:
-            self._armature[joint.name] = joint.armature
+        if joint.armature or joint.stops:
+            self.joints.append((JointSpec(name=joint.name, armature=joint.armature or None, stops=joint.stops), ""))
         self.ref[joint.number] = number(joint.ref)
         self._guess([joint.name], [self._start[joint.at_qpos]])
 

@@ -41,6 +41,7 @@ def mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
         sites.add(name, frame)
     differs += add_loops(mechanism, root, sites)
     add_springs(mechanism, root, sites)
+    differs += _soft_joints(mechanism)
     _draw(mechanism, bodies, sites)
     _motors(mechanism, root)
     key = SubElement(root, "keyframe")
@@ -55,7 +56,7 @@ def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[i
     children: dict[int, list[int]] = {}
     for joint in range(1, model.njoints):
         children.setdefault(int(model.parents[joint]), []).append(joint)
-    names, bodies, order = _body_names(mechanism), {0: world}, []
+    names, bodies, order = mechanism.frames.bodies, {0: world}, []
     waiting = children.get(0, [])[::-1]
     while waiting:
         joint = waiting.pop()
@@ -66,16 +67,6 @@ def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[i
         order.append(joint)
         waiting += children.get(joint, [])[::-1]
     return [bodies[joint] for joint in range(model.njoints)], order
-
-
-def _body_names(mechanism: Mechanism) -> dict[int, str]:
-    """Name each body by the link that its joint carries, or by the joint where fixed joints made several one."""
-    names: dict[int, str] = {}
-    for link, frame in mechanism.frames.links.items():
-        if np.allclose(frame.rotation, np.eye(3)) and not frame.translation.any():
-            names.setdefault(frame.joint, link)
-    model = mechanism.tree.model
-    return {joint: names.get(joint, model.names[joint]) for joint in range(1, model.njoints)}
 
 
 def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
@@ -92,8 +83,28 @@ def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
     if springs.joint_stiffness[at]:
         element.set("stiffness", numbers(springs.joint_stiffness[at]))
         element.set("springref", numbers(springs.joint_rest[at]))
-    if model.armature[at]:
-        element.set("armature", numbers(model.armature[at]))
+    joints, (lower, upper) = mechanism.joints, mechanism.tree.limits()
+    for key, value in (("armature", model.armature[at]), ("frictionloss", joints.friction[at])):
+        if value:
+            element.set(key, numbers(value))
+    if np.isfinite(lower[at]) and lower[at] < upper[at]:
+        element.set("range", numbers(np.array([lower[at], upper[at]])))
+        element.set("limited", str(bool(joints.stopped[at])).lower())
+
+
+def _soft_joints(mechanism: Mechanism) -> list[str]:
+    """Say which joints have friction or stops, which give way in MuJoCo."""
+    joints, labels = mechanism.joints, np.array(mechanism.coordinates)
+    says = []
+    if joints.friction.any():
+        rubbing = ", ".join(labels[joints.friction > 0])
+        says.append(f"dry friction lets joints creep there: {rubbing}; set their solreffriction and solimpfriction")
+    if joints.stopped.any():
+        stopped = ", ".join(labels[joints.stopped])
+        says.append(f"stops are soft springs there: {stopped}; set their solreflimit and solimplimit")
+    if joints.restitution.any():
+        says.append(f"stops do not rebound there: {', '.join(labels[joints.restitution > 0])}")
+    return says
 
 
 def _inertials(mechanism: Mechanism, bodies: list[Element]) -> list[str]:

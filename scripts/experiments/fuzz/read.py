@@ -179,6 +179,8 @@ class _Reader:
 def read(texts: Mapping[str, str]) -> Model:
     """Read a mechanism from the texts of its files, "mechanism.toml" among them."""
     spec = tomllib.loads(texts["mechanism.toml"])
+    if spec.get("joint"):
+        raise NoJudge("rotors, friction or stops of joints")
     reader = _Reader()
     for tree in spec.get("tree", [{"file": spec.get("urdf")}]):
         reader.tree(texts[tree["file"]], tree)

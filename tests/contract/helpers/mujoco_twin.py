@@ -10,20 +10,21 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.formats.importing import Draft, read
+from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.springs import Springs
 
 ROOT = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Twin:
-    """`draft` is what `ckc import` made of a file, `model` what MuJoCo makes of it, without rotors' inertia."""
+    """`draft` is what `ckc import` made of a file, `model` what MuJoCo makes of it; rotors on tendons do not come."""
 
     def __init__(self, path: Path) -> None:
         self.draft: Draft = read(path)
         self.tree, self.frames, _ = self.draft.tree()
+        self.joints = Joints(self.tree, [spec for spec, _ in self.draft.joints])
         self.model: Any = mujoco.MjModel.from_xml_path(str(path))
-        for armature in (self.model.dof_armature, self.model.actuator_armature, self.model.tendon_armature):
-            armature[:] = 0.0
+        self.model.tendon_armature[:] = 0.0
         self.data: Any = mujoco.MjData(self.model)
 
     def labels(self, joint: int) -> list[str]:

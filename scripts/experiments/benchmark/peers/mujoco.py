@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.analysis.precision.motion import Motion
-from ckc_pin.analysis.precision.mujoco import Joints, model_of, set_up, stepper
+from ckc_pin.analysis.precision.mujoco import StateMap, model_of, set_up, stepper
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
@@ -66,7 +66,7 @@ class Mujoco:
         q_tree, v_tree = start_of(work)
         model = model_of(_text(work.mechanism))
         data = mujoco.MjData(model)
-        joints = Joints(work.mechanism, model)
+        joints = StateMap(work.mechanism, model)
         to = joints.put(data, q_tree, v_tree)
         mujoco.mj_forward(model, data)
         M = np.zeros((model.nv, model.nv))

@@ -1,0 +1,204 @@
+"""What `ckc check` says of a model before it moves: what it weighs, what its joints do, what may not be meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from ckc_pin import check, load
+from ckc_pin.formats.exporting import export
+from ckc_pin.mechanism.library import shipped
+from tests.conftest import assert_close
+from tests.contract.helpers.command import ckc
+
+HANGING = {"theta_1": -1.434, "theta_2": 0.248, "theta_3": -1.707, "theta_4": -0.248}
+
+
+def edit(path: Path, *changes: tuple[str, str]) -> None:
+    text = path.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding="utf-8")
+
+
+def add(bar: Path, tables: str) -> None:
+    edit(bar / "mechanism.toml", ("[[point]]", f"{tables}\n[[point]]"))
+
+
+def limit(bar: Path, joint: str, lower: float, upper: float) -> None:
+    limits = f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
+    edit(bar / "five_bar.urdf", (f'"{joint}" type="continuous">', f'"{joint}" type="revolute">{limits}'))
+
+
+def warnings(what: str) -> list[str]:
+    """In JSON, beside exit code 0, and the same on standard error."""
+    answer = ckc("check", what, "--json")
+    assert answer.code == 0
+    found: list[str] = answer.json["warnings"]
+    assert answer.err == "".join(f"warning: {warning}\n" for warning in found)
+    return found
+
+
+# --- mass and inertia ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_mass_and_inertia_are_mujocos(name: str) -> None:
+    """Summed over its bodies where its key frame puts them."""
+    mechanism = load(name)
+    found = check(mechanism)
+    model = mujoco.MjModel.from_xml_string(export(mechanism, "mjcf").text)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    mass = model.body_mass
+    arms = data.xipos - mass @ data.xipos / mass.sum()
+    turned = [
+        R.reshape(3, 3) @ np.diag(I) @ R.reshape(3, 3).T for R, I in zip(data.ximat, model.body_inertia, strict=True)
+    ]
+    inertia = sum(I + m * ((r @ r) * np.eye(3) - np.outer(r, r)) for I, m, r in zip(turned, mass, arms, strict=True))
+    assert_close(found.mass, mass.sum(), 1e-10 * mass.sum())
+    assert_close(found.inertia, inertia, 1e-9, relative=True)
+
+
+def test_mass_and_inertia_are_printed_and_in_the_json(bar: Path) -> None:
+    found = ckc("check", "bar", "--json").json
+    assert found["mass"] == pytest.approx(0.2451 + 2 * 0.2611 + 0.2352, rel=1e-14)
+    assert np.shape(found["inertia"]) == (3, 3)
+    shown = " ".join(ckc("check", "bar").out.split())
+    assert "moving mass 1.0025 kg" in shown
+    assert f"izz = {found['inertia'][2][2]:.6g} kg m^2, as assembled, about its centre of mass" in shown
+
+
+def test_what_weighs_nothing_has_no_inertia(bar: Path) -> None:
+    """Without a mass there is no centre of it."""
+    path = bar / "five_bar.urdf"
+    before, *links = path.read_text(encoding="utf-8").split("<inertial>")
+    path.write_text(before + "".join(link.partition("</inertial>")[2] for link in links), encoding="utf-8")
+    found = ckc("check", "bar", "--json").json
+    assert found["mass"] == 0.0
+    assert found["inertia"] == np.zeros((3, 3)).tolist()
+
+
+# --- joints ----------------------------------------------------------------------------------------
+
+
+def test_joints_that_do_something_are_listed(bar: Path) -> None:
+    limit(bar, "theta_2", -2.0, 2.5)
+    limit(bar, "theta_4", -2.5, 2.0)
+    dynamics = '<dynamics damping="0.3" friction="0.25"/>'
+    edit(bar / "five_bar.urdf", ('"theta_1" type="continuous">', f'"theta_1" type="continuous">{dynamics}'))
+    add(
+        bar,
+        '[[joint]]\nname = "theta_1"\narmature = 0.5\n'
+        '[[joint]]\nname = "theta_2"\nstops = true\nrestitution = 0.75\n'
+        '[[joint]]\nname = "theta_3"\ndamping = 0.125\n',
+    )
+    nothing = {"armature": 0.0, "damping": 0.0, "friction": 0.0, "lower": None, "upper": None, "restitution": 0.0}
+    assert ckc("check", "bar", "--json").json["joints"] == {
+        "theta_1": nothing | {"armature": 0.5, "damping": 0.3, "friction": 0.25},
+        "theta_2": nothing | {"lower": -2.0, "upper": 2.5, "restitution": 0.75},
+    }
+    shown = [" ".join(line.split()) for line in ckc("check", "bar").out.splitlines()]
+    assert "joint armature damping friction stops restitution" in shown
+    assert "theta_1 0.5 0.3 0.25" in shown
+    assert "theta_2 0 0 0 -2 to 2.5 0.75" in shown
+    assert warnings("bar") == [
+        "joint limits are no walls, a run may pass them: theta_4; stops = true in their [[joint]] makes them walls"
+    ]
+
+
+def test_joints_that_do_nothing_are_not(bar: Path) -> None:
+    assert ckc("check", "bar", "--json").json["joints"] == {}
+    assert "armature" not in ckc("check", "bar").out
+
+
+# --- findings --------------------------------------------------------------------------------------
+
+
+def test_links_that_move_without_mass_are_named(bar: Path) -> None:
+    """One without <inertial>, one of mass 0; a frame on a link with mass moves too, and is none."""
+    text = (bar / "five_bar.urdf").read_text(encoding="utf-8")
+    link_4 = text[text.index('<link name="link_4">') :].partition("<visual>")[0]
+    edit(bar / "five_bar.urdf", ('<mass value="0.2451"/>', '<mass value="0"/>'), (link_4, '<link name="link_4">'))
+    assert warnings("bar") == [
+        "links that move without mass (no <inertial>, or its mass is 0): link_1, link_4",
+    ]
+
+
+def test_crosses_of_universal_joints_are_not() -> None:
+    """Delta's arms swing about two axes through one point, by a link that has neither mass nor length."""
+    mechanism = load("delta")
+    assert any(body.mass == 0 for body in list(mechanism.tree.model.inertias)[1:])
+    assert check(mechanism).warnings == ()
+
+
+def test_springs_that_do_nothing_are_named(bar: Path) -> None:
+    """A damper is no such spring."""
+    add(bar, '[[spring]]\njoint = "theta_1"\ndamping = 1.0\n[[spring]]\njoint = "theta_2"\nrest = 0.1')
+    assert warnings("bar") == ["spring 2 does nothing: it has neither stiffness nor damping"]
+
+
+@pytest.mark.parametrize(("off", "is_far"), [(0.45, False), (-0.45, False), (0.55, True), (-0.55, True)])
+def test_an_assembly_far_from_the_guess_is_named(off: float, is_far: bool, bar: Path) -> None:
+    """More than half a radian; a coordinate that the guess does not name has none to be far from."""
+    shifted = HANGING["theta_4"] - off
+    edit(bar / "mechanism.toml", ("theta_2 = 0.248\n", ""), ("theta_4 = -0.248", f"theta_4 = {shifted!r}"))
+    at = ckc("check", "bar", "--json").json["q_tree"][3]
+    wanted = f"theta_4 = {at:.4g} (guess {shifted:.4g})"
+    said = f"assembled more than 0.5 rad, or 0.5 of the size 0.305 m, from q_guess: {wanted}"
+    assert at == pytest.approx(HANGING["theta_4"], abs=1e-3)
+    assert warnings("bar") == ([said] if is_far else [])
+
+
+def test_a_slide_is_far_by_the_size_of_the_mechanism(tmp_path: Path) -> None:
+    """A block held 0.6 m along its slide, whose guess is 0 and whose size 1 m."""
+    (tmp_path / "s.urdf").write_text(
+        '<robot name="s"><link name="base"/><link name="block"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
+        'izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="along" type="prismatic"><parent link="base"/>'
+        '<child link="block"/><origin xyz="0 1 0"/><axis xyz="1 0 0"/></joint></robot>',
+        encoding="utf-8",
+    )
+    for reach, far in ((0.4, []), (0.6, ["along = 0.6 (guess 0)"])):
+        (tmp_path / "mechanism.toml").write_text(
+            'name = "s"\nurdf = "s.urdf"\nq_guess = {along = 0.0}\n[[loop]]\nname = "held"\ntype = "point"\n'
+            f'frame_a = "block"\nframe_b = {{link = "world", xyz = [{reach}, 1.0, 0.0]}}\n',
+            encoding="utf-8",
+        )
+        said = [warning.partition("from q_guess: ")[2] for warning in check(tmp_path / "mechanism.toml").warnings]
+        assert said == far
+
+
+def test_a_start_outside_joint_limits_is_named(bar: Path) -> None:
+    """The assembled configuration of a mechanism, the start of a scene."""
+    limit(bar, "theta_1", -1.5, -1.2)
+    add(bar, '[[joint]]\nname = "theta_1"\nstops = true')
+    assert warnings("bar") == []
+    assert warnings("bar/swing.scene.toml") == [
+        "the start is outside joint limits: theta_1 = -0.934309 (limits -1.5 to -1.2)"
+    ]
+    edit(bar / "five_bar.urdf", ('lower="-1.5" upper="-1.2"', 'lower="-1" upper="-0.5"'))
+    assert warnings("bar/swing.scene.toml") == []
+    assert warnings("bar") == [
+        "the assembled configuration is outside joint limits: theta_1 = -1.434 (limits -1 to -0.5)"
+    ]
+
+
+def test_at_a_limit_is_inside(bar: Path) -> None:
+    """But for rounding."""
+    limit(bar, "theta_1", -1.434 + 1e-12, 0.0)
+    add(bar, '[[joint]]\nname = "theta_1"\nstops = true')
+    assert warnings("bar") == []
+
+
+def test_a_scene_without_a_start_is_no_error(bar: Path) -> None:
+    """`ckc run` refuses it; what can be said of the mechanism is said."""
+    limit(bar, "theta_2", -3.0, 3.0)
+    add(bar, '[[joint]]\nname = "theta_2"\nstops = true')
+    edit(bar / "swing.scene.toml", ("theta_1 = -0.934308508090164", "theta_1 = 3.0"))
+    (said,) = warnings("bar/swing.scene.toml")
+    assert said.startswith("initial: the start theta_1 = 3, theta_3 = -1.20733 is out of reach")
