@@ -36,7 +36,8 @@ from ckc_pin.simulation.workspace import leaving
 
 __all__ = ["inverse_dynamics"]
 
-LEFT_OVER = 1e-7  # of the forces along a freedom: what the actuators may leave over, rounding
+LEFT_OVER = 1e-7  # of the forces along a freedom: rounding, which no actuator needs to produce
+DEAD = 1e-7  # of a motion: what an actuator moves by where it is at a dead centre
 
 
 @dataclass(frozen=True)
@@ -156,14 +157,10 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
     u_tree = np.zeros(mechanism.n)
     u_tree[actuation.at] = instant.tau
-    u_tree[actuation.at] += actuation.distribute(tangent, tangent.T @ (needed - u_tree))
-    left_over = np.abs(tangent.T @ (needed - u_tree))
-    sizes = np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
-    if np.any(left_over > LEFT_OVER * sizes.max(initial=0.0)):
-        loose = mechanism.coordinates[int(np.argmax(np.abs(tangent @ (tangent.T @ (needed - u_tree)))))]
-        raise NumericalError(
-            f"the actuators cannot produce the motion along {loose} at t = {t:.6g} s: they hold it no longer there", t=t
-        )
+    lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
+    if np.any(np.abs(lacking) > enough):
+        _require_grip(mechanism, tangent, actuation, t)
+    u_tree[actuation.at] += actuation.distribute(tangent, lacking)
     forces = multipliers(terms, u_tree + friction, acceleration)
     return {
         "t": t,
@@ -175,6 +172,17 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
         "loop_wrenches": loop_wrenches(terms, forces),
         "joint_forces": joint_wrenches(terms, acceleration, forces),
     }
+
+
+def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t: float) -> None:
+    """Refuse a configuration where some freedom is held by no actuator, as at a rocker's dead centre."""
+    motions = tangent / mechanism.tree.reach[:, None]
+    motions, _ = np.linalg.qr(motions)  # of one size, in radians or the mechanism's size
+    grip = motions[actuation.at]
+    values, directions = np.linalg.eigh(grip.T @ grip)
+    if values[0] <= DEAD**2:
+        loose = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
+        raise NumericalError(f"the motion along {loose} is held by no actuator at t = {t:.6g} s", t=t)
 
 
 # --- motions -------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 import ckc_pin
 from ckc_pin import inverse_dynamics
+from ckc_pin.mechanism.library import library
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, Array, FiveBar, desired
 from tests.conftest import assert_close
 
@@ -134,6 +136,66 @@ def test_four_bar_as_free_bodies() -> None:
         for joint in names:
             assert_close(found.joint_forces[joint][k, 2:5], 0, 1e-10 * scale)
         assert_close(found.loop_wrenches["coupler_pin"][k], [*pins[2], 0, 0, 0, 0], 1e-10 * scale)
+
+
+def test_at_its_dead_centre_a_rocker_drives_nothing(tmp_path: Path) -> None:
+    """Crank and coupler in line at t = 0.5 s: before, its torque is the crank's over the ratio of their rates."""
+    in_line = CRANK + COUPLER
+    dead = np.arccos((in_line**2 + GROUND**2 - ROCKER**2) / (2 * in_line * GROUND))
+    shutil.copytree(library() / "four_bar", tmp_path / "bar")
+    driven = tmp_path / "bar" / "mechanism.toml"
+    driven.write_text(driven.read_text().replace("[q_guess]", 'actuated = ["rocker"]\n\n[q_guess]'))
+    desired_crank = {"offset": dead, "harmonics": [[0.3, np.pi, -np.pi / 2]]}
+    controller = {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": {"crank": desired_crank}}
+    changes = {"controller": controller, "t_end": 1.0, "solver.output_dt": 0.1}
+    found = inverse_dynamics(tmp_path / "bar" / "turning.scene.toml", changes)
+    assert found.status == "stopped"
+    assert "the motion along" in found.message
+    assert "held by no actuator at t = 0.5 s" in found.message
+    assert_close(found.t, [0.0, 0.1, 0.2, 0.3, 0.4], 1e-15)
+    crank = inverse_dynamics("four_bar/turning", changes)
+    assert crank.status == "done"
+    assert_close(crank.a_tree[:5], found.a_tree, 1e-12)
+    for k, t in enumerate(found.t):
+        phase = np.pi * t - np.pi / 2
+        rates = bars(dead + 0.3 * np.sin(phase), 1.0, 0.0)[1]
+        assert_close(found.tau[k], crank.tau[k] / rates[2], 1e-9 * abs(found.tau[k, 0]))
+
+
+def test_a_rod_from_the_world_pulls_it_as_it_pulls_the_coupler(tmp_path: Path) -> None:
+    """The rocker as a rod without mass, either end first: on the world it is what the coupler gets, turned round."""
+    forces = []
+    for world_first in (True, False):
+        folder = tmp_path / str(world_first)
+        shutil.copytree(library() / "four_bar", folder)
+        text = (folder / "mechanism.toml").read_text().partition("[[loop]]")[0].replace("rocker = 1.6\n", "")
+        ends = ['{link = "world", xyz = [1.1, 0.0, 0.0]}', '{link = "coupler_link", xyz = [1.2, 0.0, 0.0]}']
+        a, b = ends if world_first else ends[::-1]
+        loop = f'[[loop]]\nname = "rod"\ntype = "distance"\nlength = 0.75\nframe_a = {a}\nframe_b = {b}\n'
+        (folder / "mechanism.toml").write_text(text.replace('["crank"]', '["crank", "rocker"]') + loop)
+        quiet = {"harmonics": [[0.4, 5.0, 0.0]]}
+        desired_crank = {"offset": np.pi / 2, "harmonics": [[0.4, 5.0, 0.0]]}
+        controller = {
+            "type": "tracking",
+            "Lambda": 1.0,
+            "K_D": 1.0,
+            "desired": {"crank": desired_crank, "rocker": quiet},
+        }
+        initial = {"at": "assembled"}
+        changes = {"controller": controller, "initial": initial, "t_end": 0.5, "solver.output_dt": 0.05}
+        forces.append(inverse_dynamics(folder / "turning.scene.toml", changes))
+    on_world, on_coupler = (found.loop_wrenches["rod"] for found in forces)
+    assert_close(on_world[:, :3], -on_coupler[:, :3], 1e-11)
+    assert_close(on_world[:, 3:], 0, 1e-11)
+    assert_close(on_coupler[:, 3:], 0, 1e-11)
+    mechanism = forces[0].mechanism
+    for k, q in enumerate(forces[0].q_tree):
+        coupler = mechanism.frames.find(mechanism.spec.loop[0].frame_b, "rod")
+        at = mechanism.kinematics(q).pose
+        rod = at.rotation[coupler.joint] @ coupler.translation + at.translation[coupler.joint] - [1.1, 0, 0]
+        assert_close(np.linalg.norm(rod), 0.75, 1e-12)
+        pull = forces[0].loop_forces["rod"][k, 0]
+        assert_close(on_coupler[k, :3], pull * rod / 0.75, 1e-10 * max(1.0, abs(pull)))
 
 
 # --- closed forms ----------------------------------------------------------------------------------
