@@ -143,9 +143,11 @@ def collected(
 
 
 def _exceeded(t: Array, tau: Array, limit: Array | None, motors: Sequence[str]) -> list[dict[str, Any]]:
-    found = []
-    for k, motor in enumerate(motors if limit is not None else ()):
-        size, most = np.abs(tau[:, k]), float(limit[k]) if limit is not None else np.inf
+    found: list[dict[str, Any]] = []
+    if limit is None:
+        return found
+    for k, motor in enumerate(motors):
+        size, most = np.abs(tau[:, k]), float(limit[k])
         beyond = np.flatnonzero(size > most * (1 + BEYOND))
         if len(beyond):
             peak = int(np.argmax(size))

@@ -169,7 +169,7 @@ def inverse_table(found: MotionForces) -> Group:
     from rich.console import Group
     from rich.text import Text
 
-    table = _plain_table("")
+    table = _plain_table("of the motion")
     for title in ("largest", "at t, s"):
         table.add_column(title, justify="right")
     beyond = {entry["motor"]: entry for entry in found.exceeded}

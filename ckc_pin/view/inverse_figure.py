@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_inverse", "save_inverse"]
 
+TITLED = 3  # motors; more would be longer than their panel
 NAMED = 12  # curves; more would hide what their legend names
 
 
@@ -55,8 +56,11 @@ def _efforts(ax: Any, found: MotionForces) -> None:
                 limit = beyond[motor]["limit"]
                 if np.any(side * found.tau[:, k] > limit):
                     ax.axhline(side * limit, color=colours[motor], linestyle="--", linewidth=0.9)
-    title = f"motors, beyond their limits (dashed): {', '.join(symbol(x) for x in beyond)}" if beyond else "motors"
-    ax.set(title=title, ylabel=rf"$\tau$, {units(found.mechanism, found.actuated, 'N m', 'N')}")
+    names = ", ".join(symbol(motor) for motor in beyond) if len(beyond) <= TITLED else f"{len(beyond)} of them"
+    ax.set(
+        title=f"motors, beyond their limits (dashed): {names}" if beyond else "motors",
+        ylabel=rf"$\tau$, {units(found.mechanism, found.actuated, 'N m', 'N')}",
+    )
     _legend(ax)
 
 
