@@ -25,7 +25,19 @@ from ckc_pin.mechanism import Mechanism
 if TYPE_CHECKING:
     from ckc_pin.generated.symbolic import Symbolic
     from ckc_pin.kinematics.mapped import SingularityMap
-    from ckc_pin.simulation import Check, Event, Run, Scene, Simulator, as_ivp, check, load_scene, simulate
+    from ckc_pin.simulation import (
+        Check,
+        Event,
+        MotionForces,
+        Run,
+        Scene,
+        Simulator,
+        as_ivp,
+        check,
+        inverse_dynamics,
+        load_scene,
+        simulate,
+    )
 
 __all__ = [
     "Check",
@@ -34,6 +46,7 @@ __all__ = [
     "InputError",
     "Mechanism",
     "MechanismError",
+    "MotionForces",
     "NumericalError",
     "Point",
     "Run",
@@ -43,6 +56,7 @@ __all__ = [
     "Terms",
     "as_ivp",
     "check",
+    "inverse_dynamics",
     "load",
     "load_scene",
     "play",

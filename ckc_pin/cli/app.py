@@ -33,6 +33,7 @@ COMMANDS = {
     "terms": "look:terms",
     "compile": "look:compile_",
     "run": "run:run",
+    "inverse": "inverse:inverse",
     "plot": "view:plot",
     "play": "view:play",
     "map": "map:map_",

@@ -100,6 +100,23 @@ class Actuation:
                 f"the motion along {loose} is held by none of them"
             )
 
+    def distribute(self, tangent: Array, force: Array) -> Array:
+        """Return the tau of minimum norm that does what a force on the mechanism does, unlimited.
+
+        Parameters
+        ----------
+        tangent : (n, d) array
+            Basis of the velocities that the loops allow; rho, or any other.
+        force : (d,) array
+            Along that basis: tangent^T u'.
+
+        Returns
+        -------
+        (actuators,) array
+            Where they cannot do it, as nearly as they can.
+        """
+        return np.asarray(np.linalg.lstsq(tangent[self.at].T, force, rcond=1e-9)[0], dtype=float)
+
     def apply(self, terms: Terms, u: Array) -> Effort:
         """Map u to tau (minimum norm when there are more actuators than freedoms) and limit it.
 
@@ -113,10 +130,9 @@ class Actuation:
         u = require_u(u, self.mechanism)
         if not np.isfinite(u).all():
             raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
-        transmission = terms.rho[self.at].T  # u = transmission tau
-        tau = u if self.direct else np.asarray(np.linalg.lstsq(transmission, u, rcond=1e-9)[0], dtype=float)
+        tau = u if self.direct else self.distribute(terms.rho, u)
         if self.limit is not None:
             tau = np.clip(tau, -self.limit, self.limit)
         u_tree = np.zeros(self.mechanism.n)
         u_tree[self.at] = tau
-        return Effort(tau, u_tree, tau if self.direct else transmission @ tau)
+        return Effort(tau, u_tree, tau if self.direct else terms.rho[self.at].T @ tau)

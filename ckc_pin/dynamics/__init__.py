@@ -8,13 +8,18 @@ from ckc_pin.dynamics.formulations import (
     spf_terms,
     spf_z_dot,
     tangent_basis,
+    tree_force,
 )
+from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms, terms
 
 __all__ = [
     "Terms",
     "dae_acceleration",
+    "friction_force",
     "h_gradient",
+    "joint_wrenches",
+    "loop_wrenches",
     "multipliers",
     "reduced_acceleration",
     "spf_terms",
@@ -22,4 +27,5 @@ __all__ = [
     "stable_equilibrium",
     "tangent_basis",
     "terms",
+    "tree_force",
 ]

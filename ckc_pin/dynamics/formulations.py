@@ -24,6 +24,7 @@ __all__ = [
     "spf_terms",
     "spf_z_dot",
     "tangent_basis",
+    "tree_force",
 ]
 
 CoriolisVelocity = Literal["rho", "actual"]
@@ -134,7 +135,11 @@ def multipliers(terms: Terms, u_tree: Array, acceleration: Array) -> Array:
 
     For point rows they are the force that the loop exerts on frame A, in newtons.
     """
-    force = terms.D_tree @ acceleration + terms.bias_tree - u_tree
-    if terms.mechanism.springs.any_damping:
-        force -= terms.damping_force
+    force = tree_force(terms, acceleration) - u_tree
     return np.asarray(np.linalg.lstsq(terms.at.J.T, force, rcond=1e-9)[0])
+
+
+def tree_force(terms: Terms, acceleration: Array) -> Array:
+    """What actuators and loops together must do to the tree, D' a + C' v' + h' less what dampers do: shape (n,)."""
+    force = terms.D_tree @ acceleration + terms.bias_tree
+    return force - terms.damping_force if terms.mechanism.springs.any_damping else force

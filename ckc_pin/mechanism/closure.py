@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
-from ckc_pin.mechanism.pose import Anchors, Pose, Rate
+from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
@@ -57,6 +57,18 @@ class Closure:
         for group in self.groups:
             jacobian[group.out] = group.jacobian(pose)
         return jacobian
+
+    def body_jacobian(self, pose: Pose) -> Array:
+        """d phi / d (the bodies' own velocities) as `BodyPose` has them, shape (rows, joints, 6).
+
+        Rows of couplings are zero: they hold coordinates, not bodies.
+        """
+        bodies = BodyPose(pose, self.anchors)
+        jacobian = np.zeros((len(self.names), bodies.linear_part.shape[1]))
+        for group in self.groups:
+            if not isinstance(group, Affine):
+                jacobian[group.out] = group.jacobian(bodies)
+        return jacobian.reshape(len(self.names), len(pose.translation), 6)
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         """Time derivative of J along a velocity, shape (rows, n)."""

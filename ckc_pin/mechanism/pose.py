@@ -9,7 +9,7 @@ import numpy as np
 from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
-__all__ = ["Anchors", "Pose", "Rate", "cross"]
+__all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
 
 # _LEVER[3 * b + i, a] = epsilon_iab, so that (omega x p)_i = sum_ab epsilon_iab omega_a p_b
 _LEVER = np.zeros((9, 3))
@@ -65,6 +65,11 @@ class Pose:
         self.linear_part = jacobian[:3]
         self.angular_part = jacobian[3:]
 
+    @property
+    def support(self) -> Array:
+        """Which columns of a Jacobian move which joint, shape (joints, 1, columns)."""
+        return self.tree.support
+
     @lazy
     def p(self) -> Array:
         """World positions of the points, shape (2 k, 3), metres."""
@@ -86,7 +91,7 @@ class Pose:
     def p_jacobian(self) -> Array:
         """Jacobians of the points, shape (2 k, 3, n)."""
         moved = (self.p @ self.lever).reshape(len(self.p), 3, -1) + self.linear_part
-        return self.tree.support[self.anchors.point_joint] * moved
+        return self.support[self.anchors.point_joint] * moved
 
     @lazy
     def r_jacobian(self) -> Array:
@@ -107,7 +112,34 @@ class Pose:
 
     def angular(self, joint: IntArray) -> Array:
         """Angular Jacobians of joints, shape (k, 3, n)."""
-        return self.tree.support[joint] * self.angular_part
+        return self.support[joint] * self.angular_part
+
+
+class BodyPose(Pose):
+    """A pose whose Jacobians have six columns for each joint's body, the world's too: columns 6 k to 6 k + 5.
+
+    They belong to the body's velocity, linear at the world's origin and angular, both in world axes. What such a
+    Jacobian, transposed, makes of a row's multiplier is the wrench on each body: force, moment about the origin.
+
+    Parameters
+    ----------
+    pose : Pose
+        Where the bodies are.
+    anchors : Anchors
+        Whose Jacobians.
+    """
+
+    def __init__(self, pose: Pose, anchors: Anchors) -> None:
+        self.tree, self.anchors, self.q_tree = pose.tree, anchors, pose.q_tree
+        self.rotation, self.translation = pose.rotation, pose.translation
+        bodies = len(pose.translation)
+        self.linear_part = np.tile(np.eye(3, 6), bodies)
+        self.angular_part = np.tile(np.eye(3, 6, 3), bodies)
+
+    @lazy
+    def support(self) -> Array:
+        """Each body by its own six columns alone, shape (joints, 1, 6 joints)."""
+        return np.repeat(np.eye(len(self.translation)), 6, axis=1)[:, None, :]
 
 
 class Rate:

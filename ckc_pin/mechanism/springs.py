@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.frames import Frames
-from ckc_pin.mechanism.pose import Anchors, Pose, Rate
+from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.spec import ForceSpec, SpringSpec
 from ckc_pin.mechanism.tree import Array, Tree
 
@@ -107,6 +107,26 @@ class Springs:
             force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
         return force
 
+    def body_wrenches(self, pose: Pose, v_tree: Array) -> Array:
+        """What springs and dampers between frames do to the bodies that they hold on to.
+
+        Parameters
+        ----------
+        pose : Pose
+            Where the bodies are.
+        v_tree : (n,) array
+
+        Returns
+        -------
+        (joints, 6) array
+            Force, N, and moment about the world's origin, N m, in world axes, on the body of each joint; 0: the world.
+        """
+        if not self.between_frames:
+            return np.zeros((len(pose.translation), 6))
+        length, length_jacobian = self._lengths(pose.q_tree)
+        pull = self.stiffness * (length - self.rest_length) + self.damping * (length_jacobian @ v_tree)
+        return -(pull @ _stretching(BodyPose(pose, self.anchors))[1]).reshape(-1, 6)
+
     def energy(self, q_tree: Array) -> float:
         """Energy stored, joules; what a constant force has left to give counts, zero at coordinate zero."""
         coordinates = q_tree[self.tree.place]
@@ -118,11 +138,15 @@ class Springs:
         return energy
 
     def _lengths(self, q_tree: Array) -> tuple[Array, Array]:
-        """Lengths (k,) and their Jacobian (k, n); a spring of length zero has no direction to pull in."""
-        pose = Pose(self.tree, self.anchors, q_tree)
-        length = np.sqrt(np.sum(pose.r**2, axis=1))
-        along = pose.r / np.where(length > 0, length, 1.0)[:, None]
-        return length, (along[:, None, :] @ pose.r_jacobian)[:, 0, :]
+        """Lengths (k,) and their Jacobian (k, n)."""
+        return _stretching(Pose(self.tree, self.anchors, q_tree))
+
+
+def _stretching(pose: Pose) -> tuple[Array, Array]:
+    """Lengths of the pairs (k,) and their Jacobian; a spring of length zero has no direction to pull in."""
+    length = np.sqrt(np.sum(pose.r**2, axis=1))
+    along = pose.r / np.where(length > 0, length, 1.0)[:, None]
+    return length, (along[:, None, :] @ pose.r_jacobian)[:, 0, :]
 
 
 def _forbid(where: str, kind: str, spec: SpringSpec, keys: tuple[str, ...]) -> None:

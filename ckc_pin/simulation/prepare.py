@@ -32,7 +32,7 @@ from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene, SceneSpec
 
-__all__ = ["Prepared", "prepare", "scene_controller", "scene_mechanism"]
+__all__ = ["Prepared", "output_instants", "prepare", "scene_controller", "scene_mechanism"]
 
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
@@ -144,7 +144,7 @@ def prepare(
     NumericalError
         Its start is singular.
     """
-    instants = np.zeros(0) if free else _output_instants(scene)  # refused before anything is loaded
+    instants = np.zeros(0) if free else output_instants(scene)  # refused before anything is loaded
     mechanism = scene_mechanism(scene)
     texts: dict[str, str] = {}
     spec = scene.spec.controller
@@ -186,7 +186,8 @@ def _library(mechanism: Mechanism, terms: str) -> Library | None:
     return compiled(mechanism) if terms == "generated" else find(mechanism)
 
 
-def _output_instants(scene: Scene) -> Array:
+def output_instants(scene: Scene) -> Array:
+    """Return when a run of a scene is recorded, s (InputError where that is too often)."""
     t_end, output_dt = scene.spec.t_end, scene.spec.solver.output_dt
     if output_dt is None:
         return np.unique(np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float))  # fewer in a t_end of a few denormals

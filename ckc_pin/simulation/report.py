@@ -20,9 +20,14 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-__all__ = ["check_plain", "check_table", "profile_table", "run_table", "terms_plain", "terms_table", "to_json"]
+    from ckc_pin.simulation.motion_forces import MotionForces
+
+__all__ = ["check_plain", "check_table", "inverse_plain", "inverse_table", "profile_table", "run_table", "terms_plain",
+           "terms_table", "to_json"]  # fmt: skip
 
 MOST_EVENTS = 10  # in a table for people
+SPATIAL = (slice(0, 3), slice(3, 6))  # force and moment of a wrench
+NO_MOMENT = 1e-9  # of the force on the arm of the mechanism's size
 LONG = 10.0  # s: what compiling a mechanism's terms takes at most, as a rule
 AXES = tuple(combinations_with_replacement(enumerate("xyz"), 2))
 TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
@@ -150,6 +155,65 @@ def run_table(run: Run) -> Table:
     called = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
     table.add_row("work", f"{work}, {stats['factorizations']} factorizations{called}, {stats['wall_s']:.2g} s")
     return table
+
+
+def inverse_plain(found: MotionForces) -> dict[str, Any]:
+    """Return what a motion needs as JSON-ready data."""
+    loops = {}
+    for loop, multipliers in found.loop_forces.items():
+        wrench = found.loop_wrenches.get(loop)
+        loops[loop] = {
+            "rows": found.rows(loop),
+            "multipliers": multipliers.tolist(),
+            "force": None if wrench is None else wrench[:, :3].tolist(),
+            "moment": None if wrench is None else wrench[:, 3:].tolist(),
+        }
+    return {
+        **{name: getattr(found, name).tolist() for name in ("t", "q_tree", "v_tree", "a_tree", "tau")},
+        "coordinates": found.coordinates,
+        "actuated": found.actuated,
+        "loop_forces": loops,
+        "joint_forces": {joint: wrench.tolist() for joint, wrench in found.joint_forces.items()},
+        "exceeded": found.exceeded,
+        "redundant": found.mechanism.redundant,
+        "status": found.status,
+        "message": found.message,
+    }
+
+
+def inverse_table(found: MotionForces) -> Group:
+    """Return what a motion needs for people: the largest of each, and when."""
+    from rich.console import Group
+    from rich.text import Text
+
+    table = _plain_table("of the motion")
+    for title in ("largest", "at t, s"):
+        table.add_column(title, justify="right")
+    beyond = {entry["motor"]: entry for entry in found.exceeded}
+    table.add_column("limit")
+    lengths = dict(zip(found.coordinates, found.mechanism.tree.in_metres.tolist(), strict=True))
+    for k, motor in enumerate(found.actuated):
+        unit = "N" if lengths[motor] else "N m"
+        limit = np.inf if found.limit is None else found.limit[k]
+        says = f"{limit:.4g} {unit}" if np.isfinite(limit) else ""
+        if motor in beyond:
+            says += f", exceeded from t = {beyond[motor]['t']:.4g} s on"
+        table.add_row(f"motor {motor}", *_largest(found.t, np.abs(found.tau[:, k]), unit), says)
+    for loop, multipliers in found.loop_forces.items():
+        if loop not in found.loop_wrenches:
+            table.add_row(f"coupling {loop}", *_largest(found.t, np.abs(multipliers[:, 0]), ""))
+            continue
+        force, moment = (np.linalg.norm(found.loop_wrenches[loop][:, part], axis=1) for part in SPATIAL)
+        if force.any() or not moment.any():
+            table.add_row(f"loop {loop}", *_largest(found.t, force, "N"))
+        if moment.max() > NO_MOMENT * found.mechanism.size * force.max():
+            table.add_row(f"loop {loop}, moment", *_largest(found.t, moment, "N m"))
+    return Group(table, Text(found.message))
+
+
+def _largest(t: Array, sizes: Array, unit: str) -> tuple[str, str]:
+    at = int(np.argmax(sizes))
+    return f"{sizes[at]:.4g} {unit}", f"{t[at]:.4g}"
 
 
 def _would_pay(run: Run) -> str:

@@ -12,7 +12,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["DesiredCheck", "follow_desired"]
+__all__ = ["DesiredCheck", "follow_desired", "leaving"]
 
 SAMPLES = 1000
 REFINEMENTS = 50  # bisections: to 1e-15 of a sample interval
@@ -48,7 +48,7 @@ def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> Desi
     for t in times[1:]:
         moved = _move(mechanism, at, desired, float(t))
         if moved is None:
-            return _leaving(mechanism, desired, at, t_at, float(t))
+            return leaving(mechanism, desired, at, t_at, float(t))
         at, t_at = moved, float(t)
         way.append((t_at, at.sigma_min(), at))
     return _closest(mechanism, desired, way)
@@ -65,7 +65,7 @@ def _move(
     return outcome.at if outcome.verdict == "converged" else None
 
 
-def _leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: float, outside: float) -> DesiredCheck:
+def leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: float, outside: float) -> DesiredCheck:
     """Bisect for the last instant that can be reached, along the way: within a sample nothing is behind a gap."""
     for _ in range(REFINEMENTS):
         middle = 0.5 * (inside + outside)

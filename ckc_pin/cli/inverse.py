@@ -1,0 +1,64 @@
+"""What a motion asks of motors, loops and joints: inverse."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
+from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import alone_in
+from ckc_pin.simulation.arguments import read_changes
+from ckc_pin.simulation.report import inverse_plain, inverse_table
+
+__all__ = ["inverse"]
+
+
+@click.command(
+    epilog=options.examples(
+        "ckc inverse five_bar/tracking --out forces",
+        "ckc inverse five_bar/tracking --set controller.torque_limit=1.2 --json",
+        "ckc inverse runs/spf",
+    )
+)
+@click.argument("what", metavar="SCENE|RUN", help="A scene with a desired motion, or a run: its file or its folder.")
+@options.changes
+@click.option("--out", metavar="DIR", type=Path, help="Folder for inverse.npz and the figure.")
+@options.as_json
+def inverse(what: str, changes: tuple[str, ...], out: Path | None, as_json: bool) -> None:
+    """Motor torques, loop and joint forces along a motion. The scene's desired one, or that of a run."""
+    if out is not None:
+        make_folder(out)
+    with ProgressBar(what) as progress:
+        found = ckc_pin.inverse_dynamics(what, read_changes("--set", changes), progress=progress)
+    if out is not None:
+        _write(found, out)
+    if as_json:
+        print_json(inverse_plain(found))
+    else:
+        print_table(inverse_table(found))
+        if out is not None:
+            print(f"written to {out}")
+    sys.stdout.flush()
+    if found.status != "done":
+        errors().print(found.message)
+        raise click.exceptions.Exit(STOPPED if found.status == "stopped" else interrupted(found.message))
+
+
+def _write(found: ckc_pin.MotionForces, out: Path) -> None:
+    """Save the forces, whatever signals come, then draw them."""
+    with interrupts.deferred(), ExitStack() as stack:
+        stack.enter_context(alone_in(out))
+        found.save(out / "inverse.npz")
+        try:
+            from ckc_pin.view.inverse_figure import save_inverse
+
+            save_inverse(found, out)
+        except InputError as error:  # matplotlib is an extra; the forces are saved
+            errors().print(f"no figure: {error}")

@@ -1,0 +1,244 @@
+"""Inverse dynamics: what motors, loops and joints must bear along a prescribed motion, or bore along a recorded one.
+
+Of a recorded run the accelerations are those of eq. 1 with the efforts that it recorded, instant by instant, so that
+these come back, with their share within the mechanism, and nothing is lost between output instants. Dry friction and
+stops do something to a motion that no effort tells (a joint that sticks, an impact): then the recorded rates are
+differentiated, by a quintic spline, and the efforts are the nearest ones to those recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Tracking
+from ckc_pin.control.desired import FEWEST, Desired, Table
+from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
+from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.linear import one_blas_thread
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.motion_forces import MotionForces, collected
+from ckc_pin.simulation.prepare import output_instants, scene_controller, scene_mechanism
+from ckc_pin.simulation.run import Run, Status
+from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.workspace import leaving
+
+__all__ = ["inverse_dynamics"]
+
+LEFT_OVER = 1e-7  # of the forces along a freedom: rounding, which no actuator needs to produce
+DEAD = 1e-7  # of a motion: what an actuator moves by where it is at a dead centre
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """One instant of a motion: the acceleration that the loops allow, and efforts that the wanted ones are next to."""
+
+    t: float
+    terms: Terms
+    acceleration: Array
+    tau: Array
+
+
+def inverse_dynamics(
+    what: Scene | Run | str | Path,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    progress: Callable[[float, float], None] | None = None,
+) -> MotionForces:
+    """Find the efforts, loop forces and joint forces of a motion.
+
+    Parameters
+    ----------
+    what : Scene, Run, str or Path
+        A scene, its shipped name or its path: the motion is what its controller wants (``controller.desired``,
+        of coordinates or of a point; of a set point, to rest there), on the assembly branch of its start. Or a run,
+        its file or its folder: the motion is the recorded one.
+    changes : mapping, optional
+        Values of the scene, of a run's scene too, by dotted key, e.g. ``{"controller.torque_limit": 3.0}``.
+    progress : callable, optional
+        Called as progress(t, t_end).
+
+    Returns
+    -------
+    MotionForces
+        With status "stopped" or "interrupted" everything up to there.
+
+    Raises
+    ------
+    InputError, MechanismError
+        No motion is prescribed, it starts out of reach, no actuator holds one of the freedoms, or the run is of
+        another mechanism.
+    NumericalError
+        The motion starts at a singular configuration.
+
+    Notes
+    -----
+    Of more actuators than freedoms tau has the least norm, as a run's has; of redundant rows the multipliers have.
+    Friction of a joint is -friction sign(v'), zero where the joint rests.
+    """
+    if isinstance(what, str | Path) and _names_a_run(str(what)):
+        what = Run.load(what)
+    if isinstance(what, Scene) and changes:
+        raise InputError("inverse_dynamics: changes go with a name or a run; a Scene is complete")
+    with one_blas_thread():
+        if isinstance(what, Run):
+            scene, mechanism = _scene_of(what, changes or {}), what.mechanism
+            actuation = _actuation(scene, mechanism)
+            motion, t_end = _recorded(what, mechanism, actuation), float(what.t[-1])
+        else:
+            scene = what if isinstance(what, Scene) else load_scene(what, changes)
+            mechanism, t_end = scene_mechanism(scene), scene.spec.t_end
+            actuation = _actuation(scene, mechanism)
+            motion = _prescribed(scene, mechanism, actuation)
+        return _along(motion, mechanism, actuation, scene.name, progress or (lambda t, t_end: None), t_end)
+
+
+def _names_a_run(name: str) -> bool:
+    return name.endswith(".npz") or (Path(name) / "run.npz").is_file()
+
+
+def _scene_of(run: Run, changes: Mapping[str, Any]) -> Scene:
+    """Return the scene of a run, with its motor limits or others."""
+    if any(key.partition(".")[0] == "mechanism" for key in changes):
+        raise InputError("mechanism: the motion of a run is its own mechanism's; give a scene to take another")
+    sources = Sources(run.scene_name, None, run.texts)
+    return make_scene(with_changes(run.scene, changes), run.scene_name, sources)
+
+
+def _actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
+    return Actuation(mechanism, scene.spec.controller.torque_limit if scene.spec.controller else None)
+
+
+def _along(
+    motion: Iterator[_Instant],
+    mechanism: Mechanism,
+    actuation: Actuation,
+    name: str,
+    progress: Callable[[float, float], None],
+    t_end: float,
+) -> MotionForces:
+    rows: list[dict[str, Any]] = []
+    status: Status = "done"
+    message = "reached the end of the motion"
+    try:
+        for instant in motion:
+            rows.append(_forces(instant, mechanism, actuation))
+            progress(instant.t, t_end)
+    except NumericalError as error:
+        if not rows:
+            raise
+        status, message = "stopped", f"stopped after t = {rows[-1]['t']:.6g} s: {error}"
+    except KeyboardInterrupt as signal:
+        if not rows:
+            raise
+        by = f" by {signal}" if str(signal) else ""
+        status, message = "interrupted", f"interrupted at t = {rows[-1]['t']:.6g} s{by}"
+    return collected(rows, mechanism, actuation.limit, name, status, message)
+
+
+def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
+    """Solve eq. 1 at one instant for tau and the multipliers; what each joint transmits follows."""
+    terms, acceleration, t = instant.terms, instant.acceleration, instant.t
+    friction = friction_force(mechanism, terms.v_tree)
+    needed = tree_force(terms, acceleration) - friction
+    if not np.all(np.isfinite(needed)):
+        raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
+    tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
+    u_tree = np.zeros(mechanism.n)
+    u_tree[actuation.at] = instant.tau
+    lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
+    if np.any(np.abs(lacking) > enough):
+        _require_grip(mechanism, tangent, actuation, t)
+    u_tree[actuation.at] += actuation.distribute(tangent, lacking)
+    forces = multipliers(terms, u_tree + friction, acceleration)
+    return {
+        "t": t,
+        "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
+        "v_tree": terms.v_tree,
+        "a_tree": acceleration,
+        "tau": u_tree[actuation.at],
+        "multipliers": forces,
+        "loop_wrenches": loop_wrenches(terms, forces),
+        "joint_forces": joint_wrenches(terms, acceleration, forces),
+    }
+
+
+def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t: float) -> None:
+    """Refuse a configuration where some freedom is held by no actuator, as at a rocker's dead centre."""
+    motions = tangent / mechanism.tree.reach[:, None]
+    motions, _ = np.linalg.qr(motions)  # of one size, in radians or the mechanism's size
+    grip = motions[actuation.at]
+    values, directions = np.linalg.eigh(grip.T @ grip)
+    if values[0] <= DEAD**2:
+        loose = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
+        raise NumericalError(f"the motion along {loose} is held by no actuator at t = {t:.6g} s", t=t)
+
+
+# --- motions -------------------------------------------------------------------------------------
+
+
+def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+    """What the controller of a scene wants, from sigma: v' = rho q_dot, its rate rho q_ddot + rho_dot q_dot."""
+    controller = scene_controller(scene, mechanism)
+    if controller is None:
+        raise InputError(
+            f"{scene.name}: no [controller], so no motion is prescribed; give controller.desired, or a run of the scene"
+        )
+    at, none = find_start(mechanism, scene).at, np.zeros(mechanism.d)
+    desired: Desired
+    if isinstance(controller, Tracking):
+        desired = controller.desired
+    else:
+        rest = controller.q_d, none, none
+        desired = lambda t: rest  # noqa: E731
+    before: float | None = None
+    for t in output_instants(scene).tolist():
+        q_d, q_d_dot, q_d_ddot = desired(t)
+        found = sigma(mechanism, q_d, at)
+        if found.verdict != "converged" and before is not None:
+            end = leaving(mechanism, desired, at, before, t).leaves_at
+            raise NumericalError(f"the motion cannot be followed beyond t = {end:.5f} s: {found.reason}", t=end)
+        if found.verdict != "converged":
+            kind = NumericalError if found.verdict == "singular" else InputError
+            raise kind(f"{scene.name}: the motion cannot be started: q_d(0) is {found.verdict}: {found.reason}")
+        if before is None:
+            actuation.require_transmission(found.at)
+        at, before = found.at, t
+        terms = Terms(mechanism, at, at.rho @ q_d_dot)
+        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), np.zeros(len(actuation.at)))
+
+
+def _recorded(run: Run, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+    """What a run recorded."""
+    if np.any(run.w[0]):
+        raise InputError(
+            f"{run.scene_name}: the run starts off phi = 0, with open loops: no forces in a closed mechanism move it so"
+        )
+    states = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in run.q_tree]
+    rates: Array | None = None
+    if mechanism.joints.any:
+        if len(run.t) < FEWEST:
+            raise InputError(f"{run.scene_name}: {len(run.t)} output instants; rates along {FEWEST} have accelerations")
+        actuation.require_transmission(states[0])
+        rates = Table(run.t, run.v_tree)(run.t)[1]
+    for k, (t, at) in enumerate(zip(run.t.tolist(), states, strict=True)):
+        terms = Terms(mechanism, at, run.v_tree[k])
+        if rates is None:
+            u_tree = np.zeros(mechanism.n)
+            u_tree[actuation.at] = run.tau[k]
+            acceleration = dae_acceleration(terms, u_tree)
+        else:  # as near to the spline's as the loops allow
+            gap = at.J @ rates[k] + terms.J_dot @ terms.v_tree
+            acceleration = rates[k] - np.linalg.lstsq(at.J, gap, rcond=1e-9)[0]
+        yield _Instant(t, terms, acceleration, run.tau[k])

@@ -1,0 +1,314 @@
+"""Inverse dynamics against the paper's appendix, free bodies in absolute coordinates, and closed forms."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_interp_spline
+
+import ckc_pin
+from ckc_pin import inverse_dynamics
+from ckc_pin.mechanism.library import library
+from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, Array, FiveBar, desired
+from tests.conftest import assert_close
+
+# --- the paper's appendix --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "reference"), [("five_bar", FIVE_BAR), ("five_bar_as_printed", AS_PRINTED)])
+def test_five_bar_along_eq_21(name: str, reference: FiveBar) -> None:
+    found = inverse_dynamics(f"{name}/tracking", {"t_end": 4.3})
+    assert found.status == "done"
+    assert len(found.t) > 100
+    for k, t in enumerate(found.t):
+        q_d, q_d_dot, q_d_ddot = desired(t)
+        q_tree = reference.sigma(q_d)
+        v_tree = reference.rho(q_tree) @ q_d_dot
+        tau = reference.D(q_tree) @ q_d_ddot + reference.C(q_tree, v_tree) @ q_d_dot + reference.h(q_tree)
+        acceleration, forces = reference.acceleration_and_multipliers(q_tree, v_tree, tau)
+        assert_close(np.angle(np.exp(1j * (found.q_tree[k] - q_tree))), 0, 1e-11)
+        scale = np.abs(acceleration).max()
+        assert_close(found.v_tree[k], v_tree, 1e-9 * max(1.0, scale))
+        assert_close(found.a_tree[k], acceleration, 1e-9 * max(1.0, scale))
+        assert_close(found.tau[k], tau, 1e-9 * max(1.0, np.abs(tau).max()))
+        assert_close(found.loop_forces["elbow"][k], forces, 1e-9 * max(1.0, np.abs(forces).max()))
+        assert_close(found.loop_wrenches["elbow"][k], [*forces, 0, 0, 0, 0], 1e-9 * max(1.0, np.abs(forces).max()))
+
+
+def test_torques_of_a_recorded_run_come_back(run) -> None:
+    """And its accelerations are those of the appendix, its rates' differences."""
+    recorded = run("five_bar/tracking", formulation="reduced")
+    found = inverse_dynamics(recorded)
+    assert_close(found.tau, recorded.tau, 1e-10)
+    assert_close(found.loop_forces["elbow"], recorded.loop_forces()["elbow"], 1e-10)
+    for k in range(0, len(found.t), 7):
+        theirs = FIVE_BAR.acceleration_and_multipliers(found.q_tree[k], found.v_tree[k], recorded.u[k])
+        assert_close(found.a_tree[k], theirs[0], 1e-9)
+        assert_close(found.loop_forces["elbow"][k], theirs[1], 1e-9)
+    late = recorded.t > 3.0
+    slopes = make_interp_spline(recorded.t[late], recorded.v_tree[late], k=5).derivative()(recorded.t[late])
+    assert_close(slopes[5:-5], found.a_tree[late][5:-5], 1e-5)
+
+
+# --- a four-bar as three free bodies ---------------------------------------------------------------
+
+GROUND, CRANK, COUPLER, ROCKER = 1.1, 0.5, 1.2, 0.75  # m
+MASS = np.array([0.5, 1.0, 0.75])
+LENGTH = np.array([CRANK, COUPLER, ROCKER])
+INERTIA = MASS * (LENGTH**2 + 0.04**2) / 12  # about the centres
+START = np.array([0.0, 0.0, GROUND])  # x of the pins that are fixed; the coupler's moves
+
+
+def along(angle: float) -> Array:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def across(angle: float) -> Array:
+    return np.array([-np.sin(angle), np.cos(angle)])
+
+
+def bars(crank: float, rate: float, acceleration: float) -> tuple[Array, Array, Array]:
+    """Absolute angles, rates and accelerations of crank, coupler, rocker: two circles, then two linear systems."""
+    elbow = CRANK * along(crank)
+    line = np.array([GROUND, 0.0]) - elbow
+    distance = np.linalg.norm(line)
+    middle = (distance**2 + COUPLER**2 - ROCKER**2) / (2 * distance)
+    pin = elbow + (middle * line + np.sqrt(COUPLER**2 - middle**2) * np.array([-line[1], line[0]])) / distance
+    angle = np.array([crank, np.arctan2(*(pin - elbow)[::-1]), np.arctan2(*(pin - [GROUND, 0])[::-1])])
+    matrix = np.array([COUPLER * across(angle[1]), -ROCKER * across(angle[2])]).T
+    rates = np.append(rate, np.linalg.solve(matrix, -CRANK * rate * across(crank)))
+    signed = np.array([CRANK, COUPLER, -ROCKER])
+    inward = sum(length * w**2 * along(a) for length, w, a in zip(signed, rates, angle, strict=True))
+    rest = np.linalg.solve(matrix, inward - CRANK * acceleration * across(crank))
+    return angle, rates, np.append(acceleration, rest)
+
+
+def free_bodies(crank: float, rate: float, acceleration: float) -> tuple[float, Array]:
+    """Torque on the crank and the forces on: crank from ground, coupler from crank, coupler and rocker from their pin.
+
+    Nine equations of Newton and Euler for three bodies, nine unknowns: four pins and the torque.
+    """
+    angle, rates, accelerations = bars(crank, rate, acceleration)
+
+    def centre(body: int) -> Array:
+        """Acceleration of a body's centre from its first pin's."""
+        return LENGTH[body] / 2 * (accelerations[body] * across(angle[body]) - rates[body] ** 2 * along(angle[body]))
+
+    elbow = 2 * centre(0)
+    a_centre = [centre(0), elbow + centre(1), centre(2)]
+    matrix, right = np.zeros((9, 9)), np.zeros(9)
+    # pin, body, whether at its first end, sign
+    acts = [(0, 0, True, 1), (1, 1, True, 1), (1, 0, False, -1), (2, 1, False, 1), (2, 2, False, -1), (3, 2, True, 1)]
+    for pin, body, first, sign in acts:
+        lever = (-0.5 if first else 0.5) * LENGTH[body] * along(angle[body])
+        matrix[3 * body : 3 * body + 2, 2 * pin : 2 * pin + 2] += sign * np.eye(2)
+        matrix[3 * body + 2, 2 * pin : 2 * pin + 2] += sign * np.array([-lever[1], lever[0]])
+    matrix[2, 8] = 1.0
+    for body in range(3):
+        right[3 * body : 3 * body + 2] = MASS[body] * (a_centre[body] + np.array([0.0, 9.81]))
+        right[3 * body + 2] = INERTIA[body] * accelerations[body]
+    solution = np.linalg.solve(matrix, right)
+    return float(solution[8]), solution[:8].reshape(4, 2)
+
+
+def test_four_bar_as_free_bodies() -> None:
+    """Twice round, faster and slower: torque, all four pins, and the angles' accelerations."""
+    rate = 5.0
+    desired_crank = {"offset": np.pi / 2, "harmonics": [[2.9, 2.0, 0.0], [0.4, rate, 0.3]]}
+    controller = {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": {"crank": desired_crank}}
+    found = inverse_dynamics("four_bar/turning", {"controller": controller})
+    assert found.status == "done"
+    for k, t in enumerate(found.t):
+        crank = np.pi / 2 + 2.9 * np.sin(2 * t) + 0.4 * np.sin(rate * t + 0.3)
+        crank_dot = 5.8 * np.cos(2 * t) + 0.4 * rate * np.cos(rate * t + 0.3)
+        crank_ddot = -11.6 * np.sin(2 * t) - 0.4 * rate**2 * np.sin(rate * t + 0.3)
+        tau, pins = free_bodies(crank, crank_dot, crank_ddot)
+        scale = max(1.0, np.abs(pins).max())
+        assert_close(found.tau[k], [tau], 1e-10 * scale)
+        names = ["crank", "coupler", "rocker"]
+        for joint, force in zip(names, pins[[0, 1, 3]], strict=True):
+            assert_close(found.joint_forces[joint][k, :2], force, 1e-10 * scale)
+        assert_close(found.joint_forces["crank"][k, 5], tau, 1e-10 * scale)
+        for joint in names:
+            assert_close(found.joint_forces[joint][k, 2:5], 0, 1e-10 * scale)
+        assert_close(found.loop_wrenches["coupler_pin"][k], [*pins[2], 0, 0, 0, 0], 1e-10 * scale)
+
+
+def test_at_its_dead_centre_a_rocker_drives_nothing(tmp_path: Path) -> None:
+    """Crank and coupler in line at t = 0.5 s: before, its torque is the crank's over the ratio of their rates."""
+    in_line = CRANK + COUPLER
+    dead = np.arccos((in_line**2 + GROUND**2 - ROCKER**2) / (2 * in_line * GROUND))
+    shutil.copytree(library() / "four_bar", tmp_path / "bar")
+    driven = tmp_path / "bar" / "mechanism.toml"
+    driven.write_text(driven.read_text().replace("[q_guess]", 'actuated = ["rocker"]\n\n[q_guess]'))
+    desired_crank = {"offset": dead, "harmonics": [[0.3, np.pi, -np.pi / 2]]}
+    controller = {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": {"crank": desired_crank}}
+    changes = {"controller": controller, "t_end": 1.0, "solver.output_dt": 0.1}
+    found = inverse_dynamics(tmp_path / "bar" / "turning.scene.toml", changes)
+    assert found.status == "stopped"
+    assert "the motion along" in found.message
+    assert "held by no actuator at t = 0.5 s" in found.message
+    assert_close(found.t, [0.0, 0.1, 0.2, 0.3, 0.4], 1e-15)
+    crank = inverse_dynamics("four_bar/turning", changes)
+    assert crank.status == "done"
+    assert_close(crank.a_tree[:5], found.a_tree, 1e-12)
+    for k, t in enumerate(found.t):
+        phase = np.pi * t - np.pi / 2
+        rates = bars(dead + 0.3 * np.sin(phase), 1.0, 0.0)[1]
+        assert_close(found.tau[k], crank.tau[k] / rates[2], 1e-9 * abs(found.tau[k, 0]))
+
+
+def test_a_rod_from_the_world_pulls_it_as_it_pulls_the_coupler(tmp_path: Path) -> None:
+    """The rocker as a rod without mass, either end first: on the world it is what the coupler gets, turned round."""
+    forces = []
+    for world_first in (True, False):
+        folder = tmp_path / str(world_first)
+        shutil.copytree(library() / "four_bar", folder)
+        text = (folder / "mechanism.toml").read_text().partition("[[loop]]")[0].replace("rocker = 1.6\n", "")
+        ends = ['{link = "world", xyz = [1.1, 0.0, 0.0]}', '{link = "coupler_link", xyz = [1.2, 0.0, 0.0]}']
+        a, b = ends if world_first else ends[::-1]
+        loop = f'[[loop]]\nname = "rod"\ntype = "distance"\nlength = 0.75\nframe_a = {a}\nframe_b = {b}\n'
+        (folder / "mechanism.toml").write_text(text.replace('["crank"]', '["crank", "rocker"]') + loop)
+        quiet = {"harmonics": [[0.4, 5.0, 0.0]]}
+        desired_crank = {"offset": np.pi / 2, "harmonics": [[0.4, 5.0, 0.0]]}
+        controller = {
+            "type": "tracking",
+            "Lambda": 1.0,
+            "K_D": 1.0,
+            "desired": {"crank": desired_crank, "rocker": quiet},
+        }
+        initial = {"at": "assembled"}
+        changes = {"controller": controller, "initial": initial, "t_end": 0.5, "solver.output_dt": 0.05}
+        forces.append(inverse_dynamics(folder / "turning.scene.toml", changes))
+    on_world, on_coupler = (found.loop_wrenches["rod"] for found in forces)
+    assert_close(on_world[:, :3], -on_coupler[:, :3], 1e-11)
+    assert_close(on_world[:, 3:], 0, 1e-11)
+    assert_close(on_coupler[:, 3:], 0, 1e-11)
+    mechanism = forces[0].mechanism
+    for k, q in enumerate(forces[0].q_tree):
+        coupler = mechanism.frames.find(mechanism.spec.loop[0].frame_b, "rod")
+        at = mechanism.kinematics(q).pose
+        rod = at.rotation[coupler.joint] @ coupler.translation + at.translation[coupler.joint] - [1.1, 0, 0]
+        assert_close(np.linalg.norm(rod), 0.75, 1e-12)
+        pull = forces[0].loop_forces["rod"][k, 0]
+        assert_close(on_coupler[k, :3], pull * rod / 0.75, 1e-10 * max(1.0, abs(pull)))
+
+
+# --- closed forms ----------------------------------------------------------------------------------
+
+LIFT = """<robot name="lift">
+  <link name="ground"/>
+  <link name="block"><inertial><origin xyz="0.1 0.2 0.3"/><mass value="2"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="slide" type="prismatic"><parent link="ground"/><child link="block"/><axis xyz="0 0 1"/>
+    <limit lower="-9" upper="9" effort="1" velocity="1"/></joint>
+</robot>
+"""
+MECHANISM = """name = "lift"
+urdf = "lift.urdf"
+[[joint]]
+name = "slide"
+armature = 0.5
+damping = 3.0
+friction = 4.0
+[[spring]]
+joint = "slide"
+stiffness = 30.0
+rest = 0.1
+"""
+SCENE = """mechanism = "mechanism.toml"
+formulation = "reduced"
+t_end = 2.0
+[initial]
+at = "assembled"
+[controller]
+type = "tracking"
+Lambda = 1.0
+K_D = 1.0
+torque_limit = 24.0
+[controller.desired.slide]
+harmonics = [[0.4, 3.0, 0.2]]
+"""
+
+
+def lift(folder: Path) -> Path:
+    """A block on a vertical slide with everything that acts in a joint."""
+    for name, text in (("lift.urdf", LIFT), ("mechanism.toml", MECHANISM), ("up.scene.toml", SCENE)):
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder / "up.scene.toml"
+
+
+def test_block_with_rotor_damper_friction_and_spring(tmp_path: Path) -> None:
+    """The motor moves the rotor too; the rail holds what is off the axis."""
+    found = inverse_dynamics(lift(tmp_path))
+    x, v, a = (
+        0.4 * np.sin(3 * found.t + 0.2),
+        1.2 * np.cos(3 * found.t + 0.2),
+        -3.6 * np.sin(3 * found.t + 0.2),
+    )
+    tau = 2.5 * a + 3.0 * v + 4.0 * np.sign(v) + 30.0 * (x - 0.1) + 2.0 * 9.81
+    assert_close(found.tau[:, 0], tau, 1e-12 * np.abs(tau).max())
+    lifted = 2.0 * (a + 9.81)
+    none = np.zeros_like(a)
+    rail = np.array([none, none, lifted, 0.2 * lifted, -0.1 * lifted, none]).T
+    assert_close(found.joint_forces["slide"], rail, 1e-12 * np.abs(lifted).max())
+    beyond = np.abs(tau) > 24.0
+    assert 0 < beyond.sum() < len(tau)
+    peak = int(np.argmax(np.abs(tau)))
+    (entry,) = found.exceeded
+    assert entry["motor"] == "slide"
+    assert (entry["limit"], entry["t"], entry["t_most"]) == (24.0, found.t[np.argmax(beyond)], found.t[peak])
+    assert entry["most"] == pytest.approx(abs(tau[peak]), rel=1e-12)
+
+
+def test_recorded_motion_with_friction_is_differentiated(tmp_path: Path) -> None:
+    """Of a motion that nothing is known of but its rates: no effort recorded."""
+    recorded = ckc_pin.simulate(lift(tmp_path), {"t_end": 0.5, "solver.output_dt": 0.001})
+    t = recorded.t
+    x, v, a = (
+        0.4 * np.sin(3 * t + 0.2),
+        1.2 * np.cos(3 * t + 0.2),
+        -3.6 * np.sin(3 * t + 0.2),
+    )
+    found = inverse_dynamics(
+        replace(recorded, q_tree=x[:, None], v_tree=v[:, None], tau=np.zeros((len(t), 1))),
+        {"controller.torque_limit": None},
+    )
+    tau = 2.5 * a + 3.0 * v + 4.0 * np.sign(v) + 30.0 * (x - 0.1) + 2.0 * 9.81
+    assert_close(found.tau[:, 0], tau, 1e-8)
+    assert_close(found.joint_forces["slide"][:, 2], 2.0 * (a + 9.81), 1e-8)
+    assert found.exceeded == []
+
+
+def test_at_rest_friction_is_left_out(tmp_path: Path) -> None:
+    scene = lift(tmp_path)
+    found = inverse_dynamics(scene, {"controller.desired.slide.harmonics": []})
+    assert_close(found.tau, 2 * 9.81 - 3.0, 1e-12)
+
+
+def test_set_point_is_to_rest_there() -> None:
+    found = inverse_dynamics("five_bar/set_point")
+    q_d = np.array([found.q_tree[0, 0], found.q_tree[0, 2]])
+    assert_close(found.q_tree, np.tile(found.q_tree[0], (len(found.t), 1)), 1e-12)
+    assert_close(found.v_tree, 0, 0)
+    assert_close(found.tau, np.tile(FIVE_BAR.h(FIVE_BAR.sigma(q_d)), (len(found.t), 1)), 1e-11)
+
+
+def test_preload_of_a_recorded_run_stays() -> None:
+    """Efforts that strain two arms against each other are among those recorded, not of least norm: they come back."""
+    recorded = ckc_pin.simulate("two_ur5/lift", {"t_end": 0.05, "solver.output_dt": 0.01})
+    mechanism = recorded.mechanism
+    at = mechanism.kinematics(mechanism.tree.from_coordinates(recorded.q_tree[0]))
+    transmission = at.rho[mechanism.actuated_at].T
+    strain = np.linalg.svd(transmission)[2][-1]
+    assert_close(transmission @ strain, 0, 1e-12)
+    strained = replace(recorded, tau=recorded.tau + 5.0 * strain)
+    first, second = inverse_dynamics(recorded), inverse_dynamics(strained)
+    assert_close(first.tau, recorded.tau, 1e-9)
+    assert_close(second.tau[0], recorded.tau[0] + 5.0 * strain, 1e-9)
+    assert_close(second.a_tree[0], first.a_tree[0], 1e-8)
+    assert np.abs(second.loop_wrenches["left_grip"][0] - first.loop_wrenches["left_grip"][0]).max() > 1.0

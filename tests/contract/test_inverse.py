@@ -1,0 +1,234 @@
+"""What `ckc inverse` promises: keys and shapes, the table, files, where a motion ends, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, NumericalError, inverse_dynamics
+from tests.conftest import assert_close
+from tests.contract.helpers.bad import Bad, expect
+from tests.contract.helpers.command import ckc
+
+KEYS = """t coordinates q_tree v_tree a_tree actuated tau loop_forces joint_forces exceeded redundant status
+          message"""
+SHORT = ("--set", "t_end=0.2")
+
+
+def test_json() -> None:
+    answer = ckc("inverse", "five_bar/tracking", *SHORT, "--json")
+    assert (answer.code, answer.err) == (0, "")
+    found = answer.json
+    assert sorted(KEYS.split()) == sorted(found)
+    m = len(found["t"])
+    assert m > 5
+    assert (found["t"][0], found["t"][-1]) == (0.0, 0.2)
+    assert found["coordinates"] == ["theta_1", "theta_2", "theta_3", "theta_4"]
+    assert found["actuated"] == ["theta_1", "theta_3"]
+    for key, width in (("q_tree", 4), ("v_tree", 4), ("a_tree", 4), ("tau", 2)):
+        assert np.shape(found[key]) == (m, width)
+    assert set(found["loop_forces"]) == {"elbow"}
+    elbow = found["loop_forces"]["elbow"]
+    assert elbow["rows"] == ["x", "y"]
+    assert np.shape(elbow["multipliers"]) == (m, 2)
+    assert np.shape(elbow["force"]) == np.shape(elbow["moment"]) == (m, 3)
+    assert {name: np.shape(x) for name, x in found["joint_forces"].items()} == dict.fromkeys(
+        found["coordinates"], (m, 6)
+    )
+    assert (found["status"], found["exceeded"], found["redundant"]) == ("done", [], [])
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference.md").read_text(encoding="utf-8")
+    row = next(line for line in page.partition("### JSON")[2].splitlines() if line.startswith("| `inverse`"))
+    assert [key for key in (*found, *elbow, "motor", "t_most") if not re.search(rf"\b{key}\b", row)] == []
+
+
+def test_table_names_the_largest_of_each_and_what_exceeds_its_limit() -> None:
+    answer = ckc("inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_1 = 1.2, theta_3 = 2.0}")
+    assert (answer.code, answer.err) == (0, "")
+    found = inverse_dynamics("five_bar/tracking", {"controller.torque_limit": {"theta_1": 1.2, "theta_3": 2.0}})
+    rows = {line[:14].strip(): line for line in answer.out.splitlines()}
+    for motor, tau in zip(found.actuated, np.abs(found.tau).T, strict=True):
+        assert f"{tau.max():.4g} N m" in rows[f"motor {motor}"]
+        assert f"{found.t[np.argmax(tau)]:.4g}" in rows[f"motor {motor}"]
+    (entry,) = found.exceeded
+    assert entry["motor"] == "theta_1"
+    assert f"1.2 N m, exceeded from t = {entry['t']:.4g} s on" in rows["motor theta_1"]
+    assert rows["motor theta_3"].rstrip().endswith("2 N m")
+    elbow = np.linalg.norm(found.loop_forces["elbow"], axis=1)
+    assert f"{elbow.max():.4g} N" in rows["loop elbow"]
+    assert "moment" not in answer.out
+    assert answer.out.splitlines()[0].split() == ["of", "the", "motion", "largest", "at", "t,", "s", "limit"]
+
+
+def test_files(tmp_path: Path) -> None:
+    answer = ckc("inverse", "delta/circle", *SHORT, "--out", str(tmp_path / "forces"))
+    assert answer.code == 0
+    assert (tmp_path / "forces" / "inverse.png").read_bytes().startswith(b"\x89PNG")
+    found = inverse_dynamics("delta/circle", {"t_end": 0.2})
+    with np.load(tmp_path / "forces" / "inverse.npz", allow_pickle=False) as data:
+        saved = {name: data[name] for name in data.files}
+    assert_close(saved["tau"], found.tau, 0)
+    assert saved["actuated"].tolist() == list(found.actuated)
+    assert saved["rows"].tolist() == [".".join(name) for name in found.mechanism.closure.names]
+    for k, loop in enumerate(saved["loops"]):
+        own = [name.startswith(f"{loop}.") for name in saved["rows"].tolist()]
+        assert_close(saved["multipliers"][:, own], found.loop_forces[loop], 0)
+        assert_close(saved["loop_wrenches"][:, k], found.loop_wrenches[loop], 0)
+    for k, joint in enumerate(saved["joints"]):
+        assert_close(saved["joint_forces"][:, k], found.joint_forces[joint], 0)
+    assert json.loads(saved["meta"].tobytes())["status"] == "done"
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference.md").read_text(encoding="utf-8")
+    says = page.partition("`inverse.npz` has")[2].partition("##")[0]
+    assert [name for name in saved if not re.search(rf"\b{name}\b", says)] == []
+
+
+def test_a_recorded_run(run: Callable[..., ckc_pin.Run], tmp_path: Path) -> None:
+    recorded = run("five_bar/tracking", formulation="reduced")
+    recorded.save(tmp_path / "run.npz")
+    for what in (str(tmp_path), str(tmp_path / "run.npz")):
+        found = ckc("inverse", what, "--set", "controller.torque_limit=10", "--json").json
+        assert_close(found["t"], recorded.t, 0)
+        assert_close(found["tau"], recorded.tau, 1e-9)
+        assert {entry["motor"] for entry in found["exceeded"]} == {"theta_1", "theta_3"}
+
+
+# --- along a point's path --------------------------------------------------------------------------
+
+
+CIRCLE = "controller.desired={point = 'tip', circle = {centre = [0.15, -0.42, 0.0], radius = 0.06, frequency = 2.0}}"
+LINE = (
+    "controller.desired={point = 'tip', line = {start = [0.15, -0.42, 0.0], end = [0.15, -0.9, 0.0], frequency = 1.0}}"
+)
+
+
+def test_a_point_s_path() -> None:
+    """Forces do the work that the energy tells."""
+    found = inverse_dynamics("five_bar/tracking", {"controller.desired": {
+        "point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 2.0}
+    }, "t_end": 1.0, "solver.output_dt": 0.001})  # fmt: skip
+    assert found.status == "done"
+    mechanism = found.mechanism
+    places = np.array([mechanism.point_positions(q)["tip"] for q in found.q_tree])
+    assert_close(np.linalg.norm(places - [0.15, -0.42, 0.0], axis=1), 0.06, 1e-9)
+    terms = [
+        ckc_pin.Terms(mechanism, mechanism.kinematics(q), v) for q, v in zip(found.q_tree, found.v_tree, strict=True)
+    ]
+    power = np.sum(found.tau * found.v_tree[:, mechanism.actuated_at], axis=1)
+    work = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(found.t))])
+    energy = np.array([at.energy for at in terms])
+    assert_close(energy - energy[0], work, 1e-6)
+
+
+def test_a_path_that_leaves_the_workspace_is_given_up_to_there() -> None:
+    answer = ckc("inverse", "five_bar/tracking", "--set", LINE, "--json")
+    assert answer.code == 3
+    found = answer.json
+    assert found["status"] == "stopped"
+    assert found["message"] == answer.err.rstrip("\n")
+    assert "leaves the workspace of its branch at t = " in found["message"]
+    leaves_at = float(re.search(r"branch at t = ([\d.]+)", found["message"])[1])
+    assert found["t"][-1] <= leaves_at < found["t"][-1] + 0.021
+    assert len(found["tau"]) == len(found["t"]) > 10
+
+
+def test_a_trajectory_that_leaves_the_workspace_is_given_up_to_there(tmp_path: Path) -> None:
+    answer = ckc("inverse", "five_bar_as_printed/tracking", "--out", str(tmp_path))
+    assert answer.code == 3
+    assert "the motion cannot be followed beyond t = 4.393" in answer.err
+    with np.load(tmp_path / "inverse.npz") as data:
+        assert 4.37 < data["t"][-1] < 4.394
+
+
+def test_redundant_rows_are_named() -> None:
+    found = inverse_dynamics("stewart/wave", {"t_end": 0.02})
+    assert found.mechanism.redundant == ()
+    assert "open" not in found.message
+
+
+def test_forces_of_redundant_rows_are_said_to_be_open(bar: Path) -> None:
+    text = (bar / "mechanism.toml").read_text(encoding="utf-8")
+    (bar / "mechanism.toml").write_text(text.replace('"point_2d"', '"point"'), encoding="utf-8")
+    answer = ckc("inverse", "bar/tracking.scene.toml", *SHORT, "--json")
+    assert answer.json["redundant"] == ["elbow.z"]
+    assert "rows that others imply (elbow.z) leave loop and joint forces open" in answer.json["message"]
+    assert_close(np.array(answer.json["loop_forces"]["elbow"]["multipliers"])[:, 2], 0, 1e-12)
+    flat = inverse_dynamics("five_bar/tracking", {"t_end": 0.2})
+    assert_close(answer.json["tau"], flat.tau, 1e-9)
+
+
+def test_an_interrupted_one_keeps_what_it_has() -> None:
+    def stop(t: float, t_end: float) -> None:
+        if t > 0.1:
+            raise KeyboardInterrupt("SIGTERM")
+
+    found = inverse_dynamics("five_bar/tracking", progress=stop)
+    assert found.status == "interrupted"
+    assert "by SIGTERM" in found.message
+    assert 0.1 < found.t[-1] < 0.15
+
+
+# --- what is refused -------------------------------------------------------------------------------
+
+BAD = [
+    Bad("no controller", ["inverse", "five_bar/swing"], ["five_bar/swing", "no [controller]", "controller.desired"]),
+    Bad("no desired", ["inverse", "bar/tracking.scene.toml", "--set", "controller.desired={}"],
+        ["controller.desired", "theta_1", "missing"]),
+    Bad("no such thing", ["inverse", "six_bar"], ["no mechanism 'six_bar'", "five_bar"]),
+    Bad("no run", ["inverse", "bar/run.npz"], ["bar/run.npz", "no such run file"]),
+    Bad("not a run", ["inverse", "other.npz"], ["other.npz", "not a run file"], files={"other.npz": "no zip"}),
+    Bad("a start out of reach", ["inverse", "bar/tracking.scene.toml", "--set", "controller.desired.theta_1.offset=3"],
+        ["the motion cannot be started", "q_d(0) is out of reach"]),
+    Bad("a path out of reach", ["inverse", "five_bar/tracking", "--set", CIRCLE.replace("-0.42", "-4.2")],
+        ["the path cannot be started", "'tip'"]),
+    Bad("an unknown motor", ["inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_2 = 1.0}"],
+        ["torque_limit", "theta_2", "theta_1, theta_3"]),
+    Bad("too few motors", ["inverse", "bar/tracking.scene.toml"],
+        ["actuated: theta_1 cannot hold every freedom", "theta_3 is held by none"],
+        edits={"mechanism.toml": ('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]')}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD, ids=lambda case: case.what)
+def test_bad_input(case: Bad, bar: Path) -> None:
+    expect(case, bar)
+
+
+def test_a_run_of_another_mechanism(run: Callable[..., ckc_pin.Run]) -> None:
+    recorded, other = run("five_bar/tracking", formulation="reduced"), ckc_pin.load("four_bar")
+    with pytest.raises(InputError, match=r"the run's coordinates are theta_1, .*its mechanism's crank"):
+        inverse_dynamics(replace(recorded, texts=other.sources.texts))
+    with pytest.raises(InputError, match="the motion of a run is its own mechanism's"):
+        inverse_dynamics(recorded, {"mechanism": "four_bar"})
+
+
+def test_a_run_with_open_loops() -> None:
+    recorded = ckc_pin.simulate("five_bar/swing", {
+        "formulation": "spf", "initial.at": None, "initial.q": {"theta_1": -1.2, "theta_3": -1.9},
+        "initial.w": [1e-3, 0.0], "t_end": 0.05})  # fmt: skip
+    with pytest.raises(InputError, match="starts off phi = 0, with open loops"):
+        inverse_dynamics(recorded)
+
+
+def test_a_passive_run_of_too_few_motors_is_no_mistake(bar: Path) -> None:
+    """Nothing is asked of them: loop and joint forces alone are to be told."""
+    text = (bar / "mechanism.toml").read_text(encoding="utf-8")
+    (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'))
+    recorded = ckc_pin.simulate(bar / "swing.scene.toml", {"t_end": 0.3})
+    found = inverse_dynamics(recorded)
+    assert found.status == "done"
+    assert_close(found.tau, 0, 1e-12)
+    assert_close(found.loop_forces["elbow"], recorded.loop_forces()["elbow"], 1e-10)
+    broken = replace(recorded, v_tree=np.full_like(recorded.v_tree, np.nan))
+    with pytest.raises(NumericalError):
+        inverse_dynamics(broken)
+
+
+def test_changes_go_with_a_name() -> None:
+    with pytest.raises(InputError, match="changes go with a name"):
+        inverse_dynamics(ckc_pin.load_scene("five_bar/tracking"), {"t_end": 1.0})

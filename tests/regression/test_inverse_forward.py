@@ -1,0 +1,132 @@
+"""Inverse, then forward: the efforts of a motion give the motion back, at each instant and by integration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, Mechanism, MotionForces, Terms, inverse_dynamics
+from ckc_pin.control.desired import Table
+from ckc_pin.dynamics import friction_force
+from ckc_pin.mechanism.library import shipped
+from ckc_pin.simulation.prepare import scene_mechanism
+from ckc_pin.simulation.scene import scene_names
+from scripts.experiments.fuzz.mechanisms import random_mechanism
+from tests.analytic.five_bar import Array
+from tests.conftest import assert_close
+
+CONTROLLED = [
+    f"{mechanism}/{scene}"
+    for mechanism in shipped()
+    for scene in scene_names(mechanism)
+    if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
+]
+T_END = {"andrews": 0.02}  # s; open loop, what is off grows by e in 1 ms there
+ROUNDED = 1e-9  # of the largest row of J: a row of zeros
+
+
+def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, Any]:
+    """Changes of a scene: every independent coordinate swings about where the mechanism is assembled."""
+    numbers = mechanism.tree.named(mechanism.tree.to_coordinates(mechanism.q_tree))
+    reach = mechanism.tree.named(mechanism.tree.reach)
+    desired, rates = {}, {}
+    for k, name in enumerate(mechanism.independent):
+        amplitude = size * reach[name] * (1.0 + 0.1 * k)
+        desired[name] = {"offset": numbers[name], "harmonics": [[amplitude, 4.0, 0.0]]}
+        rates[name] = 4.0 * amplitude
+    return {
+        "controller": {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": desired},
+        "initial": {"at": "assembled", "q_dot": rates},
+        "formulation": "reduced",
+        "t_end": t_end,
+        "solver": {"output_dt": t_end / 50, "rtol": 1e-12, "atol": 1e-14},
+    }
+
+
+def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
+    """Eq. 1 and its closure, differentiated twice, as one linear system in a and lambda; rows of one size."""
+    J, n = terms.at.J, mechanism.n
+    u_tree = np.zeros(n)
+    u_tree[mechanism.actuated_at] = tau
+    u_tree -= mechanism.joints.friction * np.sign(terms.v_tree)
+    force = u_tree + terms.damping_force - terms.bias_tree
+    unit = np.sqrt(np.abs(terms.D_tree).max() or 1.0)
+    size = np.linalg.norm(J, axis=1, keepdims=True)
+    size = np.where(size > ROUNDED * size.max(initial=0.0), size, 1.0)
+    rows = J / size
+    left = np.block([[terms.D_tree / unit**2, -rows.T], [rows, np.zeros((len(J), len(J)))]])
+    closing = -(terms.J_dot @ terms.v_tree)[:, None] / size
+    return np.linalg.lstsq(left, np.concatenate([force / unit**2, closing[:, 0]]), rcond=1e-13)[0][:n]
+
+
+def assert_gives_back(found: MotionForces) -> None:
+    """At every instant eq. 1 has the acceleration that the efforts were for."""
+    mechanism = found.mechanism
+    for q, v, a, tau in zip(found.q_tree, found.v_tree, found.a_tree, found.tau, strict=True):
+        terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q)), v)
+        assert_close(terms.at.J @ v, 0, 1e-10 * max(1.0, np.abs(v).max() * np.abs(terms.at.J).max(initial=0.0)))
+        assert_close(forward(mechanism, terms, tau), a, 1e-9 * max(1.0, np.abs(a).max()))
+
+
+class Prescribed:
+    """u of eq. 6 over time, whatever the state; with the friction that a run leaves out, where it says so."""
+
+    def __init__(self, found: MotionForces) -> None:
+        mechanism, u = found.mechanism, []
+        left_out = any("dry friction is not modelled" in warning for warning in mechanism.warnings)
+        for q, v, tau in zip(found.q_tree, found.v_tree, found.tau, strict=True):
+            u_tree = friction_force(mechanism, v) if left_out else np.zeros(mechanism.n)
+            u_tree[mechanism.actuated_at] += tau
+            u.append(mechanism.kinematics(mechanism.tree.from_coordinates(q)).rho.T @ u_tree)
+        self.table = Table(found.t, np.array(u))
+
+    def u(self, t: float, terms: Terms) -> Array:
+        return self.table(t)[0]
+
+
+def assert_integrates_back(scene: str | Path, changes: dict[str, Any], found: MotionForces) -> None:
+    """The run of those efforts, open loop, has the motion that was asked for."""
+    run = ckc_pin.simulate(scene, changes, controller=Prescribed(found))
+    assert run.status == "done", run.message
+    assert_close(run.t, found.t, 0)
+    for ours, theirs in ((run.q_tree, found.q_tree), (run.v_tree, found.v_tree)):
+        assert_close(ours, theirs, 1e-9 * max(1.0, np.abs(theirs).max()))
+
+
+@pytest.mark.parametrize("scene", CONTROLLED)
+def test_shipped_scenes_at_each_instant(scene: str) -> None:
+    assert len(CONTROLLED) >= 10
+    found = inverse_dynamics(scene, {"t_end": 1.0, "solver.output_dt": 0.05})
+    assert found.status == "done"
+    assert len(found.t) == 21
+    assert_gives_back(found)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
+    changes = waves(scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
+    found = inverse_dynamics(name, changes)
+    assert found.status == "done"
+    assert_gives_back(found)
+    assert_integrates_back(name, changes, found)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> None:
+    """A free root that the loops leave free is held by no motor: refused, by name."""
+    scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
+    mechanism = scene_mechanism(ckc_pin.load_scene(scene))
+    changes = waves(mechanism, 0.1)
+    if mechanism.splits_root or mechanism.rooted:
+        says = "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+ is held by none"
+        with pytest.raises(InputError, match=says):
+            inverse_dynamics(scene, changes)
+        return
+    found = inverse_dynamics(scene, changes)
+    assert found.status == "done"
+    assert_gives_back(found)
+    assert_integrates_back(scene, changes, found)
