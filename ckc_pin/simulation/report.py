@@ -118,6 +118,9 @@ def run_table(run: Run) -> Table:
     table.add_row(f"q_tree at {run.t[-1]:g} s", last)
     if "controller" in run.scene:
         table.add_row("largest |u|, |tau|", f"{np.abs(run.u).max():.4g}, {np.abs(run.tau).max():.4g}")
+    for name, rate in run.too_fast().items():
+        limit = run.mechanism.motors.speed_limit[run.actuated.index(name)]
+        table.add_row("warning", f"{name} turns at {rate:.4g}, its speed_limit is {limit:.4g}")
     table.add_row("energy start, end", f"{run.energy[0]:.9g}, {run.energy[-1]:.9g} J")
     table.add_row("largest |phi - w|", f"{run.max_phi:.2g} (its rate {run.max_phi_dot:.2g})")
     for event in run.events[:MOST_EVENTS]:
