@@ -23,7 +23,7 @@ Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector 
     factor_.shape(motors, motors, full_pattern(motors));
   scaled_.setZero(redundant_ ? motors : d, redundant_ ? d : motors), curvature_.setZero(d, d);
   for (Vector* x : {&rest_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
-  for (Vector* x : {&raw_, &slope_, &enters_, &leaves_}) x->setZero(motors);
+  for (Vector* x : {&unlimited_, &raw_, &slope_, &enters_, &leaves_}) x->setZero(motors);
   ends_.setZero(2 * motors);
 }
 
@@ -37,7 +37,10 @@ void Allocation::share(const Matrix& transmission, In u, Out tau) {
     scaled_ = transmission.transpose();
     factor_.compute(scaled_), factor_.solve(u, tau);
   }
-  if ((tau.array().abs() > limit.array()).any() && !(redundant_ && within_limits(transmission, u, tau))) clip(tau);
+  if (!(tau.array().abs() > limit.array()).any()) return;
+  unlimited_ = tau;
+  if (redundant_ && within_limits(transmission, u, tau)) return;
+  tau = unlimited_, clip(tau);
 }
 
 bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {

@@ -28,7 +28,7 @@ class Allocation {
   Factor factor_;
   Matrix scaled_, curvature_;
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;
-  Vector rest_, row_scale_, multiplier_, direction_, coefficients_, raw_, slope_, enters_, leaves_, ends_;
+  Vector unlimited_, rest_, row_scale_, multiplier_, direction_, coefficients_, raw_, slope_, enters_, leaves_, ends_;
   double rise_ = 0.0;  // of the dual along direction_
 };
 
