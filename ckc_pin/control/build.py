@@ -7,7 +7,8 @@ from collections.abc import Callable
 from ckc_pin.control.controllers import Model, SetPoint, Tracking
 from ckc_pin.control.gains import gain_matrix
 from ckc_pin.control.point_path import make_desired
-from ckc_pin.control.spec import ControllerSpec, SetPointSpec
+from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
+from ckc_pin.control.torques import Torques, read_torques
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
@@ -22,7 +23,7 @@ def make_controller(
     t_end: float,
     sources: Sources,
     load_model: Callable[[str], Mechanism],
-) -> SetPoint | Tracking:
+) -> SetPoint | Tracking | Torques:
     """Build and check a controller.
 
     Parameters
@@ -43,6 +44,8 @@ def make_controller(
     InputError, MechanismError
         Bad gains, an unreachable target, an unusable trajectory or model.
     """
+    if isinstance(spec, TorquesSpec):
+        return read_torques(spec, plant, sources, t_end)
     names = plant.independent
     model = Model(load_model(spec.model), plant, convention) if spec.model is not None else None
     if isinstance(spec, SetPointSpec):

@@ -6,6 +6,7 @@ Errors are q - q_d everywhere. A controller sees the plant's measured state thro
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Controller", "Model", "SetPoint", "Tracking"]
+__all__ = ["Controller", "Model", "SetPoint", "TorqueController", "Tracking", "gives_tau"]
 
 
 class Controller(Protocol):
@@ -27,6 +28,31 @@ class Controller(Protocol):
 
     def u(self, t: float, terms: Terms) -> Array:
         """Return the force on the independent coordinates at time t (s), shape (d,), N m or N."""
+
+
+class TorqueController(Protocol):
+    """Anything that gives the motors' own torques."""
+
+    def tau(self, t: float, terms: Terms) -> Array | Mapping[str, float]:
+        """Return tau at time t (s) by motor, N m or N: shape (motors,), or a table; motors not in it have none."""
+
+
+def gives_tau(controller: Controller | TorqueController) -> bool:
+    """Whether a controller gives torques of motors, by the method that it has.
+
+    Raises
+    ------
+    InputError
+        It has both methods, or neither.
+    """
+    u, tau = (callable(getattr(controller, name, None)) for name in ("u", "tau"))
+    if u == tau:
+        has = "both u and tau" if u else "neither u nor tau"
+        raise InputError(
+            f"{type(controller).__name__} has {has}; a controller has one of the methods u(t, terms), for the force on "
+            "the independent coordinates, and tau(t, terms), for the motors' torques"
+        )
+    return tau
 
 
 class Model:

@@ -14,7 +14,7 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Desired", "Harmonics", "Table", "read_desired", "read_table"]
+__all__ = ["Desired", "Harmonics", "Table", "read_columns", "read_desired", "read_table"]
 
 FEWEST = 6  # rows that a quintic spline needs
 
@@ -105,15 +105,26 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
 
 
 def read_table(text: str, names: Sequence[str], file: str) -> Table:
-    """Read `t` and a column for each name, in any order, empty lines passed over."""
+    """Read a trajectory: `t` and a column for each name, splined."""
+    return Table(*read_columns(text, names, file, FEWEST, "a smooth trajectory needs"))
+
+
+def read_columns(text: str, names: Sequence[str], file: str, fewest: int, who: str) -> tuple[Array, Array]:
+    """Read `t` and a column for each name, in any order, empty lines passed over: shapes (m,) and (m, names).
+
+    Raises
+    ------
+    InputError
+        Other columns, too few rows, what is no finite number, times that do not increase or start after 0.
+    """
     lines = [(number, line.split(",")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     wanted = ["t", *names]
     header = [cell.strip() for cell in lines[0][1]] if lines else []
     if sorted(header) != sorted(wanted):
         found = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
         raise InputError(f"{file}: {found}; the first line names the columns {', '.join(wanted)}")
-    if len(lines) - 1 < FEWEST:
-        raise InputError(f"{file}: {len(lines) - 1} rows; a smooth trajectory needs at least {FEWEST}")
+    if len(lines) - 1 < fewest:
+        raise InputError(f"{file}: {len(lines) - 1} rows; {who} at least {fewest}")
     table = np.array([_row(cells, len(wanted), f"{file}, line {number}") for number, cells in lines[1:]])
     table = table[:, [header.index(name) for name in wanted]]
     t = table[:, 0]
@@ -123,7 +134,7 @@ def read_table(text: str, names: Sequence[str], file: str) -> Table:
         raise InputError(f"{file}, line {number}: t = {t[back[0] + 1]:g} after t = {t[back[0]]:g}; t must increase")
     if t[0] > 0:
         raise InputError(f"{file}: starts at t = {t[0]:g} s; a run starts at 0")
-    return Table(t, table[:, 1:])
+    return t, table[:, 1:]
 
 
 def _row(cells: Sequence[str], count: int, where: str) -> list[float]:

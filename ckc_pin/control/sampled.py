@@ -1,23 +1,29 @@
 """A controller that runs on a clock: it samples the state, and holds what it answers (zero-order hold).
 
 At t = k sample_time it sees the state; from k sample_time + delay on its u acts, until the next one does.
-Before the first one acts, u = 0. What is held is eq. 6's force u. The clock itself is the step loop's.
+Before the first one acts, u = 0. What is held is eq. 6's force u, or torques: where the controller gives those, or
+where drives are described, which quantise torques. The clock itself is the step loop's, and so are sensors and drives.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
-from ckc_pin.control.controllers import Controller
-from ckc_pin.dynamics.terms import Terms
+from ckc_pin.control.controllers import Controller, TorqueController
+from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.toml import convert
 
 __all__ = ["Sampled"]
 
 MOST = 10_000_000  # samples in a run
+
+T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Sampled:
@@ -25,20 +31,30 @@ class Sampled:
 
     Parameters
     ----------
-    controller : Controller
-        Its u is evaluated at t = k sample_time only.
+    controller : Controller or TorqueController
+        It is evaluated at t = k sample_time only.
     sample_time : float
         s, greater than 0.
     delay : float
         s, at least 0, from a sample to when it acts; it may exceed the sample time.
+    sensor, drive : mapping, optional
+        What it sees of the state, and what becomes of its torques: as a scene's [controller.sensor] and
+        [controller.drive].
 
     Raises
     ------
     InputError
-        A sample time or a delay that is not as required.
+        A sample time, a delay or a table that is not as required.
     """
 
-    def __init__(self, controller: Controller, sample_time: float, delay: float = 0.0) -> None:
+    def __init__(
+        self,
+        controller: Controller | TorqueController,
+        sample_time: float,
+        delay: float = 0.0,
+        sensor: SensorSpec | Mapping[str, Any] | None = None,
+        drive: DriveSpec | Mapping[str, Any] | None = None,
+    ) -> None:
         given: list[tuple[str, Any, str]] = [
             ("sample_time", sample_time, "greater than 0"),
             ("delay", delay, "of at least 0"),
@@ -49,10 +65,7 @@ class Sampled:
                 raise InputError(f"{name} = {value!r:.80}: a number {least} is needed, in seconds")
         self.controller = controller
         self.sample_time, self.delay = float(sample_time), float(delay)
-
-    def u(self, t: float, terms: Terms) -> Array:
-        """Return what the controller answers to a sample taken at t (s), shape (d,)."""
-        return self.controller.u(t, terms)
+        self.sensor, self.drive = _table(sensor, SensorSpec, "sensor"), _table(drive, DriveSpec, "drive")
 
     def require_countable(self, t_end: float) -> None:
         """Refuse more samples than can be meant.
@@ -64,3 +77,27 @@ class Sampled:
         """
         if t_end / self.sample_time > MOST:
             raise InputError(f"sample_time = {self.sample_time:g} gives more than {MOST} samples in {t_end:g} s")
+
+    def require_sensible(self, mechanism: Mechanism) -> None:
+        """Refuse a sensor that this mechanism, or itself, has no use for.
+
+        Raises
+        ------
+        InputError
+            Noise of a rate that is not measured, encoders on a free root.
+        """
+        if self.sensor is None:
+            return
+        if self.sensor.rate == "difference" and self.sensor.q_dot_noise:
+            raise InputError(
+                'controller.sensor.q_dot_noise: with rate = "difference" no rate is measured; q_noise makes it noisy'
+            )
+        if mechanism.rooted:
+            raise InputError(
+                f"controller.sensor: {mechanism.rooted[0]} is independent and belongs to a free root, which has no "
+                "encoder; choose other independent coordinates"
+            )
+
+
+def _table(given: Any, kind: type[T], name: str) -> T | None:
+    return given if given is None or isinstance(given, kind) else convert(dict(given), kind, "Sampled", name)

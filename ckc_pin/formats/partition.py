@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ckc_pin.errors import MechanismError
 from ckc_pin.formats.draft import Draft
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.rank import choose_dependent, rank_of
 
 __all__ = ["settle_independent"]
 
@@ -34,8 +31,8 @@ def settle_independent(draft: Draft) -> None:
         mechanism = _built(draft)
         if mechanism is None:
             return
-        names = _with_actuated(mechanism, draft.actuated)
-        if names is None:
+        names = list(mechanism.independent)
+        if not set(draft.actuated) <= set(names):
             return
         draft.independent = names
         more = [name for name in names if name not in draft.actuated]
@@ -49,19 +46,3 @@ def _built(draft: Draft) -> Mechanism | None:
         return draft.mechanism()
     except MechanismError:
         return None
-
-
-def _with_actuated(mechanism: Mechanism, actuated: list[str]) -> list[str] | None:
-    """Return coordinates that can serve as q, every actuated joint among them; None if there are none."""
-    jacobian = mechanism.freedoms.jacobian
-    motors = [mechanism.tree.index[name] for name in actuated]
-    rest = np.array([k for k in range(mechanism.n) if k not in motors], dtype=np.intp)
-    if len(motors) > mechanism.d or rank_of(jacobian[:, rest]).rank < mechanism.rank:
-        return None
-    place = {int(k): position for position, k in enumerate(rest)}
-    blocks = [np.array([place[v + k] for k in range(6)], dtype=np.intp) for _, v in mechanism.tree.free]
-    dependent = choose_dependent(jacobian[:, rest], mechanism.rank, blocks)
-    if dependent is None:
-        return None
-    chosen = set(rest.tolist()) - {int(rest[k]) for k in dependent}
-    return [*actuated, *(mechanism.coordinates[k] for k in sorted(chosen))]

@@ -88,15 +88,17 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     )
 
 
-def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, actuated: IntArray) -> list[str]:
+def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, turns: Array) -> list[str]:
     """Name coordinates that only spin a body about itself: no centre of mass moves, no actuator turns.
 
     Parameters
     ----------
     tangent : (n, d) array
         Basis of the velocities that the loops allow.
+    turns : (m, n) array
+        What motors turn with each joint.
     """
-    moves = np.vstack([tree.centre_jacobians(q_tree), np.eye(tree.n)[actuated]]) @ tangent
+    moves = np.vstack([tree.centre_jacobians(q_tree), turns]) @ tangent
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)

@@ -9,6 +9,7 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
+from ckc_pin.mechanism.motors import motors_of
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.springs import Springs
@@ -38,6 +39,8 @@ class Linkage:
     Attributes
     ----------
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
+    motors : Motors or None
+        None where the file names none.
     points : dict of str to Frame
     size : float
         Characteristic length, metres.
@@ -60,6 +63,7 @@ class Linkage:
             builder.add_coupling(coupling)
         self.closure: Closure = builder.build()
         self.joints = Joints(self.tree, spec.joint)
+        self.motors = motors_of(spec, self.tree)
         self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
         if len(self.points) < len(spec.point):

@@ -10,9 +10,10 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
+from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
-from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.mechanism.tree import Array
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
@@ -46,7 +47,10 @@ class Mechanism:
     name : str
     n, d : int
         Coordinates of the tree; freedoms of the mechanism.
-    coordinates, independent, dependent, actuated : tuple of str
+    coordinates, independent, dependent : tuple of str
+    actuated : tuple of str
+        Names of the motors, in the order of tau.
+    motors : Motors
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
     partition : Partition
@@ -72,8 +76,8 @@ class Mechanism:
         self.d, self.rank = freedoms.d, freedoms.rank.rank
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
-        self._split()
-        self._actuate()
+        self._split(linkage.motors)
+        self._actuate(linkage.motors)
 
     def __repr__(self) -> str:
         return f"Mechanism({self.name!r}, n={self.n}, d={self.d}, independent={list(self.independent)})"
@@ -124,7 +128,7 @@ class Mechanism:
 
     # --- construction ----------------------------------------------------------------------------
 
-    def _split(self) -> None:
+    def _split(self, motors: Motors | None) -> None:
         """Choose q and z, or check the choice made."""
         every = set(range(self.n))
         chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
@@ -133,7 +137,7 @@ class Mechanism:
         if chosen is None:  # no choice keeps the six coordinates of a free root together
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
             best = [self.coordinates[k] for k in sorted(every - set([] if pivoted is None else pivoted.tolist()))]
-        names = list(self.spec.independent) if self.spec.independent is not None else best
+        names = list(self.spec.independent) if self.spec.independent is not None else self._driven_first(best, motors)
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
             raise MechanismError(f"independent: a coordinate is named twice in {names}")
@@ -159,16 +163,24 @@ class Mechanism:
         self.dependent = tuple(self.coordinates[k] for k in z)
         self.partition = Partition(at, z)
 
-    def _actuate(self) -> None:
+    def _driven_first(self, best: list[str], motors: Motors | None) -> list[str]:
+        """Return coordinates that can serve as q: those with motors as far as phi_z stays sound, then others."""
+        if motors is None or self.freedoms.dependent is None:
+            return best
+        driven = np.flatnonzero(motors.turns.any(axis=0))
+        driven = driven[np.argsort(np.argmax(motors.turns[:, driven] != 0, axis=0), kind="stable")]  # in tau's order
+        blocks = [np.arange(v, v + 6) for _, v in self.tree.free]
+        z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, driven)
+        if z is None:
+            return best
+        first = [int(k) for k in driven if k not in z]
+        return [self.coordinates[k] for k in [*first, *(k for k in range(self.n) if k not in {*z, *first})]]
+
+    def _actuate(self, motors: Motors | None) -> None:
         joints = [name for name in self.independent if name not in self.tree.free_coordinates]
-        self.actuated = tuple(self.spec.actuated if self.spec.actuated is not None else joints)
-        self.actuated_at: IntArray = self.tree.indices(self.actuated, "actuated")
-        if len(set(self.actuated)) != len(self.actuated):
-            raise MechanismError(f"actuated: a joint is named twice in {list(self.actuated)}")
-        rooted = [name for name in self.actuated if name in self.tree.free_coordinates]
-        if rooted:
-            raise MechanismError(f"actuated: {rooted[0]!r} belongs to a free root, which has no motor")
-        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, self.actuated_at)
+        self.motors = Motors.on_joints(self.tree, joints) if motors is None else motors
+        self.actuated = self.motors.names
+        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, self.motors.turns)
         if idle:
             self.warnings.append(
                 f"idle freedoms, bodies that spin about themselves and move nothing: {', '.join(idle)}"

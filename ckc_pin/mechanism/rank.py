@@ -14,6 +14,7 @@ from ckc_pin.mechanism.tree import Array, IntArray, Tree
 __all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled", "scales"]
 
 RANK_TOLERANCE = 1e-5  # relative; files are rounded to six digits
+SOUND = 0.03  # of the largest pivot: what a column must bring along to be in z in the place of one that shall be in q
 SURE = 1e-9  # singular values between this and the tolerance are neither zero nor not
 
 
@@ -68,7 +69,9 @@ def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
     return np.sort(order[rank:])
 
 
-def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = ()) -> IntArray | None:
+def choose_dependent(
+    scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = (), wanted: Sequence[int] | IntArray = ()
+) -> IntArray | None:
     """Choose z so that phi_z is well conditioned, by a pivoted QR.
 
     Parameters
@@ -77,6 +80,8 @@ def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArra
     rank : int
     blocks : sequence of index arrays
         Coordinates of free roots. Each is tried as dependent as a whole, then as independent as a whole.
+    wanted : sequence of int
+        Coordinates that shall be independent: dependent only where phi_z would come near to singular without them.
 
     Returns
     -------
@@ -93,9 +98,21 @@ def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArra
             # take the blocks as dependent and choose the rest in what they leave over
             q, _ = np.linalg.qr(scaled_jacobian[:, inside])
             left = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
-            order, _ = pivoted_columns(left)
-            return np.sort(np.concatenate([inside, rest[order[: rank - len(inside)]]]))
+            return np.sort(np.concatenate([inside, _pivots(left, rank - len(inside), rest, wanted)]))
         if rank_of(scaled_jacobian[:, rest]).rank < rank:
             return None
-    order, _ = pivoted_columns(scaled_jacobian[:, rest])
-    return np.sort(rest[order[:rank]])
+    return np.sort(_pivots(scaled_jacobian[:, rest], rank, rest, wanted))
+
+
+def _pivots(matrix: Array, count: int, names: IntArray, wanted: Sequence[int] | IntArray) -> IntArray:
+    """Return the names of so many columns by a pivoted QR, those that are wanted elsewhere last."""
+    first = np.flatnonzero(~np.isin(names, wanted))
+    if not 0 < len(first) < len(names):
+        return names[pivoted_columns(matrix)[0][:count]]
+    order, pivots = pivoted_columns(matrix[:, first])
+    largest = np.linalg.norm(matrix, axis=0).max(initial=0.0)
+    first = first[order[: min(count, int(np.sum(pivots > SOUND * largest)))]]
+    q, _ = np.linalg.qr(matrix[:, first])
+    others = np.setdiff1d(np.arange(len(names)), first)
+    left = matrix[:, others] - q @ (q.T @ matrix[:, others])
+    return names[np.concatenate([first, others[pivoted_columns(left)[0][: count - len(first)]]])]

@@ -14,6 +14,7 @@ __all__ = [
     "LoopSpec",
     "LoopType",
     "MechanismSpec",
+    "MotorSpec",
     "PointSpec",
     "SpringSpec",
     "TreeSpec",
@@ -109,6 +110,21 @@ class JointSpec(_Spec, frozen=True):
     restitution: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
+class MotorSpec(_Spec, frozen=True):
+    """A motor on a joint, or on a sum of joints: its angle is ratio times the sum of what `joints` says.
+
+    torque_limit, speed_limit and tau are its own, before the gear: it acts on a joint as ratio * tau.
+    """
+
+    name: Name | None = None
+    joint: Name | None = None
+    joints: dict[str, float] = {}
+    ratio: float = 1.0
+    rotor_inertia: NonNegative = 0.0
+    torque_limit: Positive | None = None
+    speed_limit: Positive | None = None
+
+
 class PointSpec(_Spec, frozen=True):
     """A point to report and to trace."""
 
@@ -131,6 +147,7 @@ class MechanismSpec(_Spec, frozen=True):
     spring: list[SpringSpec] = []
     force: list[ForceSpec] = []
     joint: list[JointSpec] = []
+    motor: list[MotorSpec] = []
     point: list[PointSpec] = []
 
     def plain(self) -> dict[str, Any]:

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
 from ckc_pin.control.desired import Desired, Harmonics, Table
 from ckc_pin.control.point_path import Circle, Line, Place, PointPath
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.spec import DriveSpec, SensorSpec
+from ckc_pin.control.torques import Torques
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native.tables import closure_table, core_table
 
@@ -22,30 +25,81 @@ QUARTER = math.pi / 2
 
 
 def control_table(
-    controller: Controller | None, actuation: Actuation, call: Callable[[Controller], Callable[[Any], Any]]
+    controller: Controller | TorqueController | Sampled | None,
+    actuation: Actuation,
+    call: Callable[[Controller | TorqueController], Callable[..., Any]],
 ) -> dict[str, Any]:
     """Describe what acts.
 
     Parameters
     ----------
-    controller : Controller or None
+    controller : Controller, TorqueController, Sampled or None
     actuation : Actuation
     call : callable
-        Makes of a controller that only Python knows a function of the loop's view of its state, to u.
+        Makes of a controller that only Python knows a function of the loop's view of its state, to u or tau.
+
+    Raises
+    ------
+    InputError
+        A controller without u or tau, a sensor or a drive for what is not there.
     """
-    at = actuation.at
-    limit = np.full(len(at), np.inf) if actuation.limit is None else actuation.limit
-    table: dict[str, Any] = {"actuated": at.tolist(), "direct": actuation.direct, "limit": limit}
+    table: dict[str, Any] = {
+        "turns": np.asfortranarray(actuation.motors.turns),
+        "direct": actuation.direct,
+        "limit": actuation.limit,
+        "weights": actuation.weights,
+        "preload": actuation.preload,
+    }
     if isinstance(controller, Sampled):
-        table |= {"sample_time": controller.sample_time, "delay": controller.delay}
-        controller = controller.controller
-    if controller is not None:
-        table["law"] = _law(controller) or {"kind": "call", "function": call(controller)}
+        clock, controller = controller, controller.controller
+        table["clock"] = _clock(clock.sample_time, clock.delay)
+        looks = type(controller) is not SetPoint or (clock.drive is not None and not actuation.direct)
+        if clock.sensor is not None:
+            table["sensor"] = _sensor(clock.sensor, actuation.mechanism, clock.sample_time, closes=looks)
+        if clock.drive is not None:
+            table["drive"] = _drive(clock.drive, actuation)
+    if controller is None:
+        return table
+    torques = gives_tau(controller)
+    if type(controller) is Torques:
+        spacing = float(np.diff(controller.times).min(initial=np.inf))
+        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.lines)
+    return table | {"law": _law(controller) or {"kind": "call", "function": call(controller), "of_motors": torques}}
+
+
+def _clock(period: float, delay: float = 0.0, times: Array | None = None, *, holds: bool = True) -> dict[str, Any]:
+    return {"period": period, "delay": delay, "times": np.zeros(0) if times is None else times, "holds": holds}
+
+
+def _sensor(sensor: SensorSpec, mechanism: Mechanism, period: float, *, closes: bool) -> dict[str, Any]:
+    """Describe a sensor; `closes`: the controller looks at more than q and q_dot, so the loops are closed at those."""
+    table: dict[str, Any] = {
+        "differences": sensor.rate == "difference",
+        "smoothing": 1.0 if sensor.filter is None else -math.expm1(-period / sensor.filter),
+        "seed": sensor.seed,
+    }
+    names = mechanism.independent
+    for key in ("resolution", "q_noise", "q_dot_noise"):
+        given = getattr(sensor, key)
+        values = given if isinstance(given, dict) else dict.fromkeys(names, given)
+        table[key] = mechanism.vector(values, names, f"controller.sensor.{key}", fill=0.0)
+    return {**table, "observer": core_table(mechanism)} if closes else table
+
+
+def _drive(drive: DriveSpec, actuation: Actuation) -> dict[str, Any]:
+    table = {}
+    for key, name, absent in (("resolution", "torque_resolution", 0.0), ("rate", "torque_rate", np.inf)):
+        given = getattr(drive, name)
+        values = given if isinstance(given, dict) else dict.fromkeys(actuation.motors.names, given or absent)
+        table[key] = actuation.motors.vector(values, f"controller.drive.{name}", absent)
     return table
 
 
-def _law(controller: Controller) -> dict[str, Any] | None:
-    """Return eq. 14 or eq. 16; None for any other controller."""
+def _law(controller: Controller | TorqueController) -> dict[str, Any] | None:
+    """Return eq. 14, eq. 16 or torques over time; None for any other controller."""
+    if type(controller) is Torques:
+        tau = np.asfortranarray(controller.values.T)
+        return {"kind": "torques", "times": controller.times, "tau": tau, "lines": controller.lines}
     if type(controller) is SetPoint:
         target = controller.target  # what it compensates is a constant, whichever model that is of
         gains = {"K_P": controller.K_P, "K_V": controller.K_V}

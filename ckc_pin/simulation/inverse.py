@@ -18,6 +18,7 @@ import numpy as np
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import FEWEST, Desired, Table
+from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
@@ -29,7 +30,7 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.motion_forces import MotionForces, collected
-from ckc_pin.simulation.prepare import output_instants, scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import output_instants, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.workspace import leaving
@@ -84,7 +85,8 @@ def inverse_dynamics(
 
     Notes
     -----
-    Of more actuators than freedoms tau has the least norm, as a run's has; of redundant rows the multipliers have.
+    Of more motors than freedoms tau is the least, or nearest to the preload, as a run's is within limits; of redundant
+    rows the multipliers are the least.
     Friction of a joint is -friction sign(v'), zero where the joint rests.
     """
     if isinstance(what, str | Path) and _names_a_run(str(what)):
@@ -94,12 +96,12 @@ def inverse_dynamics(
     with one_blas_thread():
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, changes or {}), what.mechanism
-            actuation = _actuation(scene, mechanism)
+            actuation = scene_actuation(scene, mechanism)
             motion, t_end = _recorded(what, mechanism, actuation), float(what.t[-1])
         else:
             scene = what if isinstance(what, Scene) else load_scene(what, changes)
             mechanism, t_end = scene_mechanism(scene), scene.spec.t_end
-            actuation = _actuation(scene, mechanism)
+            actuation = scene_actuation(scene, mechanism)
             motion = _prescribed(scene, mechanism, actuation)
         return _along(motion, mechanism, actuation, scene.name, progress or (lambda t, t_end: None), t_end)
 
@@ -114,10 +116,6 @@ def _scene_of(run: Run, changes: Mapping[str, Any]) -> Scene:
         raise InputError("mechanism: the motion of a run is its own mechanism's; give a scene to take another")
     sources = Sources(run.scene_name, None, run.texts)
     return make_scene(with_changes(run.scene, changes), run.scene_name, sources)
-
-
-def _actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
-    return Actuation(mechanism, scene.spec.controller.torque_limit if scene.spec.controller else None)
 
 
 def _along(
@@ -155,19 +153,18 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     if not np.all(np.isfinite(needed)):
         raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
-    u_tree = np.zeros(mechanism.n)
-    u_tree[actuation.at] = instant.tau
+    u_tree = mechanism.motors.force(instant.tau)
     lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
     if np.any(np.abs(lacking) > enough):
         _require_grip(mechanism, tangent, actuation, t)
-    u_tree[actuation.at] += actuation.distribute(tangent, lacking)
-    forces = multipliers(terms, u_tree + friction, acceleration)
+    tau = instant.tau + actuation.distribute(tangent, lacking)
+    forces = multipliers(terms, mechanism.motors.force(tau) + friction, acceleration)
     return {
         "t": t,
         "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
         "v_tree": terms.v_tree,
         "a_tree": acceleration,
-        "tau": u_tree[actuation.at],
+        "tau": tau,
         "multipliers": forces,
         "loop_wrenches": loop_wrenches(terms, forces),
         "joint_forces": joint_wrenches(terms, acceleration, forces),
@@ -178,7 +175,7 @@ def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t:
     """Refuse a configuration where some freedom is held by no actuator, as at a rocker's dead centre."""
     motions = tangent / mechanism.tree.reach[:, None]
     motions, _ = np.linalg.qr(motions)  # of one size, in radians or the mechanism's size
-    grip = motions[actuation.at]
+    grip = mechanism.motors.turns @ motions
     values, directions = np.linalg.eigh(grip.T @ grip)
     if values[0] <= DEAD**2:
         loose = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
@@ -191,9 +188,10 @@ def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t:
 def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
     """What the controller of a scene wants, from sigma: v' = rho q_dot, its rate rho q_ddot + rho_dot q_dot."""
     controller = scene_controller(scene, mechanism)
-    if controller is None:
+    if controller is None or isinstance(controller, Torques):
+        lacks = "no [controller]" if controller is None else 'the controller\'s type is "torques"'
         raise InputError(
-            f"{scene.name}: no [controller], so no motion is prescribed; give controller.desired, or a run of the scene"
+            f"{scene.name}: {lacks}, so no motion is prescribed; give controller.desired, or a run of the scene"
         )
     at, none = find_start(mechanism, scene).at, np.zeros(mechanism.d)
     desired: Desired
@@ -216,7 +214,7 @@ def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Ite
             actuation.require_transmission(found.at)
         at, before = found.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
-        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), np.zeros(len(actuation.at)))
+        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload)
 
 
 def _recorded(run: Run, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
@@ -227,7 +225,7 @@ def _recorded(run: Run, mechanism: Mechanism, actuation: Actuation) -> Iterator[
         )
     states = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in run.q_tree]
     rates: Array | None = None
-    if mechanism.joints.any:
+    if mechanism.joints.friction.any() or mechanism.joints.stopped.any():
         if len(run.t) < FEWEST:
             raise InputError(f"{run.scene_name}: {len(run.t)} output instants; rates along {FEWEST} have accelerations")
         actuation.require_transmission(states[0])
@@ -235,9 +233,7 @@ def _recorded(run: Run, mechanism: Mechanism, actuation: Actuation) -> Iterator[
     for k, (t, at) in enumerate(zip(run.t.tolist(), states, strict=True)):
         terms = Terms(mechanism, at, run.v_tree[k])
         if rates is None:
-            u_tree = np.zeros(mechanism.n)
-            u_tree[actuation.at] = run.tau[k]
-            acceleration = dae_acceleration(terms, u_tree)
+            acceleration = dae_acceleration(terms, mechanism.motors.force(run.tau[k]))
         else:  # as near to the spline's as the loops allow
             gap = at.J @ rates[k] + terms.J_dot @ terms.v_tree
             acceleration = rates[k] - np.linalg.lstsq(at.J, gap, rcond=1e-9)[0]

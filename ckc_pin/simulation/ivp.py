@@ -24,7 +24,8 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller
+from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
     dae_acceleration,
@@ -40,7 +41,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene, load_scene
 
 __all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
@@ -106,7 +107,7 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     elif changes:
         raise InputError("as_ivp: changes go with the name of a scene; a Scene is complete")
     spec, mechanism = scene.spec, scene_mechanism(scene)
-    if spec.controller is not None and spec.controller.sample_time is not None:
+    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
         raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")
     smoothing = spec.friction_smoothing
     if mechanism.joints.has_events(smoothing):
@@ -115,8 +116,7 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
             "friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    limit = spec.controller.torque_limit if spec.controller else None
-    force = force_of(scene_controller(scene, mechanism), Actuation(mechanism, limit))
+    force = force_of(scene_controller(scene, mechanism), scene_actuation(scene, mechanism))
     if smoothing is not None:
         force = _with_friction(force, mechanism, smoothing)
     span = (0.0, spec.t_end)
@@ -130,11 +130,14 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     return LevelSet(mechanism, start.at, start.q_dot, force, span, *how)
 
 
-def force_of(controller: Controller | None, actuation: Actuation) -> Force:
+def force_of(controller: Controller | TorqueController | None, actuation: Actuation) -> Force:
     """Return u' on the tree as a function of (t, terms)."""
     if controller is None:
         return lambda t, terms: actuation.none.u_tree
-    return lambda t, terms: actuation.apply(terms, controller.u(t, terms)).u_tree
+    torques = gives_tau(controller)
+    law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
+    act = actuation.drive if torques else actuation.apply
+    return lambda t, terms: act(terms, law(t, terms)).u_tree
 
 
 def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.actuation import require_u
-from ckc_pin.control.controllers import Controller
+from ckc_pin.control.actuation import require_tau, require_u
+from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
@@ -93,12 +93,15 @@ for _name in NATIVE:
     setattr(LoopTerms, _name, _native(_name))
 
 
-def controller_call(controller: Controller, mechanism: Mechanism) -> Callable[..., Any]:
-    """Return what the loop calls for a controller that only Python knows: (view) to u, or why there is none."""
+def controller_call(controller: Controller | TorqueController, mechanism: Mechanism) -> Callable[..., Any]:
+    """Return what the loop calls for a controller that only Python knows: (view) to u or tau, or why there is none."""
+    torques = gives_tau(controller)
+    law: Callable[[float, Terms], Any] = getattr(controller, "tau" if torques else "u")
+    require = require_tau if torques else require_u
 
     def call(*given: Any) -> Any:
         try:
-            return require_u(controller.u(given[2], LoopTerms(mechanism, given)), mechanism)
+            return require(law(given[2], LoopTerms(mechanism, given)), mechanism)
         except NumericalError as error:
             return str(error)
 

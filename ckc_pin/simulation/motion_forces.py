@@ -38,7 +38,7 @@ class MotionForces:
         Configuration, velocity and acceleration by coordinate, in the order of `coordinates`.
     tau : (m, actuators) array
         In the order of `actuated`, N m or N; not cut at the limits.
-    limit : (actuators,) array or None
+    limit : (motors,) array
         Of |tau|, infinite where there is none.
     loop_forces : dict of str to (m, rows of the loop) array
         Multipliers of eq. 1, N or N m, couplings among them.
@@ -62,7 +62,7 @@ class MotionForces:
     v_tree: Array
     a_tree: Array
     tau: Array
-    limit: Array | None
+    limit: Array
     loop_forces: dict[str, Array]
     loop_wrenches: dict[str, Array]
     joint_forces: dict[str, Array]
@@ -111,7 +111,7 @@ class MotionForces:
 def collected(
     rows: Sequence[dict[str, Any]],
     mechanism: Mechanism,
-    limit: Array | None,
+    limit: Array,
     name: str,
     status: Status,
     message: str,
@@ -142,10 +142,8 @@ def collected(
     )
 
 
-def _exceeded(t: Array, tau: Array, limit: Array | None, motors: Sequence[str]) -> list[dict[str, Any]]:
+def _exceeded(t: Array, tau: Array, limit: Array, motors: Sequence[str]) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
-    if limit is None:
-        return found
     for k, motor in enumerate(motors):
         size, most = np.abs(tau[:, k]), float(limit[k])
         beyond = np.flatnonzero(size > most * (1 + BEYOND))

@@ -15,8 +15,10 @@ import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.generated.library import Library, compiled, find
@@ -32,7 +34,7 @@ from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene, SceneSpec
 
-__all__ = ["Prepared", "output_instants", "prepare", "scene_controller", "scene_mechanism"]
+__all__ = ["Prepared", "output_instants", "prepare", "scene_actuation", "scene_controller", "scene_mechanism"]
 
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
@@ -58,7 +60,7 @@ def _beside(scene: Scene, name: str) -> str | Path:
 
 def scene_controller(
     scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
-) -> SetPoint | Tracking | None:
+) -> SetPoint | Tracking | Torques | None:
     """Build a scene's controller; the texts of its own model are added to `texts`."""
 
     def load_model(name: str) -> Mechanism:
@@ -73,6 +75,13 @@ def scene_controller(
     return make_controller(spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model)
 
 
+def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
+    """Return how a scene's controller, or who stands in for it, moves the motors."""
+    spec = scene.spec.controller
+    allocation = spec.allocation if isinstance(spec, FeedbackSpec) else None
+    return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A scene ready to be run, again and again.
@@ -81,8 +90,9 @@ class Prepared:
     ----------
     scene : Scene
     mechanism : Mechanism
-    controller : Controller or None
+    controller : Controller, TorqueController, Sampled or None
         What acts, beside a u that is held.
+    actuation : Actuation
     events : list of EventFunction
     instants : (m,) array
         Output instants, s; empty where the caller steps.
@@ -94,7 +104,8 @@ class Prepared:
 
     scene: Scene
     mechanism: Mechanism
-    controller: Controller | None
+    controller: Controller | TorqueController | Sampled | None
+    actuation: Actuation
     events: list[EventFunction]
     instants: Array
     start: Start
@@ -115,7 +126,7 @@ class Prepared:
 
 def prepare(
     scene: Scene,
-    controller: Controller | None = None,
+    controller: Controller | TorqueController | Sampled | None = None,
     events: Sequence[Event] = (),
     *,
     free: bool = False,
@@ -126,7 +137,7 @@ def prepare(
 
     Parameters
     ----------
-    controller : Controller, optional
+    controller : Controller, TorqueController or Sampled, optional
         Takes the place of the scene's.
     events : sequence of Event
         Beside those of the scene.
@@ -150,11 +161,12 @@ def prepare(
     spec = scene.spec.controller
     if controller is None and not free:
         controller = scene_controller(scene, mechanism, texts)
-        if controller is not None and spec is not None and spec.sample_time is not None:
-            controller = Sampled(controller, spec.sample_time, spec.delay)
+        if controller is not None and isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
+            controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
     if isinstance(controller, Sampled):
         controller.require_countable(scene.spec.t_end)
-    actuation = Actuation(mechanism, spec.torque_limit if spec else None)
+        controller.require_sensible(mechanism)
+    actuation = scene_actuation(scene, mechanism)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
@@ -164,7 +176,8 @@ def prepare(
     _require_within_stops(mechanism, start)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
-    if controller is not None or free:
+    law = controller.controller if isinstance(controller, Sampled) else controller
+    if law is not None and not gives_tau(law):
         actuation.require_transmission(start.at)
     loop = _core.Loop(
         core_table(
@@ -176,7 +189,7 @@ def prepare(
         [event.row for event in functions],
     )
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, functions, instants, start, texts, loop)
+    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, loop)
 
 
 def _library(mechanism: Mechanism, terms: str) -> Library | None:

@@ -140,6 +140,9 @@ def run_table(run: Run) -> Table:
     table.add_row(f"q_tree at {run.t[-1]:g} s", last)
     if "controller" in run.scene:
         table.add_row("largest |u|, |tau|", f"{np.abs(run.u).max():.4g}, {np.abs(run.tau).max():.4g}")
+    for name, rate in run.too_fast().items():
+        limit = run.mechanism.motors.speed_limit[run.actuated.index(name)]
+        table.add_row("warning", f"{name} turns at {rate:.4g}, its speed_limit is {limit:.4g}")
     table.add_row("energy start, end", f"{run.energy[0]:.9g}, {run.energy[-1]:.9g} J")
     table.add_row("largest |phi - w|", f"{run.max_phi:.2g} (its rate {run.max_phi_dot:.2g})")
     for event in run.events[:MOST_EVENTS]:
@@ -191,10 +194,10 @@ def inverse_table(found: MotionForces) -> Group:
         table.add_column(title, justify="right")
     beyond = {entry["motor"]: entry for entry in found.exceeded}
     table.add_column("limit")
-    lengths = dict(zip(found.coordinates, found.mechanism.tree.in_metres.tolist(), strict=True))
+    lengths, turns = found.mechanism.tree.in_metres, found.mechanism.motors.turns != 0
     for k, motor in enumerate(found.actuated):
-        unit = "N" if lengths[motor] else "N m"
-        limit = np.inf if found.limit is None else found.limit[k]
+        unit = "N" if np.all(lengths[turns[k]]) else "N m"
+        limit = found.limit[k]
         says = f"{limit:.4g} {unit}" if np.isfinite(limit) else ""
         if motor in beyond:
             says += f", exceeded from t = {beyond[motor]['t']:.4g} s on"

@@ -38,7 +38,8 @@ class Run:
     q_tree, v_tree : (m, n) arrays
         By coordinate, in the order of `coordinates`.
     u, tau : (m, d) and (m, actuators) arrays
-        Eq. 6's force in the order of `independent`; the actuators' efforts in the order of `actuated`.
+        Eq. 6's force in the order of `independent`; the motors' torques in the order of `actuated`. Where torques act
+        and phi_z is singular, there is no u: not finite.
     phi, w : (m, rows) arrays
         The closure's residual, and what it should be (zero but for the SPF started off its manifold).
     energy : (m,) array
@@ -125,6 +126,18 @@ class Run:
                 paths[name][k] = p
         return paths
 
+    @cached_property
+    def motor_rates(self) -> Array:
+        """Rates of the motors themselves, before their gears, along the run, shape (m, motors), rad/s or m/s."""
+        return self.v_tree @ self.mechanism.motors.turns.T
+
+    def too_fast(self) -> dict[str, float]:
+        """Return the largest rate of each motor that is above its speed limit at some output instant."""
+        motors = self.mechanism.motors
+        largest = np.abs(self.motor_rates).max(axis=0, initial=0.0)
+        every = zip(motors.names, largest, motors.speed_limit, strict=True)
+        return {name: float(rate) for name, rate, limit in every if rate > limit}
+
     def loop_forces(self) -> dict[str, Array]:
         """Multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
 
@@ -139,8 +152,7 @@ class Run:
         for k, numbers in enumerate(self.q_tree):
             at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
             terms = Terms(mechanism, at, self.v_tree[k])
-            u_tree = np.zeros(mechanism.n)
-            u_tree[mechanism.actuated_at] = self.tau[k]
+            u_tree = mechanism.motors.force(self.tau[k])
             try:
                 forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
             except NumericalError:
@@ -163,6 +175,7 @@ class Run:
             "points": last,
             "max_abs_u": float(np.abs(self.u).max(initial=0.0)),
             "max_abs_tau": float(np.abs(self.tau).max(initial=0.0)),
+            "too_fast": self.too_fast(),
             "max_phi": self.max_phi,
             "max_phi_dot": self.max_phi_dot,
             "energy_start": float(self.energy[0]),

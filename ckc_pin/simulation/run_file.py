@@ -70,7 +70,7 @@ class _Stats(msgspec.Struct):
 
 
 class _Controller(msgspec.Struct):
-    type: Literal["set_point", "tracking"]
+    type: Literal["set_point", "tracking", "torques"]
 
 
 class _Scene(msgspec.Struct):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from ckc_pin.control.spec import ControllerSpec
+from ckc_pin.control.spec import ControllerSpec, FeedbackSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
@@ -199,8 +199,11 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
         )
     if spec.initial.w is not None and spec.formulation != "spf":
         raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
-    if spec.controller is not None and spec.controller.delay and spec.controller.sample_time is None:
-        raise InputError(f"{sources.name}: controller.delay: give sample_time too; what is sampled is delayed")
+    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is None:
+        for key, why in (("delay", "what is sampled is delayed"), ("sensor", "it looks at samples"),
+                         ("drive", "it acts on what is sampled")):  # fmt: skip
+            if getattr(spec.controller, key):
+                raise InputError(f"{sources.name}: controller.{key}: give sample_time too; {why}")
     for k, event in enumerate(spec.event):
         _check_event(event, f"{sources.name}: event[{k}]")
     if spec.solver.baumgarte and spec.formulation != "dae":

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.controllers import Controller
+from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -33,7 +33,7 @@ def simulate(
     scene: Scene | str | Path,
     changes: Mapping[str, Any] | None = None,
     *,
-    controller: Controller | None = None,
+    controller: Controller | TorqueController | Sampled | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,
@@ -47,8 +47,8 @@ def simulate(
         A scene, its shipped name ("five_bar/tracking"), or its path.
     changes : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
-    controller : Controller, optional
-        Takes the place of the scene's, its sample time and delay included; `Sampled` gives it its own.
+    controller : Controller, TorqueController or Sampled, optional
+        Takes the place of the scene's, its sample time, delay, sensor and drive included; `Sampled` gives it its own.
     events : sequence of Event, optional
         Event functions of the state, beside the scene's events.
     progress : callable, optional

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.actuation import require_u
-from ckc_pin.control.controllers import Controller
+from ckc_pin.control.actuation import require_tau, require_u
+from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
@@ -104,7 +104,7 @@ class Simulator:
     Attributes
     ----------
     mechanism : Mechanism
-    controller : Controller or None
+    controller : Controller, TorqueController or None
         The scene's own, for who wants to call it: ``controller.u(state.t, state.terms)``.
     state : State
         Where it is.
@@ -148,7 +148,8 @@ class Simulator:
         self._ready = prepare(scene, events=events, free=True)
         self._loop = self._ready.loop
         self.mechanism = self._ready.mechanism
-        self.controller: Controller | None = scene_controller(scene, self.mechanism)
+        self.controller: Controller | TorqueController | None = scene_controller(scene, self.mechanism)
+        self._no_u = self._ready.actuation.refusal(self._ready.start.at)
         self._none = np.zeros(self.mechanism.d)
         gate = _core.Gate(InputError)  # the loop has one state
         self._step, self._reset, self._events, self._stats = (
@@ -200,8 +201,8 @@ class Simulator:
                 self._state = self._present()
             return self._state
 
-    def step(self, u: Any, dt: float) -> State:
-        """Hold u for dt seconds.
+    def step(self, u: Any = None, dt: Any = None, *, tau: Any = None) -> State:
+        """Hold u, or the motors' torques, for dt seconds.
 
         Parameters
         ----------
@@ -209,6 +210,8 @@ class Simulator:
             Eq. 6's force on the independent coordinates, N m or N; None: no force.
         dt : float
             s, greater than 0.
+        tau : (motors,) array or {motor: number}, optional
+            In the place of u, the motors' own torques, N m or N; motors not in a table have none.
 
         Returns
         -------
@@ -218,24 +221,32 @@ class Simulator:
         Raises
         ------
         InputError
-            u of the wrong shape or not finite, dt not positive, another step is under way; nothing has moved.
+            u or tau of the wrong shape or not finite, both of them, a u that the motors cannot produce, dt not
+            positive, another step is under way; nothing has moved.
         NumericalError
             The numerics stopped within the step; `state` is the last one that was reached.
         """
-        applied = self._none if u is None else require_u(u, self.mechanism, "u")
+        if tau is not None:
+            if u is not None:
+                raise InputError("step: give either u or tau, not both")
+            applied = require_tau(tau, self.mechanism, "tau")
+        else:
+            applied = self._none if u is None else require_u(u, self.mechanism, "u")
+            if self._no_u and applied.any():
+                raise InputError(f"u: {self._no_u}; give tau by motor instead")
         until = self._state.t + self._require_dt(dt)
         with self._step:
-            return self._go(applied, until)
+            return self._go(applied, tau is not None, until)
 
-    def _go(self, u: Array, until: float) -> State:
+    def _go(self, applied: Array, of_motors: bool, until: float) -> State:
         try:
-            while (found := self._loop.step(u, until, PAUSE)) is not None and found[0][0] == "pause":
+            while (found := self._loop.step(applied, of_motors, until, PAUSE)) is not None and found[0][0] == "pause":
                 pass
         except BaseException:  # a caller's function may raise, and Ctrl-C
             self._state = self._present()
             raise
         if found is None:
-            raise InputError(f"u is not finite: {u.tolist()}")
+            raise InputError(f"{'tau' if of_motors else 'u'} is not finite: {applied.tolist()}")
         stop, reached = found
         if reached is not None:
             self._state = State(self.mechanism, *reached)

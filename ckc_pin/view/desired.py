@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
-from ckc_pin.control.spec import ControllerSpec, SetPointSpec
+from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
@@ -35,7 +35,7 @@ class DesiredPath:
 
 
 def desired_along(run: Run) -> DesiredPath | None:
-    """Return q_d and its rate at the run's output instants, or None where the scene has no controller.
+    """Return q_d and its rate at the run's output instants, or None where the scene has no controller that wants any.
 
     Raises
     ------
@@ -45,6 +45,8 @@ def desired_along(run: Run) -> DesiredPath | None:
     if "controller" not in run.scene:
         return None
     spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
+    if isinstance(spec, TorquesSpec):
+        return None
     if isinstance(spec, SetPointSpec):
         q_d = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
         return DesiredPath("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))

@@ -105,7 +105,8 @@ def _groups(runs: Iterable[Run]) -> list[Group]:
     found: dict[tuple[Any, ...], list[Run]] = {}
     for run in runs:
         controller = run.scene.get("controller")
-        kind = str(controller["type"]) if controller else "own" if np.any(run.tau) else "motion"
+        law = controller["type"] if controller else "torques"
+        kind = str(law) if law != "torques" else "own" if np.any(run.tau) else "motion"
         found.setdefault((kind, run.mechanism.name, run.coordinates, run.independent, run.actuated), []).append(run)
     groups = []
     for (kind, *_), members in found.items():

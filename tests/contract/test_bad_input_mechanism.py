@@ -25,6 +25,10 @@ def _add(what: str, entry: str, *says: str) -> Bad:
     return _edit(what, "[[point]]", f"{entry}\n[[point]]", *says)
 
 
+def _motor(what: str, entry: str, *says: str) -> Bad:
+    return _edit(what, f"actuated = {INDEPENDENT}", f"[[motor]]\n{entry}\n", *says)
+
+
 def _file(what: str, content: str | bytes, *says: str) -> Bad:
     return Bad(what, CHECK, says, files={"bar/mechanism.toml": content})
 
@@ -167,6 +171,23 @@ COORDINATE_CHOICES = [
     _edit("independent as a string", INDEPENDENT, '"theta_1"', "independent = 'theta_1': a list is needed"),
     _edit("unknown actuated", f"actuated = {INDEPENDENT}", 'actuated = ["x"]', "actuated: no coordinate 'x'"),
     _edit("actuated twice", f"actuated = {INDEPENDENT}", 'actuated = ["theta_1", "theta_1"]', "actuated: a joint is"),
+    _motor("motor on no joint", 'joint = "x"', "motor 'x': no joint of one freedom called 'x'; there are theta_1"),
+    _motor("motor on nothing", 'name = "x"', "motor 'x': give either joint, or joints, a table of numbers by joint"),
+    _motor(
+        "motor on both", 'joint = "theta_1"\njoints = {theta_3 = 1.0}', "motor 'theta_1': give either joint, or joints"
+    ),
+    _motor("motor without a name", "joints = {theta_1 = 1.0}", "motor 1: give it a joint, or a name and joints"),
+    _motor("motors of one name", 'joint = "theta_1"\n[[motor]]\njoint = "theta_1"', "two motors are called 'theta_1'"),
+    _motor("motor that turns nothing", 'joint = "theta_1"\nratio = 0', "motor 'theta_1': its gear turns no joint"),
+    _motor("negative rotor", 'joint = "theta_1"\nrotor_inertia = -1.0', "rotor_inertia = -1.0: a number of at least 0"),
+    _motor("limit of nothing", 'joint = "theta_1"\ntorque_limit = 0', "torque_limit = 0: a number greater than 0"),
+    _motor("endless ratio", 'joint = "theta_1"\nratio = inf', f"motor[0].ratio = inf: {FINITE}"),
+    _motor(
+        "rotor on two joints",
+        'name = "belt"\njoints = {theta_1 = 1.0, theta_3 = 1.0}\nrotor_inertia = 1e-3',
+        "motor 'belt': rotor_inertia goes with a motor on one joint",
+    ),
+    _add("motors in two ways", '[[motor]]\njoint = "theta_1"', "actuated, motor: give one of them"),
     _edit("unknown guess", "theta_4 = -0.248", "theta_5 = 1.0", "q_guess: no coordinate 'theta_5'", COORDINATES),
     _edit("guess of nan", "theta_4 = -0.248", "theta_4 = nan", f"{NAMED}q_guess.theta_4 = nan: {FINITE}"),
     _edit("guess in words", "theta_4 = -0.248", 'theta_4 = "a"', f"{NAMED}q_guess.theta_4 = 'a': a number is needed"),

@@ -21,7 +21,7 @@ CHECK = """n d rows rank redundant independent dependent coordinates q_tree det_
 TERMS = """coordinates independent dependent q_tree v_tree D_tree C_tree h_tree phi phi_q phi_z rho rho_dot D C h
            energy"""
 RUN = """status message t coordinates q_tree v_tree u tau points max_abs_u max_abs_tau max_phi max_phi_dot energy_start
-         energy_end dissipated formulation epsilon stats"""
+         energy_end dissipated formulation epsilon stats too_fast"""
 STATS = """rhs steps rejected newton factorizations jacobians switches python_calls wall_s method
            steps_by_method terms"""
 

@@ -13,7 +13,15 @@ import pytest
 import ckc_pin
 from ckc_pin import errors
 from ckc_pin.control.point_path import CircleSpec, LineSpec, PointPathSpec
-from ckc_pin.control.spec import HarmonicsSpec, SetPointSpec, TrackingSpec
+from ckc_pin.control.spec import (
+    AllocationSpec,
+    DriveSpec,
+    HarmonicsSpec,
+    SensorSpec,
+    SetPointSpec,
+    TorquesSpec,
+    TrackingSpec,
+)
 from ckc_pin.mechanism.faults import expected
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.spec import (
@@ -24,6 +32,7 @@ from ckc_pin.mechanism.spec import (
     LoopSpec,
     LoopType,
     MechanismSpec,
+    MotorSpec,
     PointSpec,
     SpringSpec,
     TreeSpec,
@@ -37,9 +46,10 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
 
 # in the order of the page
-SPECS = [MechanismSpec, TreeSpec, LoopSpec, FrameSpec, CouplingSpec, SpringSpec, ForceSpec, JointSpec, PointSpec,
-         SceneSpec, GeneratorSpec, InitialSpec, SolverSpec, EventSpec, SetPointSpec, TrackingSpec, HarmonicsSpec,
-         PointPathSpec, CircleSpec, LineSpec]  # fmt: skip
+SPECS = [MechanismSpec, TreeSpec, LoopSpec, FrameSpec, CouplingSpec, SpringSpec, ForceSpec, JointSpec, MotorSpec,
+         PointSpec, SceneSpec, GeneratorSpec, InitialSpec, SolverSpec, EventSpec, SetPointSpec, TrackingSpec,
+         TorquesSpec, AllocationSpec, SensorSpec, DriveSpec, HarmonicsSpec, PointPathSpec, CircleSpec,
+         LineSpec]  # fmt: skip
 
 
 @cache

@@ -11,7 +11,6 @@ import pytest
 import ckc_pin
 from ckc_pin import InputError, Mechanism, MotionForces, Terms, inverse_dynamics
 from ckc_pin.control.desired import Table
-from ckc_pin.dynamics import friction_force
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import scene_names
@@ -50,8 +49,7 @@ def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, A
 def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
     """Eq. 1 and its closure, differentiated twice, as one linear system in a and lambda; rows of one size."""
     J, n = terms.at.J, mechanism.n
-    u_tree = np.zeros(n)
-    u_tree[mechanism.actuated_at] = tau
+    u_tree = mechanism.motors.force(tau)
     u_tree -= mechanism.joints.friction * np.sign(terms.v_tree)
     force = u_tree + terms.damping_force - terms.bias_tree
     unit = np.sqrt(np.abs(terms.D_tree).max() or 1.0)
@@ -73,15 +71,13 @@ def assert_gives_back(found: MotionForces) -> None:
 
 
 class Prescribed:
-    """u of eq. 6 over time, whatever the state; with the friction that a run leaves out, where it says so."""
+    """u of eq. 6 over time, whatever the state."""
 
     def __init__(self, found: MotionForces) -> None:
         mechanism, u = found.mechanism, []
-        left_out = any("dry friction is not modelled" in warning for warning in mechanism.warnings)
-        for q, v, tau in zip(found.q_tree, found.v_tree, found.tau, strict=True):
-            u_tree = friction_force(mechanism, v) if left_out else np.zeros(mechanism.n)
-            u_tree[mechanism.actuated_at] += tau
-            u.append(mechanism.kinematics(mechanism.tree.from_coordinates(q)).rho.T @ u_tree)
+        for q, tau in zip(found.q_tree, found.tau, strict=True):
+            rho = mechanism.kinematics(mechanism.tree.from_coordinates(q)).rho
+            u.append(rho.T @ mechanism.motors.force(tau))
         self.table = Table(found.t, np.array(u))
 
     def u(self, t: float, terms: Terms) -> Array:

@@ -141,17 +141,36 @@ def _draw(mechanism: Mechanism, bodies: list[Element], sites: Sites) -> None:
 
 
 def _motors(mechanism: Mechanism, root: Element) -> None:
-    """Add a motor for each actuated joint, and one that needs no control for each constant force."""
+    """Add the motors with their gears, one on several joints by a tendon; constant forces take no control."""
     constant = mechanism.springs.constant
     if not mechanism.actuated and not constant.any():
         return
     actuators = SubElement(root, "actuator")
-    for name in mechanism.actuated:
-        SubElement(actuators, "motor", name=name, joint=name)
+    motors = mechanism.motors
+    for name, turns, limit in zip(motors.names, motors.turns, motors.torque_limit, strict=True):
+        joints = np.flatnonzero(turns)
+        motor = SubElement(actuators, "motor", name=name)
+        if len(joints) == 1:
+            motor.set("joint", mechanism.coordinates[joints[0]])
+            if turns[joints[0]] != 1.0:
+                motor.set("gear", numbers(turns[joints[0]]))
+        else:
+            motor.set("tendon", name)
+            tendon = SubElement(_tendons(root), "fixed", name=name)
+            for k in joints:
+                SubElement(tendon, "joint", joint=mechanism.coordinates[k], coef=numbers(turns[k]))
+        if np.isfinite(limit):
+            motor.set("forcelimited", "true")
+            motor.set("forcerange", numbers(np.array([-limit, limit])))
     for k in np.flatnonzero(constant):
         name = mechanism.coordinates[k]
         force = {"gaintype": "fixed", "gainprm": "0", "biastype": "affine", "biasprm": f"{numbers(constant[k])} 0 0"}
         SubElement(actuators, "general", {"name": f"force on {name}", "joint": name} | force)
+
+
+def _tendons(root: Element) -> Element:
+    found = root.find("tendon")
+    return SubElement(root, "tendon") if found is None else found
 
 
 def _qpos(mechanism: Mechanism, order: list[int]) -> Array:

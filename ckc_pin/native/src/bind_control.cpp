@@ -44,10 +44,11 @@ std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
                                        get<std::string>(table, "past_end"));
 }
 
-// A caller's own, which gives u as an array of d doubles, or a string that says why there is none.
+// A caller's own, which gives u as an array of d doubles, or torques, or a string that says why there is none.
 class Caller : public Controller {
  public:
-  Caller(nb::object function, std::shared_ptr<View> view) : function_(std::move(function)), view_(std::move(view)) {}
+  Caller(nb::object function, bool of_motors, std::shared_ptr<View> view)
+      : function_(std::move(function)), of_motors_(of_motors), view_(std::move(view)) {}
   ~Caller() override {
     nb::gil_scoped_acquire acquired;
     function_.reset();
@@ -57,19 +58,29 @@ class Caller : public Controller {
     nb::gil_scoped_acquire acquired;
     nb::object answer;
     if (!view_->call(function_, at, problem, answer)) return false;
-    if (read(answer, u.head(at.core.d))) return true;
+    if (read(answer, u)) return true;
     problem.says = nb::cast<std::string>(answer);
     return false;
   }
+  bool of_motors() const override { return of_motors_; }
 
  private:
   nb::object function_;
+  const bool of_motors_;
   std::shared_ptr<View> view_;
 };
 
-std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view) {
+std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                          const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
-  if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), view);
+  if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), get<bool>(table, "of_motors"), view);
+  if (kind == "torques") {
+    const auto times = get<Vector>(table, "times");
+    const auto tau = get<Matrix>(table, "tau");
+    require(times.size() > 0 && times.allFinite(), "torques: a time is needed");
+    require(tau.cols() == times.size() && tau.rows() == motors && tau.allFinite(), "torques: a finite column a time");
+    return std::make_unique<Torques>(times, tau, get<bool>(table, "lines"));
+  }
   const int d = core.d;
   if (kind == "set_point") {
     const auto K_P = get<Matrix>(table, "K_P"), K_V = get<Matrix>(table, "K_V");
@@ -77,7 +88,7 @@ std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& cor
     require_square(K_P, d, "K_P"), require_square(K_V, d, "K_V"), require(q_d, d, "q_d"), require(h_d, d, "h_d");
     return std::make_unique<SetPoint>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
   }
-  require(kind == "tracking", "controller: set_point, tracking or call");
+  require(kind == "tracking", "controller: set_point, tracking, torques or call");
   const auto Lambda = get<Matrix>(table, "Lambda"), K_D = get<Matrix>(table, "K_D");
   require_square(Lambda, d, "Lambda"), require_square(K_D, d, "K_D");
   std::unique_ptr<Core> model;
@@ -125,18 +136,57 @@ nb::object View::term(long stamp, const std::string& name) {
   return term_of(seen_->core, name);
 }
 
+namespace {
+
+Actuation actuation_of(const nb::dict& table, const Core& core) {
+  const auto turns = get<Matrix>(table, "turns");
+  const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
+             preload = get<Vector>(table, "preload");
+  const auto m = turns.rows();
+  require(turns.cols() == core.n && turns.allFinite(), "turns: a finite column a coordinate is needed");
+  require(limit.size() == m && (limit.array() >= 0).all(), "limit: a positive number each");
+  require(weights, m, "weights"), require(preload, m, "preload");
+  require((weights.array() > 0).all(), "weights: a positive number each");
+  std::vector<std::vector<Actuation::Gear>> gears(m);
+  for (Eigen::Index k = 0; k < m; ++k)
+    for (int j = 0; j < core.n; ++j)
+      if (turns(k, j) != 0.0) gears[k].push_back({j, turns(k, j)});
+  return {core, std::move(gears), get<bool>(table, "direct"),
+          Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
+}
+
+Sensor sensor_of(const nb::dict& table, const Core& core) {
+  Sensor sensor;
+  sensor.resolution = get<Vector>(table, "resolution");
+  sensor.q_noise = get<Vector>(table, "q_noise"), sensor.q_dot_noise = get<Vector>(table, "q_dot_noise");
+  require(sensor.resolution, core.d, "resolution");
+  require(sensor.q_noise, core.d, "q_noise"), require(sensor.q_dot_noise, core.d, "q_dot_noise");
+  sensor.differences = get<bool>(table, "differences"), sensor.smoothing = get<double>(table, "smoothing");
+  sensor.seed = get<std::uint64_t>(table, "seed");
+  if (table.contains("observer")) sensor.observer = core_of(get<nb::dict>(table, "observer"));
+  return sensor;
+}
+
+}  // namespace
+
 std::unique_ptr<Control> control_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view) {
-  const auto at = get<Indices>(table, "actuated");
-  const auto limit = get<Vector>(table, "limit");
-  require_indices(at, core.n, "actuated");
-  require(limit.size() == static_cast<Eigen::Index>(at.size()) && (limit.array() >= 0).all(),
-          "limit: a positive number each");
-  auto control = std::make_unique<Control>(core, at, get<bool>(table, "direct"), limit);
-  if (table.contains("law")) control->law = controller_of(get<nb::dict>(table, "law"), core, view);
-  if (table.contains("sample_time")) {
+  auto control = std::make_unique<Control>(core, actuation_of(table, core));
+  const auto motors = control->tau.size();
+  if (table.contains("law")) control->law = controller_of(get<nb::dict>(table, "law"), core, motors, view);
+  if (table.contains("clock")) {
+    const auto clock = get<nb::dict>(table, "clock");
     Sampling& sampling = control->sampling.emplace();
-    sampling.period = get<double>(table, "sample_time"), sampling.delay = get<double>(table, "delay");
+    sampling.period = get<double>(clock, "period"), sampling.delay = get<double>(clock, "delay");
+    sampling.times = get<Vector>(clock, "times"), sampling.holds = get<bool>(clock, "holds");
   }
+  if (table.contains("sensor")) control->sensor = sensor_of(get<nb::dict>(table, "sensor"), core);
+  if (table.contains("drive")) {
+    const auto drive = get<nb::dict>(table, "drive");
+    control->drive = Drive{get<Vector>(drive, "resolution"), get<Vector>(drive, "rate"), Vector::Zero(motors)};
+    require(control->drive->resolution, motors, "resolution");
+    require(control->drive->rate.size() == motors, "rate: a number a motor is needed");
+  }
+  require(control->sampling || !(control->sensor || control->drive), "sensor and drive: a clock is needed");
   return control;
 }
 

@@ -109,11 +109,11 @@ nb::object advance(Run& run, double until, bool final, double pause, double budg
   return nb::make_tuple(reasons[stop.why], stop.t, stop.value, stop.which, run.loop->recorder.filled);
 }
 
-bool hold(Run& run, nb::handle u) {
-  Vector constant(run.core->d);
-  require(read(u, constant), "u: an array of d doubles is needed");
+bool hold(Run& run, nb::handle u, bool of_motors) {
+  Vector constant(of_motors ? run.loop->control->tau.size() : run.core->d);
+  require(read(u, constant), "u: an array of d doubles is needed, or of one for each motor");
   if (!finite(constant)) return false;
-  run.loop->hold(constant);
+  run.loop->hold(constant, of_motors);
   return true;
 }
 
@@ -132,9 +132,9 @@ nb::object state(Run& run) {
   return nb::make_tuple(loop.t(), numbers, run.places.q, run.places.z);
 }
 
-// Hold u and advance: what `advance` returns, and the state there; none where u is not finite.
-nb::object step(Run& run, nb::handle u, double until, double pause) {
-  if (!hold(run, u)) return nb::none();
+// Hold u, or the motors' torques, and advance: what `advance` returns, and the state there; none where not finite.
+nb::object step(Run& run, nb::handle u, bool of_motors, double until, double pause) {
+  if (!hold(run, u, of_motors)) return nb::none();
   nb::object stop = advance(run, until, false, pause, std::numeric_limits<double>::infinity());
   return nb::make_tuple(std::move(stop), state(run));
 }
@@ -233,7 +233,7 @@ void bind_loop(nb::module_& m) {
   nb::class_<Run> loop(m, "Loop");
   loop.def("__init__", &make, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a)
       .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
-      .def("step", &step, "u"_a, "until"_a, "pause"_a)
+      .def("step", &step, "u"_a, "of_motors"_a, "until"_a, "pause"_a)
       .def("record", &record, "instants"_a, "rows"_a)
       .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
       .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)

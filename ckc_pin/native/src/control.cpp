@@ -84,43 +84,58 @@ double Tracking::lyapunov(const Measured& at, double, In w) {
   return 0.5 * r_.dot(product_) + a_.dot(v_) + 0.5 * w.squaredNorm();
 }
 
-Actuation::Actuation(const Core& core, Indices at_, bool direct_, Vector limit)
-    : at(std::move(at_)), direct(direct_), limit_(std::move(limit)) {
-  if (direct) return;
-  const int m = static_cast<int>(at.size());
-  transmission_.setZero(m, core.d);  // u = transmission^T tau
-  if (m == core.d)
-    factor_.shape(m, m, full_pattern(m));
-  else
-    factor_.shape(m, core.d, std::vector<Indices>(m));
+bool Torques::u(const Measured& at, Out tau, Problem&) {
+  const auto last = times_.size() - 1;
+  const auto* after = std::upper_bound(times_.data(), times_.data() + times_.size(), at.t);
+  auto k = std::max<Eigen::Index>(after - times_.data() - 1, 0);
+  // the clock may come to an instant from below
+  if (!lines_ && k < last && times_(k + 1) - at.t < 1e-8 * (times_(k + 1) - times_(k))) ++k;
+  tau = tau_.col(k);
+  if (lines_ && k < last) tau += (at.t - times_(k)) / (times_(k + 1) - times_(k)) * (tau_.col(k + 1) - tau_.col(k));
+  return true;
+}
+
+Actuation::Actuation(const Core& core, std::vector<std::vector<Gear>> gears_, bool direct_, Allocation allocation)
+    : gears(std::move(gears_)), direct(direct_), allocation_(std::move(allocation)) {
+  transmission_.setZero(static_cast<Eigen::Index>(gears.size()), core.d);  // u = transmission^T tau
+}
+
+void Actuation::push(const Vector& tau, Out u_tree) const {
+  u_tree.setZero();
+  for (size_t k = 0; k < gears.size(); ++k)
+    for (const Gear& gear : gears[k]) u_tree(gear.joint) += gear.turns * tau(static_cast<Eigen::Index>(k));
 }
 
 void Actuation::apply(Core& core, Out u, Out tau, Out u_tree) {
-  const auto m = static_cast<Eigen::Index>(at.size());
   if (direct) {
-    tau = u;
+    tau = u, clip(tau);
   } else {
     core.reduce();
-    for (Eigen::Index k = 0; k < m; ++k) transmission_.row(k) = core.rho.row(at[k]);
-    if (m == core.d) {
-      transmission_.transposeInPlace();
-      factor_.compute(transmission_), factor_.solve(u, tau);
-      transmission_.transposeInPlace();
-    } else {
-      factor_.compute(transmission_), factor_.solve_transposed(u, tau);
-    }
+    transmission_.setZero();
+    for (size_t k = 0; k < gears.size(); ++k)
+      for (const Gear& gear : gears[k])
+        transmission_.row(static_cast<Eigen::Index>(k)) += gear.turns * core.rho.row(gear.joint);
+    allocation_.share(transmission_, u, tau);
   }
-  tau = tau.cwiseMin(limit_).cwiseMax(-limit_);
-  u_tree.setZero();
-  for (Eigen::Index k = 0; k < m; ++k) u_tree(at[k]) = tau(k);
+  push(tau, u_tree);
   if (direct)
     u = tau;
   else
     u.noalias() = transmission_.transpose() * tau;
 }
 
+void Actuation::drive(Out tau, Out u_tree) const {
+  clip(tau);
+  push(tau, u_tree);
+}
+
+double Sampling::due() const {
+  if (times.size()) return next < times.size() ? times(next) : std::numeric_limits<double>::infinity();
+  return static_cast<double>(next) * period;
+}
+
 double Sampling::instant() const {
-  const double sample = static_cast<double>(next) * period;
+  const double sample = due();
   return count ? std::min(sample, ring[first].first) : sample;
 }
 
@@ -133,16 +148,33 @@ void Sampling::put(double t, In u) {
   when = t, value = u;
 }
 
-Control::Control(const Core& core, Indices actuated, bool direct, Vector limit)
-    : actuation_(core, std::move(actuated), direct, std::move(limit)), own_(core.q) {
-  for (Vector* x : {&constant, &u, &sampled_, &q_, &q_dot_}) x->setZero(core.d);
-  tau.setZero(actuation_.at.size()), u_tree.setZero(core.n);
+Control::Control(const Core& core, Actuation actuation) : actuation_(std::move(actuation)), own_(core.q) {
+  for (Vector* x : {&constant, &u, &sampled_, &asked_, &q_, &q_dot_}) x->setZero(core.d);
+  tau.setZero(static_cast<Eigen::Index>(actuation_.gears.size()));
+  u_tree.setZero(core.n), pushed_.setZero(core.n);
+  to_own_.setZero(core.d, core.d);
 }
 
 void Control::begin() {
   if (!sampling) return;
   sampling->next = 0, sampling->count = 0;
-  constant.setZero();
+  constant_of_motors = drive || (law && law->of_motors());
+  constant.setZero(constant_of_motors ? tau.size() : u.size());
+  sampled_ = constant;
+  if (sensor) sensor->begin();
+  if (drive) drive->sent.setZero(tau.size());
+}
+
+bool Control::hold(In value, bool of_motors) {
+  if (of_motors == constant_of_motors && value.size() == constant.size() && value == constant) return false;
+  constant = value, constant_of_motors = of_motors;
+  return true;
+}
+
+bool Control::needs_own_partition() const {
+  if (!acts()) return false;
+  if (!law) return !constant_of_motors;
+  return law->needs_terms() || !(actuation_.direct || law->of_motors());
 }
 
 Measured Control::in_own_q(const Measured& at) {
@@ -161,45 +193,95 @@ bool Control::slopes(Matrix& by_q, Matrix& by_v) {
   const auto n = static_cast<int>(u_tree.size());
   by_q.setZero(n, n), by_v.setZero(n, n);
   if (!feedback()) return true;
+  if (law->of_motors()) return law->slopes(slope_, slope_dot_);
   if (!actuation_.direct || !law->slopes(slope_, slope_dot_)) return false;
   for (size_t i = 0; i < own_.size(); ++i) {
     if (actuation_.limited(tau, static_cast<Eigen::Index>(i))) continue;
     for (size_t k = 0; k < own_.size(); ++k)
-      by_q(actuation_.at[i], own_[k]) = slope_(i, k), by_v(actuation_.at[i], own_[k]) = slope_dot_(i, k);
+      by_q(own_[i], own_[k]) = slope_(i, k), by_v(own_[i], own_[k]) = slope_dot_(i, k);
   }
   return true;
 }
 
-bool Control::ask(const Measured& at, Out u) {
-  if (!law->u(in_own_q(at), u, problem)) return false;
+bool Control::ask(const Measured& at, Out u) { return law->u(in_own_q(at), u, problem) && known(u); }
+
+bool Control::known(In u) {
   if (u.allFinite()) return true;
   problem.u = u;
   return false;
 }
 
 bool Control::act(const Measured& at) {
+  const bool torques = of_motors();
   if (feedback()) {
-    if (!ask(at, u)) return false;
+    if (!ask(at, torques ? Out(tau) : Out(u))) return false;
+  } else if (torques) {
+    tau = constant;
   } else {
     u = constant;
   }
-  if (acts())
-    actuation_.apply(at.core, u, tau, u_tree);
-  else
+  if (!acts())
     tau.setZero(), u_tree.setZero();
+  else if (torques)
+    actuation_.drive(tau, u_tree);
+  else
+    actuation_.apply(at.core, u, tau, u_tree);
   return true;
 }
 
-bool Control::sample(const Measured& at) {
+void Control::settle_u(Core& core) {
+  if (!of_motors()) return;
+  if (actuation_.direct) {
+    u = tau;
+    return;
+  }
+  core.reduce();
+  core.reduced(u_tree, u);
+  if (core.q == own_) return;
+  for (size_t k = 0; k < own_.size(); ++k) to_own_.row(static_cast<Eigen::Index>(k)) = core.rho.row(own_[k]);
+  u = to_own_.transpose().partialPivLu().solve(Vector(u));
+}
+
+
+bool Control::answer(const Measured& at) {
+  const Measured here = in_own_q(at);
+  if (sensor) sensor->look(here.q, here.q_dot, sampling->period);
+  if (sensor && sensor->observer && !sensor->close(at.core.q_tree)) {
+    problem.says = "the loops do not close at what the sensors say of q";
+    return false;
+  }
+  const Measured seen = !sensor ? here
+                        : sensor->observer
+                            ? Measured{at.t, *sensor->observer, sensor->q, sensor->q_dot, sensor->v_tree, sensor->q_dot}
+                            : Measured{at.t, at.core, sensor->q, sensor->q_dot, at.v_tree, at.rate};
+  const bool torques = law->of_motors();
+  Vector& asked = drive && !torques ? asked_ : sampled_;
+  if (!law->u(seen, asked, problem) || !known(asked)) return false;
+  if (!drive) return true;
+  if (torques)
+    actuation_.clip(sampled_);
+  else
+    actuation_.apply(seen.core, asked_, sampled_, pushed_);
+  drive->limit(sampled_, sampling->period);
+  return true;
+}
+
+bool Control::sample(const Measured& at, bool& changed) {
+  changed = false;
   const double now = at.t + sampling->near(at.t);
-  const double sample = static_cast<double>(sampling->next) * sampling->period;
+  const double sample = sampling->due();
   if (sample <= now) {
-    if (!ask(at, sampled_)) return false;
-    sampling->put(sample + sampling->delay, sampled_);
+    if (sampling->holds) {
+      if (!answer(at)) return false;
+      sampling->put(sample + sampling->delay, sampled_);
+    } else {
+      changed = true;
+    }
     ++sampling->next;
   }
   for (; sampling->count && sampling->ring[sampling->first].first <= now; --sampling->count) {
-    constant = sampling->ring[sampling->first].second;
+    const Vector& value = sampling->ring[sampling->first].second;
+    changed |= hold(value, constant_of_motors);
     sampling->first = (sampling->first + 1) % sampling->ring.size();
   }
   return true;

@@ -3,12 +3,15 @@
 #pragma once
 
 #include <cmath>
+#include <cstdint>
 #include <limits>
 #include <memory>
 #include <optional>
 #include <vector>
 
+#include "allocation.hpp"
 #include "desired.hpp"
+#include "sensor.hpp"
 
 namespace ckc {
 
@@ -31,8 +34,9 @@ struct Problem {
 class Controller {
  public:
   virtual ~Controller() = default;
-  // Eq. 6's force; false where there is none.
+  // Eq. 6's force, or the motors' torques; false where there is none.
   virtual bool u(const Measured& at, Out u, Problem& problem) = 0;
+  virtual bool of_motors() const { return false; }
   // Its Lyapunov function; NaN where it has none here. w: what phi is.
   virtual double lyapunov(const Measured&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it looks at terms of q's own partition, or at q and q_dot alone.
@@ -73,66 +77,101 @@ class Tracking : public Controller {
   Vector e_, e_dot_, v_, a_, r_, product_, v_model_;
 };
 
-// From u to tau by actuator, of minimum norm where there are more of them than freedoms, limited, and back.
-class Actuation {
+// Torques that were measured, by time: each until the next one, or lines between them.
+class Torques : public Controller {
  public:
-  Actuation(const Core& core, Indices at, bool direct, Vector limit);
-  void apply(Core& core, Out u, Out tau, Out u_tree);
-  const Indices at;
-  const bool direct;  // u is what the actuators do
-  bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= limit_(k); }
+  Torques(Vector times, Matrix tau, bool lines) : times_(std::move(times)), tau_(std::move(tau)), lines_(lines) {}
+  bool u(const Measured& at, Out tau, Problem& problem) override;
+  bool of_motors() const override { return true; }
+  bool needs_terms() const override { return false; }
+  bool slopes(Matrix&, Matrix&) const override { return true; }  // none
 
  private:
-  Vector limit_;  // infinite where there is none
+  Vector times_;
+  Matrix tau_;  // a column a time
+  bool lines_;
+};
+
+// From u to tau by motor, limited, and back; or from tau to what it does.
+class Actuation {
+ public:
+  struct Gear {
+    int joint;
+    double turns;  // of the motor by the joint's
+  };
+  Actuation(const Core& core, std::vector<std::vector<Gear>> gears, bool direct, Allocation allocation);
+  void apply(Core& core, Out u, Out tau, Out u_tree);
+  void drive(Out tau, Out u_tree) const;  // torques that are asked for
+  void clip(Out tau) const { allocation_.clip(tau); }
+  const std::vector<std::vector<Gear>> gears;
+  const bool direct;  // u is what the motors do
+  bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
+
+ private:
+  void push(const Vector& tau, Out u_tree) const;
+  Allocation allocation_;
   Matrix transmission_;
-  Factor factor_;
 };
 
 // A clock that samples and holds: at k period the state is seen, from k period + delay on what came of it acts.
 struct Sampling {
   double period = 0.0, delay = 0.0;
-  long next = 0;  // the number of the next sample
+  Vector times;        // the instants, if they are not those
+  bool holds = true;   // else what acts has only no derivative there
+  long next = 0;       // the number of the next sample
   // A ring of what waits to act, u and when: `first` is the next, `count` how many there are.
   std::vector<std::pair<double, Vector>> ring;
   size_t first = 0, count = 0;
 
   double near(double t) const { return 1e-9 * period + 1e-15 * t; }  // instants nearer than that are one
-  double instant() const;  // the next one
+  double due() const;      // the next sample
+  double instant() const;  // the next one of the clock
   void put(double t, In u);
 };
 
 class Control {
  public:
-  Control(const Core& core, Indices actuated, bool direct, Vector limit);
+  Control(const Core& core, Actuation actuation);
 
   std::unique_ptr<Controller> law;  // null: only a constant u acts
   std::optional<Sampling> sampling;
-  Vector constant;                      // (d)
+  std::optional<Sensor> sensor;
+  std::optional<Drive> drive;
+  Vector constant;          // (d), or by motor
+  bool constant_of_motors = false;
   Problem problem;
   Vector u, tau, u_tree;            // what acts: (d), (actuators), (n)
 
   void begin();  // a run begins: nothing was sampled yet
   bool acts() const { return law || !constant.isZero(0); }
+  // Let another constant act; false where it is the same.
+  bool hold(In value, bool of_motors);
   // Whether the motion has to stay in the coordinates q that u is of: the law, or who steps, looks at terms in them, or
-  // eq. 6's force has no other meaning.
-  bool needs_own_partition() const { return acts() && !(law && !law->needs_terms() && actuation_.direct); }
+  // eq. 6's force has no other meaning. Torques of motors have one whatever q is.
+  bool needs_own_partition() const;
   // Whether what acts between samples takes more of the state than q and q_dot.
-  bool needs_terms() const { return acts() && !(actuation_.direct && !(feedback() && law->needs_terms())); }
+  bool needs_terms() const {
+    return acts() && ((feedback() && law->needs_terms()) || !(actuation_.direct || of_motors()));
+  }
   // d u' / d q' and d u' / d v', joints of one freedom alone, where u' was found last; false where that is not known.
   bool slopes(Matrix& by_q, Matrix& by_v);
   // Whether u follows the state between samples.
-  bool feedback() const { return law && !sampling; }
+  bool feedback() const { return law && !(sampling && sampling->holds); }
   bool act(const Measured& at);
-  bool sample(const Measured& at);  // at an instant of the clock
+  bool sample(const Measured& at, bool& changed);  // at an instant of the clock
+  void settle_u(Core& core);  // eq. 6's force of what acts, in q whatever the core's coordinates are
   double lyapunov(const Measured& at, double potential_energy, In w);
 
  private:
+  bool of_motors() const { return feedback() ? law->of_motors() : constant_of_motors; }
   bool ask(const Measured& at, Out u);
+  bool answer(const Measured& at);  // to a sample: sampled_
+  bool known(In u);                 // finite
   Measured in_own_q(const Measured& at);
   Actuation actuation_;
   const Indices own_;  // q, whatever the coordinates of the motion are
-  Vector sampled_, q_, q_dot_;
-  Matrix slope_, slope_dot_;
+  Vector sampled_, asked_, pushed_, q_, q_dot_;
+  Matrix slope_, slope_dot_, to_own_;
 };
 
 }  // namespace ckc

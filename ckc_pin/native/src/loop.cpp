@@ -88,10 +88,8 @@ void Loop::jump() {
   if (method_) method_->forget();
 }
 
-void Loop::hold(In u) {
-  if (control->constant == u) return;
-  control->constant = u;
-  jump();
+void Loop::hold(In u, bool of_motors) {
+  if (control->hold(u, of_motors)) jump();
 }
 
 Stop Loop::advance(double until, bool final, double pause, double budget) {
@@ -160,9 +158,9 @@ void Loop::back() {
 std::optional<Stop> Loop::sample() {
   if (!system->exact(now.t, now.y)) return trouble();
   system->core.set_velocity(system->v_tree);
-  constant_before_ = control->constant;
-  if (!control->sample(system->measured(now.t))) return trouble();
-  if (control->constant != constant_before_) jump();
+  bool changed;
+  if (!control->sample(system->measured(now.t), changed)) return trouble();
+  if (changed) jump();
   return {};
 }
 

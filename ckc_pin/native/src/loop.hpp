@@ -49,8 +49,8 @@ class Loop {
   // Begin at t from a configuration closed on phi = w, moving with v'; what was before has no influence.
   void start(double t, In q_tree, In v_tree, In w);
   void record(Vector instants, double* rows, Eigen::Index most) { recorder.begin(std::move(instants), rows, most); }
-  // Let a u act from now on, constant.
-  void hold(In u);
+  // Let a u act from now on, constant; or torques of the motors.
+  void hold(In u, bool of_motors);
   // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
   // Where it does not end, and nothing has changed for some advances, a step may reach beyond; the present state is
   // then within it, and the step is made again from there should something change.
@@ -135,7 +135,7 @@ class Loop {
     double t = 0.0;
     Vector q_tree, v_tree, w;
   } begin_;
-  Vector y_out_, constant_before_;
+  Vector y_out_;
 
   bool reaches_ = false;         // whether a step may go beyond the time asked for,
   std::optional<Made> beyond_;   // the one that does,

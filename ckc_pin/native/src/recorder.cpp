@@ -32,6 +32,7 @@ bool Recorder::row(System& system, double t, In y, Out row) {
   const Energy energy = core.energy(system.v_tree, momentum_);
   core.set_velocity(system.v_tree);
   if (!system.act(t)) return false;
+  system.control.settle_u(core);
   Eigen::Index at = 0;
   const auto put = [&](In part) { row.segment(at, part.size()) = part, at += part.size(); };
   row(at++) = t;

@@ -161,7 +161,7 @@ def _tracking() -> tuple[Problem, Tracking]:
     return problem, controller
 
 
-def _scene(name: str) -> tuple[Problem, SetPoint | Tracking | None]:
+def _scene(name: str) -> tuple[Problem, object]:
     scene = load_scene(f"{FIVE_BAR}/{name}")
     problem = Problem.of_scene(scene)
     return problem, scene_controller(scene, problem.mechanism)

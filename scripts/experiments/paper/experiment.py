@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
@@ -25,7 +24,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene
 
 __all__ = [
@@ -78,8 +77,7 @@ class Problem:
         """Take a scene's start and controller; its formulation, solver and w are left aside."""
         mechanism = scene_mechanism(scene)
         start = find_start(mechanism, scene)
-        limit = scene.spec.controller.torque_limit if scene.spec.controller else None
-        force = force_of(scene_controller(scene, mechanism), Actuation(mechanism, limit))
+        force = force_of(scene_controller(scene, mechanism), scene_actuation(scene, mechanism))
         return cls(mechanism, start.at, start.q_dot, force)
 
     def dae(self) -> Dae:

@@ -1,0 +1,87 @@
+"""How motors share a force on the freedoms: the small box QP that the native core solves too, to be read."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["allocate"]
+
+ROUNDING = 1e-13  # of u, scaled: what a tau may miss it by
+FLAT = 1e-12  # of the dual's largest curvature: a direction in which it has none
+MOST = 50  # steps; random problems take at most 10
+
+
+def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array:
+    """Return the tau with u = transmission tau that is nearest to a preload, within limits.
+
+    Where the limits leave no such tau, it is the one without limits, clipped.
+
+    Parameters
+    ----------
+    transmission : (d, m) array
+    u : (d,) array
+    limit, weights, preload : (m,) arrays
+        Nearest is what makes sum weights (tau - preload)^2 least; |tau| <= limit, which may be infinite.
+    """
+    scale = 1.0 / np.sqrt(weights)
+    tau = preload + scale * np.linalg.lstsq(transmission * scale, u - transmission @ preload, rcond=1e-9)[0]
+    if np.any(np.abs(tau) > limit):
+        found = _within_limits(transmission, u, limit, weights, preload) if np.ptp(transmission.shape) else None
+        tau = np.clip(tau, -limit, limit) if found is None else found
+    return np.asarray(tau, dtype=float)
+
+
+def _within_limits(transmission: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array | None:
+    """Maximise the dual, tau(x) = clip(preload + transmission^T x / weights), by Newton's method; None: infeasible.
+
+    The dual is concave and piecewise quadratic: with an exact line search that ends after finitely many steps.
+    """
+    rows = 1.0 / np.maximum(np.linalg.norm(transmission, axis=1), 1e-300)  # free of units
+    T, u = transmission * rows[:, None], u * rows
+    sizes = np.linalg.norm(T, axis=0)
+    limited = np.isfinite(limit)
+    size = float(np.linalg.norm(u) + limit[limited] @ sizes[limited])
+    steepest = float((sizes**2 / weights).sum())
+    x = np.zeros(len(u))
+    for _ in range(MOST):
+        raw = preload + T.T @ x / weights
+        tau = np.clip(raw, -limit, limit)
+        rest = u - T @ tau
+        if np.linalg.norm(rest) <= ROUNDING * size:
+            return np.asarray(tau)
+        pull, size_x = np.abs(T.T @ x), float(np.linalg.norm(x))
+        bounded = not np.any(pull[~limited] > ROUNDING * size_x * sizes[~limited])
+        if size_x and bounded and x @ u > limit[limited] @ pull[limited] + ROUNDING * size * size_x:
+            return None  # what x weighs in u is more than all motors together can do (Farkas)
+        free = np.abs(raw) < limit
+        curvatures, axes = np.linalg.eigh((T[:, free] / weights[free]) @ T[:, free].T)
+        parts, flat = axes.T @ rest, curvatures <= FLAT * steepest
+        if np.linalg.norm(parts[flat]) > ROUNDING * size:
+            direction = axes[:, flat] @ parts[flat]
+        else:
+            direction = axes[:, ~flat] @ (parts[~flat] / curvatures[~flat])
+        length = _along(raw, T.T @ direction / weights, limit, weights, float(direction @ rest))
+        if not np.isfinite(length):
+            return None
+        x = x + length * direction
+    return None
+
+
+def _along(raw: Array, slope: Array, limit: Array, weights: Array, rise: float) -> float:
+    """Return where along a direction the dual is largest: its slope falls by w slope^2 for each motor within limits."""
+    enters, leaves = np.zeros(len(raw)), np.where(slope == 0.0, 0.0, np.inf)
+    k = np.flatnonzero((slope != 0.0) & np.isfinite(limit))
+    ends = np.sort([(-limit[k] - raw[k]) / slope[k], (limit[k] - raw[k]) / slope[k]], axis=0)
+    enters[k], leaves[k] = np.maximum(ends, 0.0)
+    at = 0.0
+    for end in [*np.sort(np.maximum(ends, 0.0), axis=None), np.inf]:
+        if not end > at:
+            continue
+        bend = float((weights * slope**2)[(enters <= at) & (leaves > at)].sum())
+        if bend > 0.0 and rise <= bend * (end - at):
+            return at + rise / bend
+        rise -= bend * (end - at) if bend > 0.0 else 0.0
+        at = float(end)
+    return np.inf

@@ -1,0 +1,133 @@
+#include "allocation.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace ckc {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr double rounding = 1e-13;  // of u, scaled: what a tau may miss it by
+constexpr double flat = 1e-12;      // of the dual's largest curvature: a direction in which it has none
+constexpr int most = 50;            // steps; random problems take at most 10
+
+Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector preload)
+    : limit(std::move(limit_)),
+      weights_(std::move(weights)),
+      preload_(std::move(preload)),
+      scale_(weights_.cwiseSqrt().cwiseInverse()),
+      redundant_(motors != d),
+      eigen_(d) {
+  if (redundant_)
+    factor_.shape(motors, d, std::vector<Indices>(motors));
+  else
+    factor_.shape(motors, motors, full_pattern(motors));
+  scaled_.setZero(redundant_ ? motors : d, redundant_ ? d : motors), curvature_.setZero(d, d);
+  for (Vector* x : {&rest_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
+  for (Vector* x : {&unlimited_, &raw_, &slope_, &enters_, &leaves_}) x->setZero(motors);
+  ends_.setZero(2 * motors);
+}
+
+void Allocation::share(const Matrix& transmission, In u, Out tau) {
+  if (redundant_) {
+    scaled_ = transmission, scaled_.array().colwise() *= scale_.array();
+    rest_ = u, rest_.noalias() -= transmission.transpose() * preload_;
+    factor_.compute(scaled_), factor_.solve_transposed(rest_, tau);
+    tau = preload_ + scale_.cwiseProduct(tau);
+  } else {
+    scaled_ = transmission.transpose();
+    factor_.compute(scaled_), factor_.solve(u, tau);
+  }
+  if (!(tau.array().abs() > limit.array()).any()) return;
+  unlimited_ = tau;
+  if (redundant_ && within_limits(transmission, u, tau)) return;
+  tau = unlimited_, clip(tau);
+}
+
+bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {
+  const auto m = transmission.rows();
+  for (Eigen::Index i = 0; i < row_scale_.size(); ++i) row_scale_(i) = 1.0 / std::max(transmission.col(i).norm(), 1e-300);
+  scaled_ = transmission, scaled_.array().rowwise() *= row_scale_.array().transpose();
+  coefficients_ = u.cwiseProduct(row_scale_);
+  double size = coefficients_.norm(), steepest = 0.0;
+  for (Eigen::Index k = 0; k < m; ++k) {
+    if (std::isfinite(limit(k))) size += limit(k) * scaled_.row(k).norm();
+    steepest += scaled_.row(k).squaredNorm() / weights_(k);
+  }
+  multiplier_.setZero();
+  for (int step = 0; step < most; ++step) {
+    raw_.noalias() = scaled_ * multiplier_;
+    if (step && beyond(u, rounding * size)) return false;
+    raw_ = preload_ + raw_.cwiseQuotient(weights_);
+    tau = raw_, clip(tau);
+    rest_ = u.cwiseProduct(row_scale_), rest_.noalias() -= scaled_.transpose() * tau;
+    if (rest_.norm() <= rounding * size) return true;
+    curvature_.setZero();
+    for (Eigen::Index k = 0; k < m; ++k)
+      if (std::abs(raw_(k)) < limit(k))
+        curvature_.noalias() += (1.0 / weights_(k)) * scaled_.row(k).transpose() * scaled_.row(k);
+    eigen_.compute(curvature_);
+    coefficients_.noalias() = eigen_.eigenvectors().transpose() * rest_;
+    const Vector& values = eigen_.eigenvalues();
+    double level = 0.0;  // along what has no curvature
+    for (Eigen::Index i = 0; i < values.size(); ++i)
+      if (values(i) <= flat * steepest) level += coefficients_(i) * coefficients_(i);
+    const bool straight = std::sqrt(level) > rounding * size;
+    for (Eigen::Index i = 0; i < values.size(); ++i) {
+      const bool curved = values(i) > flat * steepest;
+      if (straight)
+        coefficients_(i) = curved ? 0.0 : coefficients_(i);
+      else
+        coefficients_(i) = curved ? coefficients_(i) / values(i) : 0.0;
+    }
+    direction_.noalias() = eigen_.eigenvectors() * coefficients_;
+    rise_ = direction_.dot(rest_);
+    slope_.noalias() = scaled_ * direction_;
+    slope_ = slope_.cwiseQuotient(weights_);
+    const double length = along();
+    if (!std::isfinite(length)) return false;
+    multiplier_ += length * direction_;
+  }
+  return false;
+}
+
+// Whether what the multiplier weighs in u is more than all motors together can do (Farkas).
+bool Allocation::beyond(In u, double least) const {
+  const double length = multiplier_.norm();
+  double most = least * length;
+  for (Eigen::Index k = 0; k < raw_.size(); ++k) {
+    const double pull = std::abs(raw_(k));
+    if (std::isfinite(limit(k)))
+      most += limit(k) * pull;
+    else if (pull > rounding * length * scaled_.row(k).norm())
+      return false;
+  }
+  return multiplier_.dot(u.cwiseProduct(row_scale_)) > most;
+}
+
+// Along direction_ the dual's slope falls from rise_ by w slope^2 for every motor while it is within its limits.
+double Allocation::along() {
+  const auto m = slope_.size();
+  Eigen::Index count = 0;
+  for (Eigen::Index k = 0; k < m; ++k) {
+    enters_(k) = 0.0, leaves_(k) = slope_(k) == 0.0 ? 0.0 : infinity;
+    if (slope_(k) == 0.0 || !std::isfinite(limit(k))) continue;
+    const double low = (-limit(k) - raw_(k)) / slope_(k), high = (limit(k) - raw_(k)) / slope_(k);
+    enters_(k) = std::max(0.0, std::min(low, high)), leaves_(k) = std::max(0.0, std::max(low, high));
+    ends_(count++) = enters_(k), ends_(count++) = leaves_(k);
+  }
+  std::sort(ends_.data(), ends_.data() + count);
+  double at = 0.0, left = rise_;
+  for (Eigen::Index i = 0; i <= count; ++i) {
+    const double end = i < count ? ends_(i) : infinity;
+    if (!(end > at)) continue;
+    double bend = 0.0;
+    for (Eigen::Index k = 0; k < m; ++k)
+      if (enters_(k) <= at && leaves_(k) > at) bend += weights_(k) * slope_(k) * slope_(k);
+    if (bend > 0.0 && left <= bend * (end - at)) return at + left / bend;
+    if (bend > 0.0) left -= bend * (end - at);
+    at = end;
+  }
+  return infinity;
+}
+
+}  // namespace ckc

@@ -1,0 +1,122 @@
+"""Motors as a mechanism's file describes them: gears, rotors, and that q takes the coordinates they are on."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from ckc_pin import Mechanism, load
+from ckc_pin.mechanism.library import library
+from tests.analytic.five_bar import FIVE_BAR
+from tests.conftest import assert_close
+
+INDEPENDENT = 'independent = ["theta_1", "theta_3"]\n'
+ACTUATED = 'actuated = ["theta_1", "theta_3"]\n'
+
+
+def five_bar_with(folder: Path, motors: str, independent: str = INDEPENDENT) -> Mechanism:
+    """Return the shipped five-bar with other motors."""
+    for file in ("five_bar.urdf", "mechanism.toml"):
+        text = (library() / "five_bar" / file).read_text("utf-8")
+        if file == "mechanism.toml":
+            assert INDEPENDENT in text
+            assert ACTUATED in text
+            text = text.replace(INDEPENDENT, independent).replace(ACTUATED, motors)
+        (folder / file).write_text(text, "utf-8")
+    return load(folder / "mechanism.toml")
+
+
+def test_a_rotor_behind_a_gear(tmp_path: Path) -> None:
+    """Its energy is J (ratio theta_dot)^2 / 2: ratio^2 J on the diagonal of D' of eq. 24."""
+    motors = """
+[[motor]]
+joint = "theta_3"
+ratio = -50.0
+rotor_inertia = 2e-6
+[[motor]]
+name = "second"
+joints = {theta_3 = 3.0}
+rotor_inertia = 1e-4
+"""
+    mechanism = five_bar_with(tmp_path, motors)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        q_tree = rng.uniform(-3, 3, 4)
+        D = FIVE_BAR.D_tree(q_tree)
+        D[2, 2] += 50.0**2 * 2e-6 + 3.0**2 * 1e-4
+        assert_close(mechanism.tree.evaluate(pin.crba, q_tree), D, 1e-14)
+
+
+def test_a_motor_does_the_same_work_on_both_sides_of_its_gear(tmp_path: Path) -> None:
+    motors = """
+[[motor]]
+joint = "theta_1"
+ratio = 20.0
+torque_limit = 3.0
+[[motor]]
+name = "belt"
+joints = {theta_3 = 1.0, theta_4 = -0.5}
+ratio = 4.0
+speed_limit = 100.0
+"""
+    mechanism = five_bar_with(tmp_path, motors)
+    assert mechanism.actuated == ("theta_1", "belt")
+    assert_close(mechanism.motors.force(np.array([2.0, 3.0])), [40.0, 0.0, 12.0, -6.0], 1e-15)
+    assert mechanism.motors.torque_limit.tolist() == [3.0, np.inf]
+    assert mechanism.motors.speed_limit.tolist() == [np.inf, 100.0]
+    rng = np.random.default_rng(2)
+    tau, v_tree = rng.standard_normal(2), rng.standard_normal(4)
+    shafts = np.array([20.0 * v_tree[0], 4.0 * (v_tree[2] - 0.5 * v_tree[3])])
+    assert_close(mechanism.motors.force(tau) @ v_tree, tau @ shafts, 1e-13)
+
+
+@pytest.mark.parametrize("pair", list(combinations(range(4), 2)), ids=str)
+def test_q_takes_the_coordinates_with_motors(tmp_path: Path, pair: tuple[int, int]) -> None:
+    """In the motors' order, where the determinant of the other two columns of the appendix' J is not small."""
+    names = [f"theta_{k + 1}" for k in pair[::-1]]
+    mechanism = five_bar_with(tmp_path, f"actuated = {names}\n".replace("'", '"'), "")
+    J = FIVE_BAR.J(mechanism.q_tree)
+    others = [k for k in range(4) if k not in pair]
+    assert abs(np.linalg.det(J[:, others])) > 0.03 * np.abs(J).max() ** 2
+    assert list(mechanism.independent) == names == list(mechanism.actuated)
+
+
+def test_q_leaves_out_motors_where_phi_z_would_be_singular(tmp_path: Path) -> None:
+    """The distal links nearly in line: theta_1 and theta_3 do not determine the rest, one of the two does."""
+    shipped = library() / "five_bar"
+    (tmp_path / "five_bar.urdf").write_text((shipped / "five_bar.urdf").read_text("utf-8"), "utf-8")
+    text = (shipped / "mechanism.toml").read_text("utf-8").replace(INDEPENDENT, "")
+    before, _, after = text.partition("[q_guess]")
+    q_tree = stretched()
+    guess = "".join(f"theta_{k + 1} = {x!r}\n" for k, x in enumerate(q_tree.tolist()))
+    (tmp_path / "mechanism.toml").write_text(f"{before}[q_guess]\n{guess}{after[after.index('[[') :]}", "utf-8")
+    mechanism = load(tmp_path / "mechanism.toml")
+    assert_close(mechanism.q_tree, q_tree, 1e-9)
+    assert abs(FIVE_BAR.s(mechanism.q_tree)) < 2e-3
+    assert mechanism.actuated == ("theta_1", "theta_3")
+    assert len({"theta_1", "theta_3"} & set(mechanism.independent)) == 1
+    z = [mechanism.tree.index[name] for name in mechanism.dependent]
+    assert abs(np.linalg.det(FIVE_BAR.J(mechanism.q_tree)[:, z])) > 0.01
+
+
+def stretched() -> np.ndarray:
+    """A closed configuration with the distal links 1e-3 rad from one line."""
+    l = FIVE_BAR.l
+    reach = np.sqrt(l[1] ** 2 + l[3] ** 2 + 2 * l[1] * l[3] * np.cos(1e-3))  # between the elbows
+    theta_1 = 2.0
+    left = l[0] * np.array([np.cos(theta_1), np.sin(theta_1)])
+
+    def apart(theta_3: float) -> float:
+        right = l[2] * np.array([np.cos(theta_3), np.sin(theta_3)]) + [FIVE_BAR.base, 0.0]
+        return float(np.linalg.norm(right - left)) - reach
+
+    low, high = 0.0, 2.0
+    assert apart(low) > 0 > apart(high)
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if apart(middle) > 0 else (low, middle)
+    return np.asarray(FIVE_BAR.sigma(np.array([theta_1, low])), dtype=float)

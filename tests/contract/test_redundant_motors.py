@@ -1,0 +1,122 @@
+"""Two arms on one bar: twelve motors share what moves six freedoms, by least norm, weights, preload and limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import Mechanism, Run, simulate
+from ckc_pin.control.allocation import allocate
+from ckc_pin.mechanism.library import library
+from tests.analytic.five_bar import Array
+from tests.conftest import assert_close
+
+FORMULATIONS = ["reduced", "spf", "dae"]
+LIFT = {"t_end": 0.5, "solver.rtol": 1e-10, "solver.output_dt": 0.05}
+PRELOAD = {"left_elbow_joint": 10.0, "right_shoulder_pan_joint": -5.0}
+
+
+def lift(**changes: Any) -> Run:
+    return simulate("two_ur5/lift", {**LIFT, **{name.replace("__", "."): x for name, x in changes.items()}})
+
+
+def transmission(mechanism: Mechanism, q_tree: Array) -> Array:
+    """u = T tau: columns are the motors' joints' rates by those of q, from J of the mechanism's rows."""
+    at = mechanism.kinematics(mechanism.tree.from_coordinates(q_tree))
+    rates = np.zeros((mechanism.n, mechanism.d))
+    rates[mechanism.partition.q] = np.eye(mechanism.d)
+    rates[mechanism.partition.z] = -np.linalg.lstsq(at.phi_z, at.phi_q, rcond=None)[0]
+    return rates[[mechanism.tree.index[name] for name in mechanism.actuated]].T
+
+
+@pytest.fixture(scope="module")
+def plain() -> Run:
+    return lift()
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_the_least_torques(plain: Run, formulation: str) -> None:
+    run = plain if formulation == "spf" else lift(formulation=formulation)
+    for k, q_tree in enumerate(run.q_tree):
+        T = transmission(run.mechanism, q_tree)
+        assert T.shape == (6, 12)
+        assert_close(run.tau[k], np.linalg.pinv(T) @ run.u[k], 1e-9)
+    assert_close(run.q_tree, plain.q_tree, 1e-8)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_preload_moves_nothing(plain: Run, formulation: str) -> None:
+    """Tau differs by the preload's projection on the null space, the motion does not."""
+    without = plain if formulation == "spf" else lift(formulation=formulation)
+    run = lift(controller__allocation__preload=PRELOAD, formulation=formulation)
+    assert_close(run.q_tree, without.q_tree, 1e-9)
+    assert_close(run.u, without.u, 1e-8)
+    preload = np.array([PRELOAD.get(name, 0.0) for name in run.actuated])
+    for k, q_tree in enumerate(run.q_tree):
+        T = transmission(run.mechanism, q_tree)
+        left = preload - np.linalg.pinv(T) @ (T @ preload)
+        assert np.abs(left).max() > 3.0
+        assert_close(run.tau[k] - without.tau[k], left, 1e-8)
+
+
+def test_weights(plain: Run) -> None:
+    """Torques that cost a thousand times as much are hardly used, and the motion is the same."""
+    tired = [name for name in plain.actuated if name.startswith("right")]
+    run = lift(controller__allocation__weights=dict.fromkeys(tired, 1e3))
+    assert_close(run.q_tree, plain.q_tree, 1e-9)
+    scale = np.array([1e3 if name in tired else 1.0 for name in run.actuated]) ** -0.5
+    for k, q_tree in enumerate(run.q_tree):
+        T = transmission(run.mechanism, q_tree)
+        assert_close(run.tau[k], scale * (np.linalg.pinv(T * scale) @ run.u[k]), 1e-8)
+    assert np.abs(run.tau[:, 6:]).max() < 0.05 * np.abs(plain.tau[:, 6:]).max()
+
+
+@pytest.mark.parametrize("limit", [21.0, 18.0])
+def test_limits(plain: Run, limit: float) -> None:
+    """As the reference in NumPy; while the other motors can take over what one has too much, nothing changes."""
+    run = lift(controller__torque_limit=limit, controller__allocation__preload=PRELOAD)
+    assert run.status == "done"
+    assert np.abs(run.tau).max() == limit
+    preload = np.array([PRELOAD.get(name, 0.0) for name in run.actuated])
+    for k, q_tree in enumerate(run.q_tree):
+        T = transmission(run.mechanism, q_tree)
+        assert_close(T @ run.tau[k], run.u[k], 1e-9)
+        if limit == 21.0:
+            tau = allocate(T, plain.u[k], np.full(12, limit), np.ones(12), preload)
+            assert_close(run.tau[k], tau, 1e-7)
+    off = np.abs(run.q_tree - plain.q_tree).max()
+    assert off < 1e-9 if limit == 21.0 else off > 1e-4
+
+
+def test_what_is_out_of_reach_is_clipped() -> None:
+    """Where no tau within limits gives u: the one of least norm, clipped."""
+    limit = 12.0
+    changes = {"t_end": 1e-3, "controller.torque_limit": limit}
+    run, free = simulate("two_ur5/lift", changes), simulate("two_ur5/lift", {"t_end": 1e-3})
+    assert_close(run.tau[0], np.clip(free.tau[0], -limit, limit), 1e-9)
+    assert np.abs(free.tau[0]).max() > 20
+    assert np.count_nonzero(np.abs(run.tau[0]) == limit) > 1
+
+
+def test_a_motor_at_its_own_limit(tmp_path: Path) -> None:
+    """[[motor]] in the place of actuated: names, and limits below the controller's."""
+    text = (library() / "two_ur5" / "mechanism.toml").read_text("utf-8")
+    before, _, rest = text.partition("actuated = [")
+    names = [line.strip(' ",') for part in rest.partition("]")[0].split(",") for line in [part] if line.strip()]
+    names = [name.strip().strip('"') for name in names]
+    assert len(names) == 12
+    motors = "".join(
+        f'[[motor]]\nname = "{name}_motor"\njoint = "{name}"\nratio = -100.0\ntorque_limit = 0.25\n' for name in names
+    )
+    (tmp_path / "mechanism.toml").write_text(before + motors + rest.partition("]\n")[2], "utf-8")
+    (tmp_path / "load.urdf").write_text((library() / "two_ur5" / "load.urdf").read_text("utf-8"), "utf-8")
+    scene = (library() / "two_ur5" / "lift.scene.toml").read_text("utf-8")
+    (tmp_path / "lift.scene.toml").write_text(scene, "utf-8")
+    run = simulate(tmp_path / "lift.scene.toml", {**LIFT, "controller.torque_limit": 1.0})
+    joints = lift(controller__torque_limit=25.0)
+    assert run.actuated == tuple(f"{name}_motor" for name in names)
+    assert_close(run.q_tree, joints.q_tree, 1e-9)
+    assert_close(run.tau, -0.01 * joints.tau, 1e-9)
