@@ -1,9 +1,8 @@
 """Inverse dynamics: what motors, loops and joints must bear along a prescribed motion, or bore along a recorded one.
 
 Of a recorded run the accelerations are those of eq. 1 with the efforts that it recorded, instant by instant, so that
-these come back, with their share within the mechanism, and nothing is lost between output instants. Dry friction and
-stops do something to a motion that no effort tells (a joint that sticks, an impact): then the recorded rates are
-differentiated, by a quintic spline, and the efforts are the nearest ones to those recorded.
+these come back, with their share within the mechanism, and nothing is lost between output instants. What joints that
+slide, stick and touch did there, its events tell.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Tracking
-from ckc_pin.control.desired import FEWEST, Desired, Table
+from ckc_pin.control.desired import Desired
 from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
@@ -29,6 +28,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.joint_forces import JointForces
 from ckc_pin.simulation.motion_forces import MotionForces, collected
 from ckc_pin.simulation.prepare import output_instants, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run, Status
@@ -43,12 +43,13 @@ DEAD = 1e-7  # of a motion: what an actuator moves by where it is at a dead cent
 
 @dataclass(frozen=True)
 class _Instant:
-    """One instant of a motion: the acceleration that the loops allow, and efforts that the wanted ones are next to."""
+    """One instant of a motion: what the loops allow, the efforts nearest to it, what friction and stops do."""
 
     t: float
     terms: Terms
     acceleration: Array
     tau: Array
+    of_joints: Array
 
 
 def inverse_dynamics(
@@ -87,7 +88,8 @@ def inverse_dynamics(
     -----
     Of more motors than freedoms tau is the least, or nearest to the preload, as a run's is within limits; of redundant
     rows the multipliers are the least.
-    Friction of a joint is -friction sign(v'), zero where the joint rests.
+    Friction of a joint is -friction sign(v'), zero where a prescribed motion rests; along a run what it was, in joints
+    that stick the least that holds them.
     """
     if isinstance(what, str | Path) and _names_a_run(str(what)):
         what = Run.load(what)
@@ -97,7 +99,7 @@ def inverse_dynamics(
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, changes or {}), what.mechanism
             actuation = scene_actuation(scene, mechanism)
-            motion, t_end = _recorded(what, mechanism, actuation), float(what.t[-1])
+            motion, t_end = _recorded(what, mechanism), float(what.t[-1])
         else:
             scene = what if isinstance(what, Scene) else load_scene(what, changes)
             mechanism, t_end = scene_mechanism(scene), scene.spec.t_end
@@ -148,8 +150,7 @@ def _along(
 def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
     """Solve eq. 1 at one instant for tau and the multipliers; what each joint transmits follows."""
     terms, acceleration, t = instant.terms, instant.acceleration, instant.t
-    friction = friction_force(mechanism, terms.v_tree)
-    needed = tree_force(terms, acceleration) - friction
+    needed = tree_force(terms, acceleration) - instant.of_joints
     if not np.all(np.isfinite(needed)):
         raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
@@ -158,7 +159,7 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     if np.any(np.abs(lacking) > enough):
         _require_grip(mechanism, tangent, actuation, t)
     tau = instant.tau + actuation.distribute(tangent, lacking)
-    forces = multipliers(terms, mechanism.motors.force(tau) + friction, acceleration)
+    forces = multipliers(terms, mechanism.motors.force(tau) + instant.of_joints, acceleration)
     return {
         "t": t,
         "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
@@ -214,27 +215,19 @@ def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Ite
             actuation.require_transmission(found.at)
         at, before = found.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
-        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload)
+        friction = friction_force(mechanism, terms.v_tree)
+        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload, friction)
 
 
-def _recorded(run: Run, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+def _recorded(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
     """What a run recorded."""
     if np.any(run.w[0]):
         raise InputError(
             f"{run.scene_name}: the run starts off phi = 0, with open loops: no forces in a closed mechanism move it so"
         )
-    states = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in run.q_tree]
-    rates: Array | None = None
-    if mechanism.joints.friction.any() or mechanism.joints.stopped.any():
-        if len(run.t) < FEWEST:
-            raise InputError(f"{run.scene_name}: {len(run.t)} output instants; rates along {FEWEST} have accelerations")
-        actuation.require_transmission(states[0])
-        rates = Table(run.t, run.v_tree)(run.t)[1]
-    for k, (t, at) in enumerate(zip(run.t.tolist(), states, strict=True)):
-        terms = Terms(mechanism, at, run.v_tree[k])
-        if rates is None:
-            acceleration = dae_acceleration(terms, mechanism.motors.force(run.tau[k]))
-        else:  # as near to the spline's as the loops allow
-            gap = at.J @ rates[k] + terms.J_dot @ terms.v_tree
-            acceleration = rates[k] - np.linalg.lstsq(at.J, gap, rcond=1e-9)[0]
-        yield _Instant(t, terms, acceleration, run.tau[k])
+    of_joints = JointForces(run)
+    for k, (t, numbers) in enumerate(zip(run.t.tolist(), run.q_tree, strict=True)):
+        terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(numbers)), run.v_tree[k])
+        u_tree = mechanism.motors.force(run.tau[k])
+        force = of_joints(k, terms, u_tree)
+        yield _Instant(t, terms, dae_acceleration(terms, u_tree + force), run.tau[k], force)

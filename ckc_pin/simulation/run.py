@@ -146,14 +146,16 @@ class Run:
         """
         from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
         from ckc_pin.dynamics.terms import Terms
+        from ckc_pin.simulation.joint_forces import JointForces
 
-        mechanism = self.mechanism
+        mechanism, of_joints = self.mechanism, JointForces(self)
         forces = np.empty_like(self.phi)
         for k, numbers in enumerate(self.q_tree):
             at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
             terms = Terms(mechanism, at, self.v_tree[k])
             u_tree = mechanism.motors.force(self.tau[k])
             try:
+                u_tree += of_joints(k, terms, u_tree)
                 forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
             except NumericalError:
                 forces[k] = np.nan

@@ -19,7 +19,7 @@ from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import panels, style
 from ckc_pin.view.desired import desired_along
-from ckc_pin.view.labels import plain, symbol, units
+from ckc_pin.view.labels import effort_units, plain, symbol
 from ckc_pin.view.panels import Group
 
 if TYPE_CHECKING:
@@ -229,8 +229,7 @@ def _panels(group: Group, titles: Sequence[str], size: tuple[float, float] | Non
 
 def _efforts_title(group: Group) -> str:
     """Name the efforts and their maxima, beside the paper's where it gives some."""
-    names = group.runs[0].actuated
-    unit = units(group.mechanism, names, "N m", "N")
+    unit = effort_units(group.mechanism)
     kind = {"N m": "torques", "N": "forces"}.get(unit, "torques and forces")
     peak = max(float(np.abs(run.tau).max(initial=0.0)) for run in group.runs)
     title = f"{kind}: max $|{panels.effort_symbol(group)}|$ = {peak:.3g} {unit}"

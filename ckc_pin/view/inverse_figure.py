@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.view import style
-from ckc_pin.view.labels import plain, symbol, units
+from ckc_pin.view.labels import effort_units, plain, symbol
 from ckc_pin.view.map_figure import look, write
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _efforts(ax: Any, found: MotionForces) -> None:
     names = ", ".join(symbol(motor) for motor in beyond) if len(beyond) <= TITLED else f"{len(beyond)} of them"
     ax.set(
         title=f"motors, beyond their limits (dashed): {names}" if beyond else "motors",
-        ylabel=rf"$\tau$, {units(found.mechanism, found.actuated, 'N m', 'N')}",
+        ylabel=rf"$\tau$, {effort_units(found.mechanism)}",
     )
     _legend(ax)
 

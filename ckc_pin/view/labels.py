@@ -11,7 +11,7 @@ import numpy as np
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.run import Run
 
-__all__ = ["is_length", "plain", "run_labels", "symbol", "units"]
+__all__ = ["effort_units", "is_length", "plain", "run_labels", "symbol", "units"]
 
 GREEK = (
     "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
@@ -53,6 +53,13 @@ def units(mechanism: Mechanism, coordinates: Sequence[str], angle: str, length: 
     """Return the unit of several coordinates, or both: units(m, names, "N m", "N")."""
     lengths = {is_length(mechanism, name) for name in coordinates}
     return " or ".join([angle] * (False in lengths) + [length] * (True in lengths)) or angle
+
+
+def effort_units(mechanism: Mechanism) -> str:
+    """Return the unit of the motors' torques, forces, or both."""
+    lengths, turns = mechanism.tree.in_metres, mechanism.motors.turns != 0
+    pushes = {bool(np.all(lengths[row])) for row in turns}
+    return " or ".join(["N m"] * (False in pushes) + ["N"] * (True in pushes)) or "N m"
 
 
 def run_labels(runs: Sequence[Run]) -> list[str]:

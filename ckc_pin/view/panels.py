@@ -15,7 +15,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.desired import DesiredPath
-from ckc_pin.view.labels import plain, run_labels, symbol, units
+from ckc_pin.view.labels import effort_units, plain, run_labels, symbol, units
 from ckc_pin.view.skeleton import Placements, placements, sticks, viewpoint
 
 __all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "loop_forces", "rates",
@@ -67,9 +67,11 @@ class Group:
 
     @cached_property
     def colours(self) -> dict[str, Any]:
-        """A colour for each coordinate, the independent ones first."""
+        """A colour for each coordinate, the independent ones first, and for motors that have names of their own."""
         rest = [name for name in self.runs[0].coordinates if name not in self.independent]
-        return style.colours([*self.independent, *rest])
+        named = style.colours([*self.independent, *rest])
+        own = [name for name in self.runs[0].actuated if name not in named]
+        return {**named, **style.colours(own)}
 
     @cached_property
     def shown(self) -> float:
@@ -127,7 +129,7 @@ def efforts(ax: Any, group: Group) -> None:
     """Draw the actuators' efforts over time; where a short peak dwarfs the rest, the rest again, enlarged."""
     names = group.runs[0].actuated
     _curves(ax, group, names, lambda run: run.tau)
-    _time(ax, group, f"${effort_symbol(group)}$, {units(group.mechanism, names, 'N m', 'N')}")
+    _time(ax, group, f"${effort_symbol(group)}$, {effort_units(group.mechanism)}")
     after = _peak_ends(group.runs, group.shown)
     if after is None:
         return
@@ -171,8 +173,10 @@ def loop_forces(ax: Any, group: Group) -> None:
 
 
 def effort_symbol(group: Group) -> str:
-    """Return u where the actuators are the independent joints, as in the paper, else tau."""
-    return "u" if group.runs[0].actuated == group.independent else r"\tau"
+    """Return u where the motors turn the independent joints themselves, as in the paper, else tau."""
+    mechanism = group.mechanism
+    turns = np.eye(mechanism.n)[mechanism.partition.q]
+    return "u" if np.array_equal(mechanism.motors.turns, turns) else r"\tau"
 
 
 def _curves(ax: Any, group: Group, names: Sequence[str], values: Callable[[Run], Array]) -> None:

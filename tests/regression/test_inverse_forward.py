@@ -118,7 +118,7 @@ def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> No
     mechanism = scene_mechanism(ckc_pin.load_scene(scene))
     changes = waves(mechanism, 0.1)
     if mechanism.splits_root or mechanism.rooted:
-        says = "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+ is held by none"
+        says = "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+.* is held by none"
         with pytest.raises(InputError, match=says):
             inverse_dynamics(scene, changes)
         return

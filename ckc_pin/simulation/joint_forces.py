@@ -1,0 +1,60 @@
+"""What dry friction and stops did to a recorded motion: its events tell who slid, stuck and touched when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ckc_pin.dynamics.formulations import dae_acceleration, tangent_basis
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.linear import Factorization
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.run import Run
+
+__all__ = ["JointForces"]
+
+IDLE = 1e-9  # of the forces that hold: what follows from others, of least norm
+
+
+class JointForces:
+    """Forces of friction and stops along a run.
+
+    Parameters
+    ----------
+    run : Run
+    """
+
+    def __init__(self, run: Run) -> None:
+        mechanism = self.mechanism = run.mechanism
+        self.smoothing = run.scene.get("friction_smoothing")
+        self.acts = bool(mechanism.joints.friction.any() or mechanism.joints.stopped.any())
+        sign, locked = np.zeros(mechanism.n), np.zeros(mechanism.n, dtype=bool)
+        changes = [event for event in run.events if event["of"] in ("friction", "stop")]
+        self.sign, self.locked = [], []
+        for t in run.t:
+            while changes and changes[0]["t"] <= t:
+                event = changes.pop(0)
+                k, what = mechanism.tree.index[event["coordinate"]], event["name"].rpartition(" ")[2]
+                locked[k] = what in ("sticks", "touches")
+                sign[k] = event["direction"] if what == "slides" else 0.0 if locked[k] else sign[k]
+            self.sign.append(sign.copy())
+            self.locked.append(np.flatnonzero(locked))
+
+    def __call__(self, k: int, terms: Terms, u_tree: Array) -> Array:
+        """Return the force on the tree at output instant k beside u', shape (n,), N or N m.
+
+        Of joints that stick or touch: what keeps them at rest, the least such forces where others would do too.
+        """
+        joints = self.mechanism.joints
+        if self.smoothing is not None:
+            return joints.smooth_friction(terms.v_tree, self.smoothing)
+        force = -joints.friction * self.sign[k]
+        at = self.locked[k]
+        if not len(at):
+            return force
+        tangent, _ = tangent_basis(terms, np.zeros(self.mechanism.closure.rows))
+        inertia = Factorization(tangent.T @ terms.D_tree @ tangent)
+        grip = tangent[at]
+        responses = grip @ np.column_stack([inertia.solve(row) for row in grip])
+        moved = dae_acceleration(terms, u_tree + force)[at]
+        force[at] -= np.linalg.lstsq(responses, moved, rcond=IDLE)[0]
+        return force
