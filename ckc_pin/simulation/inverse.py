@@ -28,9 +28,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.joint_forces import JointForces
 from ckc_pin.simulation.motion_forces import MotionForces, collected
 from ckc_pin.simulation.prepare import output_instants, scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.workspace import leaving
@@ -225,7 +225,7 @@ def _recorded(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
         raise InputError(
             f"{run.scene_name}: the run starts off phi = 0, with open loops: no forces in a closed mechanism move it so"
         )
-    of_joints = JointForces(run)
+    of_joints = RecordedJoints(run)
     for k, (t, numbers) in enumerate(zip(run.t.tolist(), run.q_tree, strict=True)):
         terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(numbers)), run.v_tree[k])
         u_tree = mechanism.motors.force(run.tau[k])

@@ -146,9 +146,9 @@ class Run:
         """
         from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
         from ckc_pin.dynamics.terms import Terms
-        from ckc_pin.simulation.joint_forces import JointForces
+        from ckc_pin.simulation.recorded_joints import RecordedJoints
 
-        mechanism, of_joints = self.mechanism, JointForces(self)
+        mechanism, of_joints = self.mechanism, RecordedJoints(self)
         forces = np.empty_like(self.phi)
         for k, numbers in enumerate(self.q_tree):
             at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ckc_pin import load
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.simulation.scene import catalogue
 from tests.native.loops import both, started
@@ -26,6 +27,8 @@ def _are_the_same(scene, changes, spread=SPREAD, tolerance=1e-10):
 @pytest.mark.parametrize("changes", FORMULATIONS, ids=lambda changes: changes["formulation"])
 @pytest.mark.parametrize("scene", SCENES)
 def test_right_hand_sides_are_those_of_numpy(scene, changes):
+    if load(scene.split("/")[0]).joints.friction.any():  # joints that stick are no function of t and y
+        changes = {**changes, "friction_smoothing": 0.1}
     if changes["formulation"] == "dae" and scene.split("/")[0] in ("bricard", "talos"):
         # off the closure redundant rows contradict each other, and either takes its own part of them
         _are_the_same(scene, changes, spread=0.0)

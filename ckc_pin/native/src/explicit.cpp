@@ -102,7 +102,8 @@ bool Explicit::step(double t_bound) {
     if (exists && whole(h)) {
       x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
       const double rest = disagreement(x_stage_);
-      agrees = rest < 1.0, size = std::max(size, rest);
+      agrees = rest < 1.0;
+      if (!agrees) size = std::max(size, rest);  // else it may be rounding, which no shorter step makes less
     }
     if (size < 1.0) {
       const double most = refused ? 1.0 : max_factor;

@@ -10,12 +10,12 @@ from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 
-__all__ = ["JointForces"]
+__all__ = ["RecordedJoints"]
 
 IDLE = 1e-9  # of the forces that hold: what follows from others, of least norm
 
 
-class JointForces:
+class RecordedJoints:
     """Forces of friction and stops along a run.
 
     Parameters
