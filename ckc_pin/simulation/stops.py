@@ -67,7 +67,7 @@ def explain(
         case "joints":
             return NumericalError(
                 "which joints stick, slide or touch from here on cannot be told: they change again and again at this "
-                "instant, or the quadratic program that decides has no solution",
+                "instant, the quadratic program that decides has no solution, or a stop was passed",
                 t=loop.t,
                 q_tree=where,
             )

@@ -13,13 +13,14 @@ namespace ckc {
 constexpr double infinity = std::numeric_limits<double>::infinity();
 constexpr double rounding = 1e-11;  // of the largest velocity: a joint is at rest; rad, or of the size: it is at a stop
 constexpr double gives = 1e-6;      // of the largest force: what holds no more is taken to be so much weaker
+constexpr double moves = 1e-12;     // of a joint's response without loops: they let it move
 constexpr double negligible = 1e-6; // of what friction alone would accelerate
 constexpr double exactly = 1e-9;    // of the largest acceleration: none
 
 JointChanges::JointChanges(System& system, double rise)
     : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise) {
   const int n = core_.n;
-  for (Vector* x : {&coordinates_, &v_, &a_, &rest_, &step_}) x->setZero(n);
+  for (Vector* x : {&coordinates_, &v_, &a_, &rest_, &step_, &unit_}) x->setZero(n);
   near_.assign(n, 0);
 }
 
@@ -61,6 +62,22 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   return true;
 }
 
+bool JointChanges::movable(Indices& at) {
+  if (!core_.responses(at, responses_)) return false;
+  Eigen::Index left = 0;
+  for (size_t i = 0; i < at.size(); ++i) {
+    const int k = at[i];
+    const auto column = static_cast<Eigen::Index>(i);
+    unit_.setUnit(k), core_.D_times(unit_, step_);
+    if (!(responses_(k, column) * step_(k) > moves)) continue;
+    at[left] = k;
+    if (left != column) responses_.col(left) = responses_.col(column);
+    ++left;
+  }
+  at.resize(left);
+  return true;
+}
+
 // The velocity nearest to the one before, in the metric of D', that leads no joint into a stop, and off it at
 // `restitution` times the speed it came with. As each lost v'^T D' v' / 2 is (1 - e) of something positive, energy falls.
 bool JointChanges::impact(double t, Out y) {
@@ -72,10 +89,11 @@ bool JointChanges::impact(double t, Out y) {
       into |= near_[k] * v_(k) > 0.0 && !rests(k);
     }
   if (!into) return true;
-  const auto m = static_cast<Eigen::Index>(at.size());
-  const Indices locked = std::exchange(joints_.locked, {});
+  joints_.locked.clear();
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
-  if (!system_.acceleration(t, a_) || !core_.responses(at, responses_)) return false;
+  if (!system_.acceleration(t, a_) || !movable(at)) return false;
+  const auto m = static_cast<Eigen::Index>(at.size());
+  if (!m) return true;
   A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.setZero(m), high_.setConstant(m, infinity);
   Vector back(m);  // speeds off the stops
   for (Eigen::Index i = 0; i < m; ++i) {
@@ -134,9 +152,20 @@ bool JointChanges::grip(double t, Out y) {
     joints_.sign[k] = rubs && !rests(k) ? (v_(k) > 0.0 ? 1 : -1) : 0;
     if (touches || (rubs && rests(k))) at.push_back(k);
   }
+  if (!at.empty()) {
+    if (!system_.acceleration(t, a_)) return false;
+    // Where the loops leave a joint no way, as a slide at its dead centre, they turn it round or it does nothing.
+    const double fastest = a_.cwiseQuotient(joints_.table.reach).lpNorm<Eigen::Infinity>();
+    for (int k : at)
+      if (joints_.table.friction(k) != 0.0 && std::abs(a_(k)) > exactly * fastest * joints_.table.reach(k))
+        joints_.sign[k] = joints_.rubs ? (a_(k) > 0.0 ? 1 : -1) : 0;
+    const Indices all = at, touching = joints_.touch;
+    if (!movable(at)) return false;
+    for (int k : all) joints_.touch[k] = 0;
+    for (int k : at) joints_.sign[k] = 0, joints_.touch[k] = touching[k];
+  }
   const auto m = static_cast<Eigen::Index>(at.size());
   if (m) {
-    if (!system_.acceleration(t, a_) || !core_.responses(at, responses_)) return false;
     A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.resize(m), high_.resize(m);
     for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(at[i], i));
     for (Eigen::Index i = 0; i < m; ++i) {
@@ -148,10 +177,12 @@ bool JointChanges::grip(double t, Out y) {
       size = std::max(size, negligible * joints_.table.friction(at[i]) / scale_(i));
     const double weaker = slips_ ? gives : 0.0;
     b_ /= size;
-    // rows that follow from others have accelerations that do, to the last digit
+    // Rows that follow from others have accelerations that do, but for rounding, unless they do so here alone.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
-    for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k)
-      b_ -= eigen.eigenvectors().col(k) * eigen.eigenvectors().col(k).dot(b_);
+    for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k) {
+      const double beyond = eigen.eigenvectors().col(k).dot(b_);
+      if (std::abs(beyond) <= exactly) b_ -= beyond * eigen.eigenvectors().col(k);
+    }
     for (Eigen::Index i = 0; i < m; ++i) {
       const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
       const double less = std::min(weaker, 0.5 * (high - low));
@@ -179,6 +210,11 @@ bool JointChanges::grip(double t, Out y) {
     if (holds && !held && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
   }
   joints_.lock(locked, coordinates_);
+  joints_.idle.clear();
+  for (int k = 0; k < core_.n; ++k)
+    if (joints_.rubs && joints_.table.friction(k) != 0.0 && !joints_.sign[k] &&
+        std::find(locked.begin(), locked.end(), k) == locked.end())
+      joints_.idle.push_back(k);
   bool changed;
   if (!locked.empty() && !system_.keep_locked(y, 0.0, changed)) return false;
   if (!take_state(t, y)) return false;

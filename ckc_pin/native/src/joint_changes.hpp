@@ -21,6 +21,8 @@ class JointChanges {
   bool take_state(double t, In y);
   bool impact(double t, Out y);
   bool grip(double t, Out y);
+  // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
+  bool movable(Indices& at);
   bool rests(int k) const { return std::abs(v_(k)) <= rest_(k); }
   void note(double t, int k, JointChange::What what, int direction) {
     joints_.changes.push_back({t, k, what, direction});
@@ -31,7 +33,7 @@ class JointChanges {
   Joints& joints_;
   const double rise_;
   bool known_ = false;  // whether a decision was made since the begin
-  Vector coordinates_, v_, a_, rest_, step_;
+  Vector coordinates_, v_, a_, rest_, step_, unit_;
   Indices near_;        // (n): the stop that a joint is at, as `touch`
   bool slips_ = false;  // what holds has given way
   Matrix responses_, A_;

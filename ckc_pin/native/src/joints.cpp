@@ -22,7 +22,7 @@ Joints::Joints(JointTable table_, int n)
 
 void Joints::begin() {
   std::fill(sign.begin(), sign.end(), 0), std::fill(touch.begin(), touch.end(), 0);
-  locked.clear(), changes.clear();
+  locked.clear(), idle.clear(), changes.clear();
   impact_loss = rubbed_ = 0.0;
 }
 
@@ -32,6 +32,16 @@ void Joints::add_friction(In v, Out force) const {
       force(k) -= table.friction(k) * std::tanh(v(k) / table.smoothing);
     else if (sign[k])
       force(k) -= table.friction(k) * sign[k];
+}
+
+double Joints::passed(In q_tree, const Indices& at) const {
+  double most = 0.0;
+  if (stops)
+    for (size_t k = 0; k < at.size(); ++k) {
+      const double x = q_tree(at[k]);
+      most = std::max(most, std::max(table.lower(k) - x, x - table.upper(k)) / table.reach(k));
+    }
+  return most;
 }
 
 void Joints::account(In coordinates) { rubbed_ = dissipated(coordinates) - impact_loss, since_ = coordinates; }

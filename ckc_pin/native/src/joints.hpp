@@ -44,11 +44,14 @@ class Joints {
   Indices sign;    // (n): which way a joint with friction slides, zero where it does not
   Indices touch;   // (n): -1 at the lower stop, 1 at the upper, zero at none
   Indices locked;  // coordinates that stick or touch
+  Indices idle;    // with friction, but the loops leave them no way to move from where they are
   Vector place;    // (n): where those are
   // Of sliding, the others' motion being v.
   void add_friction(In v, Out force) const;
   double lower_force(int k) const { return touch[k] > 0 ? -infinite : -table.friction(k); }
   double upper_force(int k) const { return touch[k] < 0 ? infinite : table.friction(k); }
+  // How far beyond a stop a joint is, by its reach; `place`: where coordinates stand in q'.
+  double passed(In q_tree, const Indices& place) const;
   double stop_at(int k, int side) const { return side < 0 ? table.lower(k) : table.upper(k); }
 
   void begin();

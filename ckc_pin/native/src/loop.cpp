@@ -13,9 +13,11 @@ constexpr double fine_rtol = 1e-7;
 constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
 constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
 constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
+constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
 constexpr double longer = 1.5;      // times the bounce that follows: the step from there
 constexpr long most_changes = 200;  // of joints at one instant
-constexpr double least_rise = 1e-13;  // rad, or of the mechanism's size, of a bounce
+constexpr double least_rise = 1e-10;  // rad, or of the mechanism's size, of a bounce: less is how closely loops close
+constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
@@ -304,6 +306,11 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
     if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
     if (changed) f_known_ = false;
   }
+  if (system->core.joints.passed(system->core.q_tree, system->core.tree.place) > passed) return Stop{Stop::joints, now.t};
+  const double moving = stirs * system->velocity.lpNorm<Eigen::Infinity>();
+  for (int k : system->core.joints.idle)
+    if (std::abs(system->velocity(k)) > moving) joints_known_ = false;
+  if (!joints_known_) jump();
   return {};
 }
 
