@@ -144,6 +144,8 @@ def run_table(run: Run) -> Table:
         limit = run.mechanism.motors.speed_limit[run.actuated.index(name)]
         table.add_row("warning", f"{name} turns at {rate:.4g}, its speed_limit is {limit:.4g}")
     table.add_row("energy start, end", f"{run.energy[0]:.9g}, {run.energy[-1]:.9g} J")
+    if run.dissipated is not None:
+        table.add_row("friction, impacts took", f"{run.dissipated[-1]:.9g} J")
     table.add_row("largest |phi - w|", f"{run.max_phi:.2g} (its rate {run.max_phi_dot:.2g})")
     for event in run.events[:MOST_EVENTS]:
         table.add_row("event", f"t = {event['t']:.9g} s: {event['name']}")

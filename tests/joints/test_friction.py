@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linprog
 
-from ckc_pin import Run, Terms, load, simulate
+from ckc_pin import InputError, Run, Terms, as_ivp, load, simulate
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide
 
@@ -160,3 +160,14 @@ def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Pa
 
     assert load_factor(0.0) < 1.0
     assert_close(run.events[4]["t"], brentq(lambda t: load_factor(t) - 1.0, 0.0, 0.8, xtol=1e-12), 1e-8)
+
+
+def test_what_joints_at_rest_rule_out_is_refused(scene_of: Make, with_joints: Callable[..., Path]) -> None:
+    scene = oscillator(scene_of, 1.0, 100.0, 10.0, 1.0, 1.0)
+    with pytest.raises(InputError, match="joints that stick or touch are rows of their closure"):
+        simulate(scene, {"formulation": "spf", "spf_coordinates": "z"})
+    with pytest.raises(InputError, match="stick or stop, which is no function of t and y"):
+        as_ivp(scene)
+    folder = with_joints("five_bar", {"theta_1": {"friction": 0.1}})
+    with pytest.raises(InputError, match=r"initial\.w: off phi = 0 the joints of five_bar that stick or touch cannot"):
+        simulate(folder / "swing.scene.toml", {"formulation": "spf", "initial.w": [0.01, 0.0]})

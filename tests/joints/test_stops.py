@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
-from ckc_pin import Run, simulate
+from ckc_pin import InputError, Run, simulate
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide
 
@@ -84,6 +84,13 @@ def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
     assert [event["name"] for event in run.events] == ["x touches", "x leaves"]
     rate = np.sqrt(20.0 / 50.0)  # the far mass on the spring, the block at rest
     assert_close(run.events[1]["t"], np.arcsin(4.0 / 20.0 / 0.5 * rate) / rate, 1e-10)
+
+
+def test_a_start_beyond_a_stop_is_refused(scene_of: Make) -> None:
+    scene = scene_of(slide("x", "base", "block", 1.0, 0.0), stop("x", 0.5), "q = {x = -0.25}\n", 1.0)
+    with pytest.raises(InputError, match=r"initial: x = -0.25 is beyond its stops, 0 to 1000"):
+        simulate(scene)
+    assert simulate(scene, {"initial.q.x": 0.0}).status == "done"
 
 
 def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
