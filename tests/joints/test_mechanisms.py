@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from ckc_pin import Run, Simulator, simulate
+from ckc_pin import Run, Simulator, load, simulate
+from ckc_pin.generated.library import compiled
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS
@@ -112,3 +113,20 @@ def test_at_every_tolerance_and_with_every_method(with_joints: Made, rtol: float
     run = simulate(scene, {"solver.rtol": rtol, "solver.method": method, "t_end": 0.8})
     assert run.status == "done"
     assert_close(run.q_tree[-1], fine.q_tree[-1], 30 * rtol)
+
+
+@pytest.mark.parametrize("clock", [{}, {"sample_time": 0.005}, {"sample_time": 0.005, "delay": 0.002}])
+def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float]) -> None:
+    """It starts at rest, held by all four joints, and what is sampled lets it go at an instant of the clock."""
+    scene = rubbing(with_joints) / "set_point.scene.toml"
+    compiled(load(scene.parent))
+    changes = {f"controller.{key}": value for key, value in clock.items()}
+    runs = [
+        simulate(scene, {**changes, "formulation": f, "solver.terms": terms, "t_end": 1.0, "solver.rtol": 1e-10})
+        for f in ("dae", "reduced")
+        for terms in ("pinocchio", "generated")
+    ]
+    for run in runs:
+        assert run.status == "done", run.message
+        assert [event["name"] for event in run.events] == [event["name"] for event in runs[0].events]
+        assert_close(run.q_tree, runs[0].q_tree, 1e-8)

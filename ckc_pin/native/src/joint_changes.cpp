@@ -14,7 +14,7 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 constexpr double rounding = 1e-11;  // of the largest velocity: a joint is at rest; rad, or of the size: it is at a stop
 constexpr double gives = 1e-6;      // of the largest force: what holds no more is taken to be so much weaker
 constexpr double moves = 1e-12;     // of a joint's response without loops: they let it move
-constexpr double negligible = 1e-6; // of what friction alone would accelerate
+constexpr double negligible = 1e-6, rounded = 1e-8;  // of what friction alone would accelerate
 constexpr double exactly = 1e-9;    // of the largest acceleration: none
 
 JointChanges::JointChanges(System& system, double rise)
@@ -172,16 +172,16 @@ bool JointChanges::grip(double t, Out y) {
       b_(i) = scale_(i) * a_(at[i]);
       for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
     }
-    double size = std::max(b_.lpNorm<Eigen::Infinity>(), 1e-300);
-    for (Eigen::Index i = 0; i < m; ++i)  // beside what friction can do, what is less is rounding
-      size = std::max(size, negligible * joints_.table.friction(at[i]) / scale_(i));
+    double most = 0.0;  // that friction alone would accelerate
+    for (Eigen::Index i = 0; i < m; ++i) most = std::max(most, joints_.table.friction(at[i]) / scale_(i));
+    const double size = std::max({b_.lpNorm<Eigen::Infinity>(), negligible * most, 1e-300});
     const double weaker = slips_ ? gives : 0.0;
     b_ /= size;
     // Rows that follow from others have accelerations that do, but for rounding, unless they do so here alone.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
     for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k) {
       const double beyond = eigen.eigenvectors().col(k).dot(b_);
-      if (std::abs(beyond) <= exactly) b_ -= beyond * eigen.eigenvectors().col(k);
+      if (std::abs(beyond) <= std::max(exactly, rounded * most / size)) b_ -= beyond * eigen.eigenvectors().col(k);
     }
     for (Eigen::Index i = 0; i < m; ++i) {
       const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
