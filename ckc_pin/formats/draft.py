@@ -26,6 +26,7 @@ from ckc_pin.mechanism.spec import (
     JointSpec,
     LoopSpec,
     MechanismSpec,
+    MotorSpec,
     PointSpec,
     SpringSpec,
     Vector3,
@@ -53,9 +54,9 @@ class Draft:
         What it was made from, for the head of the file.
     robot : Element
         The tree as a URDF's <robot>.
-    loops, couplings, springs, forces, joints, points : list of (spec, comment)
+    loops, couplings, springs, forces, joints, motors, points : list of (spec, comment)
     independent, actuated : list of str, or None
-        None leaves it to the program.
+        None leaves it to the program; `actuated` names the joints of motors too.
     why_independent : str
         Comment on `independent`.
     gravity : (3,) tuple
@@ -74,6 +75,7 @@ class Draft:
     springs: Noted[SpringSpec] = field(default_factory=list)
     forces: Noted[ForceSpec] = field(default_factory=list)
     joints: Noted[JointSpec] = field(default_factory=list)
+    motors: Noted[MotorSpec] = field(default_factory=list)
     points: Noted[PointSpec] = field(default_factory=list)
     independent: list[str] | None = None
     actuated: list[str] | None = None
@@ -100,13 +102,14 @@ class Draft:
             urdf=self.urdf_file,
             gravity=self.gravity,
             independent=self.independent,
-            actuated=self.actuated,
+            actuated=None if self.motors else self.actuated,
             q_guess=self.q_guess,
             loop=[spec for spec, _ in self.loops],
             coupling=[spec for spec, _ in self.couplings],
             spring=[spec for spec, _ in self.springs],
             force=[spec for spec, _ in self.forces],
             joint=[spec for spec, _ in self.joints],
+            motor=[spec for spec, _ in self.motors],
             point=[spec for spec, _ in self.points],
         )
 

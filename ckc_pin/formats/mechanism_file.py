@@ -51,8 +51,8 @@ def mechanism_text(draft: Draft) -> str:
     lines += [f"name = {_value(spec.name)}", f"urdf = {_value(draft.urdf_file)}", f"gravity = {_value(spec.gravity)}"]
     if draft.independent is not None:
         lines += _comment(draft.why_independent) + _list("independent", draft.independent)
-    if draft.actuated is not None:
-        lines += _list("actuated", draft.actuated)
+    if spec.actuated is not None:
+        lines += _list("actuated", spec.actuated)
     if draft.q_guess:
         lines += ["", "[q_guess]", *(f"{_key(k)} = {_value(v)}" for k, v in draft.q_guess.items())]
     tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
@@ -61,6 +61,7 @@ def mechanism_text(draft: Draft) -> str:
         "spring": draft.springs,
         "force": draft.forces,
         "joint": draft.joints,
+        "motor": draft.motors,
         "point": draft.points,
     }
     for table, noted in tables.items():
@@ -90,7 +91,8 @@ def _entries(spec: msgspec.Struct) -> Iterator[str]:
     """Yield the keys of a structure that differ from their defaults."""
     for field in msgspec.structs.fields(spec):
         value = getattr(spec, field.name)
-        if field.required or value != field.default:
+        made = field.default_factory
+        if field.required or value != (field.default if made is msgspec.NODEFAULT else made()):
             yield f"{_key(field.encode_name)} = {_value(value)}"
 
 

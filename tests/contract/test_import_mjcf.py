@@ -148,7 +148,7 @@ def test_what_else_the_workshop_says(tmp_path: Path) -> None:
     assert said(draft.guessed, "hard stops without rebound", "left_hip, right_hip")
     assert not said(draft.left_out, "armature")
     assert not said(draft.left_out, "friction")
-    assert said(draft.left_out, "gears", "left_knee, right_knee")
+    assert [(spec.joint, spec.ratio) for spec, _ in draft.motors] == [("left_knee", 3.0), ("right_knee", 3.0)]
 
 
 # --- loops ----------------------------------------------------------------------------------------------------------

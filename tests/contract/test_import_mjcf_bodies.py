@@ -13,7 +13,7 @@ import pytest
 from ckc_pin.errors import InputError
 from ckc_pin.formats.importing import read
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.spec import JointSpec
+from ckc_pin.mechanism.spec import JointSpec, MotorSpec
 from tests.conftest import assert_close
 from tests.contract.helpers.models import TWO_ARMS, model, said, tetrahedron
 from tests.contract.helpers.mujoco_twin import Twin
@@ -177,6 +177,27 @@ def test_what_joints_and_tendons_have_beyond_springs_is_said(tmp_path: Path) -> 
     assert len(draft.springs) == 1
 
 
+def test_gears_and_limits_of_motors(tmp_path: Path) -> None:
+    """MuJoCo's joint force at a control is what the motor's torque does, through the gear and within its limits."""
+    actuators = """<motor name="left" joint="a" gear="-20" forcerange="-1.5 2" forcelimited="true"/>
+      <general name="right" joint="b" gainprm="3" ctrlrange="-2 2" ctrllimited="true"/>"""
+    draft = model(tmp_path, TWO_ARMS, f"<actuator>{actuators}</actuator>")
+    assert [spec for spec, _ in draft.motors] == [
+        MotorSpec(name="left", joint="a", ratio=-20.0, torque_limit=1.5),
+        MotorSpec(name="right", joint="b", torque_limit=6.0),
+    ]
+    assert draft.left_out == []
+    mechanism = draft.mechanism()
+    assert mechanism.actuated == ("left", "right")
+    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "thing.xml"))
+    data = mujoco.MjData(whole)
+    data.ctrl[:] = [1.1, 0.4]
+    mujoco.mj_forward(whole, data)
+    ours = mechanism.tree.named(mechanism.motors.force(np.array([1.1, 3 * 0.4])))
+    for joint in "ab":
+        assert ours[joint] == pytest.approx(data.joint(joint).qfrc_actuator[0], rel=1e-12)
+
+
 def test_motors_and_constant_forces(tmp_path: Path) -> None:
     """A motor whose control is the force leaves nothing out; a force that takes no control is one of the mechanism."""
     actuators = """<motor joint="a"/><position joint="b" kp="9"/><motor site="s1"/>
@@ -184,7 +205,7 @@ def test_motors_and_constant_forces(tmp_path: Path) -> None:
     draft = model(tmp_path, TWO_ARMS, f"<actuator>{actuators}</actuator>")
     assert draft.actuated == ["a", "b"]
     assert [(spec.joint, spec.value) for spec, _ in draft.forces] == [("c", 3.0)]
-    assert said(draft.left_out, "gears", ": b")
+    assert said(draft.left_out, "gains", ": b")
     assert said(draft.left_out, "actuator on site s1")
     whole = mujoco.MjModel.from_xml_path(str(tmp_path / "thing.xml"))
     data = mujoco.MjData(whole)

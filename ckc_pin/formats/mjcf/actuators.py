@@ -1,11 +1,13 @@
-"""MuJoCo's actuators: the joints that they move, and constant forces. Gains and gears are MuJoCo's own controllers'."""
+"""MuJoCo's actuators: motors with their gears and limits, and constant forces. Gains are MuJoCo's own controllers'."""
 
 from __future__ import annotations
+
+import math
 
 from ckc_pin.formats.draft import number, some
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tree import MjcfTree
-from ckc_pin.mechanism.spec import ForceSpec
+from ckc_pin.mechanism.spec import ForceSpec, MotorSpec
 
 __all__ = ["Actuators", "moved_joints"]
 
@@ -17,12 +19,15 @@ class Actuators:
     ----------
     joints : list of str
         What has a motor.
+    motors : list of MotorSpec
+        A motor a joint, where one has a gear or a limit.
     forces : list of (ForceSpec, comment)
     left_out : list of str
     """
 
     def __init__(self, compiled: Compiled, tree: MjcfTree) -> None:
         self.joints: list[str] = []
+        motors: list[MotorSpec] = []
         self.forces: list[tuple[ForceSpec, str]] = []
         self.left_out: list[str] = []
         controlled = []
@@ -37,10 +42,15 @@ class Actuators:
                 spec = ForceSpec(joint=compiled.joints[joint], value=number(value))
                 self.forces.append((spec, f"actuator {name}, which takes no control".replace("  ", " ")))
             else:
-                self.joints += [compiled.joints[joint]] if compiled.joints[joint] not in self.joints else []
+                if compiled.joints[joint] not in self.joints:
+                    self.joints.append(compiled.joints[joint])
+                    motors.append(_motor(compiled, k, compiled.joints[joint]))
                 controlled += [] if _is_plain_motor(compiled, k) else [compiled.joints[joint]]
+        names = {motor.name for motor in motors}
+        plain = len(names) < len(motors) or all(motor.ratio == 1.0 and motor.torque_limit is None for motor in motors)
+        self.motors = [] if plain else motors
         if controlled:
-            said = "what actuators do, their gears, gains and ranges; their joints are `actuated`"
+            said = "what actuators do with their control, their gains and curves; their joints have motors"
             self.left_out.append(f"{said}: {some(list(dict.fromkeys(controlled)))}")
 
 
@@ -79,11 +89,29 @@ def _constant(compiled: Compiled, k: int) -> float:
     return float(model.actuator_gear[k, 0] * bias[0])
 
 
+def _motor(compiled: Compiled, k: int, joint: str) -> MotorSpec:
+    """Return an actuator on a joint as a motor; its armature is with the joint's already."""
+    model = compiled.model
+    limit = math.inf
+    gain = abs(float(model.actuator_gainprm[k, 0]))
+    for limited, bounds, by in (
+        (model.actuator_forcelimited[k], model.actuator_forcerange[k], 1.0),
+        (model.actuator_ctrllimited[k] and _is_plain_motor(compiled, k), model.actuator_ctrlrange[k], gain),
+    ):
+        if limited and bounds[0] < 0 < bounds[1]:
+            limit = min(limit, by * float(min(-bounds[0], bounds[1])))
+    gear = float(model.actuator_gear[k, 0])
+    return MotorSpec(
+        name=compiled.name("actuator", k) or joint,
+        joint=joint,
+        ratio=number(gear) if gear else 1.0,
+        torque_limit=number(limit) if math.isfinite(limit) else None,
+    )
+
+
 def _is_plain_motor(compiled: Compiled, k: int) -> bool:
-    """Whether an actuator's control is the force on its joint, without limits."""
+    """Whether an actuator's control is its force, but for a factor."""
     model, mujoco = compiled.model, compiled.mujoco
     kinds = [int(kind[k]) for kind in (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)]
     plain = [mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE]
-    limited = model.actuator_ctrllimited[k] or model.actuator_forcelimited[k]
-    force = model.actuator_gear[k, 0] * model.actuator_gainprm[k, 0]
-    return kinds == [int(kind) for kind in plain] and not limited and bool(force == 1.0)
+    return kinds == [int(kind) for kind in plain] and bool(model.actuator_gear[k, 0])

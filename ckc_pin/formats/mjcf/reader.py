@@ -53,6 +53,7 @@ def read_mjcf(text: str, path: Path) -> Draft:
         springs=tree.springs + springs,
         forces=actuators.forces,
         joints=tree.joints,
+        motors=[(motor, "") for motor in actuators.motors],
         points=free_sites(compiled, tree),
         actuated=actuators.joints or None,
         gravity=vector((0.0, 0.0, 0.0) if "gravity" in off else model.opt.gravity),
