@@ -12,10 +12,7 @@ using Clock = std::chrono::steady_clock;
 constexpr double fine_rtol = 1e-7;
 constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
 constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
-constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
 constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
-constexpr double longer = 1.5;      // times the bounce that follows: the step from there
-constexpr long most_changes = 200;  // of joints at one instant
 constexpr double least_rise = 1e-10;  // rad, or of the mechanism's size, of a bounce: less is how closely loops close
 constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
 constexpr double infinity = std::numeric_limits<double>::infinity();
@@ -57,29 +54,6 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   beyond_.reset(), unchanged_ = 0;
   crossing_.begin();
   events.begin();
-}
-
-void Loop::begin_joints() {
-  system->core.joints.begin();
-  joint_changes_.begin();
-  joints_known_ = !system->core.joints.any(), joints_often_ = 0;
-}
-
-std::optional<Stop> Loop::change_joints() {
-  const double within = located + of_step * std::max(now.t - now.t_old, 0.0);
-  joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
-  joints_at_ = now.t;
-  if (joints_often_ > most_changes || !joint_changes_.decide(now.t, now.y, events.changing, within)) {
-    const Stop stop = trouble();
-    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::joints, now.t} : stop;
-  }
-  Vector coordinates(system->core.n);
-  system->core.tree.to_coordinates(system->core.q_tree, coordinates);
-  events.watch_joints(coordinates, system->velocity);
-  joints_known_ = true, begun_ = f_known_ = false;
-  // A step that is far longer than what happens next would not see that.
-  now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);
-  return {};
 }
 
 void Loop::jump() {

@@ -1,0 +1,36 @@
+// When it is decided anew which joints slide, stick and touch.
+#include <algorithm>
+#include <cmath>
+
+#include "loop.hpp"
+
+namespace ckc {
+
+constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
+constexpr long most_changes = 200;  // of joints at one instant
+constexpr double longer = 1.5;      // times the bounce that follows: the step from there
+
+void Loop::begin_joints() {
+  system->core.joints.begin();
+  joint_changes_.begin();
+  joints_known_ = !system->core.joints.any(), joints_often_ = 0;
+}
+
+std::optional<Stop> Loop::change_joints() {
+  const double within = located + of_step * std::max(now.t - now.t_old, 0.0);
+  joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
+  joints_at_ = now.t;
+  if (joints_often_ > most_changes || !joint_changes_.decide(now.t, now.y, events.changing, within)) {
+    const Stop stop = trouble();
+    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::joints, now.t} : stop;
+  }
+  Vector coordinates(system->core.n);
+  system->core.tree.to_coordinates(system->core.q_tree, coordinates);
+  events.watch_joints(coordinates, system->velocity);
+  joints_known_ = true, begun_ = f_known_ = false;
+  // A step that is far longer than what happens next would not see that.
+  now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);
+  return {};
+}
+
+}  // namespace ckc
