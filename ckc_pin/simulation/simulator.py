@@ -234,9 +234,9 @@ class Simulator:
             applied = self._none if u is None else require_u(u, self.mechanism, "u")
             if self._no_u and applied.any():
                 raise InputError(f"u: {self._no_u}; give tau by motor instead")
-        until = self._state.t + self._require_dt(dt)
+        dt = self._require_dt(dt)
         with self._step:
-            return self._go(applied, tau is not None, until)
+            return self._go(applied, tau is not None, self._state.t + dt)
 
     def _go(self, applied: Array, of_motors: bool, until: float) -> State:
         try:

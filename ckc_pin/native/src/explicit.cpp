@@ -10,6 +10,7 @@ namespace ckc {
 constexpr double safety = 0.9, min_factor = 0.2, max_factor = 10.0;
 // Of the length that the error proposes, a third of which are refused: 7 % less work.
 constexpr double step_safety = 5.0 / 6.0;
+constexpr double near_refusal = 0.3;  // of a disagreement that refuses a step
 // Of a step; more when two steps in a row ask for it, for one may do so by chance.
 constexpr double growth = 2.0;
 
@@ -99,15 +100,18 @@ bool Explicit::step(double t_bound) {
     if (!exists && over()) return false;
     double size = exists ? error(h) : std::numeric_limits<double>::infinity();
     bool agrees = true;
+    double rest = 0.0;
     if (exists && whole(h)) {
       x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
-      const double rest = disagreement(x_stage_);
+      rest = disagreement(x_stage_);
       agrees = rest < 1.0;
-      if (!agrees) size = std::max(size, rest);  // else it may be rounding, which no shorter step makes less
+      if (!agrees) size = std::max(size, rest);
     }
     if (size < 1.0) {
       const double most = refused ? 1.0 : max_factor;
-      const double factor = step_safety * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
+      double factor = step_safety * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
+      // What y tells differently from its rates may be rounding, which no shorter step makes less; no longer one is tried.
+      if (rest > near_refusal) factor = std::min(factor, 1.0);
       growth_next_ = step_.t_new < t_bound && factor > growth;
       step_.h_next = length * (growth_next_ && !growth_pending_ ? growth : factor);
       if (step_.t_new == t_bound && !refused) step_.h_next = std::max(step_.h_next, step_.h);

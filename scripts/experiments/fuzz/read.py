@@ -132,8 +132,6 @@ class _Reader:
         dynamics, mimic = element.find("dynamics"), element.find("mimic")
         if dynamics is not None:
             self.damped[name] = float(dynamics.get("damping", "0"))
-            if float(dynamics.get("friction", "0")):
-                raise NoJudge(f"joint {name}: dry friction")
         if mimic is not None:
             self.mimic.append((name, prefix + mimic.attrib["joint"], float(mimic.get("multiplier", "1"))))
         return frame

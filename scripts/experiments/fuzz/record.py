@@ -121,6 +121,8 @@ def _judge(record: Record, run: Run, motion: Motion, thorough: bool) -> None:
         wrong = wrong or between_rows(run, motion.changes.get("event", []))
     if finite and not run.w.any() and len(run.t) > 1:
         try:
+            if mechanism.joints.friction.any():
+                raise NoJudge("dry friction")
             judge = Judge(read(run.texts))
             wrong = _pieces(record, run, motion, judge) or wrong
             wrong = wrong or _beyond_pieces(record, run, motion, judge, thorough)
