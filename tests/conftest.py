@@ -86,7 +86,7 @@ def run() -> Callable[..., Run]:
     done: dict[tuple[Any, ...], Run] = {}
 
     def run(scene: str, **changes: Any) -> Run:
-        terms = os.environ["XDG_CACHE_HOME"]  # what is compiled there
+        terms = os.environ.get("XDG_CACHE_HOME", "")  # what is compiled there
         key = (terms, scene, *sorted((name, repr(value)) for name, value in changes.items()))
         if key not in done:
             done[key] = simulate(scene, {name.replace("__", "."): value for name, value in changes.items()})
