@@ -20,7 +20,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       beta_(beta),
       projects_(projects) {
   crosses = projects;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), uncorrected_.setZero(core.rows.closure.rows), unforced_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), unforced_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
@@ -79,8 +79,7 @@ bool Dae::rate(double t, In v, Out y_dot) {
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  if (!core.dae_acceleration(acting(v), residual_, y_dot.tail(n))) return fails(Trouble::rank);
-  if (!core.joints.locked.empty() && !hold(y_dot.tail(n))) return false;
+  if (!eq_1(v, residual_, y_dot.tail(n))) return false;
   return finite(y_dot) || fails(Trouble::infinite);
 }
 

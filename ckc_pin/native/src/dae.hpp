@@ -40,7 +40,7 @@ class Dae : public System {
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
-  Vector q_tree_, step_, z_step_, residual_, uncorrected_, unforced_;
+  Vector q_tree_, step_, z_step_, residual_, unforced_;
   Matrix by_u_, by_q_, by_v_;
 };
 

@@ -152,7 +152,7 @@ void Events::add_own() {
     events_.push_back(event);
   };
   for (int k = 0; k < system_.core.n; ++k) {
-    if (joints.rubs && joints.table.friction(k) != 0.0) add(Event::q_dot, k, 0.0);
+    if (joints.rubs_at(k)) add(Event::q_dot, k, 0.0);
     for (double stop : {joints.table.lower(k), joints.table.upper(k)})
       if (std::isfinite(stop)) add(Event::q, k, stop);
   }
@@ -166,7 +166,7 @@ void Events::begin() {
 }
 
 // What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located.
-void Events::watch_joints(In coordinates, In velocity) {
+void Events::monitor_joints(In coordinates, In velocity) {
   const Joints& joints = system_.core.joints;
   changing.clear();
   for (size_t i = 0; i < events_.size(); ++i) {

@@ -64,7 +64,7 @@ class Events {
   // `failed` and the system's problem say which.
   bool check(Interpolant& motion, bool last, bool silent, double& halt);
   // Joints slide, stick and touch as they do from now on; where they are, and how they move.
-  void watch_joints(In coordinates, In velocity);
+  void monitor_joints(In coordinates, In velocity);
 
   std::vector<Crossed> met;
   std::vector<Event> changing;  // the loop's own that were met where the last check halted

@@ -20,7 +20,7 @@ constexpr double exactly = 1e-9;    // of the largest acceleration: none
 JointChanges::JointChanges(System& system, double rise)
     : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise) {
   const int n = core_.n;
-  for (Vector* x : {&coordinates_, &v_, &a_, &rest_, &step_, &unit_}) x->setZero(n);
+  for (Vector* x : {&coordinates, &v_, &a_, &rest_, &step_, &unit_}) x->setZero(n);
   near_.assign(n, 0);
 }
 
@@ -28,7 +28,7 @@ void JointChanges::begin() { known_ = false; }
 
 bool JointChanges::take_state(double t, In y) {
   if (!system_.exact(t, y)) return false;
-  core_.tree.to_coordinates(core_.q_tree, coordinates_);
+  core_.tree.to_coordinates(core_.q_tree, coordinates);
   v_ = system_.velocity;
   return true;
 }
@@ -36,7 +36,7 @@ bool JointChanges::take_state(double t, In y) {
 bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
   if (!take_state(t, y)) return false;
   const Vector& reach = joints_.table.reach;
-  joints_.account(coordinates_);
+  joints_.account(coordinates);
   // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
   rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
   if (known_ && within > 0.0) {
@@ -47,7 +47,7 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   slips_ = false, flight = infinity;
   for (int k = 0; k < core_.n; ++k)
     for (int side : {-1, 1}) {
-      const double off = std::abs(coordinates_(k) - joints_.stop_at(k, side));
+      const double off = std::abs(coordinates(k) - joints_.stop_at(k, side));
       if (off <= rounding * reach(k) + within * std::abs(v_(k))) near_[k] = side;
     }
   for (const Event& event : met) {
@@ -78,6 +78,14 @@ bool JointChanges::movable(Indices& at) {
   return true;
 }
 
+void JointChanges::scale(const Indices& at) {
+  const auto m = static_cast<Eigen::Index>(at.size());
+  A_.resize(m, m), scale_.resize(m);
+  for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(at[i], i));
+  for (Eigen::Index i = 0; i < m; ++i)
+    for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
+}
+
 // The velocity nearest to the one before, in the metric of D', that leads no joint into a stop, and off it at
 // `restitution` times the speed it came with. As each lost v'^T D' v' / 2 is (1 - e) of something positive, energy falls.
 bool JointChanges::impact(double t, Out y) {
@@ -94,7 +102,8 @@ bool JointChanges::impact(double t, Out y) {
   if (!system_.acceleration(t, a_) || !movable(at)) return false;
   const auto m = static_cast<Eigen::Index>(at.size());
   if (!m) return true;
-  A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.setZero(m), high_.setConstant(m, infinity);
+  scale(at);
+  b_.resize(m), low_.setConstant(m, -infinity), high_.setConstant(m, infinity);
   Vector back(m);  // speeds off the stops
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = at[i], side = near_[k];
@@ -102,17 +111,15 @@ bool JointChanges::impact(double t, Out y) {
     const double towards = side * a_(k), rise = towards > 0.0 ? after * after / (2 * towards) : infinity;
     back(i) = rise > rise_ * joints_.table.reach(k) ? after : 0.0;
     if (towards > 0.0 && back(i) > 0.0) flight = std::min(flight, 2 * after / towards);
-    scale_(i) = 1.0 / std::sqrt(responses_(k, i));
-    b_(i) = scale_(i) * (-side * v_(k) - back(i));
-    for (Eigen::Index j = 0; j < m; ++j)
-      A_(i, j) = scale_(i) / std::sqrt(responses_(at[j], j)) * side * near_[at[j]] * responses_(k, j);
+    b_(i) = scale_(i) * (v_(k) + side * back(i));
+    (side < 0 ? low_ : high_)(i) = 0.0;  // a stop pushes
   }
   const double size = b_.lpNorm<Eigen::Infinity>();
   if (!least_in_box(A_, b_ / size, low_, high_, x_)) return false;
   step_.setZero();
   double change = 0.0;
   for (Eigen::Index i = 0; i < m; ++i) {
-    x_(i) *= -near_[at[i]] * scale_(i) * size;  // an impulse
+    x_(i) *= scale_(i) * size;  // an impulse
     step_ += x_(i) * responses_.col(i);
   }
   for (Eigen::Index i = 0; i < m; ++i) {
@@ -146,7 +153,7 @@ bool JointChanges::grip(double t, Out y) {
   Indices at, locked;
   const Indices sign = joints_.sign, touch = joints_.touch, before = std::exchange(joints_.locked, {});
   for (int k = 0; k < core_.n; ++k) {
-    const bool rubs = joints_.rubs && joints_.table.friction(k) != 0.0;
+    const bool rubs = joints_.rubs_at(k);
     const bool touches = near_[k] && rests(k);
     joints_.touch[k] = touches ? near_[k] : 0;
     joints_.sign[k] = rubs && !rests(k) ? (v_(k) > 0.0 ? 1 : -1) : 0;
@@ -157,8 +164,8 @@ bool JointChanges::grip(double t, Out y) {
     // Where the loops leave a joint no way, as a slide at its dead centre, they turn it round or it does nothing.
     const double fastest = a_.cwiseQuotient(joints_.table.reach).lpNorm<Eigen::Infinity>();
     for (int k : at)
-      if (joints_.table.friction(k) != 0.0 && std::abs(a_(k)) > exactly * fastest * joints_.table.reach(k))
-        joints_.sign[k] = joints_.rubs ? (a_(k) > 0.0 ? 1 : -1) : 0;
+      if (joints_.rubs_at(k) && std::abs(a_(k)) > exactly * fastest * joints_.table.reach(k))
+        joints_.sign[k] = a_(k) > 0.0 ? 1 : -1;
     const Indices all = at, touching = joints_.touch;
     if (!movable(at)) return false;
     for (int k : all) joints_.touch[k] = 0;
@@ -166,12 +173,9 @@ bool JointChanges::grip(double t, Out y) {
   }
   const auto m = static_cast<Eigen::Index>(at.size());
   if (m) {
-    A_.resize(m, m), b_.resize(m), scale_.resize(m), low_.resize(m), high_.resize(m);
-    for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(at[i], i));
-    for (Eigen::Index i = 0; i < m; ++i) {
-      b_(i) = scale_(i) * a_(at[i]);
-      for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
-    }
+    scale(at);
+    b_.resize(m), low_.resize(m), high_.resize(m);
+    for (Eigen::Index i = 0; i < m; ++i) b_(i) = scale_(i) * a_(at[i]);
     double most = 0.0;  // that friction alone would accelerate
     for (Eigen::Index i = 0; i < m; ++i) most = std::max(most, joints_.table.friction(at[i]) / scale_(i));
     const double size = std::max({b_.lpNorm<Eigen::Infinity>(), negligible * most, 1e-300});
@@ -198,23 +202,20 @@ bool JointChanges::grip(double t, Out y) {
         continue;
       }
       joints_.touch[k] = 0;
-      if (joints_.rubs && joints_.table.friction(k) != 0.0) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
+      if (joints_.rubs_at(k)) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
     }
   }
+  joints_.lock(locked, coordinates);
+  joints_.idle.clear();
+  const auto among = [](const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); };
   for (int k = 0; k < core_.n; ++k) {
-    const bool holds = std::find(locked.begin(), locked.end(), k) != locked.end();
-    const bool held = std::find(before.begin(), before.end(), k) != before.end();
+    const bool holds = among(locked, k);
     if (joints_.touch[k] && !touch[k]) note(t, k, JointChange::touches, joints_.touch[k]);
     if (!joints_.touch[k] && touch[k]) note(t, k, JointChange::leaves, touch[k]);
     if (joints_.sign[k] && joints_.sign[k] != sign[k]) note(t, k, JointChange::slides, joints_.sign[k]);
-    if (holds && !held && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
+    if (holds && !among(before, k) && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
+    if (joints_.rubs_at(k) && !joints_.sign[k] && !holds) joints_.idle.push_back(k);
   }
-  joints_.lock(locked, coordinates_);
-  joints_.idle.clear();
-  for (int k = 0; k < core_.n; ++k)
-    if (joints_.rubs && joints_.table.friction(k) != 0.0 && !joints_.sign[k] &&
-        std::find(locked.begin(), locked.end(), k) == locked.end())
-      joints_.idle.push_back(k);
   bool changed;
   if (!locked.empty() && !system_.keep_locked(y, 0.0, changed)) return false;
   if (!take_state(t, y)) return false;

@@ -15,6 +15,7 @@ class JointChanges {
   // Decide, at the core's exact state, that of y, from what was met there; `within`: s, how closely events are located.
   // A velocity that jumps is changed in y. False where that cannot be: the system's trouble says why, or none does.
   bool decide(double t, Out y, const std::vector<Event>& met, double within);
+  Vector coordinates;   // (n), of the state that was decided about
   double flight = 0.0;  // s: how long the first bounce from there will last, infinite where there is none
 
  private:
@@ -23,6 +24,7 @@ class JointChanges {
   bool grip(double t, Out y);
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
   bool movable(Indices& at);
+  void scale(const Indices& at);  // A_, free of units: what unit forces make of the coordinates that they are on
   bool rests(int k) const { return std::abs(v_(k)) <= rest_(k); }
   void note(double t, int k, JointChange::What what, int direction) {
     joints_.changes.push_back({t, k, what, direction});
@@ -33,7 +35,7 @@ class JointChanges {
   Joints& joints_;
   const double rise_;
   bool known_ = false;  // whether a decision was made since the begin
-  Vector coordinates_, v_, a_, rest_, step_, unit_;
+  Vector v_, a_, rest_, step_, unit_;
   Indices near_;        // (n): the stop that a joint is at, as `touch`
   bool slips_ = false;  // what holds has given way
   Matrix responses_, A_;

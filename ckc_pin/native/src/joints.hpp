@@ -36,6 +36,7 @@ class Joints {
   const JointTable table;
   const bool rubs, stops;  // any of them, as events
   bool any() const { return rubs || stops; }
+  bool rubs_at(int k) const { return rubs && table.friction(k) != 0.0; }
   // Whether a force acts that is no controller's.
   bool acts() const { return rubs || smooth_; }
   bool smooth() const { return smooth_; }

@@ -27,7 +27,7 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
       alarm_(switch_margin),
       predictor_(core, epsilon) {
   const int m = core.rows.closure.rows;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), uncorrected_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m), z_.setZero(core.z.size());
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m), z_.setZero(core.z.size());
 }
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
@@ -141,7 +141,7 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
   // On the manifold eq. 6 is eq. 1 at rho q_dot.
   const Vector& force = acting(v_tree);
   const bool locked = !core.joints.locked.empty();
-  if (locked && !(core.dae_acceleration(force, uncorrected_, a_tree_) && hold(a_tree_))) return fails(Trouble::rank);
+  if (locked && !eq_1(v_tree, uncorrected_, a_tree_)) return false;
   written_ = locked || (on_manifold_ && core.written_acceleration(core.q_tree, v_tree, force, uncorrected_, a_tree_));
   if (written_)
     for (int k = 0; k < d; ++k) y_dot(d + k) = a_tree_(core.q[k]);

@@ -12,9 +12,7 @@ using Clock = std::chrono::steady_clock;
 constexpr double fine_rtol = 1e-7;
 constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
 constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
-constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
 constexpr double least_rise = 1e-10;  // rad, or of the mechanism's size, of a bounce: less is how closely loops close
-constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
@@ -275,17 +273,7 @@ std::optional<Stop> Loop::keep(const Made& step, bool last) {
   f_known_ = accepted == Accepted::kept;
   if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, step.margin};
   if (accepted == Accepted::restarted) method_->forget();
-  if (!system->core.joints.locked.empty()) {
-    bool changed;
-    if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
-    if (changed) f_known_ = false;
-  }
-  if (system->core.joints.passed(system->core.q_tree, system->core.tree.place) > passed) return Stop{Stop::joints, now.t};
-  const double moving = stirs * system->velocity.lpNorm<Eigen::Infinity>();
-  for (int k : system->core.joints.idle)
-    if (std::abs(system->velocity(k)) > moving) joints_known_ = false;
-  if (!joints_known_) jump();
-  return {};
+  return system->core.joints.any() ? keep_joints() : std::nullopt;
 }
 
 std::optional<Stop> Loop::look(Interpolant& motion, bool last, double& halt) {

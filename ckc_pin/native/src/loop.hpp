@@ -104,6 +104,8 @@ class Loop {
   // Which joints slide, stick and touch from the present state on.
   std::optional<Stop> change_joints();
   void begin_joints();
+  // At the end of a step that was kept.
+  std::optional<Stop> keep_joints();
   void choose(double bound);      // a method, at the start
   void choose_again(double bound);  // of the explicit ones, for another segment
   bool is_stiff(double duration);

@@ -8,6 +8,8 @@ namespace ckc {
 
 constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
 constexpr long most_changes = 200;  // of joints at one instant
+constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
+constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
 constexpr double longer = 1.5;      // times the bounce that follows: the step from there
 
 void Loop::begin_joints() {
@@ -24,12 +26,24 @@ std::optional<Stop> Loop::change_joints() {
     const Stop stop = trouble();
     return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::joints, now.t} : stop;
   }
-  Vector coordinates(system->core.n);
-  system->core.tree.to_coordinates(system->core.q_tree, coordinates);
-  events.watch_joints(coordinates, system->velocity);
+  events.monitor_joints(joint_changes_.coordinates, system->velocity);
   joints_known_ = true, begun_ = f_known_ = false;
   // A step that is far longer than what happens next would not see that.
   now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);
+  return {};
+}
+
+std::optional<Stop> Loop::keep_joints() {
+  Joints& joints = system->core.joints;
+  if (!joints.locked.empty()) {
+    bool changed;
+    if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
+    if (changed) f_known_ = false;
+  }
+  if (joints.passed(system->core.q_tree, system->core.tree.place) > passed) return Stop{Stop::joints, now.t};
+  const double moving = stirs * system->velocity.lpNorm<Eigen::Infinity>();
+  for (int k : joints.idle)
+    if (std::abs(system->velocity(k)) > moving) return jump(), std::nullopt;
   return {};
 }
 

@@ -20,17 +20,18 @@ const Vector& System::acting(In v) {
   return acting_;
 }
 
-bool System::hold(Out a) {
-  if (!core.responses(core.joints.locked, responses_)) return fails(Trouble::rank);
-  core.joints.hold(responses_, a);
+bool System::eq_1(In v, In correction, Out a) {
+  Joints& joints = core.joints;
+  if (!core.dae_acceleration(acting(v), correction, a)) return fails(Trouble::rank);
+  if (joints.locked.empty()) return true;
+  if (!core.responses(joints.locked, responses_)) return fails(Trouble::rank);
+  joints.hold(responses_, a);
   return true;
 }
 
 bool System::acceleration(double t, Out a) {
   core.set_velocity(velocity);
-  if (!act(t)) return false;
-  if (!core.dae_acceleration(acting(velocity), uncorrected_, a)) return fails(Trouble::rank);
-  return core.joints.locked.empty() || hold(a);
+  return act(t) && eq_1(velocity, uncorrected_, a);
 }
 
 bool System::keep_locked(Out y, double tolerance, bool& changed) {

@@ -82,9 +82,7 @@ class System {
   // --- dry friction and stops ---
   // What acts on the tree where its motion is v: the controller's forces, and friction of what slides.
   const Vector& acting(In v);
-  // From an acceleration of the tree without what holds the joints that stick or touch to the one with it.
-  bool hold(Out a);
-  // That at the core's state, which is exact.
+  // Acceleration of the tree at the core's state, which is exact, with what holds the joints that stick or touch.
   bool acceleration(double t, Out a);
   // Take back what locked joints have drifted by more than `tolerance`, and their rates, at the core's state, that of y;
   // false where that cannot be.
@@ -115,10 +113,14 @@ class System {
  protected:
   bool fails(Trouble why) { return trouble = why, false; }
   void new_partition() { phi_z_.reset(); }  // of the core
+  // Eq. 1 at the core's state moving with v, what acts there known, with what holds joints; `correction`: of J a.
+  bool eq_1(In v, In correction, Out a);
+
+  Vector uncorrected_;  // zero, (rows)
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_, rate_here_, acting_, uncorrected_, drift_, back_;
+  Vector moved_, rate_, rate_here_, acting_, drift_, back_;
   Matrix responses_;
 };
 
