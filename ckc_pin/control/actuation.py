@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.allocation import allocate
+from ckc_pin.control.allocation import allocate, least
 from ckc_pin.control.spec import AllocationSpec, Limit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -92,9 +92,8 @@ class Actuation:
         allocation: AllocationSpec | None = None,
     ) -> None:
         self.mechanism, self.motors = mechanism, mechanism.motors
-        motors, n = self.motors, mechanism.n
-        count = len(motors.names)
-        self.direct = np.array_equal(motors.turns, np.eye(n)[mechanism.partition.q])
+        motors, count = self.motors, len(self.motors.names)
+        self.direct = mechanism.driven_directly
         given = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
         self.limit = np.minimum(motors.vector(given, "controller.torque_limit", np.inf), motors.torque_limit)
         allocation = allocation or AllocationSpec()
@@ -106,7 +105,7 @@ class Actuation:
                     f"controller.allocation.{key}: {mechanism.name} has no redundancy, its {count} motors for "
                     f"{mechanism.d} freedoms leave no choice of tau"
                 )
-        self.none = Effort(np.zeros(count), np.zeros(n), np.zeros(mechanism.d))
+        self.none = Effort(np.zeros(count), np.zeros(mechanism.n), np.zeros(mechanism.d))
 
     def undriven(self, at: Kinematics) -> list[str]:
         """Name freedoms that no motor drives, as many as there are."""
@@ -156,9 +155,7 @@ class Actuation:
         (motors,) array
             Where they cannot do it, as nearly as they can.
         """
-        scale = 1.0 / np.sqrt(self.weights)
-        transmission = (self.motors.turns @ tangent).T
-        return np.asarray(scale * np.linalg.lstsq(transmission * scale, force, rcond=1e-9)[0], dtype=float)
+        return least((self.motors.turns @ tangent).T, force, self.weights)
 
     def apply(self, terms: Terms, u: Array) -> Effort:
         """Map u to tau within limits; of redundant motors, as `allocate` does.

@@ -6,7 +6,7 @@ import numpy as np
 
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["allocate"]
+__all__ = ["allocate", "least"]
 
 ROUNDING = 1e-13  # of u, scaled: what a tau may miss it by
 FLAT = 1e-12  # of the dual's largest curvature: a direction in which it has none
@@ -25,12 +25,17 @@ def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preloa
     limit, weights, preload : (m,) arrays
         Nearest is what makes sum weights (tau - preload)^2 least; |tau| <= limit, which may be infinite.
     """
-    scale = 1.0 / np.sqrt(weights)
-    tau = preload + scale * np.linalg.lstsq(transmission * scale, u - transmission @ preload, rcond=1e-9)[0]
+    tau = preload + least(transmission, u - transmission @ preload, weights)
     if np.any(np.abs(tau) > limit):
         found = _within_limits(transmission, u, limit, weights, preload) if np.ptp(transmission.shape) else None
         tau = np.clip(tau, -limit, limit) if found is None else found
     return np.asarray(tau, dtype=float)
+
+
+def least(transmission: Array, u: Array, weights: Array) -> Array:
+    """Return the tau with u = transmission tau, or as nearly as can be, whose sum of weights tau^2 is least."""
+    scale = 1.0 / np.sqrt(weights)
+    return np.asarray(scale * np.linalg.lstsq(transmission * scale, u, rcond=1e-9)[0], dtype=float)
 
 
 def _within_limits(transmission: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array | None:

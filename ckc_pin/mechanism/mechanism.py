@@ -98,6 +98,11 @@ class Mechanism:
         """Independent coordinates that belong to free roots."""
         return tuple(name for name in self.independent if name in self.tree.free_coordinates)
 
+    @property
+    def driven_directly(self) -> bool:
+        """Whether the motors turn the independent joints themselves, so that tau is u of eq. 6."""
+        return np.array_equal(self.motors.turns, np.eye(self.n)[self.partition.q])
+
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]

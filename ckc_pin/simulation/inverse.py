@@ -194,13 +194,8 @@ def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Ite
         raise InputError(
             f"{scene.name}: {lacks}, so no motion is prescribed; give controller.desired, or a run of the scene"
         )
-    at, none = find_start(mechanism, scene).at, np.zeros(mechanism.d)
-    desired: Desired
-    if isinstance(controller, Tracking):
-        desired = controller.desired
-    else:
-        rest = controller.q_d, none, none
-        desired = lambda t: rest  # noqa: E731
+    at = find_start(mechanism, scene).at
+    desired = controller.desired if isinstance(controller, Tracking) else _rest(controller.q_d)
     before: float | None = None
     for t in output_instants(scene).tolist():
         q_d, q_d_dot, q_d_ddot = desired(t)
@@ -217,6 +212,12 @@ def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Ite
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
         friction = friction_force(mechanism, terms.v_tree)
         yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload, friction)
+
+
+def _rest(q_d: Array) -> Desired:
+    """Return the motion that stays at q_d."""
+    none = np.zeros_like(q_d)
+    return lambda t: (q_d, none, none)
 
 
 def _recorded(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:

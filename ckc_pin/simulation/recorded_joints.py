@@ -26,7 +26,6 @@ class RecordedJoints:
     def __init__(self, run: Run) -> None:
         mechanism = self.mechanism = run.mechanism
         self.smoothing = run.scene.get("friction_smoothing")
-        self.acts = bool(mechanism.joints.friction.any() or mechanism.joints.stopped.any())
         sign, locked = np.zeros(mechanism.n), np.zeros(mechanism.n, dtype=bool)
         changes = [event for event in run.events if event["of"] in ("friction", "stop")]
         self.sign, self.locked = [], []

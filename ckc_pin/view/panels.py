@@ -174,9 +174,7 @@ def loop_forces(ax: Any, group: Group) -> None:
 
 def effort_symbol(group: Group) -> str:
     """Return u where the motors turn the independent joints themselves, as in the paper, else tau."""
-    mechanism = group.mechanism
-    turns = np.eye(mechanism.n)[mechanism.partition.q]
-    return "u" if np.array_equal(mechanism.motors.turns, turns) else r"\tau"
+    return "u" if group.mechanism.driven_directly else r"\tau"
 
 
 def _curves(ax: Any, group: Group, names: Sequence[str], values: Callable[[Run], Array]) -> None:
