@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,9 +67,10 @@ def with_joints(tmp_path: Path) -> Callable[..., Path]:
 
 
 def limited(urdf: str, joint: str, lower: float, upper: float) -> str:
-    """Give a continuous joint of a URDF limits."""
-    before, found, after = urdf.partition(f'<joint name="{joint}" type="continuous">')
+    """Give a joint of a URDF limits, if it is there."""
+    before, found, after = urdf.partition(f'<joint name="{joint}"')
     if not found:
         return urdf
-    limit = f'<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>'
-    return f'{before}<joint name="{joint}" type="revolute">{limit}{after}'
+    own, end, rest = after.partition("</joint>")
+    own = re.sub(r"<limit[^>]*/>", "", own).replace('type="continuous"', 'type="revolute"')
+    return f'{before}{found}{own}<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>{end}{rest}'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from ckc_pin import Terms, load, simulate
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.conftest import assert_close
+from tests.joints.conftest import limited
 
 # 0, 13, 41: a row that follows from others at one instant alone; 12, 19: joints that loops leave no way;
 # 28, 54: many bounces that die out together
@@ -34,23 +34,13 @@ def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
         text += f'\n[[joint]]\nname = "{name}"\nfriction = {float(size[k] * random.uniform(0.02, 0.6))!r}\n'
         if random.random() < 0.4:
             below, above = random.uniform(0.02, 0.4, 2) * reach[k]
-            limit(folder, name, float(numbers[k] - below), float(numbers[k] + above))
+            for path in folder.glob("*.urdf"):
+                path.write_text(limited(path.read_text(), name, float(numbers[k] - below), float(numbers[k] + above)))
             text += f"stops = true\nrestitution = {float(random.choice([0.0, 0.5, 0.8]))!r}\n"
     (folder / "mechanism.toml").write_text(text)
     pace = np.sqrt(mechanism.size)
     rates = {name: float(random.normal() * 0.5 * reach[tree.index[name]] / pace) for name in mechanism.independent}
     return folder / "default.scene.toml", {"initial.q_dot": rates, "t_end": float(0.6 * pace), "solver.rtol": 1e-10}
-
-
-def limit(folder: Path, joint: str, lower: float, upper: float) -> None:
-    """Give a joint limits in whichever URDF it is."""
-    for path in folder.glob("*.urdf"):
-        before, found, after = path.read_text().partition(f'<joint name="{joint}"')
-        if found:
-            own, end, rest = after.partition("</joint>")
-            own = re.sub(r"<limit[^>]*/>", "", own).replace('type="continuous"', 'type="revolute"')
-            own += f'<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>'
-            path.write_text(before + found + own + end + rest)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

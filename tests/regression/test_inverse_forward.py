@@ -24,7 +24,7 @@ CONTROLLED = [
     for scene in scene_names(mechanism)
     if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
 ]
-T_END = {"andrews": 0.02}  # s; open loop, what is off grows by e in 1 ms there
+T_END = {"andrews": 0.01}  # s; open loop, what is off grows by e in 2 ms there, and rounding differs by machine
 ROUNDED = 1e-9  # of the largest row of J: a row of zeros
 
 
