@@ -260,7 +260,7 @@ def test_the_map_listens_on_nothing():
                 seen |= listening(process.pid)
                 looks += 1
             with suppress(subprocess.TimeoutExpired):
-                process.wait(0.05)
+                process.wait(0.01)
     assert process.returncode == 0
     assert looks > 10
     assert seen == set()
