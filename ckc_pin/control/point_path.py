@@ -20,7 +20,7 @@ from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.many import integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.spec import Vector3
+from ckc_pin.mechanism.spec_frames import Vector3
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array
 
@@ -44,7 +44,26 @@ class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class CircleSpec(_Spec, frozen=True):
-    """Round a centre, `frequency` in rad/s, against the clock when seen against the normal."""
+    """Round a centre, `frequency` in rad/s, against the clock when seen against the normal.
+
+    Attributes
+    ----------
+    centre : m
+        In the world's axes.
+        ``centre = [0.15, -0.42, 0.0]``
+    radius : m
+        Of the circle.
+        ``radius = 0.06``
+    frequency : rad/s
+        Against the clock when seen against the normal.
+        ``frequency = 1.0``
+    phase : rad
+        At t = 0.
+        ``phase = 1.5707963``
+    normal
+        Of its plane; any length but 0.
+        ``normal = [0.0, 0.0, -1.0]``
+    """
 
     centre: Vector3
     radius: Annotated[float, msgspec.Meta(gt=0)]
@@ -54,7 +73,20 @@ class CircleSpec(_Spec, frozen=True):
 
 
 class LineSpec(_Spec, frozen=True):
-    """From one place to another and back, as a cosine, `frequency` in rad/s."""
+    """From one place to another and back, as a cosine, `frequency` in rad/s.
+
+    Attributes
+    ----------
+    start : m
+        Where it is at t = 0, at rest.
+        ``start = [0.1, -0.4, 0.0]``
+    end : m
+        Where it turns back, at rest.
+        ``end = [0.2, -0.4, 0.0]``
+    frequency : rad/s
+        There and back in 2π / frequency, as a cosine.
+        ``frequency = 2.0``
+    """
 
     start: Vector3
     end: Vector3
@@ -62,7 +94,23 @@ class LineSpec(_Spec, frozen=True):
 
 
 class PointPathSpec(_Spec, frozen=True):
-    """`[controller.desired]` with `point` in it: one of file, circle and line."""
+    """`[controller.desired]` with `point` in it: one of file, circle and line.
+
+    Attributes
+    ----------
+    point
+        a ``[[point]]`` of the mechanism.
+        ``point = "tip"``
+    file
+        CSV with the columns ``t, x, y, z``; one of ``file``, ``circle``, ``line``.
+        ``file = "path.csv"``
+    circle
+        Round a centre.
+        ``circle = {centre = [0.15, -0.42, 0.0], radius = 0.06, frequency = 1.0}``
+    line
+        From one place to another and back.
+        ``line = {start = [0.1, -0.4, 0.0], end = [0.2, -0.4, 0.0], frequency = 2.0}``
+    """
 
     point: str
     file: str | None = None

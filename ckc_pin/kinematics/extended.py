@@ -22,7 +22,8 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors
 from ckc_pin.mechanism.rank import RANK_TOLERANCE
 from ckc_pin.mechanism.rows import Affine
-from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
+from ckc_pin.mechanism.spec import LoopSpec
+from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["Extended", "Task", "extend", "find_point"]

@@ -11,7 +11,8 @@ from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
-from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
+from ckc_pin.mechanism.spec import LoopSpec
+from ckc_pin.mechanism.spec_parts import CouplingSpec
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Closure", "ClosureBuilder", "perpendicular"]

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import MechanismError
-from ckc_pin.mechanism.spec import FrameSpec
+from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Frame", "Frames"]

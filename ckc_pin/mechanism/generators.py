@@ -15,7 +15,17 @@ MAX_N = 160  # n = 2 N + 1 coordinates, and memory grows with n^3: 2.2 GB
 
 
 class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A scene's ``mechanism = {generator = "n_four_bar", N = 40}``; the bound holds before anything is made."""
+    """A scene's ``mechanism = {generator = "n_four_bar", N = 40}``; the bound holds before anything is made.
+
+    Attributes
+    ----------
+    generator
+        N unit squares in a row that share their verticals.
+        ``generator = "n_four_bar"``
+    N
+        How many.
+        ``N = 40``
+    """
 
     generator: Literal["n_four_bar"]
     N: Annotated[int, msgspec.Meta(ge=1, le=MAX_N)] = 4

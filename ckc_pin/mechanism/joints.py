@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ckc_pin.errors import MechanismError
-from ckc_pin.mechanism.spec import JointSpec
+from ckc_pin.mechanism.spec_parts import JointSpec
 from ckc_pin.mechanism.tree import Array, BoolArray, Tree
 
 __all__ = ["Joints"]

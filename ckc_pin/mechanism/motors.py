@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.spec import MechanismSpec, MotorSpec
+from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.mechanism.spec_parts import MotorSpec
 from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Motors", "motors_of"]

@@ -1,10 +1,17 @@
-"""The mechanism file, `mechanism.toml`, as a typed structure. What each key means: docs/reference.md."""
+"""The mechanism file, `mechanism.toml`, as a typed structure.
+
+What a key means stands in its structure's docstring, from which the reference is made: where numpydoc has the type,
+which the annotation says, stands the unit, and the last line is an example.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
+
+from ckc_pin.mechanism.spec_frames import Frame, FrameSpec, Name, Positive, Vector3
+from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec
 
 __all__ = [
     "CouplingSpec",
@@ -21,11 +28,6 @@ __all__ = [
     "Vector3",
 ]
 
-Vector3 = tuple[float, float, float]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Name = Annotated[str, msgspec.Meta(min_length=1)]
-
 LoopType = Literal["point", "point_2d", "hinge", "cylindrical", "universal", "prismatic", "weld", "distance"]
 
 
@@ -33,19 +35,30 @@ class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     pass
 
 
-class FrameSpec(_Spec, frozen=True):
-    """A frame placed in a link (or ``joint:NAME``, or ``world``)."""
-
-    link: Name
-    xyz: Vector3 = (0.0, 0.0, 0.0)
-    rpy: Vector3 = (0.0, 0.0, 0.0)
-
-
-Frame = Name | FrameSpec
-
-
 class TreeSpec(_Spec, frozen=True):
-    """One URDF of the world."""
+    """One URDF of the world.
+
+    Attributes
+    ----------
+    file
+        The URDF, beside this file or ``package://...``.
+        ``file = "package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf"``
+    prefix
+        Before every link, joint and frame name of this tree.
+        ``prefix = "left_"``
+    root
+        A free root has the six coordinates ``root.x`` to ``root.rz``.
+        ``root = "free"``
+    parent
+        The link of an earlier tree, or ``world``, that the root stands on.
+        ``parent = "table"``
+    xyz : m
+        Position in the parent.
+        ``xyz = [0.0, 0.5, 0.0]``
+    rpy : rad
+        Orientation in the parent: roll, pitch, yaw about fixed axes, as in a URDF.
+        ``rpy = [0.0, 0.0, 1.5707963]``
+    """
 
     file: Name
     prefix: str = ""
@@ -56,7 +69,35 @@ class TreeSpec(_Spec, frozen=True):
 
 
 class LoopSpec(_Spec, frozen=True):
-    """One loop closure between frames A and B."""
+    """One loop closure between frames A and B.
+
+    Attributes
+    ----------
+    name
+        Names its rows: ``elbow.x``, ``elbow.y``.
+        ``name = "elbow"``
+    type
+        Which rows it has.
+        ``type = "point_2d"``
+    frame_a
+        Frame A: a link, ``joint:NAME``, ``world``, or a table ``{link, xyz, rpy}``.
+        ``frame_a = {link = "rod", xyz = [0.6, 0.0, 0.0]}``
+    frame_b
+        Frame B, in the same ways.
+        ``frame_b = "joint:knee"``
+    rows_in
+        The axes that p_A - p_B is resolved in: frame A's or the world's.
+        ``rows_in = "world"``
+    axis_a
+        The direction a, in frame A; its length does not matter.
+        ``axis_a = [0.0, 1.0, 0.0]``
+    axis_b
+        The direction b, in frame B.
+        ``axis_b = [0.0, 1.0, 0.0]``
+    length : m
+        Of ``distance``, which needs it; no other type takes it.
+        ``length = 0.3``
+    """
 
     name: Name
     type: LoopType
@@ -68,72 +109,73 @@ class LoopSpec(_Spec, frozen=True):
     length: Positive | None = None
 
 
-class CouplingSpec(_Spec, frozen=True):
-    """joint = ratio * other + offset."""
-
-    joint: Name
-    other: Name
-    ratio: float
-    offset: float = 0.0
-
-
-class SpringSpec(_Spec, frozen=True):
-    """A spring and damper between two frames' origins, or on a joint."""
-
-    frame_a: Frame | None = None
-    frame_b: Frame | None = None
-    rest_length: NonNegative | None = None
-    joint: Name | None = None
-    rest: float | None = None
-    stiffness: NonNegative = 0.0
-    damping: NonNegative = 0.0
-
-
-class ForceSpec(_Spec, frozen=True):
-    """A constant force or torque on a joint, N or N m: part of the mechanism, with potential -value * coordinate.
-
-    A motor's fixed drive torque, a weight on a string: what pushes a joint without being a controller.
-    """
-
-    joint: Name
-    value: float
-
-
-class JointSpec(_Spec, frozen=True):
-    """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s (N s/m)."""
-
-    name: Name
-    armature: NonNegative | None = None
-    damping: NonNegative | None = None
-    friction: NonNegative | None = None
-    stops: bool = False
-    restitution: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
-
-
-class MotorSpec(_Spec, frozen=True):
-    """A motor on a joint, or on a sum of joints: its angle is ratio times the sum of what `joints` says.
-
-    torque_limit, speed_limit and tau are its own, before the gear: it acts on a joint as ratio * tau.
-    """
-
-    name: Name | None = None
-    joint: Name | None = None
-    joints: dict[str, float] = {}
-    ratio: float = 1.0
-    rotor_inertia: NonNegative = 0.0
-    torque_limit: Positive | None = None
-    speed_limit: Positive | None = None
-
-
 class PointSpec(_Spec, frozen=True):
-    """A point to report and to trace."""
+    """A point to report and to trace.
+
+    Attributes
+    ----------
+    name
+        The key under ``points``.
+        ``name = "tip"``
+    frame
+        a link, ``joint:NAME``, or a table ``{link, xyz, rpy}``; the point is its origin.
+        ``frame = {link = "rod", xyz = [0.6, 0.0, 0.0]}``
+    """
 
     name: Name
     frame: Frame
 
 
 class MechanismSpec(_Spec, frozen=True):
-    """The whole file."""
+    """The whole file.
+
+    Attributes
+    ----------
+    name
+        What it is called.
+        ``name = "five_bar"``
+    urdf
+        File of the one fixed tree, beside this file, or ``package://...``; either this or ``[[tree]]``.
+        ``urdf = "five_bar.urdf"``
+    tree
+        The URDFs of a world of several, or of a free root.
+        ``tree = [{file = "left.urdf", prefix = "left_"}]``
+    gravity : m/s²
+        Acceleration, in the world's axes.
+        ``gravity = [0.0, -9.81, 0.0]``
+    independent
+        q, in the order that u, D, C, h and matrix gains have; absent: chosen by a pivoted factorization,
+        coordinates with motors first as far as φ_z stays sound.
+        ``independent = ["theta_1", "theta_3"]``
+    actuated
+        Joints with a motor of their name, without a gear, in tau's order; in the place of ``[[motor]]``;
+        absent both: the independent ones.
+        ``actuated = ["theta_1", "theta_3"]``
+    q_guess : rad, m
+        Where assembly starts; it picks the assembly branch; 0 for what is not named.
+        ``q_guess = {theta_1 = -1.4, "root.z" = 0.5}``
+    loop
+        Loop closures.
+        ``loop = [{name = "elbow", type = "point_2d", frame_a = "left", frame_b = "right"}]``
+    coupling
+        Gears: one coordinate follows another.
+        ``coupling = [{joint = "wheel", other = "pinion", ratio = -0.5}]``
+    spring
+        Springs and dampers.
+        ``spring = [{joint = "hip", stiffness = 3.0}]``
+    force
+        Constant forces and torques.
+        ``force = [{joint = "slider", value = -9.81}]``
+    joint
+        What joints themselves do: rotors, friction, stops.
+        ``joint = [{name = "hip", friction = 0.2}]``
+    motor
+        Motors with their gears, in tau's order.
+        ``motor = [{joint = "hip", ratio = 50.0}]``
+    point
+        Points that are reported at the end of a run and traced in playback.
+        ``point = [{name = "tip", frame = "foot"}]``
+    """
 
     name: Name
     urdf: Name | None = None

@@ -9,7 +9,7 @@ import numpy as np
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
-from ckc_pin.mechanism.spec import ForceSpec, SpringSpec
+from ckc_pin.mechanism.spec_parts import ForceSpec, SpringSpec
 from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Springs"]

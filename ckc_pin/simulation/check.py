@@ -18,7 +18,8 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
+from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
+from ckc_pin.simulation.scene_spec import TermsOf
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
 __all__ = ["Check", "check"]

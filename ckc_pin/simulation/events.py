@@ -16,7 +16,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.loop_terms import event_call
-from ckc_pin.simulation.scene import EventSpec
+from ckc_pin.simulation.scene_spec import EventSpec
 
 __all__ = ["Event", "EventFunction", "event_functions", "events_met"]
 

@@ -32,7 +32,8 @@ from ckc_pin.native.tables import core_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
-from ckc_pin.simulation.scene import Scene, SceneSpec
+from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene_spec import SceneSpec
 
 __all__ = ["Prepared", "output_instants", "prepare", "scene_actuation", "scene_controller", "scene_mechanism"]
 

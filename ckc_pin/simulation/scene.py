@@ -8,95 +8,22 @@ from dataclasses import dataclass
 from functools import cached_property
 from os.path import isdir, isfile
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from ckc_pin.control.spec import ControllerSpec, FeedbackSpec
+from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
+from ckc_pin.simulation.scene_spec import EventSpec, SceneSpec, SolverSpec
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
-
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers replace anything finer
-
-Method = Literal["auto", "DOP853", "RK45", "Radau"]
-TermsOf = Literal["auto", "pinocchio", "generated"]
-
-
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class InitialSpec(_Spec, frozen=True):
-    """Where a run starts: at q, at the stable equilibrium reached from q_guess, or as assembled from q_guess."""
-
-    at: Literal["equilibrium", "assembled"] | None = None
-    q: dict[str, float] = {}
-    q_dot: dict[str, float] = {}
-    w: list[float] | None = None
-
-
-class SolverSpec(_Spec, frozen=True):
-    """How a run is integrated.
-
-    `terms`: "pinocchio", "generated" (written out for the mechanism, compiled), "auto": the latter if they are there.
-    `baumgarte`: alpha and beta, 1/s, of a DAE that is not projected.
-    """
-
-    method: Method = "auto"
-    rtol: Tolerance = 1e-8
-    atol: Positive | None = None
-    max_step: Positive | None = None
-    min_step: NonNegative = 0.0
-    max_rhs: Annotated[int, msgspec.Meta(ge=1, le=2**62)] | None = None
-    max_wall_s: Positive | None = None
-    output_dt: Positive | None = None
-    projection: bool = True
-    terms: TermsOf = "auto"
-    baumgarte: tuple[NonNegative, NonNegative] | None = None
-
-
-class EventSpec(_Spec, frozen=True):
-    """A coordinate or its rate crossing a value, a joint limit passed, or a singularity margin crossing a value.
-
-    `value`: 0 for "q" and "q_dot"; a limit's is the URDF's; a margin needs one, greater than 0.
-    """
-
-    coordinate: str | None = None
-    of: Literal["q", "q_dot", "limit", "sigma_min_phi_z", "sigma_min_J"] = "q"
-    value: float | None = None
-    direction: Literal[-1, 0, 1] = 0
-    stop: bool = False
-
-
-class SceneSpec(_Spec, frozen=True):
-    """The whole file.
-
-    `spf_coordinates`: the SPF in the coordinates of eq. 17, exact in w, or with z as eq. 8 is printed.
-    `friction_smoothing`: the rate over which dry friction grows as tanh, rad/s or m/s, instead of joints that stick.
-    """
-
-    mechanism: str | GeneratorSpec
-    formulation: Literal["reduced", "spf", "dae"]
-    t_end: Positive
-    epsilon: Positive = 1e-3
-    spf_coordinates: Literal["w", "z"] = "w"
-    coriolis_velocity: Literal["rho", "actual"] = "rho"
-    friction_smoothing: Positive | None = None
-    initial: InitialSpec = InitialSpec()
-    solver: SolverSpec = SolverSpec()
-    controller: ControllerSpec | None = None
-    event: list[EventSpec] = []
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.events import EventFunction
-from ckc_pin.simulation.scene import SolverSpec
+from ckc_pin.simulation.scene_spec import SolverSpec
 
 __all__ = ["PAUSE", "Stop", "explain", "why_not_q"]
 

@@ -13,9 +13,10 @@ from ckc_pin import InputError
 from ckc_pin.formats.urdf.robot_yaml import RobotYaml
 from ckc_pin.mechanism.faults import faults
 from ckc_pin.mechanism.library import library
-from ckc_pin.mechanism.spec import FrameSpec, LoopType, MechanismSpec
+from ckc_pin.mechanism.spec import LoopType, MechanismSpec
+from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.toml import convert
-from ckc_pin.simulation.scene import SceneSpec
+from ckc_pin.simulation.scene_spec import SceneSpec
 from tests.contract.test_mutations import mutated
 
 

@@ -24,21 +24,11 @@ from ckc_pin.control.spec import (
 )
 from ckc_pin.mechanism.faults import expected
 from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.spec import (
-    CouplingSpec,
-    ForceSpec,
-    FrameSpec,
-    JointSpec,
-    LoopSpec,
-    LoopType,
-    MechanismSpec,
-    MotorSpec,
-    PointSpec,
-    SpringSpec,
-    TreeSpec,
-)
+from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, PointSpec, TreeSpec
+from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, OTHERS
-from ckc_pin.simulation.scene import EventSpec, InitialSpec, SceneSpec, SolverSpec
+from ckc_pin.simulation.scene_spec import EventSpec, InitialSpec, SceneSpec, SolverSpec
 from tests.contract.helpers.command import ckc
 from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
 
