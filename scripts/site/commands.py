@@ -1,0 +1,61 @@
+"""The commands, their arguments and options, from click itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from inspect import cleandoc
+
+import click
+
+from ckc_pin.cli.app import COMMANDS, ckc
+
+__all__ = ["markdown", "undocumented"]
+
+
+def markdown() -> str:
+    """Return every command's section, in MyST."""
+    return "\n".join(line for name in COMMANDS for line in _command(name))
+
+
+def undocumented() -> list[str]:
+    """Return what has no help: commands, and their options and arguments."""
+    found = []
+    for name in COMMANDS:
+        command, context = _click(name)
+        found += [f"ckc {name}"] if not command.help else []
+        for parameter in command.get_params(context):
+            if not getattr(parameter, "help", None):
+                found.append(f"ckc {name} {parameter.human_readable_name}")
+    return found
+
+
+def _click(name: str) -> tuple[click.Command, click.Context]:
+    command = ckc.get_command(click.Context(ckc), name)
+    assert command is not None
+    return command, click.Context(command, info_name=f"ckc {name}")
+
+
+def _command(name: str) -> Iterator[str]:
+    command, context = _click(name)
+    yield f"(command-{name})=\n## `ckc {name}`\n"
+    yield f"```text\n{command.get_usage(context).removeprefix('Usage: ')}\n```\n"
+    for part in cleandoc(command.help or "").split("\n\n"):
+        if part.startswith("\b\n"):
+            yield "```text\n" + part.removeprefix("\b\n") + "\n```\n"
+        else:
+            yield _text(part) + "\n"
+    rows = [record for record in (parameter.get_help_record(context) for parameter in command.get_params(context)) if record]
+    if rows:
+        yield from ("| option | does |", "|---|---|")
+        yield from (f"| `{left.replace('|', chr(92) + '|')}` | {_text(right)} |" for left, right in rows)
+        yield ""
+    if command.epilog:
+        lines = [line.strip() for line in command.epilog.replace("\b", "").splitlines() if line.strip().startswith("ckc")]
+        yield "```sh\n" + "\n".join(lines) + "\n```\n"
+
+
+def _text(text: str) -> str:
+    """Keep what Markdown would take for its own."""
+    for sign in "*_<[|":
+        text = text.replace(sign, f"\\{sign}")
+    return " ".join(text.split())

@@ -1,0 +1,79 @@
+"""A Sphinx domain for keys of files and for commands: entries to link to, and to find by name or unit in the search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+from docutils import nodes
+from docutils.parsers.rst import directives
+from sphinx import addnodes
+from sphinx.directives import ObjectDescription
+from sphinx.domains import Domain, ObjType
+from sphinx.roles import XRefRole
+from sphinx.util.nodes import make_id, make_refnode
+
+__all__ = ["CkcDomain"]
+
+
+class KeyEntry(ObjectDescription[str]):
+    """``ckc:key``: a key with its type, default and unit."""
+
+    option_spec: ClassVar[Any] = ObjectDescription.option_spec | {
+        name: directives.unchanged for name in ("file", "kind", "default", "unit")
+    }
+
+    def handle_signature(self, sig: str, signode: Any) -> str:
+        table, _, name = sig.rpartition(".")
+        if table:
+            signode += addnodes.desc_addname("", f"{table}.")
+        signode += addnodes.desc_name("", name)
+        for what in ("kind", "default", "unit"):
+            value = self.options.get(what)
+            if value:
+                text = {"needed": "needed", "absent": "absent by default"}.get(value, f"default {value}")
+                shown = text if what == "default" else value
+                signode += nodes.inline("", shown, classes=["ckc-fact", f"ckc-{what}"])
+        return sig
+
+    def add_target_and_index(self, name: str, sig: str, signode: Any) -> None:
+        file, unit = self.options.get("file", ""), self.options.get("unit", "")
+        anchor = make_id(self.env, self.state.document, f"key-{file}", name)
+        signode["ids"].append(anchor)
+        self.state.document.note_explicit_target(signode)
+        self.env.get_domain("ckc").note(name, file, unit, self.env.docname, anchor)  # type: ignore[attr-defined]
+        self.indexnode["entries"].append(("single", f"{name} ({file})", anchor, "", None))
+
+
+class CkcDomain(Domain):
+    """Keys, by (file, path)."""
+
+    name = "ckc"
+    label = "ckc_pin"
+    object_types: ClassVar[dict[str, ObjType]] = {"key": ObjType("key", "key")}
+    directives: ClassVar[dict[str, Any]] = {"key": KeyEntry}
+    roles: ClassVar[dict[str, Any]] = {"key": XRefRole()}
+    initial_data: ClassVar[dict[str, Any]] = {"keys": {}}
+    data_version = 1
+
+    def note(self, name: str, file: str, unit: str, docname: str, anchor: str) -> None:
+        """Keep an entry; one key may stand in two structures, the first is linked to."""
+        self.data["keys"].setdefault(f"{file}:{name}", (name, unit, docname, anchor))
+
+    def clear_doc(self, docname: str) -> None:
+        self.data["keys"] = {key: entry for key, entry in self.data["keys"].items() if entry[2] != docname}
+
+    def merge_domaindata(self, docnames: Any, otherdata: Any) -> None:
+        self.data["keys"] |= {key: entry for key, entry in otherdata["keys"].items() if entry[2] in docnames}
+
+    def resolve_xref(self, env: Any, fromdocname: str, builder: Any, typ: str, target: str, node: Any, contnode: Any) -> Any:  # noqa: E501
+        found = next((entry for key, entry in self.data["keys"].items() if target in (key, key.partition(":")[2])), None)
+        return found and make_refnode(builder, fromdocname, found[2], found[3], contnode, target)
+
+    def resolve_any_xref(self, *arguments: Any) -> list[Any]:
+        return []
+
+    def get_objects(self) -> Iterator[tuple[str, str, str, str, str, int]]:
+        """Yield entries; the shown name has the unit, so that a search for rad/s finds what is in rad/s."""
+        for key, (name, unit, docname, anchor) in self.data["keys"].items():
+            yield key, f"{name} [{unit}]" if unit else name, "key", docname, anchor, 1

@@ -1,0 +1,35 @@
+"""Lines ``% insert: NAME ARGUMENT`` of a page, replaced by what the program says when the site is built."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from scripts.site import api, commands, gallery, keys
+
+__all__ = ["INSERTS", "inserted"]
+
+LINE = re.compile(r"^% insert: (\w+)(?: (\S+))?$", re.MULTILINE)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _file(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8").rstrip()
+
+
+INSERTS: dict[str, Callable[..., str]] = {
+    "keys": keys.markdown,
+    "commands": commands.markdown,
+    "api": api.markdown,
+    "gallery": gallery.markdown,
+    "python": lambda name: f"```python\n{_file(name)}\n```",
+    "toml": lambda name: f"```toml\n{_file(name)}\n```",
+    "xml": lambda name: f"```xml\n{_file(name)}\n```",
+    "changes": lambda: _file("CHANGELOG.md").partition("\n")[2].replace("](docs/", "](/"),
+}
+
+
+def inserted(text: str) -> str:
+    """Return a page's text with its inserts."""
+    return LINE.sub(lambda match: INSERTS[match[1]](*filter(None, [match[2]])), text)

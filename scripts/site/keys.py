@@ -1,0 +1,188 @@
+"""The keys of a user's files, from the typed structures that the program reads them with.
+
+Type, bounds and default are the structure's; meaning, unit and example stand in its docstring, in the form of a numpydoc
+`Attributes` section where the unit takes the place of the type, and the last line is an example.
+"""
+
+from __future__ import annotations
+
+import inspect
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+import msgspec
+
+from ckc_pin.control.point_path import PointPathSpec
+from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
+from ckc_pin.mechanism.faults import expected
+from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.simulation.scene_spec import SceneSpec
+
+__all__ = ["FILES", "Key", "Table", "markdown", "tables"]
+
+FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec}
+# Tables that a structure leaves open, since what stands in them decides how they are read.
+OPEN = {(TrackingSpec, "desired"): (HarmonicsSpec, PointPathSpec)}
+# What the path of an open table says beside its structure's name.
+PLACES: dict[Any, str] = {HarmonicsSpec: ".COORDINATE"}
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key: all that its structure says of it."""
+
+    name: str
+    kind: str
+    default: str
+    unit: str
+    meaning: str
+    example: str
+    annotation: Any
+
+    @property
+    def documented(self) -> bool:
+        """Whether meaning and example are there."""
+        return bool(self.meaning and self.example)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a file: its path without the file's name, how TOML heads it, its structure and its keys."""
+
+    path: str
+    heading: str
+    structure: Any
+    about: str
+    keys: tuple[Key, ...]
+
+
+@cache
+def tables(file: str) -> tuple[Table, ...]:
+    """Return the tables of a file, the file itself first, each structure once."""
+    return tuple(_walk(FILES[file], "", f"{file}.toml" if file == "mechanism" else "NAME.scene.toml", set()))
+
+
+def _walk(structure: Any, path: str, heading: str, seen: set[Any]) -> Iterator[Table]:
+    seen.add(structure)
+    about, entries = described(structure)
+    fields = msgspec.structs.fields(structure)
+    keys = tuple(_key(field, entries.get(field.encode_name, ("", "", ""))) for field in fields)
+    yield Table(path, heading, structure, about, keys)
+    for field in fields:
+        many = get_origin(field.type) is list
+        inner = OPEN.get((structure, field.encode_name)) or _structures(field.type)
+        for member in inner:
+            if member not in seen:
+                where = f"{path}.{field.encode_name}".lstrip(".") + PLACES.get(member, "")
+                tag = member.__struct_config__.tag
+                says = f' with type = "{tag}"' if tag else ""
+                yield from _walk(member, where, (f"[[{where}]]" if many else f"[{where}]") + says, seen)
+
+
+def _structures(kind: Any) -> tuple[Any, ...]:
+    """Return the structures that a type names, at any depth."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return (kind,)
+    return tuple(found for member in get_args(kind) for found in _structures(member))
+
+
+def _key(field: Any, entry: tuple[str, str, str]) -> Key:
+    unit, meaning, example = entry
+    return Key(field.encode_name, _kind(field.type), _default(field), unit, meaning, example, field.type)
+
+
+def _kind(kind: Any) -> str:
+    choices = [member for member in (kind, *get_args(kind)) if get_origin(member) is Literal]
+    if choices:
+        return ", ".join(f'"{value}"' if isinstance(value, str) else str(value) for value in get_args(choices[0]))
+    if get_origin(kind) is dict:
+        return "table of numbers" if get_args(kind)[1] is not Any else "table"
+    if get_origin(kind) is list and _structures(kind):
+        return "list of tables"
+    members = [member for member in get_args(kind) if member is not NoneType]
+    inner = next((member for member in members if get_origin(member) in (list, tuple)), kind)
+    if get_origin(inner) is tuple and Ellipsis not in get_args(inner):
+        return f"list of {len(get_args(inner))} {'numbers of at least 0' if 'ge' in str(inner) else 'numbers'}"
+    if get_origin(inner) is list and get_args(inner)[0] is not list and not _nested(inner):
+        return "list of numbers" if get_args(inner)[0] is float else "list of names"
+    return re.sub(r"^an? ", "", expected(kind))
+
+
+def _nested(kind: Any) -> bool:
+    return get_origin(get_args(kind)[0]) in (list, tuple)
+
+
+def _default(field: Any) -> str:
+    if field.required:
+        return "needed"
+    value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
+    if isinstance(value, msgspec.Struct):
+        return "its keys' defaults"
+    if value is None:
+        return "absent"
+    written = list(value) if isinstance(value, tuple) else value
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(written)
+
+
+# --- docstrings ------------------------------------------------------------------------------------
+
+
+@cache
+def described(structure: Any) -> tuple[str, dict[str, tuple[str, str, str]]]:
+    """Return what a structure's docstring says: what it is, and (unit, meaning, example) by key, bases' keys too."""
+    entries: dict[str, tuple[str, str, str]] = {}
+    for base in reversed(structure.__mro__):
+        if issubclass(base, msgspec.Struct) and base.__dict__.get("__doc__"):
+            entries |= _entries(_section(inspect.cleandoc(base.__doc__))[1])
+    return _section(inspect.cleandoc(structure.__doc__ or ""))[0], entries
+
+
+def _section(text: str) -> tuple[str, str]:
+    about, _, rest = text.partition("Attributes\n----------\n")
+    return about.strip(), rest
+
+
+def _entries(text: str) -> dict[str, tuple[str, str, str]]:
+    found = {}
+    for match in re.finditer(r"^(\w+)(?: : (.*))?\n((?:    .*\n?)+)", text, re.MULTILINE):
+        name, unit, body = match[1], match[2] or "", [line.strip() for line in match[3].strip().splitlines()]
+        example = body.pop().strip("`") if re.match(rf"``{name} = .*``$", body[-1]) else ""
+        found[name] = (unit, " ".join(body), example)
+    return found
+
+
+# --- a page ----------------------------------------------------------------------------------------
+
+
+def markdown(file: str) -> str:
+    """Return the reference of a file, in MyST."""
+    return "\n".join(line for table in tables(file) for line in _table(file, table))
+
+
+def _table(file: str, table: Table) -> Iterator[str]:
+    anchor = "-".join(filter(None, ("table", file, re.sub(r"\W+", "-", table.path), table.structure.__name__)))
+    yield f"({anchor.lower()})="
+    yield f"## `{table.heading}`\n"
+    yield f"{_code(table.about)}\n"
+    for key in table.keys:
+        yield f":::{{ckc:key}} {'.'.join(filter(None, (table.path, key.name)))}"
+        said = {"file": file, "kind": key.kind, "default": key.default, "unit": key.unit}
+        yield from (f":{name}: {_quoted(value)}" for name, value in said.items() if value)
+        yield f"\n{_code(key.meaning)}\n"
+        yield f"```toml\n{key.example}\n```\n:::\n"
+
+
+def _code(text: str) -> str:
+    return text.replace("``", "`")
+
+
+def _quoted(value: str) -> str:
+    """Write an option as YAML, in which an apostrophe is written twice."""
+    return "'" + value.replace("'", "''") + "'"
