@@ -129,17 +129,6 @@ def rank_loss(
     rank_loss.show(formulation.value, quick)
 
 
-@app.command("swing_up")
-def swing_up(out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "images") -> None:
-    """A five-bar swung up by weak motors, as IPOPT plans it.
-
-    Writes swing_up.png; exit 1 where the replay is off.
-    """
-    from scripts.experiments import swing_up
-
-    raise typer.Exit(swing_up.main(out))
-
-
 @app.command("generated_sizes")
 def generated_sizes(
     mechanisms: Annotated[

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import ckc_pin
@@ -53,5 +54,7 @@ def undocumented() -> list[str]:
 def _members(value: Any) -> Iterator[tuple[str, Any]]:
     if inspect.isclass(value):
         for member, of in vars(value).items():
-            if not member.startswith("_") and (callable(of) or isinstance(of, property | classmethod)):
+            if not member.startswith("_") and (
+                callable(of) or isinstance(of, property | cached_property | classmethod)
+            ):
                 yield member, of

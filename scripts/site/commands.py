@@ -44,13 +44,17 @@ def _command(name: str) -> Iterator[str]:
             yield "```text\n" + part.removeprefix("\b\n") + "\n```\n"
         else:
             yield _text(part) + "\n"
-    rows = [record for record in (parameter.get_help_record(context) for parameter in command.get_params(context)) if record]
+    rows = [
+        record for record in (parameter.get_help_record(context) for parameter in command.get_params(context)) if record
+    ]
     if rows:
         yield from ("| option | does |", "|---|---|")
         yield from (f"| `{left.replace('|', chr(92) + '|')}` | {_text(right)} |" for left, right in rows)
         yield ""
     if command.epilog:
-        lines = [line.strip() for line in command.epilog.replace("\b", "").splitlines() if line.strip().startswith("ckc")]
+        lines = [
+            line.strip() for line in command.epilog.replace("\b", "").splitlines() if line.strip().startswith("ckc")
+        ]
         yield "```sh\n" + "\n".join(lines) + "\n```\n"
 
 

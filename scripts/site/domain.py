@@ -19,9 +19,7 @@ __all__ = ["CkcDomain"]
 class KeyEntry(ObjectDescription[str]):
     """``ckc:key``: a key with its type, default and unit."""
 
-    option_spec: ClassVar[Any] = ObjectDescription.option_spec | {
-        name: directives.unchanged for name in ("file", "kind", "default", "unit")
-    }
+    option_spec: ClassVar[Any] = ObjectDescription.option_spec | dict.fromkeys(("file", "kind", "default", "unit"), directives.unchanged)
 
     def handle_signature(self, sig: str, signode: Any) -> str:
         table, _, name = sig.rpartition(".")
@@ -66,8 +64,12 @@ class CkcDomain(Domain):
     def merge_domaindata(self, docnames: Any, otherdata: Any) -> None:
         self.data["keys"] |= {key: entry for key, entry in otherdata["keys"].items() if entry[2] in docnames}
 
-    def resolve_xref(self, env: Any, fromdocname: str, builder: Any, typ: str, target: str, node: Any, contnode: Any) -> Any:  # noqa: E501
-        found = next((entry for key, entry in self.data["keys"].items() if target in (key, key.partition(":")[2])), None)
+    def resolve_xref(
+        self, env: Any, fromdocname: str, builder: Any, typ: str, target: str, node: Any, contnode: Any
+    ) -> Any:
+        found = next(
+            (entry for key, entry in self.data["keys"].items() if target in (key, key.partition(":")[2])), None
+        )
         return found and make_refnode(builder, fromdocname, found[2], found[3], contnode, target)
 
     def resolve_any_xref(self, *arguments: Any) -> list[Any]:

@@ -34,7 +34,11 @@ class Example:
 
 def examples() -> list[Example]:
     """Return the examples in the order of their names."""
-    return [_example(path) for path in sorted((ROOT / "examples").iterdir()) if path.suffix in (".py", ".ipynb")]
+    return [
+        _example(path)
+        for path in sorted((ROOT / "examples").iterdir())
+        if path.suffix in (".py", ".ipynb") and path.stem != "__init__"
+    ]
 
 
 def _example(path: Path) -> Example:

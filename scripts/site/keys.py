@@ -7,7 +7,6 @@ Type, bounds and default are the structure's; meaning, unit and example stand in
 from __future__ import annotations
 
 import inspect
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -22,11 +22,10 @@ PARTS = {
     "stability": (["length"], "| length | 21 | 21 | 0 | 0 |"),
     "rank_loss": (["--quick", "--formulation", "dae"], "0 wrong"),
     "generated_sizes": (["1"], "| 1 | 3 |"),
-    "swing_up": ([], "replayed in 40 steps"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }
-WRITES = {"paper", "swing_up"}
+WRITES = {"paper"}
 NEEDY = {"map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark"}
 
 

@@ -1,0 +1,74 @@
+"""A gymnasium environment.
+
+The five-bar as a task for reinforcement learning: torques by motor in, angles and rates out, a reward for the tip near a goal. A
+`Simulator` is the physics, with the tolerance of a run; gymnasium's own checker approves of it, and random torques play an episode.
+"""
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+from gymnasium.utils.env_checker import check_env
+
+import ckc_pin
+
+GOAL = np.array([0.15, -0.45])
+TORQUE = 1.0  # N m
+DT = 0.02  # s
+
+
+class FiveBar(gym.Env):
+    """Observation: sines and cosines of q, q_dot, and where the tip is; action: motors' torques over their limit."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self):
+        self.simulator = ckc_pin.Simulator("five_bar/swing", {"formulation": "dae", "solver.rtol": 1e-6})
+        self.start = self.simulator.state
+        self.motors = self.simulator.mechanism.actuated
+        self.point = ckc_pin.Point(self.simulator.mechanism, "tip")
+        self.observation_space = gym.spaces.Box(-100.0, 100.0, (8,), np.float64)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.simulator.reset(self.start)
+        for _ in range(10):  # to a state of its own
+            self.simulator.step(self.np_random.uniform(-0.3, 0.3, 2), DT)
+        return self.observe(), {}
+
+    def step(self, action):
+        try:
+            self.simulator.step(tau=dict(zip(self.motors, (TORQUE * action).tolist(), strict=True)), dt=DT)
+        except ckc_pin.NumericalError as stop:  # a singular configuration ends the episode
+            return self.observe(), -1.0, True, False, {"why": str(stop)}
+        seen = self.observe()
+        return seen, float(-np.sum((seen[6:] - GOAL) ** 2)), False, self.simulator.state.t > 5.0, {}
+
+    def observe(self):
+        state = self.simulator.state
+        tip = self.point.position(state.terms.at.q_tree)[:2]
+        return np.concatenate([np.sin(state.q), np.cos(state.q), state.q_dot, tip])
+
+
+def main(steps=150):
+    check_env(FiveBar(), skip_render_check=True)
+    env = FiveBar()
+    seen, _ = env.reset(seed=1)
+    env.action_space.seed(1)
+    tips, rewards = [seen[6:]], []
+    for _ in range(steps):
+        seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        tips.append(seen[6:])
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    assert max(rewards) <= 0.0
+    figure, ax = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
+    ax.plot(*np.transpose(tips))
+    ax.plot(*GOAL, "*", ms=14)
+    ax.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the tip under random torques, and the goal")
+    return figure
+
+
+if __name__ == "__main__":
+    main().savefig("gym_env.png")

@@ -1,0 +1,52 @@
+"""Identification of a mass.
+
+The five-bar's equations as CasADi functions are linear in the masses. A run with noise on it is the experiment; least squares
+over its instants finds the mass of the left distal link, projected on the motions that the loop allows.
+"""
+
+import casadi as cs
+import matplotlib.pyplot as plt
+import numpy as np
+
+import ckc_pin
+
+NAME = "theta_2.mass"
+NOISE = 0.01  # N m, of the measured torques
+
+
+def main():
+    run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced", "solver.rtol": 1e-10})
+    forces = ckc_pin.inverse_dynamics(run)
+    model = ckc_pin.symbolic("five_bar")
+    k = model.parameters.index(NAME)
+    p, q, v, a = cs.SX.sym("p", len(model.parameters)), cs.SX.sym("q", 4), cs.SX.sym("v", 4), cs.SX.sym("a", 4)
+    left = model.D_tree(q, p) @ a + model.bias_tree(q, v, p)
+    both = cs.Function("both", [q, v, a, p], [left, cs.jacobian(left, p)[:, k]])
+
+    rng = np.random.default_rng(7)
+    unknown = model.values.copy()
+    unknown[k] = 0.0
+    slopes, rests = [], []
+    for j in range(len(run.t)):
+        terms = ckc_pin.terms(run.mechanism, dict(zip(run.coordinates, run.q_tree[j].tolist(), strict=True)))
+        rest, slope = (np.array(x).ravel() for x in both(run.q_tree[j], run.v_tree[j], forces.a_tree[j], unknown))
+        measured = run.u[j] + NOISE * rng.standard_normal(2)
+        slopes.append(terms.rho.T @ slope)  # eq. 6: the loop's forces do no work along rho
+        rests.append(measured - terms.rho.T @ rest)
+    slopes, rests = np.concatenate(slopes), np.concatenate(rests)
+    mass = slopes @ rests / (slopes @ slopes)
+    sigma = NOISE / np.sqrt(slopes @ slopes)
+    print(f"{NAME} = {mass:.5f} ± {sigma:.5f} kg; it is {model.values[k]:.5f}")
+    assert abs(mass - model.values[k]) < 4 * sigma
+
+    figure, ax = plt.subplots(figsize=(5, 3.6), layout="constrained")
+    ax.plot(slopes, rests, ".", ms=2)
+    ends = np.array([slopes.min(), slopes.max()])
+    ax.plot(ends, mass * ends, label=f"{mass:.4f} kg")
+    ax.set(xlabel="torque per kg / N m/kg", ylabel="torque left over / N m")
+    ax.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    main().savefig("identify_mass.png")

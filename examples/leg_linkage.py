@@ -1,0 +1,37 @@
+"""A leg linkage.
+
+Two motors on one axis and four links that meet at the foot, which treads a circle. The mechanism is three files in
+`examples/leg`; tracking control drives it there through gears of 10, and inverse dynamics says what the motors must bear.
+"""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import ckc_pin
+
+SCENE = Path(__file__).parent / "leg" / "step.scene.toml"
+
+
+def main():
+    run = ckc_pin.simulate(SCENE)
+    foot = run.points["foot"]
+    late = run.t > 1.0
+    off = np.linalg.norm(foot[late, :2] - [0.0, -0.22], axis=1) - 0.03
+    print(f"the foot is off its circle by {np.abs(off).max():.1e} m from t = 1 s on")
+    assert np.abs(off).max() < 1e-4
+    forces = ckc_pin.inverse_dynamics(SCENE)
+    assert not forces.exceeded  # 0.3 N m is enough
+
+    figure, (path, torque) = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained")
+    path.plot(foot[:, 0], foot[:, 1])
+    path.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the foot, from its start")
+    torque.plot(forces.t, forces.tau, label=forces.actuated)
+    torque.set(xlabel="t / s", ylabel="torque / N m", title="motors, before their gears")
+    torque.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    main().savefig("leg_linkage.png")

@@ -1,0 +1,169 @@
+"""The guide's drawings and the home page's moving picture: ``python -m scripts.site.pictures``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ckc_pin
+
+__all__ = ["main"]
+
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+RED, GREEN, BLUE, ORANGE, GREY = "#C0392B", "#009E73", "#0072B2", "#D55E00", "#777777"
+# Which of the moves along e1, e2, a and of the turns about them a type forbids.
+FORBIDS = {
+    "point": ("111", "000"), "point_2d": ("110", "000"), "hinge": ("111", "110"), "cylindrical": ("110", "110"),
+    "universal": ("111", "010"), "prismatic": ("110", "111"), "weld": ("111", "111"), "distance": ("001", "000"),
+}  # fmt: skip
+AXES = {"e1": np.array([-0.80, -0.42]), "e2": np.array([0.92, -0.24]), "a": np.array([0.0, 1.0])}  # seen from the front
+
+
+def rows() -> Any:
+    """The eight loop types, with what each forbids."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 5.4), dpi=100, layout="constrained")
+    for ax, (kind, (moves, turns)) in zip(figure.subplots(2, 4).flat, FORBIDS.items(), strict=True):
+        for k, (name, axis) in enumerate(AXES.items()):
+            colour = RED if moves[k] == "1" else GREEN
+            label = "r" if kind == "distance" and name == "a" else name
+            ax.annotate("", axis, (0, 0), arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.4})
+            ax.text(*(1.16 * axis), label, ha="center", va="center", color=colour, fontsize=10)
+            _arc(ax, axis, RED if turns[k] == "1" else GREEN)
+        ax.plot(0, 0, "o", color="black", ms=5)
+        count = sum(map(int, moves + turns))
+        ax.set_title(f"{kind}: {count} row{'s' if count > 1 else ''}", fontsize=11, family="monospace")
+        ax.set(xlim=(-1.3, 1.3), ylim=(-0.9, 1.4), aspect="equal")
+        ax.axis("off")
+    return figure
+
+
+def _arc(ax: Any, axis: Any, colour: str) -> None:
+    """A turn about an axis: an open ellipse across it, with a head."""
+    along = axis / np.linalg.norm(axis)
+    across = np.array([-along[1], along[0]])
+    angle = np.linspace(0.6, 5.4, 40)[:, np.newaxis]
+    at = 0.62 * axis + 0.21 * np.cos(angle) * across + 0.08 * np.sin(angle) * along
+    ax.plot(*at.T, color=colour, lw=1.7)
+    ax.annotate("", at[-1], at[-4], arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.2})
+
+
+def frames() -> Any:
+    """The four-bar of the guide: links, coordinates, and the frames that the loop joins."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 4.4), dpi=100, layout="constrained")
+    ax = figure.subplots()
+    a, b = np.array([0.0, 0.0]), np.array([0.5, 0.0])
+    elbow = 0.2 * np.array([np.cos(1.2), np.sin(1.2)])
+    reach = b - elbow
+    distance = np.hypot(*reach)
+    cosine = (0.6**2 + distance**2 - 0.4**2) / (2 * 0.6 * distance)
+    at = np.arctan2(reach[1], reach[0]) + np.arccos(cosine)
+    knee = elbow + 0.6 * np.array([np.cos(at), np.sin(at)])
+    for ends, colour, name in ((np.array([a, elbow]), BLUE, "crank"), (np.array([elbow, knee]), ORANGE, "rod"),
+                               (np.array([b, knee]), GREEN, "rocker")):  # fmt: skip
+        ax.plot(*ends.T, color=colour, lw=7, alpha=0.55, solid_capstyle="round")
+        ax.text(*(ends.mean(axis=0) + [0.0, -0.045]), name, color=colour, ha="left", fontsize=12)
+    for place, name, side in ((a, "shoulder", -1), (elbow, "elbow", -1), (b, "hip", 1)):
+        ax.plot(*place, "o", ms=10, mfc="white", mec="black", mew=1.8)
+        ax.text(place[0] + 0.03 * side, place[1] + 0.02, name, ha="right" if side < 0 else "left", fontsize=11)
+    ax.plot([-0.1, 0.62], [-0.03, -0.03], color=GREY, lw=3)
+    ax.text(0.25, -0.065, "ground", color=GREY, ha="center")
+    for turn, colour, where, name in ((at, ORANGE, knee, "frame A, in rod"),
+                                      (np.arctan2(*(knee - b)[::-1]), GREEN, knee, "frame B, in rocker")):  # fmt: skip
+        for angle, letter in ((turn, "x"), (turn + np.pi / 2, "y")):
+            tip = where + 0.1 * np.array([np.cos(angle), np.sin(angle)])
+            ax.annotate("", tip, where, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2})
+            ax.text(*(where + 0.115 * np.array([np.cos(angle), np.sin(angle)])), letter, color=colour, ha="center")
+        ax.text(where[0] - 0.14, where[1] + (0.075 if colour == ORANGE else 0.045), name, color=colour, ha="right")
+    ax.plot(*knee, "o", ms=13, mfc="none", mec=RED, mew=2)
+    ax.text(knee[0] - 0.14, knee[1] + 0.012, "cut here; the loop closes it: r = 0", color=RED, ha="right")
+    ax.set(aspect="equal")
+    ax.axis("off")
+    return figure
+
+
+def pipeline() -> Any:
+    """From files to the three formulations."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.4, 3.7), dpi=100, layout="constrained")
+    ax = figure.subplots()
+    boxes = {
+        "urdf": (0.6, 3.0, "URDF\nthe tree", GREY), "toml": (0.6, 1.0, "mechanism.toml\nthe loops", GREY),
+        "tree": (2.9, 3.0, "Pinocchio\nD', C', h'", BLUE), "rows": (2.9, 1.0, "rows\nφ, J, J̇v", BLUE),
+        "split": (5.2, 1.0, "q' = (q, z)\nρ, σ", BLUE),
+        "dae": (7.9, 3.3, "DAE (eq. 1)\nq', q̇', λ", ORANGE), "reduced": (7.9, 2.0, "reduced (eq. 6)\nq, q̇; z = σ(q)", ORANGE),
+        "spf": (7.9, 0.7, "SPF (eqs. 8, 17)\nq, q̇, z or w", ORANGE),
+    }  # fmt: skip
+    for x, y, text, colour in boxes.values():
+        style = {"boxstyle": "round,pad=0.5", "fc": "white", "ec": colour, "lw": 1.8}
+        ax.text(x, y, text, ha="center", va="center", fontsize=10.5, bbox=style)
+    for start, end in (("urdf", "tree"), ("toml", "rows"), ("rows", "split"), ("tree", "dae"), ("tree", "reduced"),
+                       ("rows", "dae"), ("split", "reduced"), ("split", "spf"), ("tree", "spf")):  # fmt: skip
+        (x, y), (to_x, to_y) = boxes[start][:2], boxes[end][:2]
+        arrow = {"arrowstyle": "-|>", "color": GREY, "lw": 1.2, "shrinkA": 44, "shrinkB": 52}
+        ax.annotate("", (to_x, to_y), (x, y), arrowprops=arrow)
+    ax.set(xlim=(-0.5, 9.3), ylim=(0, 4))
+    ax.axis("off")
+    return figure
+
+
+def moving(path: Path, count: int = 60) -> None:
+    """The five-bar under tracking control, as it moves."""
+    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.figure import Figure
+
+    run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
+    mechanism = run.mechanism
+    instants = np.linspace(0, len(run.t) - 1, count).astype(int)
+    pins = []
+    for k in instants:
+        named = dict(zip(run.coordinates, run.q_tree[k].tolist(), strict=True))
+        pose = ckc_pin.terms(mechanism, named).at.pose
+        pins.append(np.vstack([pose.translation[[1, 2]], pose.p[:1], pose.translation[[4, 3]]])[:, :2])
+    path_of_tip = run.points["tip"]
+    figure = Figure(figsize=(6.2, 3.6), dpi=80, layout="constrained")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    pose_ax, angles = figure.subplots(1, 2)
+    pose_ax.plot(path_of_tip[:, 0], path_of_tip[:, 1], color=GREY, lw=0.8)
+    (left,) = pose_ax.plot([], [], "-o", color=BLUE, lw=4, ms=5)
+    (right,) = pose_ax.plot([], [], "-o", color=ORANGE, lw=4, ms=5)
+    pose_ax.set(aspect="equal", xlim=(-0.45, 0.75), ylim=(-0.62, 0.62))
+    pose_ax.axis("off")
+    columns = [run.column(name) for name in run.independent]
+    for column, colour, name in zip(columns, (BLUE, ORANGE), ("θ₁", "θ₃"), strict=True):
+        angles.plot(run.t, run.q_tree[:, column], color=colour, label=name)
+    angles.plot(run.t, np.pi / 3 * np.sin(run.t), ":", color="black", lw=1, label="desired")
+    angles.plot(run.t, np.pi / 4 * (1 - np.cos(run.t)), ":", color="black", lw=1)
+    now = angles.axvline(0, color=GREY, lw=0.9)
+    angles.set(xlabel="t / s", ylabel="angle / rad")
+    angles.legend(fontsize=8)
+
+    def draw(k: int) -> list[Any]:
+        left.set_data(*pins[k][:3].T)
+        right.set_data(*pins[k][2:].T)
+        now.set_xdata([run.t[instants[k]]] * 2)
+        return []
+
+    FuncAnimation(figure, draw, frames=count).save(path, PillowWriter(fps=12))
+
+
+def main() -> None:
+    """Draw all of them."""
+    for draw, place in ((rows, "guide/rows.png"), (frames, "guide/frames.png"), (pipeline, "theory/pipeline.png")):
+        (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
+        draw().savefig(IMAGES / place)
+        print(f"written: {IMAGES / place}")
+    moving(IMAGES / "moving.gif")
+    print(f"written: {IMAGES / 'moving.gif'}")
+
+
+if __name__ == "__main__":
+    main()

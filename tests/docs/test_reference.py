@@ -1,0 +1,117 @@
+"""The reference is whole: every key has meaning and an example that fits, every command, option and name its text."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from typing import Any, get_args
+
+import msgspec
+import pytest
+
+import ckc_pin
+from ckc_pin import errors
+from ckc_pin.mechanism.spec import LoopType
+from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, OTHERS
+from scripts.site import api, commands, keys
+from scripts.site.gallery import ROOT
+from scripts.site.insert import INSERTS, LINE
+from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
+
+TABLES = [(file, table) for file in keys.FILES for table in keys.tables(file)]
+# Of keys that measure nothing. Every other number has a unit.
+WITHOUT_UNIT = {"axis_a", "axis_b", "restitution", "N", "rtol", "atol", "max_rhs", "direction", "seed", "weights", "normal",
+                "joints"}  # fmt: skip
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
+def test_every_key_has_meaning_and_an_example_that_fits(file: str, table: keys.Table) -> None:
+    assert table.about
+    assert [key.name for key in table.keys if not key.documented] == []
+    for key in table.keys:
+        example = tomllib.loads(key.example)
+        assert list(example) == [key.name]
+        msgspec.convert(example[key.name], key.annotation)
+
+
+@pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
+def test_a_docstring_describes_no_key_that_is_not_there(file: str, table: keys.Table) -> None:
+    assert set(keys.described(table.structure)[1]) == {key.name for key in table.keys}
+
+
+@pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
+def test_every_number_has_a_unit(file: str, table: keys.Table) -> None:
+    numbers = [key for key in table.keys if "number" in key.kind or "integer" in key.kind]
+    assert [
+        key.name for key in numbers if not key.unit and key.name not in WITHOUT_UNIT and "ratio" not in key.name
+    ] == []
+
+
+def test_what_a_key_lacks_is_seen() -> None:
+    class Spec(msgspec.Struct):
+        """A table.
+
+        Attributes
+        ----------
+        a : m
+            How long.
+            ``a = 0.3``
+        b
+            No example.
+        """
+
+        a: float
+        b: str = ""
+        c: int = 0
+
+    about, entries = keys.described(Spec)
+    assert about == "A table."
+    assert entries == {"a": ("m", "How long.", "a = 0.3"), "b": ("", "No example.", "")}
+
+
+@pytest.mark.parametrize("file", keys.FILES)
+def test_a_page_has_every_key(file: str) -> None:
+    text = keys.markdown(file)
+    for name, table in TABLES:
+        if name == file:
+            paths = [".".join(filter(None, (table.path, key.name))) for key in table.keys]
+            assert [path for path in paths if f"{{ckc:key}} {path}\n" not in text] == []
+    assert f"% insert: keys {file}\n" in page(f"reference/{file}.md")
+
+
+def test_every_command_and_option_says_what_it_does() -> None:
+    assert commands.undocumented() == []
+    assert "% insert: commands\n" in page("reference/commands.md")
+
+
+def test_every_public_name_has_a_docstring() -> None:
+    assert api.undocumented() == []
+    found: Any = api.names()
+    assert sorted(sum(found.values(), [])) == sorted(ckc_pin.__all__)
+    assert "% insert: api\n" in page("reference/api.md")
+
+
+def test_every_insert_is_one_that_there_is() -> None:
+    names = {match[1] for path in (ROOT / "docs").rglob("*.md") for match in LINE.finditer(path.read_text("utf-8"))}
+    assert names
+    assert names <= set(INSERTS)
+
+
+def test_every_loop_type_has_its_rows() -> None:
+    rows = re.search(r"\| type \| rows of φ.*\n\|[-|]+\|\n((?:\|.*\n)+)", page("reference/mechanism.md"))
+    assert rows
+    assert re.findall(r"^\| `(\w+)`", rows[1], re.MULTILINE) == list(get_args(LoopType))
+
+
+def test_every_json_key_array_and_error_is_named() -> None:
+    wanted = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS}
+    for name, named in wanted.items():
+        row = next(line for line in page("reference/json.md").splitlines() if line.startswith(f"| `{name}`"))
+        assert [key for key in named.split() if not re.search(rf"\b{key}\b", row)] == []
+    file = page("reference/run_file.md").partition("## run.npz")[2].partition("##")[0]
+    assert [name for name in (*ARRAYS, *OPTIONAL, *OTHERS) if not re.search(rf"\b{name}\b", file)] == []
+    assert [name for name in errors.__all__ if f"| `{name}`" not in page("reference/errors.md")] == []

@@ -1,0 +1,50 @@
+"""Every piece of code that README and the site show is run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scripts.site.gallery import ROOT
+from tests.docs.snippets import run, snippets
+
+MADE = {
+    "paper.md",
+    "errata.md",
+    "stability.md",
+    "published_robots.md",
+    "report.md",
+}  # by experiments, without code to run
+PAGES = [ROOT / "README.md"] + [path for path in sorted((ROOT / "docs").rglob("*.md")) if path.name not in MADE]
+WITH_CODE = [path for path in PAGES if snippets(path.read_text(encoding="utf-8"))]
+
+
+def test_pages_have_code() -> None:
+    assert len(WITH_CODE) > 8
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_the_pieces_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {"__name__": "page"}
+    for snippet in snippets(page.read_text(encoding="utf-8")):
+        try:
+            run(snippet, space)
+        except Exception as error:
+            raise AssertionError(f"{page.name}, line {snippet.line}: {error}") from error
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("```python\nassert 1 == 2\n```\n", ""),
+        ("```sh\nckc check five_bra\n```\n", "five_bra"),
+        ("```toml\n[solver]\nrtl = 1e-3\n```\n", "rtl"),
+        ("```pyton\n1\n```\n", "pyton"),
+    ],
+)
+def test_a_wrong_piece_is_found(text: str, wrong: str) -> None:
+    (snippet,) = snippets(text)
+    with pytest.raises(Exception, match=wrong):
+        run(snippet, {})
