@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import ckc_pin
 from scripts.site.domain import CkcDomain
 from scripts.site.insert import inserted
-from scripts.site.mathml import setup_math
+from scripts.site.formulas import setup_formulas
 
 project = "ckc_pin"
 author = "the ckc_pin authors"
@@ -28,7 +28,7 @@ numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # shapes and units are in the docstrings
-html_math_renderer = "mathml"
+html_math_renderer = "drawn"
 
 html_theme = "furo"
 html_title = "ckc_pin"
@@ -49,7 +49,7 @@ BARS = re.compile(r"(`[^`]*`)|\\|")  # of |phi|, a norm: Sphinx takes them for s
 
 def setup(app):
     app.add_domain(CkcDomain)
-    setup_math(app)
+    setup_formulas(app)
     app.connect("source-read", insert)
     app.connect("autodoc-process-docstring", escape_bars)
 

@@ -82,7 +82,7 @@ def frames() -> Any:
         ax.text(where[0] - 0.14, where[1] + (0.075 if colour == ORANGE else 0.045), name, color=colour, ha="right")
     ax.plot(*knee, "o", ms=13, mfc="none", mec=RED, mew=2)
     ax.text(knee[0] - 0.14, knee[1] + 0.012, "cut here; the loop closes it: r = 0", color=RED, ha="right")
-    ax.set(aspect="equal")
+    ax.set(aspect="equal", xlim=(-0.15, 0.82), ylim=(-0.09, 0.53))
     ax.axis("off")
     return figure
 
@@ -106,7 +106,7 @@ def pipeline() -> Any:
     for start, end in (("urdf", "tree"), ("toml", "rows"), ("rows", "split"), ("tree", "dae"), ("tree", "reduced"),
                        ("rows", "dae"), ("split", "reduced"), ("split", "spf"), ("tree", "spf")):  # fmt: skip
         (x, y), (to_x, to_y) = boxes[start][:2], boxes[end][:2]
-        arrow = {"arrowstyle": "-|>", "color": GREY, "lw": 1.2, "shrinkA": 44, "shrinkB": 52}
+        arrow = {"arrowstyle": "-|>", "color": GREY, "lw": 1.2, "shrinkA": 62 if start == "toml" else 44, "shrinkB": 52}
         ax.annotate("", (to_x, to_y), (x, y), arrowprops=arrow)
     ax.set(xlim=(-0.5, 9.3), ylim=(0, 4))
     ax.axis("off")
@@ -127,15 +127,15 @@ def moving(path: Path, count: int = 60) -> None:
         pose = ckc_pin.terms(mechanism, named).at.pose
         pins.append(np.vstack([pose.translation[[1, 2]], pose.p[:1], pose.translation[[4, 3]]])[:, :2])
     path_of_tip = run.points["tip"]
-    figure = Figure(figsize=(6.2, 3.6), dpi=80, layout="constrained")
+    figure = Figure(figsize=(7.2, 3.8), dpi=80, layout="constrained")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    pose_ax, angles = figure.subplots(1, 2)
+    pose_ax, angles = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
     pose_ax.plot(path_of_tip[:, 0], path_of_tip[:, 1], color=GREY, lw=0.8)
     (left,) = pose_ax.plot([], [], "-o", color=BLUE, lw=4, ms=5)
     (right,) = pose_ax.plot([], [], "-o", color=ORANGE, lw=4, ms=5)
-    pose_ax.set(aspect="equal", xlim=(-0.45, 0.75), ylim=(-0.62, 0.62))
+    pose_ax.set(aspect="equal", xlim=(-0.35, 0.6), ylim=(-0.6, 0.55))
     pose_ax.axis("off")
     columns = [run.column(name) for name in run.independent]
     for column, colour, name in zip(columns, (BLUE, ORANGE), ("θ₁", "θ₃"), strict=True):
