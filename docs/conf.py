@@ -8,8 +8,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import ckc_pin
 from scripts.site.domain import CkcDomain
-from scripts.site.insert import inserted
 from scripts.site.formulas import setup_formulas
+from scripts.site.insert import inserted
 
 project = "ckc_pin"
 author = "the ckc_pin authors"

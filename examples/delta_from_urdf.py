@@ -1,7 +1,7 @@
 """A delta robot from a URDF.
 
-A tree of three arms and six rods, cut open at the balls of the plate and closed again by six loops of three rows. The plate goes
-round a level circle, prescribed as a circle: exact inverse kinematics gives the arms' angles.
+A tree of three arms and six rods, cut open at the balls of the plate and closed again by six loops of three rows. The
+plate goes round a level circle, prescribed as a circle: exact inverse kinematics gives the arms' angles.
 """
 
 import matplotlib.pyplot as plt

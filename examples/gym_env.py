@@ -1,7 +1,8 @@
 """A gymnasium environment.
 
-The five-bar as a task for reinforcement learning: torques by motor in, angles and rates out, a reward for the tip near a goal. A
-`Simulator` is the physics, with the tolerance of a run; gymnasium's own checker approves of it, and random torques play an episode.
+The five-bar as a task for reinforcement learning: torques by motor in, angles and rates out, a reward for the tip
+near a goal. A `Simulator` is the physics, with the tolerance of a run; gymnasium's own checker approves of it, and
+random torques play an episode.
 """
 
 import gymnasium as gym

@@ -1,7 +1,7 @@
 """Identification of a mass.
 
-The five-bar's equations as CasADi functions are linear in the masses. A run with noise on it is the experiment; least squares
-over its instants finds the mass of the left distal link, projected on the motions that the loop allows.
+The five-bar's equations as CasADi functions are linear in the masses. A run with noise on it is the experiment; least
+squares over its instants finds the mass of the left distal link, projected on the motions that the loop allows.
 """
 
 import casadi as cs

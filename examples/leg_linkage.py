@@ -1,7 +1,8 @@
 """A leg linkage.
 
 Two motors on one axis and four links that meet at the foot, which treads a circle. The mechanism is three files in
-`examples/leg`; tracking control drives it there through gears of 10, and inverse dynamics says what the motors must bear.
+`examples/leg`; tracking control drives it there through gears of 10, and inverse dynamics says what the motors must
+bear.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """MJCF in.
 
-A slider-crank written for MuJoCo, with its soft `connect`, becomes a mechanism with an exact loop: read, completed by what the format
-leaves open, written as a folder, and run.
+A slider-crank written for MuJoCo, with its soft `connect`, becomes a mechanism with an exact loop: read, completed by
+what the format leaves open, written as a folder, and run.
 """
 
 import tempfile
@@ -33,6 +33,18 @@ MODEL = """
 </mujoco>
 """
 
+SCENE = """
+mechanism = "mechanism.toml"
+formulation = "dae"
+t_end = 1.0
+[initial]
+at = "assembled"
+[initial.q_dot]
+crank = 8.0
+[solver]
+output_dt = 0.005
+"""
+
 
 def main():
     with tempfile.TemporaryDirectory() as folder:
@@ -44,8 +56,7 @@ def main():
         print(f"{found.d} freedom, {found.rank} of {found.rows} rows count; redundant: {', '.join(found.redundant)}")
         assert found.d == 1
         scene = mine / "default.scene.toml"
-        scene.write_text('mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n'
-                         '[initial]\nat = "assembled"\n[initial.q_dot]\ncrank = 8.0\n[solver]\noutput_dt = 0.005\n')  # fmt: skip
+        scene.write_text(SCENE)
         run = ckc_pin.simulate(scene)
     assert run.max_phi < 1e-9
 

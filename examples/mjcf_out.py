@@ -1,6 +1,7 @@
 """MJCF out.
 
-The swinging five-bar as a model for MuJoCo, stepped there beside it: MuJoCo's loop is a soft constraint, and the difference grows.
+The swinging five-bar as a model for MuJoCo, stepped there beside it: MuJoCo's loop is a soft constraint, and the
+difference grows.
 """
 
 import matplotlib.pyplot as plt

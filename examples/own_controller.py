@@ -1,7 +1,8 @@
 """A controller of your own.
 
-Whatever has a `u(t, terms)` controls a run; it gets the terms that the step loop has already computed. This one compensates gravity
-exactly, shapes the closed loop as a critically damped oscillator by the reduced model's D and C, and so knows its motion in closed form.
+Whatever has a `u(t, terms)` controls a run; it gets the terms that the step loop has already computed. This one
+compensates gravity exactly, shapes the closed loop as a critically damped oscillator by the reduced model's D and C,
+and so knows its motion in closed form.
 """
 
 import matplotlib.pyplot as plt

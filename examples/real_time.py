@@ -1,7 +1,8 @@
 """A real-time loop.
 
-A controller at 500 Hz against the clock, without ROS: each cycle reads the plant's state, computes a torque, steps the plant by 2 ms and
-sleeps until the next one is due. How late cycles begin, and how much of a cycle the physics takes, is measured.
+A controller at 500 Hz against the clock, without ROS: each cycle reads the plant's state, computes a torque, steps
+the plant by 2 ms and sleeps until the next one is due. How late cycles begin, and how much of a cycle the physics
+takes, is measured.
 """
 
 import time

@@ -1,7 +1,7 @@
 """Sampled control.
 
-The set-point controller as a computer runs it: samples, a delay, encoders of 4096 counts, rates by differences, a filter. The error
-that remains is what an encoder's step leaves open.
+The set-point controller as a computer runs it: samples, a delay, encoders of 4096 counts, rates by differences, a
+filter. The error that remains is what an encoder's step leaves open.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +21,9 @@ def main():
         }  # fmt: skip
         run = ckc_pin.simulate("five_bar/set_point", {"formulation": "reduced", "t_end": 1.5, **sampled})
         error = run.q_tree[:, run.column("theta_1")] - np.pi / 4
-        ax.semilogy(run.t, np.abs(error), label="continuous" if sample_time is None else f"every {1e3 * sample_time:g} ms")
+        ax.semilogy(
+            run.t, np.abs(error), label="continuous" if sample_time is None else f"every {1e3 * sample_time:g} ms"
+        )
         ends.append(np.abs(error[run.t > 1.2]).max())
     ax.set(xlabel="t / s", ylabel="|error of θ₁| / rad")
     ax.legend()

@@ -1,10 +1,11 @@
 """A swing-up by IPOPT.
 
-Motors too weak to hold the five-bar's arms level swing it up: planned by IPOPT, replayed in the step loop. From rest at the hanging equilibrium to rest with both arms straight up, on the branch of the start, torques constant
-on each interval. The equations of motion are the CasADi functions that `ckc_pin.symbolic` gives. The motion is found
-by direct collocation: on each piece a polynomial that meets the equations of motion at Gauss points, of order 2
-DEGREE where the piece ends. Only the independent angles and rates are asked for at the end: the closure follows from
-the start, and asked for twice it would leave IPOPT with constraints whose gradients depend on each other.
+Motors too weak to hold the five-bar's arms level swing it up: planned by IPOPT, replayed in the step loop. From rest
+at the hanging equilibrium to rest with both arms straight up, on the branch of the start, torques constant on each
+interval. The equations of motion are the CasADi functions that `ckc_pin.symbolic` gives. The motion is found by
+direct collocation: on each piece a polynomial that meets the equations of motion at Gauss points, of order 2 DEGREE
+where the piece ends. Only the independent angles and rates are asked for at the end: the closure follows from the
+start, and asked for twice it would leave IPOPT with constraints whose gradients depend on each other.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The paper's five-bar.
 
-Both of its control cases, each as the singular perturbation formulation that eq. 8 prints and as the reduced model of eq. 6:
-errors of the arms, and torques within the 30 N m that the paper states.
+Both of its control cases, each as the singular perturbation formulation that eq. 8 prints and as the reduced model of
+eq. 6: errors of the arms, and torques within the 30 N m that the paper states.
 """
 
 import matplotlib.pyplot as plt

@@ -1,7 +1,7 @@
 """Two arms on one load.
 
-Two UR5 hold one bar: a closed chain of twelve motors and six freedoms. The motors share the work by least norm, and the run
-says what the grips bear.
+Two UR5 hold one bar: a closed chain of twelve motors and six freedoms. The motors share the work by least norm, and
+the run says what the grips bear.
 """
 
 import matplotlib.pyplot as plt

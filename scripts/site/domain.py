@@ -19,7 +19,9 @@ __all__ = ["CkcDomain"]
 class KeyEntry(ObjectDescription[str]):
     """``ckc:key``: a key with its type, default and unit."""
 
-    option_spec: ClassVar[Any] = ObjectDescription.option_spec | dict.fromkeys(("file", "kind", "default", "unit"), directives.unchanged)
+    option_spec: ClassVar[Any] = ObjectDescription.option_spec | dict.fromkeys(
+        ("file", "kind", "default", "unit"), directives.unchanged
+    )
 
     def handle_signature(self, sig: str, signode: Any) -> str:
         table, _, name = sig.rpartition(".")

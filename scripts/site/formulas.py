@@ -1,4 +1,4 @@
-"""Formulas as drawings in the page: no font, script or network is needed to read them, and they take the text's colour."""
+"""Formulas as drawings in the page: no font, script or network is needed, and they take the text's colour."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from functools import cache
 from html import escape
 from typing import Any
 
-import ziamath
 from docutils import nodes
+from ziamath.config import config
+from ziamath.zmath import Latex
 
 __all__ = ["setup_formulas"]
 
@@ -22,8 +23,8 @@ def setup_formulas(app: Any) -> None:
 @cache
 def _drawn(latex: str, inline: bool) -> str:
     """Return a formula as SVG, on its base line."""
-    ziamath.config.svg2 = False  # glyphs as paths: ids of glyphs that are shared would clash within a page
-    formula = ziamath.Latex(latex, size=SIZE, color="currentColor", inline=inline)
+    config.svg2 = False  # glyphs as paths: ids of glyphs that are shared would clash within a page
+    formula = Latex(latex, size=SIZE, color="currentColor", inline=inline)
     sits = f"vertical-align: {formula.getyofst():.2f}px" if inline else ""
     said = escape(latex, quote=True)
     return formula.svg().replace("<svg ", f'<svg role="img" aria-label="{said}" style="{sits}" ', 1)

@@ -1,7 +1,7 @@
 """The keys of a user's files, from the typed structures that the program reads them with.
 
-Type, bounds and default are the structure's; meaning, unit and example stand in its docstring, in the form of a numpydoc
-`Attributes` section where the unit takes the place of the type, and the last line is an example.
+Type, bounds and default are the structure's; meaning, unit and example stand in its docstring, in the form of a
+numpydoc `Attributes` section where the unit takes the place of the type, and the last line is an example.
 """
 
 from __future__ import annotations

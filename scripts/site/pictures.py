@@ -26,7 +26,8 @@ def rows() -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 5.4), dpi=100, layout="constrained")
-    for ax, (kind, (moves, turns)) in zip(figure.subplots(2, 4).flat, FORBIDS.items(), strict=True):
+    axes: Any = figure.subplots(2, 4)
+    for ax, (kind, (moves, turns)) in zip(axes.flat, FORBIDS.items(), strict=True):
         for k, (name, axis) in enumerate(AXES.items()):
             colour = RED if moves[k] == "1" else GREEN
             label = "r" if kind == "distance" and name == "a" else name
@@ -56,7 +57,7 @@ def frames() -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.4), dpi=100, layout="constrained")
-    ax = figure.subplots()
+    ax: Any = figure.subplots()
     a, b = np.array([0.0, 0.0]), np.array([0.5, 0.0])
     elbow = 0.2 * np.array([np.cos(1.2), np.sin(1.2)])
     reach = b - elbow
@@ -67,7 +68,7 @@ def frames() -> Any:
     for ends, colour, name in ((np.array([a, elbow]), BLUE, "crank"), (np.array([elbow, knee]), ORANGE, "rod"),
                                (np.array([b, knee]), GREEN, "rocker")):  # fmt: skip
         ax.plot(*ends.T, color=colour, lw=7, alpha=0.55, solid_capstyle="round")
-        ax.text(*(ends.mean(axis=0) + [0.0, -0.045]), name, color=colour, ha="left", fontsize=12)
+        ax.text(*(ends.mean(axis=0) - np.array([0.0, 0.045])), name, color=colour, ha="left", fontsize=12)
     for place, name, side in ((a, "shoulder", -1), (elbow, "elbow", -1), (b, "hip", 1)):
         ax.plot(*place, "o", ms=10, mfc="white", mec="black", mew=1.8)
         ax.text(place[0] + 0.03 * side, place[1] + 0.02, name, ha="right" if side < 0 else "left", fontsize=11)
@@ -97,7 +98,8 @@ def pipeline() -> Any:
         "urdf": (0.6, 3.0, "URDF\nthe tree", GREY), "toml": (0.6, 1.0, "mechanism.toml\nthe loops", GREY),
         "tree": (2.9, 3.0, "Pinocchio\nD', C', h'", BLUE), "rows": (2.9, 1.0, "rows\nφ, J, J̇v", BLUE),
         "split": (5.2, 1.0, "q' = (q, z)\nρ, σ", BLUE),
-        "dae": (7.9, 3.3, "DAE (eq. 1)\nq', q̇', λ", ORANGE), "reduced": (7.9, 2.0, "reduced (eq. 6)\nq, q̇; z = σ(q)", ORANGE),
+        "dae": (7.9, 3.3, "DAE (eq. 1)\nq', q̇', λ", ORANGE),
+        "reduced": (7.9, 2.0, "reduced (eq. 6)\nq, q̇; z = σ(q)", ORANGE),
         "spf": (7.9, 0.7, "SPF (eqs. 8, 17)\nq, q̇, z or w", ORANGE),
     }  # fmt: skip
     for x, y, text, colour in boxes.values():

@@ -1,7 +1,8 @@
 """Pieces of code in a page: commands and Python are run, files are written and read, keys are checked.
 
-In a page's order, in one folder and one namespace. A TOML or XML piece whose first line is a comment with a file's name is
-that file; a TOML piece without is checked as part of a scene or a mechanism. ``text`` and ``console`` are only shown.
+In a page's order, in one folder and one namespace. A TOML or XML piece whose first line is a comment with a file's
+name is that file; a TOML piece without is checked as part of a scene or a mechanism. ``text`` and ``console`` are
+only shown.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 import pytest
@@ -20,8 +20,8 @@ from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
 
 TABLES = [(file, table) for file in keys.FILES for table in keys.tables(file)]
 # Of keys that measure nothing. Every other number has a unit.
-WITHOUT_UNIT = {"axis_a", "axis_b", "restitution", "N", "rtol", "atol", "max_rhs", "direction", "seed", "weights", "normal",
-                "joints"}  # fmt: skip
+WITHOUT_UNIT = {"axis_a", "axis_b", "restitution", "N", "rtol", "atol", "max_rhs", "direction", "seed", "weights",
+                "normal", "joints"}  # fmt: skip
 
 
 def page(name: str) -> str:
@@ -90,8 +90,7 @@ def test_every_command_and_option_says_what_it_does() -> None:
 
 def test_every_public_name_has_a_docstring() -> None:
     assert api.undocumented() == []
-    found: Any = api.names()
-    assert sorted(sum(found.values(), [])) == sorted(ckc_pin.__all__)
+    assert sorted(name for named in api.names().values() for name in named) == sorted(ckc_pin.__all__)
     assert "% insert: api\n" in page("reference/api.md")
 
 
@@ -115,3 +114,13 @@ def test_every_json_key_array_and_error_is_named() -> None:
     file = page("reference/run_file.md").partition("## run.npz")[2].partition("##")[0]
     assert [name for name in (*ARRAYS, *OPTIONAL, *OTHERS) if not re.search(rf"\b{name}\b", file)] == []
     assert [name for name in errors.__all__ if f"| `{name}`" not in page("reference/errors.md")] == []
+
+
+def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> None:
+    """Texts of the sources, pieces of one string joined."""
+    source = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "ckc_pin").rglob("*.py")))
+    joined = re.sub(r'"\s*\n\s*f?"', "", source)
+    headings = re.findall(r"^### (.*)$", page("guide/troubleshooting.md"), re.MULTILINE)
+    messages = [message for heading in headings for message in re.findall(r"`([^`]+)`", heading)]
+    assert len(messages) > 12
+    assert [message for message in messages if message not in joined] == []

@@ -38,7 +38,7 @@ def test_the_pieces_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [
-        ("```python\nassert 1 == 2\n```\n", ""),
+        ('```python\nraise ValueError("this one")\n```\n', "this one"),
         ("```sh\nckc check five_bra\n```\n", "five_bra"),
         ("```toml\n[solver]\nrtl = 1e-3\n```\n", "rtl"),
         ("```pyton\n1\n```\n", "pyton"),
