@@ -1,0 +1,69 @@
+"""The site is built without a warning, its links lead somewhere, nothing is fetched, and its search finds units."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.site.gallery import ROOT, examples
+from scripts.site.links import broken
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("site")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-d",
+        out.as_posix() + "-trees",
+        "docs",
+        str(out),
+    ]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    return out
+
+
+def test_links_lead_somewhere(site: Path) -> None:
+    assert broken(site) == []
+
+
+def test_a_link_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(
+        '<p id="here"><a href="b.html">b</a><a href="a.html#there">c</a><a href="#here">d</a>'
+    )
+    assert broken(tmp_path) == ["a.html: b.html: no such file", "a.html: a.html#there: no such anchor"]
+
+
+def test_nothing_is_fetched(site: Path) -> None:
+    pages = [path.read_text(encoding="utf-8") for path in site.rglob("*.html")]
+    assert len(pages) > 30
+    fetched = [
+        m
+        for page in pages
+        for m in re.findall(r"<(?:script|img|link|iframe)\b[^>]*?(?:src|href)=\"(https?:[^\"]*)", page)
+    ]
+    assert fetched == []
+
+
+def test_every_example_is_in_the_gallery(site: Path) -> None:
+    page = (site / "gallery.html").read_text(encoding="utf-8")
+    assert [
+        example.name for example in examples() if f'id="example-{example.name.replace("_", "-")}"' not in page
+    ] == []
+
+
+def test_the_search_finds_a_key_by_its_unit(site: Path) -> None:
+    """As the page does it: words of the query in the names of entries."""
+    index = (site / "searchindex.js").read_text(encoding="utf-8")
+    assert "frequency [rad/s]" in index
+    assert "K_P [N m/rad, N/m]" in index
