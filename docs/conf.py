@@ -44,7 +44,7 @@ pygments_dark_style = "monokai"
 copybutton_prompt_text = "$ "
 
 
-BARS = re.compile(r"(`[^`]*`)|\\|")  # of |phi|, a norm: Sphinx takes them for substitutions
+BARS = re.compile(r"(`[^`]*`)|[|]")  # of |phi|, a norm: Sphinx takes them for substitutions
 
 
 def setup(app):

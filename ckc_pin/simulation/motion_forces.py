@@ -83,7 +83,7 @@ class MotionForces:
         return [row for name, row in self.mechanism.closure.names if name == loop]
 
     def save(self, path: Path) -> Path:
-        """Write it to a file, NumPy's npz without pickle (docs/reference.md): whole or not at all.
+        """Write it to a file, NumPy's npz without pickle (docs/reference/run_file.md): whole or not at all.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Findings as plain data (the JSON of docs/reference.md) and as tables for a terminal."""
+"""Findings as plain data (the JSON of docs/reference/json.md) and as tables for a terminal."""
 
 from __future__ import annotations
 

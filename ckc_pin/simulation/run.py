@@ -163,7 +163,7 @@ class Run:
         return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}
 
     def summary(self) -> dict[str, Any]:
-        """Return what `ckc run --json` prints (docs/reference.md): scalars, and the last instant by name."""
+        """Return what `ckc run --json` prints (docs/reference/json.md): scalars, and the last instant by name."""
         last = {name: path[-1].tolist() for name, path in self.points.items()}
         return {
             "status": self.status,

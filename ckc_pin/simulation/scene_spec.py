@@ -141,7 +141,7 @@ class SceneSpec(_Spec, frozen=True):
         The mechanism's file, beside the scene; or a table ``{generator, N}``.
         ``mechanism = "mechanism.toml"``
     formulation
-        The DAE (projected), the reduced model, the singular perturbation formulation.
+        ``dae``: eq. 1, projected; ``reduced``: eq. 6; ``spf``: the singular perturbation formulation, eqs. 8 and 17.
         ``formulation = "reduced"``
     t_end : s
         How long.

@@ -15,7 +15,7 @@ from ckc_pin.simulation.report import to_json
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 
-# docs/reference.md, in its order; more keys may be added, none may go
+# docs/reference/json.md, in its order; more keys may be added, none may go
 CHECK = """n d rows rank redundant independent dependent coordinates q_tree det_phi_z sigma_min_phi_z cond_phi_z
            mass inertia joints warnings desired"""
 TERMS = """coordinates independent dependent q_tree v_tree D_tree C_tree h_tree phi phi_q phi_z rho rho_dot D C h

@@ -43,8 +43,8 @@ def test_json() -> None:
         found["coordinates"], (m, 6)
     )
     assert (found["status"], found["exceeded"], found["redundant"]) == ("done", [], [])
-    page = (Path(__file__).resolve().parents[2] / "docs" / "reference.md").read_text(encoding="utf-8")
-    row = next(line for line in page.partition("### JSON")[2].splitlines() if line.startswith("| `inverse`"))
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if line.startswith("| `inverse`"))
     assert [key for key in (*found, *elbow, "motor", "t_most") if not re.search(rf"\b{key}\b", row)] == []
 
 
@@ -83,7 +83,7 @@ def test_files(tmp_path: Path) -> None:
     for k, joint in enumerate(saved["joints"]):
         assert_close(saved["joint_forces"][:, k], found.joint_forces[joint], 0)
     assert json.loads(saved["meta"].tobytes())["status"] == "done"
-    page = (Path(__file__).resolve().parents[2] / "docs" / "reference.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "run_file.md").read_text(encoding="utf-8")
     says = page.partition("`inverse.npz` has")[2].partition("##")[0]
     assert [name for name in saved if not re.search(rf"\b{name}\b", says)] == []
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+TOPS = ("ckc_pin", "examples", "scripts", "tests")
 
 # what to say instead of each
 WORDS = {
@@ -42,7 +43,7 @@ TWICE = {"Approach", "Case", "Crossing", "Frame", "Locus", "Model", "Motion", "R
 @cache
 def files() -> tuple[str, ...]:
     """Python files of the project, as paths from its top."""
-    found = (path.relative_to(ROOT) for top in ("ckc_pin", "scripts", "tests") for path in (ROOT / top).rglob("*.py"))
+    found = (path.relative_to(ROOT) for top in TOPS for path in (ROOT / top).rglob("*.py"))
     return tuple(sorted(path.as_posix() for path in found))
 
 
@@ -103,7 +104,7 @@ def test_words_of_a_name(name: str, count: int) -> None:
     assert len(forbidden(name)) == count
 
 
-@pytest.mark.parametrize("top", ["ckc_pin", "scripts", "tests"])
+@pytest.mark.parametrize("top", TOPS)
 def test_no_name_has_a_word_that_another_stands_for(top: str) -> None:
     mine = [file for file in files() if file.startswith(f"{top}/")]
     assert mine

@@ -44,6 +44,13 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path: Path) -> None:
     assert broken(tmp_path) == ["a.html: b.html: no such file", "a.html: a.html#there: no such anchor"]
 
 
+def test_docstrings_are_shown_as_they_are(site: Path) -> None:
+    page = re.sub(r"<[^>]+>", "", (site / "reference" / "api.html").read_text(encoding="utf-8"))
+    assert "Values by dotted key, e.g. " in page
+    assert "Largest |phi - w| and |phi_dot - w_dot| over the output instants." in page
+    assert "!! processed by numpydoc !!" not in page
+
+
 def test_nothing_is_fetched(site: Path) -> None:
     pages = [path.read_text(encoding="utf-8") for path in site.rglob("*.html")]
     assert len(pages) > 30

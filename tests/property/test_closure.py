@@ -1,4 +1,4 @@
-"""Every loop type: phi is the table of docs/reference.md, J its derivative, J_dot that of J. Off the manifold."""
+"""Every loop type: phi as docs/reference/mechanism.md says, J its derivative, J_dot that of J. Off the manifold."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def placed(world: World, q: Numbers, frame: str | FrameSpec) -> Placement:
 
 
 def table(loop: LoopSpec, A: Placement, B: Placement) -> Array:
-    """phi as docs/reference.md's table has it."""
+    """phi as docs/reference/mechanism.md's table has it."""
     (R_A, p_A), (R_B, p_B) = A, B
     resolve = R_A.T if loop.rows_in == "a" else np.eye(3)
     r = resolve @ (p_A - p_B)

@@ -17,7 +17,7 @@ from scripts.experiments.fuzz.build import link, words
 from tests.analytic.five_bar import Array
 
 Placement = tuple[Array, Array]  # rotation (3, 3), translation (3,)
-Numbers = dict[str, float]  # a configuration by coordinate, or a velocity; a free root's as in docs/reference.md
+Numbers = dict[str, float]  # a configuration by coordinate, or a velocity; a free root's as in docs/reference/names.md
 
 ROOT = ("x", "y", "z", "rx", "ry", "rz")
 # joint, kind, parent link; the child link of joint "jK" is "K", the base "0"

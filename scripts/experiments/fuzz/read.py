@@ -227,7 +227,7 @@ def read(texts: Mapping[str, str]) -> Model:
 
 
 def _add_loop(model: Model, reader: _Reader, loop: Mapping[str, Any]) -> None:
-    """The rows of docs/reference.md's table; log(R_A^T R_B) = 0 is two bodies that turn together."""
+    """The rows of docs/reference/mechanism.md's table; log(R_A^T R_B) = 0 is two bodies that turn together."""
     kind, a, b = loop["type"], reader.frame(loop["frame_a"]), reader.frame(loop["frame_b"])
     model.size = max(model.size, float(np.linalg.norm(a.p)), float(np.linalg.norm(b.p)))
     axis_a, axis_b = (np.array(loop.get(key, (0, 0, 1)), float) for key in ("axis_a", "axis_b"))

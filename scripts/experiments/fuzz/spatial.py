@@ -71,7 +71,7 @@ def rotation_vector(R: Array) -> Array:
 
 
 def perpendicular(a: Array) -> tuple[Array, Array]:
-    """e1, e2 of docs/reference.md's table: cyclic for a coordinate axis, else across the least aligned one."""
+    """e1, e2 as docs/reference/mechanism.md says: cyclic for a coordinate axis, else across the least aligned one."""
     along = int(np.argmax(np.abs(a)))
     if a[along] > 0 and np.count_nonzero(a) == 1:
         return np.eye(3)[(along + 1) % 3], np.eye(3)[(along + 2) % 3]
