@@ -1,4 +1,4 @@
-"""A Sphinx domain for keys of files and for commands: entries to link to, and to find by name or unit in the search."""
+"""A Sphinx domain for keys of files and for commands: entries to find by name or unit in the search."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from docutils.parsers.rst import directives
 from sphinx import addnodes
 from sphinx.directives import ObjectDescription
 from sphinx.domains import Domain, ObjType
-from sphinx.roles import XRefRole
-from sphinx.util.nodes import make_id, make_refnode
+from sphinx.util.nodes import make_id
 
 __all__ = ["CkcDomain"]
 
@@ -50,9 +49,8 @@ class CkcDomain(Domain):
 
     name = "ckc"
     label = "ckc_pin"
-    object_types: ClassVar[dict[str, ObjType]] = {"key": ObjType("key", "key")}
+    object_types: ClassVar[dict[str, ObjType]] = {"key": ObjType("key")}
     directives: ClassVar[dict[str, Any]] = {"key": KeyEntry}
-    roles: ClassVar[dict[str, Any]] = {"key": XRefRole()}
     initial_data: ClassVar[dict[str, Any]] = {"keys": {}}
     data_version = 1
 
@@ -65,17 +63,6 @@ class CkcDomain(Domain):
 
     def merge_domaindata(self, docnames: Any, otherdata: Any) -> None:
         self.data["keys"] |= {key: entry for key, entry in otherdata["keys"].items() if entry[2] in docnames}
-
-    def resolve_xref(
-        self, env: Any, fromdocname: str, builder: Any, typ: str, target: str, node: Any, contnode: Any
-    ) -> Any:
-        found = next(
-            (entry for key, entry in self.data["keys"].items() if target in (key, key.partition(":")[2])), None
-        )
-        return found and make_refnode(builder, fromdocname, found[2], found[3], contnode, target)
-
-    def resolve_any_xref(self, *arguments: Any) -> list[Any]:
-        return []
 
     def get_objects(self) -> Iterator[tuple[str, str, str, str, str, int]]:
         """Yield entries; the shown name has the unit, so that a search for rad/s finds what is in rad/s."""
