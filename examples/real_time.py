@@ -4,8 +4,8 @@ A controller at 500 Hz against the clock, without ROS: each cycle reads the plan
 the plant by 2 ms and sleeps until the next one is due. How late cycles begin, and how much of a cycle the physics
 takes, is measured.
 
-Measured on two cores that were busy with other work: late by 97 µs in the median and 6.2 ms in the 99th percentile, which is
-the scheduler; the physics took 76 µs in the median and 194 µs at most of the 2000.
+Measured on two cores that were busy with other work: late by 97 µs in the median and 6.2 ms in the 99th percentile,
+which is the scheduler; the physics took 76 µs in the median and 194 µs at most of the 2000.
 """
 
 import time

@@ -8,9 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 
 from scripts.site.gallery import ROOT, examples
 from scripts.site.links import broken
+from tests.browser.pages import PATIENCE, browser
+
+__all__ = ["browser"]  # a fixture
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +73,15 @@ def test_every_example_is_in_the_gallery(site: Path) -> None:
     ] == []
 
 
-def test_the_search_finds_a_key_by_its_unit(site: Path) -> None:
-    """As the page does it: words of the query in the names of entries."""
-    index = (site / "searchindex.js").read_text(encoding="utf-8")
-    assert "frequency [rad/s]" in index
-    assert "K_P [N m/rad, N/m]" in index
+def test_the_search_finds_a_key_by_its_unit(site: Path, browser: Browser) -> None:
+    """From disk, in a browser without network; the entry leads to the key."""
+    page = browser.new_context(offline=True).new_page()
+    page.goto(f"{(site / 'search.html').as_uri()}?q=rad%2Fs")
+    found = page.locator("#search-results li a", has_text="frequency [rad/s]").first
+    found.wait_for(timeout=PATIENCE * 1e3)
+    found.click()
+    page.wait_for_url("**/reference/scene.html*")
+    key = page.evaluate("document.getElementById(decodeURIComponent(location.hash.slice(1))).textContent")
+    assert "frequency" in key
+    assert "rad/s" in key
+    page.context.close()
