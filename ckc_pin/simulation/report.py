@@ -155,7 +155,9 @@ def run_table(run: Run) -> Table:
     steps = ", ".join(f"{name} {count} steps" for name, count in stats["steps_by_method"].items())
     table.add_row("method", f"{steps or stats['method']}, {stats['rejected']} rejected")
     terms = stats.get("terms", "pinocchio")  # a file may be from before there were others
-    table.add_row("terms", terms + (_would_pay(run) if terms == "pinocchio" else ""))
+    before = stats.get("rhs_by_terms", {}).get("pinocchio", 0)
+    late = f", compiled after {before} right-hand sides" if terms == "generated" and before else ""
+    table.add_row("terms", terms + late + (_would_pay(run) if terms == "pinocchio" else ""))
     work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
     called = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
     table.add_row("work", f"{work}, {stats['factorizations']} factorizations{called}, {stats['wall_s']:.2g} s")

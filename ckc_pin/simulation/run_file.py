@@ -67,6 +67,7 @@ class _Stats(msgspec.Struct):
     python_calls: int
     wall_s: float
     terms: Literal["pinocchio", "generated"] = "pinocchio"  # of files from before there were others
+    rhs_by_terms: dict[str, int] = {}
 
 
 class _Controller(msgspec.Struct):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,6 +14,7 @@ from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.library import compiled
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.prepare import Prepared, prepare
@@ -26,6 +28,9 @@ __all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
+# Right-hand sides that cost what writing terms out and compiling them does, of whatever mechanism (docs/reference.md,
+# Compiled terms); a run with as many still ahead takes them then, wherever it runs.
+REPAYS, NEVER = 2_000_000, 2**62
 SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
 
 
@@ -125,9 +130,16 @@ def _drive(
     loop, solver, t_end = ready.loop, ready.scene.spec.solver, ready.scene.spec.t_end
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
     n, shown, filled = ready.mechanism.n, 0, 0
+    may_compile = solver.terms == "auto" and loop.stats()["terms"] == "pinocchio"
+    loop.pause_at(REPAYS if may_compile else NEVER)
     try:
         while True:
             stop = Stop(*loop.advance(t_end, True, PAUSE, deadline - perf_counter()))
+            if may_compile and stop.why == "pause" and loop.stats()["rhs"] >= REPAYS:
+                may_compile = False
+                loop.pause_at(NEVER)
+                if loop.t <= t_end / 2:
+                    _compile(ready)
             filled = stop.filled
             if on_output is not None:
                 for row in rows[shown:filled]:
@@ -153,6 +165,13 @@ def _drive(
         status, message = "stopped", _sentence(error, loop.t)
     filled = max(filled, loop.record_now())  # where not even that state has terms, the last output instant is the end
     return status, message, filled
+
+
+def _compile(ready: Prepared) -> None:
+    """Give the loop terms that are written out, where they can be."""
+    with suppress(InputError):  # too many coordinates, no CasADi, no compiler: it goes on as it is
+        library = compiled(ready.mechanism)
+        ready.loop.write((library.path, library.parameters))
 
 
 def _parts(ready: Prepared, rows: Array) -> dict[str, Array]:

@@ -89,13 +89,14 @@ JointTable joints_of(const nb::dict& table) {
 
 }  // namespace
 
+std::unique_ptr<Written> written_of(const nb::tuple& library) {
+  return std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
+}
+
 std::unique_ptr<Core> core_of(const nb::dict& table) {
   Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
   std::unique_ptr<Written> written;
-  if (table.contains("written")) {
-    const auto library = nb::cast<nb::tuple>(table["written"]);
-    written = std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
-  }
+  if (table.contains("written")) written = written_of(nb::cast<nb::tuple>(table["written"]));
   auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
                                      closure_of(nb::cast<nb::dict>(table["closure"])),
                                      springs_of(nb::cast<nb::dict>(table["springs"])),

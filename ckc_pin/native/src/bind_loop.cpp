@@ -6,6 +6,7 @@
 #include <nanobind/stl/unique_ptr.h>
 
 #include "bind_run.hpp"
+#include "written.hpp"
 #include "printed_spf.hpp"
 
 namespace ckc {
@@ -84,8 +85,15 @@ void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {
   const Core& core = *run.core;
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(w, core.rows.closure.rows, "w");
   require(std::isfinite(t), "t: a number is not finite");
-  run.view->calls = 0;
+  run.view->calls = 0, run.rhs_before = 0;
   run.loop->start(t, q_tree, v_tree, w);
+}
+
+// From here on the core has terms that are written out.
+void write(Run& run, const nb::tuple& library) {
+  if (!run.core->written) run.rhs_before = run.loop->work.rhs;
+  run.core->written = written_of(library);
+  run.loop->settle_core();
 }
 
 void record(Run& run, Given instants, Rows rows) {
@@ -155,13 +163,16 @@ nb::tuple trouble(Run& run) {
 nb::dict stats(const Run& run) {
   const Loop& loop = *run.loop;
   const Counts& counts = loop.system->counts;
-  nb::dict found, by_method;
+  nb::dict found, by_method, by_terms;
   long steps = 0;
   for (int k = 0; k < 3; ++k) {
     steps += loop.steps[k];
     if (loop.steps[k]) by_method[methods[k]] = loop.steps[k];
   }
   found["terms"] = run.core->written ? "generated" : "pinocchio";
+  if (run.core->written) by_terms["generated"] = loop.work.rhs - run.rhs_before;
+  if (run.rhs_before || !run.core->written) by_terms["pinocchio"] = run.core->written ? run.rhs_before : loop.work.rhs;
+  found["rhs_by_terms"] = by_terms;
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
   found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
   found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;
@@ -236,6 +247,8 @@ void bind_loop(nb::module_& m) {
       .def("step", &step, "u"_a, "of_motors"_a, "until"_a, "pause"_a)
       .def("record", &record, "instants"_a, "rows"_a)
       .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
+      .def("write", &write, "library"_a)
+      .def("pause_at", [](Run& run, long rhs) { run.loop->pause_at = rhs; }, "rhs"_a)
       .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)
       .def("state", &state)
       .def("trouble", &trouble)

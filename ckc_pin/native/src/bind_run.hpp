@@ -13,6 +13,7 @@ struct Run {
   std::unique_ptr<Loop> loop;
   nb::object rows;
   Places places;
+  long rhs_before = 0;  // right-hand sides before the core was given terms that are written out
 };
 
 void bind_parts(nb::module_& m, nb::class_<Run>& loop);

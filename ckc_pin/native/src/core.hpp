@@ -43,7 +43,7 @@ class Core {
   int d;
   Indices q, z;
   Profile profile;
-  const std::unique_ptr<Written> written;  // the terms of the tree and the rows; null: Pinocchio's
+  std::unique_ptr<Written> written;  // the terms of the tree and the rows; null: Pinocchio's
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
