@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "written.hpp"
 
@@ -15,6 +16,7 @@ constexpr double poor = 1e-3;           // and from there on at every step
 constexpr double clearly = 2.0;         // times as far from singular: a better q
 constexpr double gains = 0.1;  // Newton's method to rounding goes on while a step leaves no more
 constexpr double weight = 3.0, patience = 100.0;  // of a refused step, in steps as before it; until none is tried
+constexpr double rounding = 8 * std::numeric_limits<double>::epsilon();
 constexpr double gone = 100.0;  // epsilons after which w is no more
 
 LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double slack)
@@ -243,6 +245,16 @@ void LevelSet::whole(In f, Out x, Out x_dot) const {
     x << core.q_tree, q_dot;
     x_dot.tail(core.d) = f.tail(core.d);
   }
+}
+
+// y is rounded as its largest number is, a crank's angle after many turns, and z follows it: an angle that passes zero is
+// not known better. What a nearly singular phi_z makes of that is not rounding.
+void LevelSet::add_rounding(In x, Out scale) const {
+  const Vector& units = core.scales.columns;
+  double largest = 0.0;
+  for (int k : core.tree.single) largest = std::max(largest, std::abs(x(core.tree.place[k])) / units(k));
+  for (int k : core.tree.single) scale(core.tree.place[k]) += rounding * largest * units(k);
+  if (on_manifold_) scale.tail(core.n) += rounding * x.tail(core.n).cwiseQuotient(units).lpNorm<Eigen::Infinity>() * units;
 }
 
 // Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.

@@ -34,6 +34,7 @@ class LevelSet : public System {
   int whole_size() const override { return core.rank ? core.tree.nq + (on_manifold_ ? core.n : core.d) : 0; }
   double whole_within() const override { return on_manifold_ ? System::whole_within() : epsilon_; }
   void whole(In f, Out x, Out x_dot) const override;
+  void add_rounding(In x, Out scale) const override;
 
  private:
   void level(double t);

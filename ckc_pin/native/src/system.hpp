@@ -78,6 +78,8 @@ class System {
   virtual double whole_within() const { return std::numeric_limits<double>::infinity(); }
   // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).
   virtual void whole(In, Out, Out) const {}
+  // Add to what may be wrong in each of its numbers x what rounding alone makes wrong.
+  virtual void add_rounding(In, Out) const {}
 
   // --- dry friction and stops ---
   // What acts on the tree where its motion is v: the controller's forces, and friction of what slides.
