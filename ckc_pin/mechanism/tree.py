@@ -73,9 +73,11 @@ class Tree:
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
+        self.carrier = np.zeros(self.n, dtype=np.intp)  # by coordinate: the joint whose body its own is fixed to
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
+            self.carrier[joint.idx_v : joint.idx_v + joint.nv] = parents[k]
 
     def measure(self, size: float) -> None:
         """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
@@ -181,6 +183,16 @@ class Tree:
                 [w * p + y * r - z * q, w * q + z * p - x * r, w * r + x * q - y * p, -x * p - y * q - z * r]
             )
         return rate
+
+    def bracket(self, v_tree: Array) -> Array:
+        """Return the (n, n) matrix that makes [v', x] of x; zero but for free roots, whose motions do not commute.
+
+        A tangent step x beside a motion v' changes at its own rate less [v', x].
+        """
+        matrix = np.zeros((self.n, self.n))
+        for _, at in self.free:
+            matrix[at : at + 6, at : at + 6] = pin.Motion(v_tree[at : at + 6]).action
+        return matrix
 
     def axis(self, joint: int) -> tuple[Array, bool]:
         """Return the axis of a one-freedom joint in its body, shape (3,), and whether it turns; else it slides."""
