@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.dynamics.linearization import LinearModel
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.kinematics import load
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
         Run,
         Scene,
         Simulator,
+        Stability,
         as_ivp,
         check,
         inverse_dynamics,
+        linearize,
         load_scene,
         simulate,
     )
@@ -44,6 +47,7 @@ __all__ = [
     "CkcError",
     "Event",
     "InputError",
+    "LinearModel",
     "Mechanism",
     "MechanismError",
     "MotionForces",
@@ -53,10 +57,12 @@ __all__ = [
     "Sampled",
     "Scene",
     "Simulator",
+    "Stability",
     "Terms",
     "as_ivp",
     "check",
     "inverse_dynamics",
+    "linearize",
     "load",
     "load_scene",
     "play",

@@ -34,6 +34,7 @@ COMMANDS = {
     "compile": "look:compile_",
     "run": "run:run",
     "inverse": "inverse:inverse",
+    "linearize": "linearize:linearize",
     "plot": "view:plot",
     "play": "view:play",
     "map": "map:map_",

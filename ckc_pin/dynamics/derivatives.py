@@ -24,7 +24,7 @@ from ckc_pin.mechanism.linear import Factorization, null_space
 from ckc_pin.mechanism.rank import rank_of, scaled
 from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["AccelerationDerivatives", "acceleration_derivatives", "tree_force_derivatives"]
+__all__ = ["AccelerationDerivatives", "acceleration_derivatives", "multiplier_gradient", "tree_force_derivatives"]
 
 NONE = np.zeros(0, dtype=np.intp)
 
@@ -49,8 +49,8 @@ class AccelerationDerivatives:
     a_q, a_v, a_u : (n, n) arrays
         Of a by q' (tangent coordinates), v' and u'.
     multipliers_q, multipliers_v, multipliers_u : (rows, n) arrays
-    v_q : (rows, n) array
-        Of J v' by q', v' constant: what a change of q' asks of v', so that the loops stay closed.
+    v_q : (n, n) array
+        Of v' by q', as the loops ask for it: the least change of v' that keeps J v' = 0.
     """
 
     acceleration: Array
@@ -104,10 +104,10 @@ def acceleration_derivatives(
         R_v -= np.diag(terms.mechanism.joints.smooth_friction_rate(terms.v_tree, smoothing))
     closure, pose = terms.mechanism.closure, terms.at.pose
     swing = closure.acceleration_gradient(pose, terms.v_tree, acceleration)
-    v_q = closure.acceleration_gradient(pose, np.zeros(n), terms.v_tree)
-    R_q -= multiplier_gradient(terms, own)
+    opened = closure.acceleration_gradient(pose, np.zeros(n), terms.v_tree)
+    R_q -= multiplier_gradient(terms, own, np.eye(n))
     right = np.hstack([-R_q, -R_v, np.eye(n)])
-    along = np.hstack([-swing, -(terms.J_dot + v_q), np.zeros((rows, n))])
+    along = np.hstack([-swing, -(terms.J_dot + opened), np.zeros((rows, n))])
     a_x, multipliers_x = system.solve(right, along)
     multipliers_x[:rows, :n] += system.least_norm_change(multipliers[:, 0])
     a_q, a_v, a_u = np.split(a_x, 3, axis=1)
@@ -123,28 +123,27 @@ def acceleration_derivatives(
         multipliers_q=multipliers_q,
         multipliers_v=multipliers_v,
         multipliers_u=multipliers_u,
-        v_q=v_q,
+        v_q=-system.J_inverse[:, :rows] @ opened,
     )
 
 
-def tree_force_derivatives(terms: Terms, acceleration: Array) -> tuple[Array, Array]:
-    """Derivatives of D' a + C' v' + h' less what dampers do, by q' and by v', (n, n) each; by a it is D'."""
+def tree_force_derivatives(terms: Terms, acceleration: Array, *, dampers: bool = True) -> tuple[Array, Array]:
+    """Derivatives of D' a + C' v' + h', less what dampers do, by q' and by v', (n, n) each; by a it is D'."""
     mechanism, state = terms.mechanism, (terms.q_tree, terms.v_tree, acceleration)
     by_q, by_v = mechanism.tree.evaluate(_tree_derivatives, *state)
     if mechanism.springs.any:
         by_q += mechanism.springs.elastic_gradient(terms.q_tree)
-    if mechanism.springs.any_damping:
+    if dampers and mechanism.springs.any_damping:
         damping_q, damping_v = mechanism.springs.damping_gradient(terms.q_tree, terms.v_tree)
         by_q, by_v = by_q - damping_q, by_v - damping_v
     return by_q, by_v
 
 
-def multiplier_gradient(terms: Terms, multipliers: Array) -> Array:
-    """Derivative of J^T lambda along the tangent coordinates, lambda constant, shape (n, n)."""
-    n = terms.mechanism.n
+def multiplier_gradient(terms: Terms, multipliers: Array, steps: Array) -> Array:
+    """Derivative of J^T lambda along tangent steps (n, k), lambda constant: shape (n, k)."""
     if not multipliers.any():
-        return np.zeros((n, n))
-    return np.array([multipliers @ terms.at.J_dot(unit) for unit in np.eye(n)]).T
+        return np.zeros(steps.shape)
+    return np.array([multipliers @ terms.at.J_dot(step) for step in steps.T]).reshape(steps.shape[::-1]).T
 
 
 def _tree_derivatives(model: pin.Model, data: pin.Data, *state: Array) -> Array:
@@ -173,7 +172,7 @@ class _Constrained:
             )
         self.chart = _units(self.tangent)
         self._inertia = Factorization(self.tangent.T @ terms.D_tree @ self.tangent)
-        self._J_inverse = np.linalg.pinv(self._J, rcond=1e-9)
+        self.J_inverse = np.linalg.pinv(self._J, rcond=1e-9)
 
     def solve(self, force: Array, along: Array) -> tuple[Array, Array]:
         """Return a and multipliers with D' a = force + J^T multipliers, J a = along; locked coordinates rest."""
@@ -181,17 +180,17 @@ class _Constrained:
         _, particular, _ = null_space(self._J, self._rank, -full)
         D = self._terms.D_tree
         a = particular + self.tangent @ self._inertia.solve(self.tangent.T @ (force - D @ particular))
-        return a, self._J_inverse.T @ (D @ a - force)
+        return a, self.J_inverse.T @ (D @ a - force)
 
     def least_norm_change(self, multipliers: Array) -> Array:
         """What keeps the multipliers the least ones as the range of J turns: zero without redundant rows."""
         closure, pose = self._terms.mechanism.closure, self._terms.at.pose
         if self._rank == len(self._J):
             return np.zeros((closure.rows, len(self.tangent)))
-        step = self._J_inverse @ multipliers
+        step = self.J_inverse @ multipliers
         turned = np.zeros(self._J.shape)
         turned[: closure.rows] = closure.acceleration_gradient(pose, np.zeros(len(step)), step)
-        return (turned - self._J @ (self._J_inverse @ turned))[: closure.rows]
+        return (turned - self._J @ (self.J_inverse @ turned))[: closure.rows]
 
 
 def _units(tangent: Array) -> IntArray:

@@ -11,7 +11,7 @@ from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
-from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.tree import Array
 
@@ -122,6 +122,17 @@ class Mechanism:
         return {
             name: pose.rotation[f.joint] @ f.translation + pose.translation[f.joint] for name, f in self.points.items()
         }
+
+    def point_jacobians(self, q_tree: Array) -> dict[str, Array]:
+        """Derivatives of the named points' world positions along the tangent coordinates, (3, n) each."""
+        frames = list(self.points.values())
+        ends = Anchors(
+            np.array([f.joint for f in frames], dtype=np.intp),
+            np.array([f.translation for f in frames]).reshape(-1, 3),
+            np.zeros(0, dtype=np.intp),
+            np.zeros((0, 3)),
+        )
+        return dict(zip(self.points, Pose(self.tree, ends, q_tree).p_jacobian, strict=True))
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
         """Turn a table by coordinate into a vector, as `Tree.vector` does."""

@@ -18,7 +18,9 @@ __all__ = ["log_jacobian", "log_jacobian_change", "log_jacobian_dot", "skew"]
 # c = sum of |B_2k| / (2k)! theta^(2k - 2); beyond these terms nothing is left where theta < 1
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330,
               854513 / 138, 236364091 / 2730, 8553103 / 6)  # fmt: skip
-_SERIES = np.array([b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, 1)])[::-1]
+_SERIES = [np.array([b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, 1)])[::-1]]
+for _ in range(2):  # derivatives by theta^2, of which d/dtheta / theta is twice
+    _SERIES.append(2 * np.polyder(_SERIES[-1]))
 
 
 def skew(a: Array) -> Array:
@@ -28,32 +30,31 @@ def skew(a: Array) -> Array:
     return m - np.swapaxes(m, 1, 2)
 
 
-def _coefficients(u: Array) -> tuple[Array, Array, Array]:
-    """Return c, c'/theta and (c'/theta)'/theta, each (k,)."""
+def _coefficients(u: Array, count: int) -> list[Array]:
+    """Return so many of c, c'/theta and (c'/theta)'/theta, (k,) each."""
     square = np.sum(u * u, axis=1)
+    if np.all(square < 1.0):
+        return [np.polyval(series, square) for series in _SERIES[:count]]
     t = np.where(square < 1.0, 1.0, np.sqrt(square))
     cotangent, sine2 = 1 / np.tan(t / 2), np.sin(t / 2) ** 2
     c = 1 / t**2 - cotangent / (2 * t)
     first = -2 / t**3 + cotangent / (2 * t**2) + 1 / (4 * t * sine2)
     second = 6 / t**4 - cotangent / t**3 - 1 / (2 * t**2 * sine2) - cotangent / (4 * t * sine2)
     far = (c, first / t, second / t**2 - first / t**3)
-    by_square = [_SERIES]  # derivatives by theta^2, of which d/dtheta / theta is twice
-    for _ in range(2):
-        by_square.append(2 * np.polyder(by_square[-1]))
-    near = (np.polyval(series, square) for series in by_square)
-    return tuple(np.where(square < 1.0, a, b) for a, b in zip(near, far, strict=True))  # type: ignore[return-value]
+    each = zip(_SERIES[:count], far, strict=False)
+    return [np.where(square < 1.0, np.polyval(series, square), x) for series, x in each]
 
 
 def log_jacobian(u: Array) -> Array:
     """Jlog, shape (k, 3, 3)."""
-    c, _, _ = _coefficients(u)
+    (c,) = _coefficients(u, 1)
     s = skew(u)
     return np.eye(3) + s / 2 + c[:, None, None] * (s @ s)
 
 
 def log_jacobian_dot(u: Array, u_dot: Array) -> Array:
     """Time derivative of `log_jacobian` along u_dot."""
-    c, c_rate, _ = _coefficients(u)
+    c, c_rate = _coefficients(u, 2)
     c_dot = c_rate * np.sum(u * u_dot, axis=1)
     s, s_dot = skew(u), skew(u_dot)
     return s_dot / 2 + c_dot[:, None, None] * (s @ s) + c[:, None, None] * (s_dot @ s + s @ s_dot)
@@ -69,7 +70,7 @@ def log_jacobian_change(u: Array, steps: Array, x: Array, along: Array | None = 
     along : (k, 3) array, optional
         Differentiate Jlog_dot(u, along) x instead, `along` constant.
     """
-    c, c_rate, c_rate_rate = (k[:, None, None] for k in _coefficients(u))
+    c, c_rate, c_rate_rate = (k[:, None, None] for k in _coefficients(u, 3))
     U, X = u[:, :, None], x[:, :, None]
 
     def twice(a: Array, b: Array) -> Array:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
@@ -17,11 +18,13 @@ from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.linear_report import stability_warning
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
+from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
-__all__ = ["Check", "check"]
+__all__ = ["Check", "check", "names_a_scene"]
 
 MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
 
@@ -55,6 +58,8 @@ class Check:
         Whose terms a run takes: the scene's choice; without one, "generated" where they were compiled before.
     desired : DesiredCheck or None
         For a scene with a controller.
+    stability : Stability or None
+        Of its closed loop, where its target or its motion can be reached.
     branches : (k, n) array or None
         Closed configurations at the assembled q, when asked for; the assembled one first.
     """
@@ -78,6 +83,7 @@ class Check:
     warnings: tuple[str, ...]
     terms: str
     desired: DesiredCheck | None = None
+    stability: Stability | None = None
     branches: Array | None = None
 
 
@@ -97,14 +103,19 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
         It cannot exist as described. Findings about one that can are not errors.
     """
     if isinstance(what, str | Path):
-        what = load_scene(what) if _names_a_scene(str(what)) else load(what)
+        what = load_scene(what) if names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
         found = _mechanism_check(what, None, _limits(what, what.q_tree, "the assembled configuration"), "auto")
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
-    desired = _desired(what, mechanism)
+    controller = scene_controller(what, mechanism)
+    desired = _desired(controller, mechanism, what.spec.t_end)
+    stable = None
+    if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
+        stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing)
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
-    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms)
+    warnings += stability_warning(stable, mechanism.independent)
+    found = replace(_mechanism_check(mechanism, desired, warnings, what.spec.solver.terms), stability=stable)
     return replace(found, branches=_branches(mechanism)) if branches else found
 
 
@@ -113,7 +124,8 @@ def _branches(mechanism: Mechanism) -> Array:
     return np.array([mechanism.tree.to_coordinates(at.q_tree) for at in found])
 
 
-def _names_a_scene(name: str) -> bool:
+def names_a_scene(name: str) -> bool:
+    """Whether a name or path is meant as a scene's, not a mechanism's."""
     if is_path(name):
         return name.endswith(SUFFIX)
     return "/" in name
@@ -149,10 +161,11 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
     )
 
 
-def _desired(scene: Scene, mechanism: Mechanism) -> DesiredCheck | None:
-    controller = scene_controller(scene, mechanism)
+def _desired(
+    controller: SetPoint | Tracking | Torques | None, mechanism: Mechanism, t_end: float
+) -> DesiredCheck | None:
     if isinstance(controller, Tracking):
-        return follow_desired(mechanism, controller.desired, scene.spec.t_end)
+        return follow_desired(mechanism, controller.desired, t_end)
     if isinstance(controller, SetPoint):
         return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
     return None

@@ -14,6 +14,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.generated.library import MOST_COORDINATES
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import Check
+from ckc_pin.simulation.linear_report import stability_plain, stability_text
 from ckc_pin.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ def _finite(value: Any) -> Any:
 def check_plain(found: Check) -> dict[str, Any]:
     """Return a check as JSON-ready data."""
     branches = None if found.branches is None else found.branches.tolist()
-    arrays = {"q_tree": found.q_tree.tolist(), "inertia": found.inertia.tolist(), "branches": branches}
+    arrays = {"q_tree": found.q_tree.tolist(), "inertia": found.inertia.tolist(), "branches": branches,
+              "stability": stability_plain(found.stability)}  # fmt: skip
     return asdict(found) | arrays
 
 
@@ -83,6 +85,8 @@ def check_table(found: Check) -> Group:
         table.add_row("desired", f"{closest}, sigma_min(phi_z) = {found.desired.sigma_min:.4g}")
     elif found.desired is not None:
         table.add_row("desired", f"leaves the workspace at t = {found.desired.leaves_at:.5f} s")
+    if found.stability is not None:
+        table.add_row("closed loop", stability_text(found.stability))
     joints = [_joints_table(found)] if found.joints else []
     return Group(table, *joints, *(Text(f"warning: {warning}") for warning in found.warnings))
 
