@@ -40,7 +40,7 @@ __all__ = ["linearize"]
 @click.option("--out", metavar="DIR", type=Path, help="Folder for linear.npz, figures, and the modes as runs to play.")
 @options.as_json
 def linearize(what: str, at: str, changes: tuple[str, ...], out: Path | None, as_json: bool) -> None:
-    """A, B, C, D in minimal coordinates, with modes, frequencies and damping ratios. Exact, motor by motor."""
+    """Linear model in minimal coordinates: A, B, C, D, modes. Exact, about a state of rest or of a run."""
     if out is not None:
         make_folder(out)
     model = ckc_pin.linearize(what, _at(at), read_changes("--set", changes))

@@ -21,7 +21,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["LinearModel", "Mode", "Reduced", "eigenvalues_of", "linear_model", "reduced"]
+__all__ = ["LinearModel", "MinimalCoordinates", "Mode", "eigenvalues_of", "linear_model", "reduced"]
 
 ComplexArray = NDArray[np.complex128]
 
@@ -183,7 +183,7 @@ def eigenvalues_of(A: Array) -> ComplexArray:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class MinimalCoordinates:
     """Eq. 1's derivatives in minimal coordinates.
 
     Attributes
@@ -204,7 +204,7 @@ class Reduced:
     by_u: Array
 
 
-def reduced(terms: Terms, found: AccelerationDerivatives) -> Reduced:
+def reduced(terms: Terms, found: AccelerationDerivatives) -> MinimalCoordinates:
     """Bring derivatives of eq. 1 to minimal coordinates: `independent`, or others where those are no chart."""
     at, d = found.chart, len(found.chart)
     own = terms.mechanism.partition.q
@@ -218,7 +218,7 @@ def reduced(terms: Terms, found: AccelerationDerivatives) -> Reduced:
     A[:d, d:] = np.eye(d)
     A[d:, :d] = (found.a_q @ T + found.a_v @ V)[at]
     A[d:, d:] = (found.a_v @ T)[at]
-    return Reduced(at, T, V, A, np.vstack([np.zeros((d, terms.mechanism.n)), found.a_u[at]]))
+    return MinimalCoordinates(at, T, V, A, np.vstack([np.zeros((d, terms.mechanism.n)), found.a_u[at]]))
 
 
 def linear_model(

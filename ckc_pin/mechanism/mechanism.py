@@ -126,6 +126,8 @@ class Mechanism:
     def point_jacobians(self, q_tree: Array) -> dict[str, Array]:
         """Derivatives of the named points' world positions along the tangent coordinates, (3, n) each."""
         frames = list(self.points.values())
+        if not frames:
+            return {}
         ends = Anchors(
             np.array([f.joint for f in frames], dtype=np.intp),
             np.array([f.translation for f in frames]).reshape(-1, 3),

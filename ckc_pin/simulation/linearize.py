@@ -35,7 +35,7 @@ __all__ = ["At", "linearize"]
 
 At = str | float | Mapping[str, float]
 
-HELD_TO = 1e-9  # of the forces along a freedom: rounding, which no motor needs to hold
+LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which no motor needs to hold
 ROUNDING = 1e-4  # of that along the others
 OPEN = 1e-6  # of the mechanism's size: loops further open are not those of eq. 1
 MOMENT = 1e-9  # s: a run to its very start
@@ -98,7 +98,7 @@ def linearize(
             return _at_equilibrium(subject)
         if at == "assembled":
             mechanism = subject.mechanism
-            return _held(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
+            return _operating(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
         return _at_instant(subject, _instant(at))
 
 
@@ -143,17 +143,17 @@ def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
         raise InputError(
             f"at: the loops do not close there (|phi| = {miss:.3g}); give {', '.join(mechanism.independent)} alone"
         )
-    return _held(subject, state)
+    return _operating(subject, state)
 
 
-def _held(subject: _Subject, state: Terms) -> LinearModel:
+def _operating(subject: _Subject, state: Terms) -> LinearModel:
     """Hold a configuration by the least torques; refuse what the motors do not reach."""
     mechanism, actuation = subject.mechanism, _actuation(subject)
     tangent, _ = tangent_basis(state, np.zeros(mechanism.closure.rows))
     needed = tangent.T @ state.h_tree
     tau = actuation.distribute(tangent, needed)
     u_tree = mechanism.motors.force(tau)
-    enough = HELD_TO * (np.abs(tangent.T) @ (np.abs(state.h_tree) + np.abs(u_tree)))
+    enough = LEFT_OVER * (np.abs(tangent.T) @ (np.abs(state.h_tree) + np.abs(u_tree)))
     if np.any(np.abs(needed - tangent.T @ u_tree) > enough + ROUNDING * enough.max()):
         loose = ", ".join(actuation.undriven(state.at)) or "some freedom"
         names = ", ".join(mechanism.actuated) or "no motor"

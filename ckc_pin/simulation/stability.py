@@ -23,7 +23,7 @@ __all__ = ["Stability", "stability"]
 
 FEWEST, MOST = 48, 768  # steps of the variational equation
 AGREED = 0.05  # of the growth, between a number of steps and half as many: it is known four times as well
-SURE = 1e-9  # of the fastest eigenvalue: what is no further left of the axis may be on it
+SURE = 1e-12  # of the fastest eigenvalue: what is no further left of the axis may be on it
 NEWTON = 30  # iterations to where a controller with a model of its own comes to rest
 
 

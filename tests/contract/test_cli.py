@@ -17,7 +17,7 @@ from tests.contract.helpers.command import ckc
 
 # docs/reference.md, in its order; more keys may be added, none may go
 CHECK = """n d rows rank redundant independent dependent coordinates q_tree det_phi_z sigma_min_phi_z cond_phi_z
-           mass inertia joints warnings desired"""
+           mass inertia joints warnings desired stability"""
 TERMS = """coordinates independent dependent q_tree v_tree D_tree C_tree h_tree phi phi_q phi_z rho rho_dot D C h
            energy"""
 RUN = """status message t coordinates q_tree v_tree u tau points max_abs_u max_abs_tau max_phi max_phi_dot energy_start

@@ -41,6 +41,7 @@ from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, OTHERS
 from ckc_pin.simulation.scene import EventSpec, InitialSpec, SceneSpec, SolverSpec
 from tests.contract.helpers.command import ckc
 from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
+from tests.contract.test_linearize_command import KEYS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
@@ -111,7 +112,7 @@ def test_every_command_json_key_array_and_error_is_named() -> None:
     commands = re.findall(r"^  (\w+) ", ckc("--help").out.partition("\nCommands:\n")[2], re.MULTILINE)
     assert "run" in commands
     assert [name for name in commands if f"| `ckc {name}" not in PAGE] == []
-    keys = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS}
+    keys = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS, "linearize": " ".join(KEYS)}
     for name, wanted in keys.items():
         row = next(line for line in PAGE.partition("### JSON")[2].splitlines() if line.startswith(f"| `{name}`"))
         assert [key for key in wanted.split() if not re.search(rf"\b{key}\b", row)] == []
