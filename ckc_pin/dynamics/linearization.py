@@ -27,7 +27,7 @@ ComplexArray = NDArray[np.complex128]
 
 MOST_ROWS = 12  # of modes, in what is printed
 ROUNDING = 1e-12  # a damping ratio as small as that is printed as none
-MARGIN = 1e-6  # of phi_z's smallest singular value to |J|: nearer to singular than that q is no chart
+LARGEST = 1e6  # condition of the coordinates' part of a tangent basis: beyond that they are no chart
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +207,8 @@ class MinimalCoordinates:
 def reduced(terms: Terms, found: AccelerationDerivatives) -> MinimalCoordinates:
     """Bring derivatives of eq. 1 to minimal coordinates: `independent`, or others where those are no chart."""
     at, d = found.chart, len(found.chart)
-    own = terms.mechanism.partition.q
-    if len(own) == d and not terms.mechanism.splits_root and terms.at.margin() > MARGIN:
+    own = np.array([k for k in terms.mechanism.partition.q if found.tangent[k].any()], dtype=np.intp)  # not locked
+    if len(own) == d and np.linalg.cond(found.tangent[own]) < LARGEST:
         at = own
     T = found.tangent @ np.linalg.inv(found.tangent[at])
     V = found.v_q @ T

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
@@ -19,7 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.linear_report import stability_warning
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
 from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
@@ -113,6 +114,8 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     stable = None
     if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
         stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing)
+    if stable is not None:
+        stable = replace(stable, leaves_out=_leaves_out(what, mechanism))
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
     warnings += stability_warning(stable, mechanism.independent)
     found = replace(_mechanism_check(mechanism, desired, warnings, what.spec.solver.terms), stability=stable)
@@ -169,6 +172,20 @@ def _desired(
     if isinstance(controller, SetPoint):
         return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
     return None
+
+
+def _leaves_out(scene: Scene, mechanism: Mechanism) -> tuple[str, ...]:
+    """What of a scene stands between a run and the linear model of its closed loop."""
+    spec = scene.spec.controller
+    sampled = spec if isinstance(spec, FeedbackSpec) and spec.sample_time is not None else None
+    there = {
+        "sampling": sampled is not None,
+        "delay": sampled is not None and sampled.delay > 0,
+        "sensor and drive": sampled is not None and (sampled.sensor is not None or sampled.drive is not None),
+        "torque limits": bool(np.isfinite(scene_actuation(scene, mechanism).limit).any()),
+        "dry friction": bool(mechanism.joints.friction.any()) and scene.spec.friction_smoothing is None,
+    }
+    return tuple(name for name, is_there in there.items() if is_there)
 
 
 def _start_warnings(scene: Scene, mechanism: Mechanism) -> list[str]:

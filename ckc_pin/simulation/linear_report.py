@@ -115,6 +115,8 @@ def stability_plain(found: Stability | None) -> dict[str, Any] | None:
 def stability_text(found: Stability) -> str:
     """Say in a line whether a closed loop is stable, and how much."""
     says = "stable" if found.stable else "UNSTABLE"
+    if found.leaves_out:
+        says += f", {' and '.join(found.leaves_out)} left out,"
     if found.growth is not None and found.largest_growth is not None:
         return (
             f"{says} along the motion: errors grow to {found.largest_growth:.3g} times at most, to {found.growth:.2e} "

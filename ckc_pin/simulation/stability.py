@@ -29,7 +29,7 @@ NEWTON = 30  # iterations to where a controller with a model of its own comes to
 
 @dataclass(frozen=True)
 class Stability:
-    """The closed loop about its target, linearized exactly; limits, sampling and dry friction are left out.
+    """The closed loop about its target, linearized exactly.
 
     Attributes
     ----------
@@ -47,6 +47,9 @@ class Stability:
     growth, largest_growth : float or None
         Of tracking: by how much the variational equation multiplies an error of position that starts with e_dot = 0,
         the worst there is, until the end of the motion, and at most on the way.
+    leaves_out : tuple of str
+        What of the scene the linear model does not have: "sampling", "delay", "sensor and drive", "torque limits",
+        "dry friction".
     """
 
     stable: bool
@@ -56,6 +59,7 @@ class Stability:
     slowest: float
     growth: float | None = None
     largest_growth: float | None = None
+    leaves_out: tuple[str, ...] = ()
 
 
 def stability(

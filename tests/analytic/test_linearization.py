@@ -90,7 +90,7 @@ def test_labels_say_what_is_what() -> None:
 
 @pytest.mark.parametrize("name", shipped())
 def test_it_is_the_slope_of_the_reduced_model(name: str) -> None:
-    """Eq. 6 differenced along sigma, while what is linearized is eq. 1."""
+    """Eq. 6 differenced along sigma, while what is linearized is eq. 1; the multipliers of least norm with it."""
     mechanism, random = load(name), np.random.default_rng(1)
     d, forces = mechanism.d, random.uniform(-1, 1, len(mechanism.actuated))
     start = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.03, 0.03, d)).at
@@ -98,14 +98,19 @@ def test_it_is_the_slope_of_the_reduced_model(name: str) -> None:
 
     def rate(x: Array) -> Array:
         at = sigma(mechanism, x[:d], start).at
-        return reduced_acceleration(Terms(mechanism, at, at.rho @ x[d : 2 * d]), mechanism.motors.force(x[2 * d :]))
+        state, u_tree = Terms(mechanism, at, at.rho @ x[d : 2 * d]), mechanism.motors.force(x[2 * d :])
+        loops = multipliers(state, u_tree, dae_acceleration(state, u_tree))
+        return np.concatenate([reduced_acceleration(state, u_tree), loops])
 
     model = linear_model(Terms(mechanism, start, start.rho @ x[d : 2 * d]), forces, at="somewhere")
     step = random.uniform(-1, 1, len(x))
     slopes = [(rate(x + h * step) - rate(x - h * step)) / (2 * h) for h in (4e-4, 2e-4, 1e-4)]
     first, second = ((4 * fine - coarse) / 3 for coarse, fine in pairwise(slopes))
     assert model.states[:d] == mechanism.independent
-    agree(np.hstack([model.A, model.B])[d:] @ step, (16 * second - first) / 15, 1e-6)
+    wanted, rows = (16 * second - first) / 15, mechanism.closure.rows
+    agree(np.hstack([model.A, model.B])[d:] @ step, wanted[:d], 1e-6)
+    if rows:
+        agree(np.hstack([model.C, model.D])[-rows:] @ step, wanted[d:], 1e-6)
 
 
 @pytest.mark.parametrize("case", ["five_bar", "stewart", "springs"])
@@ -203,6 +208,28 @@ def test_friction_is_smoothed_or_locks(tmp_path: Path) -> None:
     assert smooth.inputs == ("crank",)
     agree(smooth.A - free.A, np.array([[0, 0], [0, extra]]), 1e-9)
     assert smooth.modes[0].frequency == 0.0, "overdamped"
+
+
+def test_a_locked_joint_leaves_the_others() -> None:
+    """The five-bar with theta_1 locked, by the appendix: the row of eq. 6 that is left."""
+    mechanism, q_dot = load("five_bar"), 0.7
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + np.array([0.2, -0.1])).at
+    state = Terms(mechanism, at, at.rho @ [0.0, q_dot])
+    model = linear_model(state, np.array([0.3, 0.2]), at="somewhere", locked=np.array([0]))
+    assert model.locked == ("theta_1",)
+    assert model.states == ("theta_3", "theta_3_dot")
+
+    def acceleration(x: Array) -> Array:
+        """Of theta_3, at steps of theta_3, its rate and tau."""
+        moved = at.q_tree + FIVE_BAR.rho(at.q_tree)[:, 1] * x[0]
+        rate = np.array([0.0, q_dot + x[1]])
+        C = FIVE_BAR.C(moved, FIVE_BAR.rho(moved) @ rate)
+        force = 0.2 + x[2] - (C @ rate)[1] - FIVE_BAR.h(moved)[1]
+        return np.array([force / FIVE_BAR.D(moved)[1, 1]])
+
+    slopes = complex_step(acceleration, np.zeros(3))[0]
+    agree(model.A, np.array([[0.0, 1.0], slopes[:2]]))
+    agree(model.B, np.array([[0.0, 0.0], [0.0, slopes[2]]]))
 
 
 def test_motors_hold_an_operating_point() -> None:

@@ -104,6 +104,7 @@ def test_check_tells_of_the_closed_loop() -> None:
     found = ckc("check", "talos/squat", "--json").json["stability"]
     assert found["stable"] is True
     assert len(found["eigenvalues"]) == 52
+    assert found["leaves_out"] == ["dry friction"]
     assert "stable at its target" in ckc("check", "five_bar/set_point").out
     assert ckc("check", "five_bar", "--json").json["stability"] is None
 
