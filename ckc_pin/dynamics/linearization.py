@@ -25,7 +25,7 @@ __all__ = ["LinearModel", "MinimalCoordinates", "Mode", "eigenvalues_of", "linea
 
 ComplexArray = NDArray[np.complex128]
 
-MOST_ROWS = 12  # of modes, in what is printed
+MOST_NAMES, MOST_ROWS = 14, 12  # names in a list, and modes, in what is printed
 ROUNDING = 1e-12  # a damping ratio as small as that is printed as none
 LARGEST = 1e6  # condition of the coordinates' part of a tangent basis: beyond that they are no chart
 
@@ -163,11 +163,18 @@ class LinearModel:
     def __repr__(self) -> str:
         head = f"LinearModel of {self.name} {self.at}: {len(self.states)} states, {len(self.inputs)} inputs"
         shown = [f"  {says}" for says in (*_rows(self), *(f"note: {note}" for note in self.notes))]
-        return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {', '.join(self.states)}", *shown])
+        return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {_some(self.states)}", *shown])
+
+
+def _some(names: tuple[str, ...]) -> str:
+    """Names as far as people read them."""
+    return ", ".join(
+        names if len(names) <= MOST_NAMES else (*names[: MOST_NAMES - 1], f"{len(names) - MOST_NAMES + 1} more")
+    )
 
 
 def _rows(model: LinearModel) -> list[str]:
-    rows = [f"inputs  {', '.join(model.inputs) or 'none'}"]
+    rows = [f"inputs  {_some(model.inputs) or 'none'}"]
     for mode in model.modes[:MOST_ROWS]:
         value = mode.eigenvalue
         still = bool(mode.frequency) and abs(mode.damping_ratio) < ROUNDING
@@ -273,7 +280,7 @@ def linear_model(
     if chart != mechanism.independent and not names:
         notes = (*notes, f"{', '.join(mechanism.independent)} are no coordinates there; {', '.join(chart)} are")
     if names:
-        notes = (*notes, f"locked by friction or a stop, so that they do not move: {', '.join(names)}")
+        notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
     points = mechanism.point_jacobians(terms.q_tree)
     turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(small.at)))
     places = np.vstack([small.T, *(x @ small.T for x in points.values())])

@@ -206,9 +206,15 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
         state, run.tau[k], at=f"at t = {t:g} s", t=t, u_tree=sliding, locked=locked, smoothing=smoothing, notes=notes
     )
     law = scene_controller(scene, mechanism)
-    if not isinstance(law, SetPoint | Tracking) or model.states[: mechanism.d] != mechanism.independent:
+    if law is None:
         return model
-    return replace(model, closed_loop=closed_loop(law, t, state, smoothing))
+    if not isinstance(law, SetPoint | Tracking) or model.states[: mechanism.d] != mechanism.independent:
+        return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
+    says = "A and B are the plant's; closed_loop is A with the scene's controller"
+    spec = scene.spec.controller
+    if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
+        says += ", without its sampling and delay"
+    return replace(model, closed_loop=closed_loop(law, t, state, smoothing), notes=(*model.notes, says))
 
 
 def _run_to(scene: Scene, t: float) -> Run:
@@ -232,11 +238,6 @@ def _notes(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
     notes = []
     if np.any(np.abs(run.v_tree[k]) > 1e-6 * run.mechanism.tree.reach):
         notes.append("about a motion, not a state of rest: A and B are those of the instant")
-    spec = scene.spec.controller
-    if spec is not None:
-        notes.append("A and B are the plant's; closed_loop is A with the scene's controller")
-    if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-        notes.append("closed_loop leaves sampling and delay out")
     limits = scene_actuation(scene, run.mechanism).limit
     full = [name for name, x, most in zip(run.actuated, run.tau[k], limits, strict=True) if abs(x) >= most * (1 - 1e-9)]
     if full:
