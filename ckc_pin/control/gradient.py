@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,19 +13,38 @@ from ckc_pin.dynamics.linearization import reduced
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["closed_loop", "error_loop", "u_gradient"]
+__all__ = ["Feedback", "closed_loop", "error_loop", "feedback", "u_gradient"]
 
 
-def closed_loop(law: SetPoint | Tracking, t: float, terms: Terms, smoothing: float | None = None) -> Array:
-    """Return A of the state (q, q_dot) with a controller in the loop, its u on the independent coordinates: (2 d, 2 d).
+@dataclass(frozen=True)
+class Feedback:
+    """A controller about one state: x_dot = A x + B u, u = K x, x = (q, q_dot), u on the independent coordinates.
 
-    Neither limits nor sampling are in it. `terms` at v' = rho q_dot, phi_z regular.
+    Attributes
+    ----------
+    A : (2 d, 2 d) array
+    B : (2 d, d) array
+    K : (d, 2 d) array
     """
+
+    A: Array
+    B: Array
+    K: Array
+
+
+def feedback(law: SetPoint | Tracking, t: float, terms: Terms, smoothing: float | None = None) -> Feedback:
+    """Linearize plant and controller; `terms` at v' = rho q_dot, phi_z regular. Limits are not in it."""
     mechanism, q = terms.mechanism, terms.at.partition.q
     u_tree = np.zeros(mechanism.n)
     u_tree[q] = law.u(t, terms)
     plant = reduced(terms, acceleration_derivatives(terms, u_tree, smoothing=smoothing))
-    return plant.A + plant.by_u[:, q] @ np.hstack(u_gradient(law, t, terms))
+    return Feedback(plant.A, plant.by_u[:, q], np.hstack(u_gradient(law, t, terms)))
+
+
+def closed_loop(law: SetPoint | Tracking, t: float, terms: Terms, smoothing: float | None = None) -> Array:
+    """Return A of the state (q, q_dot) with a controller in the loop, as `feedback` has them: (2 d, 2 d)."""
+    found = feedback(law, t, terms, smoothing)
+    return found.A + found.B @ found.K
 
 
 def error_loop(law: Tracking, t: float, terms: Terms, smoothing: float | None = None) -> Array:

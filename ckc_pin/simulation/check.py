@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.sampling import MOST_DELAYED
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
@@ -113,9 +114,10 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     desired = _desired(controller, mechanism, what.spec.t_end)
     stable = None
     if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
-        stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing)
+        sampling = _sampling(what) if isinstance(controller, SetPoint) else None
+        stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing, sampling)
     if stable is not None:
-        stable = replace(stable, leaves_out=_leaves_out(what, mechanism))
+        stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.multiplier is not None))
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
     warnings += stability_warning(stable, mechanism.independent)
     found = replace(_mechanism_check(mechanism, desired, warnings, what.spec.solver.terms), stability=stable)
@@ -174,13 +176,21 @@ def _desired(
     return None
 
 
-def _leaves_out(scene: Scene, mechanism: Mechanism) -> tuple[str, ...]:
+def _sampling(scene: Scene) -> tuple[float, float] | None:
+    """Sample time and delay of a scene's controller; None without, or where more is under way than can be listed."""
+    spec = scene.spec.controller
+    if not isinstance(spec, FeedbackSpec) or spec.sample_time is None or spec.delay > MOST_DELAYED * spec.sample_time:
+        return None
+    return spec.sample_time, spec.delay
+
+
+def _leaves_out(scene: Scene, mechanism: Mechanism, sampled_in: bool) -> tuple[str, ...]:
     """What of a scene stands between a run and the linear model of its closed loop."""
     spec = scene.spec.controller
     sampled = spec if isinstance(spec, FeedbackSpec) and spec.sample_time is not None else None
     there = {
-        "sampling": sampled is not None,
-        "delay": sampled is not None and sampled.delay > 0,
+        "sampling": sampled is not None and not sampled_in,
+        "delay": sampled is not None and sampled.delay > 0 and not sampled_in,
         "sensor and drive": sampled is not None and (sampled.sensor is not None or sampled.drive is not None),
         "torque limits": bool(np.isfinite(scene_actuation(scene, mechanism).limit).any()),
         "dry friction": bool(mechanism.joints.friction.any()) and scene.spec.friction_smoothing is None,

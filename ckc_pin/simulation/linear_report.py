@@ -122,6 +122,8 @@ def stability_text(found: Stability) -> str:
             f"{says} along the motion: errors grow to {found.largest_growth:.3g} times at most, to {found.growth:.2e} "
             f"at its end; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
         )
+    if found.multiplier is not None:
+        says += f" as sampled, factor {found.multiplier:.6g} a sample,"
     slowest = f", slowest decay {found.slowest:.3g} s" if np.isfinite(found.slowest) else ""
     return f"{says} at its target{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
 
@@ -136,6 +138,11 @@ def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> 
             "at its end; larger Lambda and K_D would help"
         ]
     worst = float(found.eigenvalues[0].real)
+    if found.multiplier is not None and worst < 0:
+        return [
+            f"the closed loop is unstable as sampled: errors grow {found.multiplier:.4g} times a sample, while without "
+            "sampling and delay they would decay; sample more often, delay less, or take smaller gains"
+        ]
     if not found.least_K_P.any():
         return [f"the closed loop does not come to rest at its target (eigenvalue {worst:.3g} 1/s): K_V is too small"]
     return [

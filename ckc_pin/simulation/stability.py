@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.gradient import closed_loop, error_loop
+from ckc_pin.control.gradient import error_loop, feedback
+from ckc_pin.control.sampling import sampled_loop
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.linearization import eigenvalues_of
 from ckc_pin.dynamics.terms import Terms
@@ -47,6 +48,8 @@ class Stability:
     growth, largest_growth : float or None
         Of tracking: by how much the variational equation multiplies an error of position that starts with e_dot = 0,
         the worst there is, until the end of the motion, and at most on the way.
+    multiplier : float or None
+        Of a set point that is sampled: the largest factor of an error from one sample to the next, delay included.
     leaves_out : tuple of str
         What of the scene the linear model does not have: "sampling", "delay", "sensor and drive", "torque limits",
         "dry friction".
@@ -59,11 +62,16 @@ class Stability:
     slowest: float
     growth: float | None = None
     largest_growth: float | None = None
+    multiplier: float | None = None
     leaves_out: tuple[str, ...] = ()
 
 
 def stability(
-    mechanism: Mechanism, law: SetPoint | Tracking, t_end: float, smoothing: float | None = None
+    mechanism: Mechanism,
+    law: SetPoint | Tracking,
+    t_end: float,
+    smoothing: float | None = None,
+    sampling: tuple[float, float] | None = None,
 ) -> Stability | None:
     """Linearize a controller's closed loop.
 
@@ -73,6 +81,8 @@ def stability(
         How long a desired motion lasts, s.
     smoothing : float, optional
         A scene's friction_smoothing.
+    sampling : (sample_time, delay), optional
+        s; a set point's verdict is then that of the sampled loop. Tracking is taken as continuous.
 
     Returns
     -------
@@ -81,24 +91,33 @@ def stability(
     """
     with one_blas_thread():
         if isinstance(law, SetPoint):
-            return _about(mechanism, law, smoothing)
+            return _about(mechanism, law, smoothing, sampling)
         return _along(mechanism, law, t_end, smoothing)
 
 
-def _about(mechanism: Mechanism, law: SetPoint, smoothing: float | None) -> Stability | None:
+def _about(
+    mechanism: Mechanism, law: SetPoint, smoothing: float | None, sampling: tuple[float, float] | None
+) -> Stability | None:
     at = _rest(mechanism, law)
     if at is None:
         return None
-    values = eigenvalues_of(closed_loop(law, 0.0, Terms(mechanism, at, np.zeros(mechanism.n)), smoothing))
+    loop = feedback(law, 0.0, Terms(mechanism, at, np.zeros(mechanism.n)), smoothing)
+    values = eigenvalues_of(loop.A + loop.B @ loop.K)
+    stable, slowest = bool(values[0].real < -SURE * np.abs(values).max()), _time_constant(float(values[0].real))
+    multiplier = None
+    if sampling is not None:
+        multiplier = float(np.abs(np.linalg.eigvals(sampled_loop(loop, *sampling))).max())
+        stable, slowest = multiplier < 1.0, _time_constant(float(np.log(max(multiplier, 1e-300))) / sampling[0])
     K_P, hessian = (x / 2 + x.T / 2 for x in (law.K_P, h_gradient(mechanism, at)))
     half = np.linalg.inv(np.linalg.cholesky(K_P))
     factor = max(0.0, -float(np.linalg.eigvalsh(half @ hessian @ half.T)[0]))
     return Stability(
-        stable=bool(values[0].real < -SURE * np.abs(values).max()),
+        stable=stable,
         eigenvalues=values,
         least_K_P=factor * law.K_P,
         least_eigenvalue=float(np.linalg.eigvalsh(K_P + hessian)[0]),
-        slowest=_time_constant(float(values[0].real)),
+        slowest=slowest,
+        multiplier=multiplier,
     )
 
 
