@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Run, linearize
+from ckc_pin import Run, check, linearize
+from ckc_pin.simulation.locus import gain_locus
+from ckc_pin.simulation.sway import sways
+from ckc_pin.view.linear_figure import draw_locus, draw_modes, draw_poles
 from tests.contract.helpers.command import ckc
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,3 +124,51 @@ def test_the_regulator_of_the_example_holds() -> None:
     assert error[0] > 0.07
     assert error[run.at(1.0)] < 1e-5
     assert error[-1] < 1e-10
+
+
+def test_the_root_locus_crosses_at_the_least_gain() -> None:
+    locus, found = gain_locus("five_bar/set_point"), check("five_bar/set_point").stability
+    assert locus is not None
+    assert locus.gain == "K_P"
+    assert found is not None
+    assert found.least_K_P is not None
+    least = found.least_K_P[0, 0] / 10.0  # of the scene's K_P
+    rightmost = locus.eigenvalues.real.max(axis=1)
+    assert np.array_equal(rightmost < 0, locus.factors > least)
+    own = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
+    assert np.abs(np.sort_complex(own) - np.sort_complex(found.eigenvalues)).max() < 1e-6
+    assert gain_locus("five_bar") is None
+    assert gain_locus("five_bar/swing") is None
+
+
+def test_figures_show_poles_modes_and_the_locus() -> None:
+    model = linearize("five_bar/set_point", 0.5)
+    ax = draw_poles(model).axes[0]
+    plant, closed = (np.sort_complex(line.get_xdata() + 1j * line.get_ydata()) for line in ax.lines[-2:])
+    assert model.closed_loop is not None
+    assert np.array_equal(plant, np.sort_complex(model.eigenvalues))
+    assert np.abs(closed - np.sort_complex(np.linalg.eigvals(model.closed_loop))).max() < 1e-9
+    low, high = ax.get_xlim()
+    assert low < closed.real.min() < plant.real.max() < high
+    panels = draw_modes(linearize("stewart")).axes
+    assert len(panels) == 6
+    assert panels[0].get_title(loc="left").startswith("1: 1.503 Hz")
+    locus = gain_locus("three_rrr/circle")
+    assert locus is not None
+    assert locus.gain == "K_D"
+    assert len(draw_locus(locus).axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
+
+
+def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
+    model = linearize("stewart")
+    runs = sways(model)
+    assert list(runs) == [1, 2, 3, 4, 5, 6]
+    for number, run in runs.items():
+        mode = model.modes[number - 1]
+        assert run.max_phi < 1e-9
+        assert run.max_phi_dot < 1e-9
+        assert run.t[-1] == pytest.approx(2 / mode.frequency)
+        # the rates are those of the motion, by differences around the ring of frames, to the size of a swing squared
+        swing, rates = run.q_tree[:49, 2], run.v_tree[:48, 2]
+        slope = (np.roll(swing[:48], -1) - np.roll(swing[:48], 1)) / (2 * run.t[1])
+        assert np.abs(slope - rates).max() <= 0.2 * np.abs(rates).max()
