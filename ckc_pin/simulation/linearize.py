@@ -37,6 +37,7 @@ At = str | float | Mapping[str, float]
 
 LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which no motor needs to hold
 ROUNDING = 1e-4  # of that along the others
+NO_CHART = 1e-6  # margin of phi_z below which q is none
 OPEN = 1e-6  # of the mechanism's size: loops further open are not those of eq. 1
 MOMENT = 1e-9  # s: a run to its very start
 
@@ -137,7 +138,8 @@ def _at_equilibrium(subject: _Subject) -> LinearModel:
 
 def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
     mechanism = subject.mechanism
-    state = terms(mechanism, given)
+    whole = set(given) >= set(mechanism.coordinates)  # taken as it is: q may be no chart there
+    state = terms(mechanism, given, dict.fromkeys(mechanism.coordinates, 0.0) if whole else None)
     miss = float(np.abs(state.phi).max(initial=0.0))
     if miss > max(OPEN * mechanism.size, mechanism.tolerance):
         raise InputError(
@@ -155,7 +157,7 @@ def _operating(subject: _Subject, state: Terms) -> LinearModel:
     u_tree = mechanism.motors.force(tau)
     enough = LEFT_OVER * (np.abs(tangent.T) @ (np.abs(state.h_tree) + np.abs(u_tree)))
     if np.any(np.abs(needed - tangent.T @ u_tree) > enough + ROUNDING * enough.max()):
-        loose = ", ".join(actuation.undriven(state.at)) or "some freedom"
+        loose = _loose(state, tangent, actuation)
         names = ", ".join(mechanism.actuated) or "no motor"
         raise InputError(
             f"{mechanism.name}: the motors ({names}) cannot hold this configuration: nothing holds the motion along "
@@ -169,6 +171,17 @@ def _operating(subject: _Subject, state: Terms) -> LinearModel:
             f"{abs(tau[k]):.4g}, its limit is {actuation.limit[k]:.4g}"
         )
     return _at_rest(subject, state.at, tau, "held by its motors")
+
+
+def _loose(state: Terms, tangent: Array, actuation: Actuation) -> str:
+    """Name freedoms that no motor drives; where q is no chart, the coordinate that moves most in the loosest one."""
+    if state.at.margin() > NO_CHART:
+        return ", ".join(actuation.undriven(state.at))
+    mechanism = state.mechanism
+    motions, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
+    grip = mechanism.motors.turns @ motions
+    loosest = np.linalg.eigh(grip.T @ grip)[1][:, 0]
+    return mechanism.coordinates[int(np.argmax(np.abs(motions @ loosest)))]
 
 
 def _actuation(subject: _Subject) -> Actuation:

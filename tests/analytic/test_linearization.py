@@ -281,19 +281,44 @@ def test_other_refusals() -> None:
 
 def test_where_q_is_no_chart_others_are() -> None:
     """At the type 1 point of the five-bar, elbows coincident, det phi_z = 0 while J keeps its rank."""
-    mechanism = load("five_bar")
-    q = np.array([0.993865, 2.147728])
-    left = 0.2794 * np.array([np.cos(q[0]), np.sin(q[0])])
-    tip = left + 0.3048 * np.array([0.0, 1.0])  # any way up will do
-    a2, a4 = (np.arctan2(*(tip - elbow)[::-1]) for elbow in (left, left))
-    numbers = np.array([q[0], a2 - q[0], q[1], a4 - q[1]])
+    mechanism, q_1 = load("five_bar"), float(np.arccos(0.1524 / 0.2794))
+    numbers = np.array([q_1, 1.0 - q_1, np.pi - q_1, 1.0 - (np.pi - q_1)])  # the tip any way up
     at = mechanism.kinematics(numbers)
-    assert np.abs(at.phi).max() < 1e-5
-    assert at.margin() < 1e-5
+    assert np.abs(at.phi).max() < 1e-12
+    assert at.margin() < 1e-9
     model = linear_model(Terms(mechanism, at, np.zeros(4)), np.zeros(2), at="at a singular q")
     assert model.states[:2] != mechanism.independent
     assert np.all(np.isfinite(model.A))
     assert "theta_1, theta_3 are no coordinates there" in model.notes[0]
+    # of eq. 1 by complex steps along the other coordinates
+    chart = [mechanism.coordinates.index(name) for name in model.states[:2]]
+    others = [k for k in range(4) if k not in chart]
+    J = FIVE_BAR.J(numbers)
+    T = np.zeros((4, 2))
+    T[chart] = np.eye(2)
+    T[others] = -np.linalg.solve(J[:, others], J[:, chart])
+
+    def acceleration(x: Array) -> Array:
+        return FIVE_BAR.acceleration_and_multipliers(numbers + T @ x[:2], np.zeros(4), x[2:])[0][chart]
+
+    slopes = complex_step(acceleration, np.zeros(4))
+    agree(model.A[2:, :2], slopes[:, :2], 1e-9)
+    agree(model.B[2:], slopes[:, 2:], 1e-9)
+    # where the elbows meet the tip may turn about them, and no motor holds it
+    with pytest.raises(InputError, match=r"cannot hold .* along theta_[24],"):
+        linearize(mechanism, dict(zip(mechanism.coordinates, numbers.tolist(), strict=True)))
+
+
+def test_a_singular_configuration_is_refused() -> None:
+    """Where J loses rank no linear model is that of the whole motion; of independent ones alone phi_z tells."""
+    mechanism = load("n_four_bar")
+    with pytest.raises(NumericalError, match="theta_0 = 0 is singular"):
+        linearize(mechanism, {"theta_0": 0.0})
+    with pytest.raises(NumericalError, match="J has lost rank"):
+        linearize(mechanism, dict.fromkeys(mechanism.coordinates, 0.0))
+    state = Terms(mechanism, mechanism.kinematics(np.zeros(mechanism.n)), np.zeros(mechanism.n))
+    with pytest.raises(NumericalError, match="J has lost rank"):
+        linear_model(state, np.zeros(1), at="there")
 
 
 def test_an_instant_of_a_run_is_its_state() -> None:
