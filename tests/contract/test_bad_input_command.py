@@ -20,7 +20,11 @@ def _set(*changes: str) -> tuple[str, ...]:
 
 CASES = [
     # the command itself
-    Bad("unknown command", ["rnu"], ["No such command 'rnu'", "list, check, terms, compile, run, inverse, plot, play"]),
+    Bad(
+        "unknown command",
+        ["rnu"],
+        ["No such command 'rnu'", "check, terms, compile, run, inverse, linearize, plot, play"],
+    ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
     Bad("missing argument", ["check"], ["ckc check: Missing argument 'MECHANISM|SCENE'", "--help"]),
     Bad("too many arguments", ["check", "five_bar", "again"], ["unexpected extra argument", "again"]),
