@@ -13,6 +13,7 @@ from ckc_pin.mechanism.freedoms import count_freedoms
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
@@ -103,15 +104,15 @@ def _gauss_newton(
     return q
 
 
-def assembled(spec: MechanismSpec, sources: Sources) -> Mechanism:
-    """Assemble a mechanism from what its files say.
+def assembled(spec: MechanismSpec, sources: Sources, changes: Changes | None = None) -> Mechanism:
+    """Assemble a mechanism from what its files say, with numbers changed by name.
 
     Raises
     ------
     MechanismError
         Unknown names, loops that cannot be closed from q_guess, coordinates that cannot serve as q.
     """
-    linkage = Linkage(spec, sources)
+    linkage = Linkage(spec, sources, changes)
     tree, closure, size = linkage.tree, linkage.closure, linkage.size
     with one_blas_thread():
         guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)

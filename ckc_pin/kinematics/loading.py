@@ -5,11 +5,13 @@ from __future__ import annotations
 from copy import deepcopy
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_toml
@@ -18,11 +20,11 @@ __all__ = ["build", "load"]
 
 MOST_KEPT = 32  # of the mechanisms built
 
-_built: dict[tuple[str, str, Path | None], Mechanism] = {}  # never handed out, only copied
+_built: dict[Any, Mechanism] = {}  # never handed out, only copied
 _building = Lock()
 
 
-def load(name: str | Path | GeneratorSpec) -> Mechanism:
+def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
     Parameters
@@ -30,6 +32,8 @@ def load(name: str | Path | GeneratorSpec) -> Mechanism:
     name : str, Path or GeneratorSpec
         For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
         usual number of links.
+    changes : mapping, optional
+        Numbers that are other ones, by name, e.g. ``{"link.link_2.mass": 0.3}``.
 
     Raises
     ------
@@ -38,23 +42,23 @@ def load(name: str | Path | GeneratorSpec) -> Mechanism:
     MechanismError
         A mechanism that cannot exist as described.
     """
-    return build(*texts_of(name))
+    return build(*texts_of(name), changes)
 
 
-def build(text: str, sources: Sources) -> Mechanism:
+def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechanism:
     """Build a mechanism from the text of its file; the text is kept among its sources.
 
     One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
     many a run.
     """
     sources.texts[MECHANISM_FILE] = text
-    key = (text, sources.name, sources.folder)
+    key = (text, sources.name, sources.folder, tuple(sorted((changes or {}).items())))
     built = _built.get(key)
     if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
         twin = deepcopy(built)
         twin.sources = sources
         return twin
-    mechanism = _build(text, sources)
+    mechanism = _build(text, sources, changes)
     built = deepcopy(mechanism)
     built.tree.rest()
     with _building:
@@ -64,8 +68,8 @@ def build(text: str, sources: Sources) -> Mechanism:
     return mechanism
 
 
-def _build(text: str, sources: Sources) -> Mechanism:
+def _build(text: str, sources: Sources, changes: Changes | None) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    return assembled(spec, sources)
+    return assembled(spec, sources, changes)

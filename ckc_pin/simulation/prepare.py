@@ -48,7 +48,7 @@ MAX_OUTPUTS = 1_000_000
 def scene_mechanism(scene: Scene) -> Mechanism:
     """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
     mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism)
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, scene.spec.parameters)
 
 
 def _beside(scene: Scene, name: str) -> str | Path:

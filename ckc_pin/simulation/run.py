@@ -13,6 +13,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import plain_values
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
@@ -95,7 +96,8 @@ class Run:
 
         InputError: it is not the one that the numbers are of.
         """
-        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts))
+        changes = plain_values(self.scene.get("parameters", {}))
+        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), changes)
         for what in ("coordinates", "independent", "actuated"):
             own, theirs = getattr(self, what), getattr(mechanism, what)
             if own != theirs:

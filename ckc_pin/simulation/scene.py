@@ -17,13 +17,16 @@ from ckc_pin.control.spec import ControllerSpec, FeedbackSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
+from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.sources import Sources
+from ckc_pin.mechanism.spec import Vector3
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
+BY_NAME = (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("parameters",))  # tables with dots in keys
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -84,6 +87,7 @@ class SceneSpec(_Spec, frozen=True):
 
     `spf_coordinates`: the SPF in the coordinates of eq. 17, exact in w, or with z as eq. 8 is printed.
     `friction_smoothing`: the rate over which dry friction grows as tanh, rad/s or m/s, instead of joints that stick.
+    `parameters`: numbers of the mechanism that are other ones, by name (docs/reference.md).
     """
 
     mechanism: str | GeneratorSpec
@@ -93,6 +97,7 @@ class SceneSpec(_Spec, frozen=True):
     spf_coordinates: Literal["w", "z"] = "w"
     coriolis_velocity: Literal["rho", "actual"] = "rho"
     friction_smoothing: Positive | None = None
+    parameters: dict[str, float | Vector3] = {}
     initial: InitialSpec = InitialSpec()
     solver: SolverSpec = SolverSpec()
     controller: ControllerSpec | None = None
@@ -173,7 +178,8 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
     name : str or Path
         ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path.
     changes : mapping, optional
-        Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``.
+        Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``; names of the mechanism's numbers too, e.g.
+        ``{"link.link_2.mass": 0.3}``.
 
     Raises
     ------
@@ -188,7 +194,7 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
 
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     """Check parsed data; where msgspec's checks end, ours begin."""
-    for table in (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d")):
+    for table in BY_NAME:
         by_coordinate(data, *table)
     spec = convert(data, SceneSpec, sources.name)
     if spec.initial.at is not None and spec.initial.q:
@@ -230,10 +236,16 @@ def _check_event(event: EventSpec, where: str) -> None:
 
 
 def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scene's data with values replaced by dotted key; None removes a key."""
+    """Return a scene's data with values replaced by dotted key; None removes a key.
+
+    A name of the mechanism's numbers stands for its entry in the table of parameters; so does a coordinate's in those
+    by coordinate, whatever dots are in it.
+    """
     changed = deepcopy(data)
+    for path in BY_NAME:
+        by_coordinate(changed, *path)
     for key, value in changes.items():
-        *tables, last = key.split(".")
+        *tables, last = _place_of(f"parameters.{key}" if is_parameter(key) else key)
         at = changed
         for k, table in enumerate(tables):
             at = at.setdefault(table, {})
@@ -244,6 +256,15 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
         else:
             at[last] = _plain(value)
     return changed
+
+
+def _place_of(key: str) -> list[str]:
+    """Take a dotted key apart, but for the name of what a table by name has."""
+    for path in BY_NAME:
+        start = ".".join([*path, ""])
+        if key.startswith(start):
+            return [*path, key.removeprefix(start)]
+    return key.split(".")
 
 
 def _plain(value: Any) -> Any:
