@@ -16,7 +16,7 @@ from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.urdf_checks import INERTIA, check_inertial, floats
 
-__all__ = ["ROOTS", "Changes", "Value", "changed", "is_parameter", "plain_values", "require_known", "values_of"]
+__all__ = ["AXES", "ROOTS", "Changes", "Value", "changed", "is_parameter", "plain_values", "require_known", "values_of"]
 
 Value = float | tuple[float, float, float]
 Changes = Mapping[str, Value]

@@ -99,6 +99,8 @@ class Prepared:
     start : Start
     texts : dict of str to str
         The files of mechanism, scene and controller.
+    tables : tuple
+        What the loop is made of: core, formulation, control, solver, events.
     loop : native Loop
     """
 
@@ -110,6 +112,7 @@ class Prepared:
     instants: Array
     start: Start
     texts: dict[str, str]
+    tables: tuple[Any, ...]
     loop: Any
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
@@ -179,7 +182,7 @@ def prepare(
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not gives_tau(law):
         actuation.require_transmission(start.at)
-    loop = _core.Loop(
+    tables = (
         core_table(
             mechanism, library or _library(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
         ),
@@ -188,8 +191,9 @@ def prepare(
         _solver(mechanism, scene.spec, profile),
         [event.row for event in functions],
     )
+    loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, loop)
+    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop)
 
 
 def _library(mechanism: Mechanism, terms: str) -> Library | None:

@@ -15,6 +15,7 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import compiled
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.prepare import Prepared, prepare
@@ -23,7 +24,7 @@ from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
-__all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
+__all__ = ["OnOutput", "Progress", "columns_of", "run_of", "run_prepared", "run_rows", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
@@ -87,9 +88,16 @@ def simulate(
 
 def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run what was prepared, from its start; errors are those of `simulate`."""
-    scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
-    times = ready.instants
     started = perf_counter()  # loading and assembling are not the run's work
+    rows, status, message = run_rows(ready, progress, on_output)
+    return run_of(ready, rows, status, message, perf_counter() - started)
+
+
+def run_rows(
+    ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None
+) -> tuple[Array, Status, str]:
+    """Run what was prepared, and return what the loop has recorded, how it ended and why."""
+    loop, times = ready.loop, ready.instants
     rows = np.empty((len(times) + 1, loop.width))
     if rows.nbytes > MAX_BYTES:
         raise InputError(
@@ -99,7 +107,13 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
     ready.begin()
     loop.record(times, rows)
     status, message, filled = _drive(ready, rows, progress, on_output)
-    parts = _parts(ready, rows[:filled])
+    return rows[:filled], status, message
+
+
+def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: float) -> Run:
+    """Make a `Run` of what was recorded."""
+    scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
+    parts = _parts(ready, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
     run = Run(
         status=status,
@@ -112,7 +126,7 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=events_met(ready.events, mechanism, loop),
-        stats={**loop.stats(), "wall_s": perf_counter() - started},
+        stats={**loop.stats(), "wall_s": wall_s},
         scene_name=scene.name,
         scene=scene.plain(),
         texts=ready.texts,
@@ -175,17 +189,21 @@ def _compile(ready: Prepared) -> None:
 
 
 def _parts(ready: Prepared, rows: Array) -> dict[str, Array]:
-    """Split what the loop has recorded, a row an instant (`Recorder` in recorder.hpp)."""
-    mechanism = ready.mechanism
+    """Split what the loop has recorded, a row an instant."""
+    parts: dict[str, Array] = {}
+    for name, at in columns_of(ready.mechanism).items():
+        part = rows[:, at].copy()
+        parts[name] = part[:, 0] if name in SCALARS else part
+    return parts
+
+
+def columns_of(mechanism: Mechanism) -> dict[str, slice]:
+    """Return where what the loop records stands in a row (`Recorder` in recorder.hpp)."""
     n, m = mechanism.n, mechanism.closure.rows
     widths = {"t": 1, "q_tree": n, "v_tree": n, "u": mechanism.d, "tau": len(mechanism.actuated), "phi": m, "w": m,
               "energy": 1, "dissipated": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
-    parts: dict[str, Array] = {}
-    at = 0
-    for name, width in widths.items():
-        part = rows[:, at : at + width].copy()
-        parts[name], at = part[:, 0] if name in SCALARS else part, at + width
-    return parts
+    ends = np.cumsum([0, *widths.values()]).tolist()
+    return {name: slice(ends[k], ends[k + 1]) for k, name in enumerate(widths)}
 
 
 def _lyapunov(ready: Prepared, found: Array, parts: dict[str, Array]) -> Array | None:

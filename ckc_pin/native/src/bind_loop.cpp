@@ -13,13 +13,14 @@ namespace ckc {
 
 using namespace nb::literals;
 
+const char* const reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
+                               "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
+
 namespace {
 
 using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 constexpr const char* changes[] = {"sticks", "slides", "touches", "leaves", "bounces"};
-constexpr const char* reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
-                                   "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
 constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague"};
 constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
@@ -65,20 +66,29 @@ Event event_of(const nb::tuple& row, const Core& core, const std::shared_ptr<Vie
   return event;
 }
 
-void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
-          const nb::list& events) {
-  new (self) Run;
-  self->core = core_of(core);
-  auto acting = control_of(control, *self->core, self->view);
-  auto system = system_of(*self->core, *acting, formulation);
+}  // namespace
+
+void prepare(Run& run, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
+             const nb::dict& solver, const nb::list& events) {
+  run.core = core_of(core);
+  auto acting = control_of(control, *run.core, run.view);
+  auto system = system_of(*run.core, *acting, formulation);
   const Options options{get<std::string>(solver, "method"), get<double>(solver, "rtol"),   get<double>(solver, "atol"),
                         get<double>(solver, "max_step"),    get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
                         get<double>(solver, "closed")};
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
   std::vector<Event> functions;
-  for (const auto& row : events) functions.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
-  self->core->profile.on = get<bool>(solver, "profile");
-  self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(functions));
+  for (const auto& row : events) functions.push_back(event_of(nb::cast<nb::tuple>(row), *run.core, run.view));
+  run.core->profile.on = get<bool>(solver, "profile");
+  run.loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(functions));
+}
+
+namespace {
+
+void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
+          const nb::list& events) {
+  new (self) Run;
+  prepare(*self, core, formulation, control, solver, events);
 }
 
 void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {

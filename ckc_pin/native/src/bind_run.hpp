@@ -16,6 +16,12 @@ struct Run {
   long rhs_before = 0;  // right-hand sides before the core was given terms that are written out
 };
 
+// Make its loop, from Python's tables.
+void prepare(Run& run, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
+             const nb::dict& solver, const nb::list& events);
+
+extern const char* const reasons[];  // why a loop stopped, as Python has it
+
 void bind_parts(nb::module_& m, nb::class_<Run>& loop);
 
 }  // namespace ckc

@@ -83,5 +83,6 @@ nb::object term_of(Core& core, const std::string& name);
 void bind_core(nb::module_& m);
 void bind_loop(nb::module_& m);
 void bind_gate(nb::module_& m);
+void bind_batch(nb::module_& m);
 
 }  // namespace ckc

@@ -34,6 +34,17 @@ class Core {
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
+  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.parameters` has them in, and what the code that
+  // is written out takes; nothing that was computed before is known after it.
+  enum class Number {
+    gravity, offset, mass, centre, inertia, armature, point, length, affine, affine_offset, end, stiffness, rest_length,
+    damping, joint_stiffness, joint_rest, joint_damping, constant, written,
+  };
+  Eigen::Index size_of(Number what) const;
+  void vary(Number what, In numbers);
+  // Whether det phi_z is negative here; false where phi_z is not square.
+  bool reversed();
+
   Tree tree;
   Rows rows;
   Springs springs;

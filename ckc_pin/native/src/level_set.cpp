@@ -34,7 +34,7 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   if (core.q != own_.q) core.split(own_.q, own_.z);
-  refusals_ = 0, balance_ = 0.0;
+  refusals_ = 0, balance_ = 0.0, expected_ = 0;
   t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
   core.set(q_tree);
   core.reduce();

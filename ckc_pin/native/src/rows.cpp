@@ -83,6 +83,18 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
   }
 }
 
+void Rows::vary(Number what, In numbers) {
+  if (what == Number::point)
+    for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = numbers.segment<3>(3 * k);
+  if (what == Number::length)
+    for (auto& row : closure.distances) row.length = numbers(row.out);
+  const auto n = J.cols();
+  for (auto& row : closure.affine) {
+    if (what == Number::affine) row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (what == Number::affine_offset) row.offset = numbers(row.out);
+  }
+}
+
 void Rows::set(const Tree& tree, In q) {
   const Closure& c = closure;
   for (size_t k = 0; k < p_.size(); ++k)

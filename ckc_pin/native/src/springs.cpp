@@ -7,8 +7,7 @@ namespace ckc {
 Springs::Springs(const Tree& tree, SpringTable table) : table_(std::move(table)) {
   const SpringTable& s = table_;
   count_ = static_cast<int>(s.stiffness.size());
-  any = !s.stiffness.isZero(0) || !s.joint_stiffness.isZero(0) || !s.constant.isZero(0);
-  any_damping = !s.damping.isZero(0) || !s.joint_damping.isZero(0);
+  look();
   length_.setZero(count_), jacobian_.setZero(count_, tree.n), pattern_.resize(count_);
   for (int k = 0; k < count_; ++k) {
     std::set<int> columns;
@@ -18,6 +17,23 @@ Springs::Springs(const Tree& tree, SpringTable table) : table_(std::move(table))
     }
     pattern_[k].assign(columns.begin(), columns.end());
   }
+}
+
+void Springs::look() {
+  const SpringTable& s = table_;
+  any = !s.stiffness.isZero(0) || !s.joint_stiffness.isZero(0) || !s.constant.isZero(0);
+  any_damping = !s.damping.isZero(0) || !s.joint_damping.isZero(0);
+}
+
+void Springs::vary(Number what, In numbers) {
+  if (what == Number::end) {
+    for (size_t k = 0; k < table_.point_local.size(); ++k) table_.point_local[k] = numbers.segment<3>(3 * k);
+    return;
+  }
+  Vector* parts[] = {nullptr, &table_.stiffness, &table_.rest_length, &table_.damping,
+                     &table_.joint_stiffness, &table_.joint_rest, &table_.joint_damping, &table_.constant};
+  *parts[static_cast<int>(what)] = numbers;
+  look();
 }
 
 void Springs::set(const Tree& tree) {

@@ -17,6 +17,10 @@ class Springs {
   Springs(const Tree& tree, SpringTable table);
 
   bool any, any_damping;
+  Eigen::Index count() const { return count_; }
+
+  enum class Number { end, stiffness, rest_length, damping, joint_stiffness, joint_rest, joint_damping, constant };
+  void vary(Number what, In numbers);
 
   void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
   void add_elastic(const Tree& tree, In q, Out force) const;
@@ -24,6 +28,8 @@ class Springs {
   double energy(const Tree& tree, In q) const;
 
  private:
+  void look();  // which of them there are
+
   SpringTable table_;
   int count_;
   std::vector<Indices> pattern_;

@@ -45,6 +45,20 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
 
 Tree::~Tree() = default;
 
+void Tree::vary(Number what, In numbers) {
+  pin::Model& model = own->model;
+  const auto three = [&](int joint) { return Vector3(numbers.segment<3>(3 * joint)); };
+  if (what == Number::gravity) model.gravity.linear() = three(0);
+  if (what == Number::armature) model.armature = numbers;
+  for (int joint = 0; joint < joints; ++joint) {
+    pin::Inertia& body = model.inertias[joint];
+    if (what == Number::offset) model.jointPlacements[joint].translation() = three(joint);
+    if (what == Number::mass) body.mass() = numbers(joint);
+    if (what == Number::centre) body.lever() = three(joint);
+    if (what == Number::inertia) body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
+  }
+}
+
 void Tree::set(In q) { pin::computeJointJacobians(own->model, own->data, q); }
 
 const Matrix6x& Tree::jacobian() const { return own->data.J; }

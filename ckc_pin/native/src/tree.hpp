@@ -23,6 +23,10 @@ class Tree {
   std::vector<Indices> support;   // by joint: the tangent coordinates that move it, ascending
   std::vector<Indices> ancestors; // by coordinate: those at or above it on its branch, where D' is not zero
 
+  // Other numbers of the model, all joints' one after the other.
+  enum class Number { gravity, offset, mass, centre, inertia, armature };
+  void vary(Number what, In numbers);
+
   // Placements of all joints, and the Jacobian in world axes.
   void set(In q);
   const Matrix6x& jacobian() const;
