@@ -35,6 +35,7 @@ COMMANDS = {
     "run": "run:run",
     "inverse": "inverse:inverse",
     "linearize": "linearize:linearize",
+    "sweep": "sweep:sweep",
     "plot": "view:plot",
     "play": "view:play",
     "map": "map:map_",

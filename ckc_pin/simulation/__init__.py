@@ -1,6 +1,7 @@
 """From a scene to a run: integrate, project, events, record. Or step by step, the loop closed by the caller."""
 
 from ckc_pin.simulation.check import Check, check
+from ckc_pin.simulation.ensembles.ensemble import ensemble
 from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.inverse import inverse_dynamics
 from ckc_pin.simulation.ivp import as_ivp
@@ -12,5 +13,19 @@ from ckc_pin.simulation.simulate import simulate
 from ckc_pin.simulation.simulator import Simulator
 from ckc_pin.simulation.stability import Stability
 
-__all__ = ["Check", "Event", "MotionForces", "Run", "Scene", "Simulator", "Stability", "as_ivp", "check",
-           "inverse_dynamics", "linearize", "load_scene", "simulate"]  # fmt: skip
+__all__ = [
+    "Check",
+    "Event",
+    "MotionForces",
+    "Run",
+    "Scene",
+    "Simulator",
+    "Stability",
+    "as_ivp",
+    "check",
+    "ensemble",
+    "inverse_dynamics",
+    "linearize",
+    "load_scene",
+    "simulate",
+]

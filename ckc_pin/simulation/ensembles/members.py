@@ -82,7 +82,7 @@ class Members:
         count: int,
         threads: int,
     ) -> None:
-        self._scene_name, self._changes, self.names = scene, dict(changes), names
+        self.scene_name, self._changes, self.names = scene, dict(changes), names
         self._threads = threads
         self.scene: Scene = load_scene(scene, changes)
         self.ready = prepare(self.scene)
@@ -214,7 +214,7 @@ class Members:
 
     def _single(self, values: Array, k: int, recorded: Recorded, found: dict[str, Array]) -> tuple[int, str, int]:
         try:
-            ready = prepare(load_scene(self._scene_name, self.changes_of(values)))
+            ready = prepare(load_scene(self.scene_name, self.changes_of(values)))
             rows, ended, message = run_rows(ready)
         except CkcError as error:
             return FAILED, str(error), 0
@@ -277,7 +277,7 @@ class Members:
                     raise InputError(f"{self.scene.name}: {says}")
                 return
         try:
-            load_scene(self._scene_name, {**self._changes, name: 0.5})
+            load_scene(self.scene_name, {**self._changes, name: 0.5})
         except InputError as error:
             if "greater than" in str(error) or "at least" in str(error) or "less than" in str(error):
                 return
@@ -308,14 +308,14 @@ class Members:
         if wanted == "generated":
             return compiled(self.mechanism, which=which)
         library = find(self.mechanism, which)
-        if library is not None or count < 2 or count * self._work() < WORTH * self.mechanism.n:
+        if library is not None or count < 2 or count * self.work() < WORTH * self.mechanism.n:
             return library
         try:
             return compiled(self.mechanism, which=which)
         except InputError:  # no compiler, no CasADi: the general terms do
             return None
 
-    def _work(self) -> int:
+    def work(self) -> int:
         """Right-hand sides of the scene itself."""
         try:
             run_rows(self.ready)

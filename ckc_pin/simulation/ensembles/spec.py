@@ -46,13 +46,21 @@ class VariableSpec(_Spec, frozen=True):
     sobol: Pair | None = None
     lhs: Pair | None = None
     grid: GridSpec | None = None
-    list: Annotated[list[float], msgspec.Meta(min_length=1)] | None = None
+    values: Annotated[list[float], msgspec.Meta(min_length=1)] | None = msgspec.field(default=None, name="list")
     file: str | None = None
 
     @property
     def kind(self) -> str:
         """Which key it has."""
-        return next(name for name in self.__struct_fields__ if getattr(self, name) is not None)
+        return self.given()[0]
+
+    def given(self) -> list[str]:
+        """Return the keys it has."""
+        keys = zip(self.__struct_fields__, KINDS, strict=True)
+        return [key for name, key in keys if getattr(self, name) is not None]
+
+
+KINDS = VariableSpec.__struct_encode_fields__
 
 
 class OutputSpec(_Spec, frozen=True):
@@ -111,9 +119,8 @@ def scene_path(spec: SweepSpec, sources: Sources) -> str | Path:
 
 def _variables(key: str, table: Mapping[str, Any]) -> Any:
     """Join tables into dotted names, down to those that say how a variable differs."""
-    kinds = VariableSpec.__struct_fields__
     for name, value in table.items():
-        if isinstance(value, dict) and value and not any(inner in kinds for inner in value):
+        if isinstance(value, dict) and value and not any(inner in KINDS for inner in value):
             yield from _variables(f"{key}{name}.", value)
         elif isinstance(value, list | np.ndarray):
             yield f"{key}{name}", {"list": [float(x) for x in value]}
@@ -123,11 +130,11 @@ def _variables(key: str, table: Mapping[str, Any]) -> Any:
 
 def _check(name: str, variable: VariableSpec, source: str) -> None:
     where = f"{source}: variables: {name}"
-    given = [key for key in variable.__struct_fields__ if getattr(variable, key) is not None]
+    given = variable.given()
     if len(given) != 1:
         said = f"{' and '.join(given)} are given" if given else "nothing is given"
-        raise InputError(f"{where}: {said}; give one of {', '.join(variable.__struct_fields__)}")
-    pair = getattr(variable, given[0])
+        raise InputError(f"{where}: {said}; give one of {', '.join(KINDS)}")
+    pair: Any = getattr(variable, given[0], None)
     if given[0] in ("uniform", "sobol", "lhs", "loguniform") and not pair[0] <= pair[1]:
         raise InputError(f"{where}: {given[0]} = [{pair[0]:g}, {pair[1]:g}]: from the smaller to the larger number")
     if given[0] == "loguniform" and not pair[0] > 0:

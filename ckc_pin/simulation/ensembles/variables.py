@@ -78,8 +78,8 @@ class Variables:
         for name, spec in self._specs.items():
             if spec.grid is not None:
                 axes.append({name: np.linspace(spec.grid.start, spec.grid.stop, spec.grid.count)})
-            elif spec.list is not None:
-                axes.append({name: np.array(spec.list, dtype=float)})
+            elif spec.values is not None:
+                axes.append({name: np.array(spec.values, dtype=float)})
             elif spec.file is not None:
                 if spec.file not in files:
                     files[spec.file] = {}
