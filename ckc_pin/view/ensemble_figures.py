@@ -62,7 +62,7 @@ def draw_fan(x: xr.DataArray, path: Path) -> Path:
 
 
 def draw_map(results: xr.Dataset, variables: tuple[str, str], name: str, path: Path) -> Path:
-    """Draw an output over two variables: a raster where they are a grid, else points; crosses are members without it."""
+    """Draw an output over two variables: a raster of a grid, else points; crosses are members without it."""
     plt = _pyplot()
     x, y, z = (results[key].to_numpy() for key in (*variables, name))
     figure, at = plt.subplots(figsize=(6, 5))

@@ -87,6 +87,8 @@ class Members:
         self.scene: Scene = load_scene(scene, changes)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
+        if self.scene.spec.initial.at is not None and any(name.startswith("initial.q.") for name in names):
+            self._start_from_there()
         self._vectors = self._check_names()
         self.outputs = Outputs(outputs, self.ready)
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
@@ -136,7 +138,7 @@ class Members:
                 whole[at] = float(value)
                 changes[of] = whole
             else:
-                changes[name] = float(value)
+                changes[name] = float(value) if is_parameter(name) or not float(value).is_integer() else int(value)
         return changes
 
     @property
@@ -247,6 +249,15 @@ class Members:
 
     # --- what is asked ---------------------------------------------------------------------------
 
+    def _start_from_there(self) -> None:
+        """Where the scene starts at an equilibrium, or as assembled, q is varied from there."""
+        q = self.mechanism.independent_part(self.ready.start.at.q_tree)
+        self._changes["initial.at"] = None
+        self._changes |= {f"initial.q.{name}": float(x) for name, x in zip(self.mechanism.independent, q, strict=True)}
+        self.scene = load_scene(self.scene_name, self._changes)
+        self.ready = prepare(self.scene)
+        self.mechanism = self.ready.mechanism
+
     def _check_names(self) -> dict[str, tuple[str, int]]:
         """Refuse variables that are none; return those that are components of what the scene gives whole."""
         own = self.mechanism
@@ -277,7 +288,7 @@ class Members:
                     raise InputError(f"{self.scene.name}: {says}")
                 return
         try:
-            load_scene(self.scene_name, {**self._changes, name: 0.5})
+            load_scene(self.scene_name, {**self._changes, name: 1})
         except InputError as error:
             if "greater than" in str(error) or "at least" in str(error) or "less than" in str(error):
                 return

@@ -20,7 +20,6 @@ __all__ = ["Variables"]
 BLOCK = 1024  # members that one stream of random numbers serves
 MOST_LHS = 10_000_000  # members of a Latin hypercube, which is one whole permutation a variable
 CROSSED = ("grid", "list", "file")
-BITS = 53  # of Sobol's numbers: 2^53 members before they repeat
 
 
 class Variables:
@@ -121,10 +120,12 @@ class Variables:
     def _sobol(self, first: int, end: int) -> Array:
         from scipy.stats import qmc
 
-        sequence = qmc.Sobol(len(self._of("sobol")), scramble=True, rng=np.random.default_rng(self._seed), bits=BITS)
+        sequence = qmc.Sobol(len(self._of("sobol")), scramble=True, rng=np.random.default_rng(self._seed))
         if first:
             sequence.fast_forward(first)
-        return sequence.random(end - first)
+            return sequence.random(end - first)
+        # the first point by itself: SciPy warns of beginnings that are no power of 2
+        return np.concatenate([sequence.random(1), sequence.random(end - 1)])
 
     def _hypercube(self, first: int, end: int) -> Array:
         return self._whole_hypercube[first:end]
