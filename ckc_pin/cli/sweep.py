@@ -11,6 +11,7 @@ from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import errors, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.ensemble import Summary, run_sweep, sweep_task
+from ckc_pin.simulation.ensembles.task import SweepTask
 
 __all__ = ["sweep"]
 
@@ -36,6 +37,9 @@ EPILOG = options.examples(
 @click.option(
     "--worst", metavar="OUTPUT", multiple=True, help="Run the members where it is largest again, for ckc play."
 )
+@click.option(
+    "--indices", type=click.IntRange(min=2), metavar="N", help="Sobol indices, from (variables + 2) N members."
+)
 @click.option("--figures/--no-figures", default=True, help="Draw fans, maps and which variable matters.")
 @options.as_json
 def sweep(
@@ -46,6 +50,7 @@ def sweep(
     scheduler: str | None,
     chunk: int | None,
     worst: tuple[str, ...],
+    indices: int | None,
     figures: bool,
     as_json: bool,
 ) -> None:
@@ -62,6 +67,8 @@ def sweep(
     found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
     if found.status == "done":
         _afterwards(found, out, worst, figures)
+        if indices is not None:
+            _weigh(task, indices, threads, out, figures)
     _print(found, out, as_json)
     if found.status != "done":
         errors().print(found.message)
@@ -82,6 +89,28 @@ def _print(found: Summary, out: Path, as_json: bool) -> None:
         table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
     print_table(table)
     print(f"written to {out}")
+
+
+def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures: bool) -> None:
+    """Write which variable matters, a row an output and variable, and draw it."""
+    from ckc_pin.mechanism.whole_file import write_whole
+    from ckc_pin.simulation.ensembles.importance import importance
+
+    found = importance(task, count, threads)
+    rows = ["output,variable,first_order,total_order"]
+    for name in found["output"].to_numpy():
+        of = found.sel(output=name)
+        for variable in found["variable"].to_numpy():
+            one = of.sel(variable=variable)
+            rows.append(f"{name},{variable},{float(one['first_order'])!r},{float(one['total_order'])!r}")
+        if figures:
+            try:
+                from ckc_pin.view.ensemble_figures import draw_importance
+
+                draw_importance(of, out / f"indices_{name}.png")
+            except InputError as error:
+                errors().print(f"no figures: {error}")
+    write_whole(out / "indices.csv", "\n".join(rows) + "\n")
 
 
 def _afterwards(found: Summary, out: Path, worst: tuple[str, ...], figures: bool) -> None:

@@ -37,6 +37,7 @@ from ckc_pin.mechanism.spec import (
     SpringSpec,
     TreeSpec,
 )
+from ckc_pin.simulation.ensembles.spec import GridSpec, OutputSpec, SweepSpec, VariableSpec
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, OTHERS
 from ckc_pin.simulation.scene import EventSpec, InitialSpec, SceneSpec, SolverSpec
 from tests.contract.helpers.command import ckc
@@ -50,7 +51,7 @@ PAGE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
 SPECS = [MechanismSpec, TreeSpec, LoopSpec, FrameSpec, CouplingSpec, SpringSpec, ForceSpec, JointSpec, MotorSpec,
          PointSpec, SceneSpec, GeneratorSpec, InitialSpec, SolverSpec, EventSpec, SetPointSpec, TrackingSpec,
          TorquesSpec, AllocationSpec, SensorSpec, DriveSpec, HarmonicsSpec, PointPathSpec, CircleSpec,
-         LineSpec]  # fmt: skip
+         LineSpec, SweepSpec, VariableSpec, GridSpec, OutputSpec]  # fmt: skip
 
 
 @cache

@@ -8,7 +8,7 @@ from typing import Any
 
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.members import Chunk, Members
-from ckc_pin.simulation.ensembles.task import Task
+from ckc_pin.simulation.ensembles.task import SweepTask
 
 __all__ = ["chunks_by", "client_of"]
 
@@ -18,7 +18,7 @@ AHEAD = 3  # chunks a worker that are waiting or under way: none of them idles, 
 _members: dict[str, Members] = {}  # of this process: what was prepared last
 
 
-def work(task: Task, first: int, end: int) -> Chunk:
+def work(task: SweepTask, first: int, end: int) -> Chunk:
     """Run one chunk on a worker; what is prepared for a sweep is kept for its next chunk."""
     if task.identity not in _members:
         _members.clear()
@@ -62,7 +62,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         yield client
 
 
-def chunks_by(client: Any, task: Task, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
+def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
     """Yield chunks as workers finish them, in whatever order.
 
     Raises
@@ -73,11 +73,10 @@ def chunks_by(client: Any, task: Task, pending: Iterable[tuple[int, int]], worke
     from dask.distributed import as_completed
 
     todo = iter(pending)
-    sent = client.scatter(task, broadcast=True)
 
     def submit(count: int) -> list[Any]:
         return [
-            client.submit(work, sent, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
+            client.submit(work, task, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
             for (first, end), _ in zip(todo, range(count), strict=False)
         ]
 

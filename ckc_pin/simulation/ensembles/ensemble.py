@@ -20,7 +20,7 @@ from ckc_pin.simulation.ensembles.outputs import Function
 from ckc_pin.simulation.ensembles.progress import Advance, bar
 from ckc_pin.simulation.ensembles.spec import read_sweep, scene_path, sweep_of
 from ckc_pin.simulation.ensembles.store import RESULTS, Store, require_libraries
-from ckc_pin.simulation.ensembles.task import Task
+from ckc_pin.simulation.ensembles.task import SweepTask
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -123,7 +123,7 @@ def ensemble(
     spec = sweep_of(data, Sources("ensemble", Path()))
     if functions and len(functions) == len(outputs):
         spec = msgspec.structs.replace(spec, outputs={})  # a file has to name one
-    task = Task(spec, "ensemble", scene, Path(), functions)
+    task = SweepTask(spec, "ensemble", scene, Path(), functions)
     summary = run_sweep(
         task, None if out is None else Path(out), threads=threads, workers=workers, scheduler=scheduler, chunk=chunk,
         progress=progress,
@@ -136,14 +136,14 @@ def ensemble(
     return found.load() if out is None else found
 
 
-def sweep_task(path: str | Path) -> Task:
+def sweep_task(path: str | Path) -> SweepTask:
     """Return the sweep of a file (InputError)."""
     spec, sources = read_sweep(path)
-    return Task(spec, str(path), scene_path(spec, sources), sources.folder)
+    return SweepTask(spec, str(path), scene_path(spec, sources), sources.folder)
 
 
 def run_sweep(
-    task: Task,
+    task: SweepTask,
     out: Path | None,
     *,
     threads: int | None = None,
@@ -203,7 +203,7 @@ def run_sweep(
     )  # fmt: skip
 
 
-def _here(members: Members, task: Task, pending: Iterable[tuple[int, int]]) -> Iterator[Chunk]:
+def _here(members: Members, task: SweepTask, pending: Iterable[tuple[int, int]]) -> Iterator[Chunk]:
     for first, end in pending:
         yield members.run(first, task.variables().values(first, end))
 
@@ -216,9 +216,9 @@ def _collect(store: Store, chunks: Iterator[Chunk], members: Members, shown: Adv
             shown(there, store.count)
 
 
-def _content(task: Task, members: Members) -> dict[str, Any]:
+def _content(task: SweepTask, members: Members) -> dict[str, Any]:
     """All that the results follow from."""
-    functions = {name: getattr(f, "__qualname__", repr(f)) for name, f in task.functions.items()}
+    functions = {name: getattr(f, "__qualname__", type(f).__qualname__) for name, f in task.functions.items()}
     files = {file: Sources(task.name, task.folder).text(file) for v in task.spec.variables.values() if (file := v.file)}
     return {
         "scene_name": members.scene.name, "scene": members.scene.plain() | {"name": members.scene.name},

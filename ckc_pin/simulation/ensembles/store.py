@@ -62,6 +62,8 @@ class Store:
         from zarr.storage import MemoryStore
 
         self.path, self.count = path, count
+        _require_free_names(members)
+        sweep = json.loads(json.dumps(sweep))
         self._identity = sha256(msgspec.json.encode(sweep, order="deterministic")).hexdigest()
         if path is not None and path.exists():
             self._group = self._open(path, sweep)
@@ -143,11 +145,6 @@ class Store:
 
     def _make(self, sweep: Mapping[str, Any], members: Members, chunk: int) -> None:
         group: Any = self._group
-        for name in (*members.names, *members.shapes):
-            if name in (STATUS_NAME, MESSAGE_NAME, *members.outputs.labels, "time") or (
-                name in members.names and name in members.shapes
-            ):
-                raise InputError(f"outputs: {name!r} is taken; choose another name")
         labels = {name: found for name, found in members.outputs.labels.items() if _is_used(name, members)}
         for name, found in labels.items():
             place = group.create_array(name, shape=(len(found),), dtype=str, dimension_names=(name,))
@@ -174,6 +171,15 @@ class Store:
         group.attrs.update(
             {"format": FORMAT, "units": UNITS, "sweep": json.dumps(sweep), "identity": self._identity}
         )  # last: a store without them was not begun to its end
+
+
+def _require_free_names(members: Members) -> None:
+    """Refuse outputs that are called like something else in the store."""
+    for name in (*members.names, *members.shapes):
+        if name in (STATUS_NAME, MESSAGE_NAME, *members.outputs.labels, "time") or (
+            name in members.names and name in members.shapes
+        ):
+            raise InputError(f"outputs: {name!r} is taken; choose another name")
 
 
 def _is_used(dimension: str, members: Members) -> bool:

@@ -16,11 +16,11 @@ from ckc_pin.simulation.ensembles.outputs import Function
 from ckc_pin.simulation.ensembles.spec import SweepSpec
 from ckc_pin.simulation.ensembles.variables import Variables
 
-__all__ = ["Task"]
+__all__ = ["SweepTask"]
 
 
 @dataclass(frozen=True)
-class Task:
+class SweepTask:
     """One sweep.
 
     Attributes
@@ -63,6 +63,8 @@ class Task:
     @cached_property
     def identity(self) -> str:
         """A name for what it computes."""
-        functions = sorted((name, getattr(f, "__qualname__", repr(f))) for name, f in self.functions.items())
+        functions = sorted(
+            (name, getattr(f, "__qualname__", type(f).__qualname__)) for name, f in self.functions.items()
+        )
         what = (msgspec.to_builtins(self.spec), str(self.scene), str(self.folder), functions, self.terms)
         return sha256(msgspec.json.encode(what, order="deterministic")).hexdigest()
