@@ -177,7 +177,7 @@ def run_sweep(
     started, message = perf_counter(), ""
     status: Literal["done", "stopped", "interrupted"] = "done"
     with ExitStack() as own:
-        pending = list(store.pending()) if count <= 10**7 else store.pending()
+        pending = store.pending()
         if workers or scheduler:
             from ckc_pin.simulation.ensembles.cluster import chunks_by, client_of
 

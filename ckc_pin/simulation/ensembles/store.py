@@ -18,6 +18,7 @@ __all__ = ["RESULTS", "Store", "require_libraries"]
 
 RESULTS = "results.zarr"
 FORMAT = 1
+BLOCK = 2**20  # members whose status is read at once
 STATUS_NAME, MESSAGE_NAME = "status", "message"
 UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
@@ -83,20 +84,25 @@ class Store:
 
     def pending(self) -> Iterator[tuple[int, int]]:
         """Yield the chunks that are not there yet, as first and end of their members."""
-        status: Any = self._group[STATUS_NAME]
-        for first in range(0, self.count, self.chunk):
-            end = min(first + self.chunk, self.count)
-            if (status[first:end] == PENDING).any():
-                yield first, end
+        for block, status in self._statuses():
+            for first in range(0, len(status), self.chunk):
+                end = min(first + self.chunk, len(status))
+                if (status[first:end] == PENDING).any():
+                    yield block + first, block + end
 
     def counts(self) -> dict[str, int]:
         """Count members by how they ended."""
         counts = np.zeros(len(STATUS), dtype=np.int64)
-        status: Any = self._group[STATUS_NAME]
-        step = self.chunk * max(1, 2**20 // self.chunk)
-        for first in range(0, self.count, step):
-            counts += np.bincount(status[first : first + step], minlength=len(STATUS))
+        for _, status in self._statuses():
+            counts += np.bincount(status, minlength=len(STATUS))
         return {name: int(counts[k]) for k, name in enumerate(STATUS)}
+
+    def _statuses(self) -> Iterator[tuple[int, Any]]:
+        """Read how members ended, many chunks at a time."""
+        status: Any = self._group[STATUS_NAME]
+        step = self.chunk * max(1, BLOCK // self.chunk)
+        for first in range(0, self.count, step):
+            yield first, status[first : first + step]
 
     def write(self, chunk: Chunk, names: tuple[str, ...]) -> None:
         """Write a chunk; how its members ended comes last, and says that it is whole.
