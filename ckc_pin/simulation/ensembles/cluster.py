@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 from ckc_pin.errors import InputError
@@ -77,7 +78,7 @@ def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], 
     def submit(count: int) -> list[Any]:
         return [
             client.submit(work, task, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
-            for (first, end), _ in zip(todo, range(count), strict=False)
+            for first, end in islice(todo, count)
         ]
 
     running = as_completed(submit(AHEAD * workers))  # type: ignore[no-untyped-call]
