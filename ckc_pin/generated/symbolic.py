@@ -12,7 +12,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.expressions import expressions
 from ckc_pin.generated.parameters import labels, numbers, present, values
-from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
@@ -83,12 +83,11 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     >>> five_bar.v_dot(five_bar.q_tree, np.zeros(4), np.zeros(4), five_bar.values).shape
     (4, 1)
     """
+    mechanism = as_mechanism(mechanism, "symbolic")
     try:
         import casadi as cs
     except ModuleNotFoundError as error:
         raise InputError("symbolic needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
-    if not isinstance(mechanism, Mechanism):
-        mechanism = load(mechanism)
     terms, given = expressions(mechanism), numbers(mechanism)
     q, v, p = terms.angles.q, terms.v, terms.parameters.vector
     u = cs.SX.sym("u", mechanism.n)

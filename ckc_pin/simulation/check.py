@@ -13,6 +13,7 @@ from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
+from ckc_pin.mechanism.kinds import require_flag, require_kind
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -96,6 +97,8 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     InputError, MechanismError
         It cannot exist as described. Findings about one that can are not errors.
     """
+    require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
+    require_flag(branches, "check: branches")
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):

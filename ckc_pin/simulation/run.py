@@ -11,13 +11,14 @@ import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import build
+from ckc_pin.mechanism.kinds import a_kind, is_number, require_kind, require_path
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
 
-__all__ = ["Run", "Status"]
+__all__ = ["Run", "Status", "given_runs"]
 
 Status = Literal["done", "stopped", "interrupted"]
 
@@ -113,7 +114,9 @@ class Run:
         return self.coordinates.index(coordinate)
 
     def at(self, t: float) -> int:
-        """Return the row of the output instant nearest to t."""
+        """Return the row of the output instant nearest to t, s."""
+        if not is_number(t):
+            raise InputError(f"Run.at: {a_kind(t)} was given; it takes a time, s")
         return int(np.argmin(np.abs(self.t - t)))
 
     @cached_property
@@ -199,6 +202,7 @@ class Run:
         InputError
             It cannot be written; what was there is still there.
         """
+        require_path(path, "Run.save: path")
         path = Path(path)
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL) if getattr(self, name) is not None}
         write_run(path, self.coordinates, arrays, self._meta())
@@ -213,6 +217,7 @@ class Run:
         InputError
             No such file, not a run file, damaged, too large, or of another version.
         """
+        require_path(path, "Run.load: path", "the path of a run file, or of a folder that holds a run.npz")
         path = Path(path)
         if path.is_dir():
             path = path / "run.npz"
@@ -229,3 +234,19 @@ class Run:
 
     def _meta(self) -> RunMeta:
         return RunMeta(**{name: getattr(self, name) for name in META})
+
+
+def given_runs(given: Any, who: str) -> list[Run]:
+    """Return the runs that a public function was given, one or several.
+
+    Raises
+    ------
+    InputError
+        None at all, or something else among them.
+    """
+    runs = list(given) if isinstance(given, list | tuple) else [given]
+    if not runs:
+        raise InputError(f"{who}: no run given; give at least one")
+    for run in runs:
+        require_kind(run, Run, f"{who}: runs", "runs, as simulate and Run.load return them")
+    return runs

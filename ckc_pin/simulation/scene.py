@@ -16,14 +16,18 @@ import numpy as np
 from ckc_pin.control.spec import ControllerSpec, FeedbackSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.kinds import require_kind, require_table
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 
-__all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "load_scene", "scene_names", "with_changes"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
+TAKES = 'a scene: its shipped name, as "five_bar/swing", its path, or what load_scene returns'
+CHANGES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -180,10 +184,49 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
     InputError
         A missing file, malformed TOML, an unknown key, a wrong type or value.
     """
+    require_kind(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
+    if changes is not None:
+        require_table(changes, "load_scene: changes", CHANGES)
     path = scene_file(name)
     called = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), called)
     return make_scene(with_changes(data, changes or {}), str(name), Sources(called, path.parent))
+
+
+def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
+    """Return the scene that a public function was given: as it is, or loaded by name or path, with changes.
+
+    Parameters
+    ----------
+    given
+        What it was given.
+    changes : mapping or None
+        They go with a name or path.
+    who : str
+        The function.
+
+    Raises
+    ------
+    InputError, MechanismError
+        No scene; changes of a Scene, which is complete; what `load_scene` raises.
+    """
+    if isinstance(given, Mechanism):
+        folder = given.sources.folder
+        beside = [] if folder is None else sorted(path.name.removesuffix(SUFFIX) for path in folder.glob(f"*{SUFFIX}"))
+        known = folder is not None and folder.parent == library()
+        names = ", ".join(f"{folder.name}/{name}" if known and folder else f"{name}{SUFFIX}" for name in beside)
+        raise InputError(
+            f"{who}: a Mechanism was given, which does not say from where and how long it moves; it takes {TAKES}"
+            + (f"; those of {given.name}: {names}" if names else "")
+        )
+    require_kind(given, (Scene, str, Path), f"{who}: scene", TAKES)
+    if changes is not None:
+        require_table(changes, f"{who}: changes", CHANGES)
+    if not isinstance(given, Scene):
+        return load_scene(given, changes)
+    if changes:
+        raise InputError(f"{who}: changes go with the name of a scene; a Scene is complete")
+    return given
 
 
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:

@@ -15,13 +15,14 @@ from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.mechanism.kinds import is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller
-from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["Simulator", "State"]
@@ -141,10 +142,7 @@ class Simulator:
         *,
         events: Sequence[Event] = (),
     ) -> None:
-        if not isinstance(scene, Scene):
-            scene = load_scene(scene, changes)
-        elif changes:
-            raise InputError("Simulator: changes go with the name of a scene; a Scene is complete")
+        scene = as_scene(scene, changes, "Simulator")
         self._ready = prepare(scene, events=events, free=True)
         self._loop = self._ready.loop
         self.mechanism = self._ready.mechanism
@@ -276,7 +274,6 @@ class Simulator:
         return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 
     def _require_dt(self, dt: Any) -> float:
-        number = isinstance(dt, int | float | np.integer | np.floating) and not isinstance(dt, bool)
-        if not number or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:
+        if not is_number(dt) or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:
             raise InputError(f"dt = {dt!r:.80}: a number greater than 0 is needed, in seconds")
         return float(dt)
