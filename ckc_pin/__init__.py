@@ -27,20 +27,16 @@ from ckc_pin.mechanism import Mechanism
 if TYPE_CHECKING:
     from ckc_pin.generated.symbolic import Symbolic
     from ckc_pin.kinematics.mapped import SingularityMap
-    from ckc_pin.simulation import (
-        Check,
-        Event,
-        MotionForces,
-        Run,
-        Scene,
-        Simulator,
-        State,
-        as_ivp,
-        check,
-        inverse_dynamics,
-        load_scene,
-        simulate,
-    )
+    from ckc_pin.simulation.check import Check, check
+    from ckc_pin.simulation.events import Event
+    from ckc_pin.simulation.inverse import inverse_dynamics
+    from ckc_pin.simulation.ivp import as_ivp
+    from ckc_pin.simulation.motion_forces import MotionForces
+    from ckc_pin.simulation.run import Run
+    from ckc_pin.simulation.scene import Scene, load_scene
+    from ckc_pin.simulation.simulate import simulate
+    from ckc_pin.simulation.simulator import Simulator
+    from ckc_pin.simulation.state import State
     from ckc_pin.view.inline import Figures, Playback
     from ckc_pin.view.server import ViewServer
 

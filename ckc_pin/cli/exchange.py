@@ -8,9 +8,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.cli.output import errors, print_card, print_json
 from ckc_pin.formats import exporting, importing
-from ckc_pin.simulation.report import check_plain, check_table
+from ckc_pin.simulation.report import check_plain
 
 __all__ = ["export", "import_"]
 
@@ -38,7 +38,10 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
     for verb, items in (("written", written), ("guessed", draft.guessed), ("left out", draft.left_out)):
         for item in items:
             print(f"{verb}: {item}")
-    print_table(check_table(found) if found else f"check: {problem}")
+    if found:
+        print_card(found.card())
+    else:
+        print(f"check: {problem}")
 
 
 @click.command(

@@ -6,9 +6,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.cli.output import print_card, print_json, print_table
 from ckc_pin.simulation.arguments import read_table
-from ckc_pin.simulation.report import check_plain, check_table, terms_plain, terms_table
+from ckc_pin.simulation.report import check_plain, terms_plain, terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
 
@@ -37,11 +37,9 @@ def check(what: str, branches: bool, as_json: bool) -> None:
     """Freedoms, rank, redundant rows, partition. For a scene also whether its trajectory stays in the workspace."""
     found = ckc_pin.check(what, branches=branches)
     if as_json:
-        for warning in found.warnings:
-            errors().print(f"warning: {warning}")
         print_json(check_plain(found))
     else:
-        print_table(check_table(found))
+        print_card(found.card())
 
 
 @click.command(

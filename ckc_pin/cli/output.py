@@ -6,6 +6,7 @@ import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.errors import InputError
@@ -14,7 +15,9 @@ from ckc_pin.simulation.report import to_json
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-__all__ = ["ProgressBar", "errors", "make_folder", "on_terminal", "print_json", "print_table"]
+    from ckc_pin.mechanism.card import Card
+
+__all__ = ["ProgressBar", "errors", "make_folder", "on_terminal", "print_card", "print_json", "print_table"]
 
 
 @cache
@@ -40,6 +43,11 @@ def print_table(table: RenderableType) -> None:
     from rich.console import Console
 
     Console(highlight=False, markup=False, emoji=False).print(table)
+
+
+def print_card(card: Card) -> None:
+    """Print all of a card, as wide as the terminal is; a command that prints no more loads no rich."""
+    print(card.text(get_terminal_size().columns, None))
 
 
 def make_folder(out: Path) -> None:

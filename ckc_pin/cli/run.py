@@ -13,11 +13,11 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted, interrupts
-from ckc_pin.cli.output import ProgressBar, errors, make_folder, on_terminal, print_json, print_table
+from ckc_pin.cli.output import ProgressBar, errors, make_folder, on_terminal, print_card, print_json
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.report import profile_table, run_table
+from ckc_pin.simulation.report import profile_table
 
 __all__ = ["run"]
 
@@ -78,7 +78,7 @@ def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: boo
     if as_json:
         print_json(finished.summary())
     else:
-        print_table(run_table(finished))
+        print_card(finished.card())
         if out is not None:
             print(f"written to {out}")
     sys.stdout.flush()  # a view may keep the command alive

@@ -16,6 +16,7 @@ import pinocchio as pin
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.kinds import require_table
 from ckc_pin.mechanism.lazy import lazy
@@ -26,7 +27,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Terms", "terms"]
 
 
-class Terms:
+class Terms(Shown):
     """Dynamics of a mechanism at one state.
 
     Parameters
@@ -47,6 +48,20 @@ class Terms:
         self.at = at
         self.q_tree = at.q_tree
         self.v_tree = v_tree
+
+    def card(self) -> Card:
+        """Return what there is to see of it: the state, and what it can be asked for."""
+        mechanism, tree = self.mechanism, self.mechanism.tree
+        names, n, d = mechanism.coordinates, mechanism.n, mechanism.d
+        rows: list[Row] = [
+            ("q_tree", quantities(names, tree.to_coordinates(self.q_tree), tree.units())),
+            ("v_tree", quantities(names, self.v_tree, tree.units("/s"))),
+            ("energy", f"{self.energy:.9g} J"),
+            ("largest |phi|", f"{np.abs(self.phi).max(initial=0.0):.2g}"),
+            ("of the tree", [f"D_tree {n, n}", f"C_tree {n, n}", f"h_tree ({n},)"]),
+            ("reduced", [f"D {d, d}", f"C {d, d}", f"h ({d},)", f"rho {n, d}", f"rho_dot {n, d}"]),
+        ]
+        return Card(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
 
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 

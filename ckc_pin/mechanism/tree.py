@@ -252,6 +252,10 @@ class Tree:
             raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
         return vector
 
+    def units(self, per: str = "") -> list[str]:
+        """Return the unit of each coordinate, rad or m, ``per="/s"`` of its rate."""
+        return [f"{'m' if length else 'rad'}{per}" for length in self.in_metres]
+
     def one_freedom(self, joint: str, where: str) -> int:
         """Return where a joint of one freedom stands; MechanismError names those there are."""
         if joint not in self.index or joint in self.free_coordinates:

@@ -8,7 +8,8 @@ from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
-from ckc_pin.simulation.simulator import Simulator, State
+from ckc_pin.simulation.simulator import Simulator
+from ckc_pin.simulation.state import State
 
 __all__ = ["Check", "Event", "MotionForces", "Run", "Scene", "Simulator", "State", "as_ivp", "check",
            "inverse_dynamics", "load_scene", "simulate"]  # fmt: skip

@@ -12,11 +12,13 @@ from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
 from ckc_pin.mechanism.kinds import require_flag, require_kind
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.cards import check_card
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
@@ -27,17 +29,21 @@ __all__ = ["Check", "check"]
 MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, repr=False)
+class Check(Shown):
     """Findings on a mechanism, and on a scene's desired trajectory.
 
     Attributes
     ----------
+    name : str
+        What was checked.
     n, d, rows, rank : int
         Coordinates, freedoms, rows of phi, rank of J at the assembled configuration.
     redundant : tuple of str
         Rows that the others imply, one admissible choice.
     independent, dependent, coordinates : tuple of str
+    units : tuple of str
+        "rad" or "m", by coordinate.
     q_tree : (n,) array
         The assembled configuration.
     det_phi_z : float or None
@@ -60,6 +66,7 @@ class Check:
         Closed configurations at the assembled q, when asked for; the assembled one first.
     """
 
+    name: str
     n: int
     d: int
     rows: int
@@ -68,6 +75,7 @@ class Check:
     independent: tuple[str, ...]
     dependent: tuple[str, ...]
     coordinates: tuple[str, ...]
+    units: tuple[str, ...]
     q_tree: Array
     det_phi_z: float | None
     sigma_min_phi_z: float
@@ -80,6 +88,10 @@ class Check:
     terms: str
     desired: DesiredCheck | None = None
     branches: Array | None = None
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return check_card(self)
 
 
 def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Check:
@@ -102,12 +114,13 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     if isinstance(what, str | Path):
         what = load_scene(what) if _names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, None, _limits(what, what.q_tree, "the assembled configuration"), "auto")
+        outside = _limits(what, what.q_tree, "the assembled configuration")
+        found = _mechanism_check(what, None, outside, "auto", what.name)
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     desired = _desired(what, mechanism)
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
-    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms)
+    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
     return replace(found, branches=_branches(mechanism)) if branches else found
 
 
@@ -122,7 +135,9 @@ def _names_a_scene(name: str) -> bool:
     return "/" in name
 
 
-def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf) -> Check:
+def _mechanism_check(
+    mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf, name: str
+) -> Check:
     if terms == "auto":
         terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
@@ -130,6 +145,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
     mass, inertia = moving_mass(mechanism)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
     return Check(
+        name=name,
         n=mechanism.n,
         d=mechanism.d,
         rows=mechanism.closure.rows,
@@ -138,6 +154,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         independent=mechanism.independent,
         dependent=mechanism.dependent,
         coordinates=mechanism.coordinates,
+        units=tuple(mechanism.tree.units()),
         q_tree=mechanism.tree.to_coordinates(mechanism.q_tree),
         det_phi_z=float(np.linalg.det(at.phi_z)) if square else None,
         sigma_min_phi_z=float(values[-1]),

@@ -15,12 +15,14 @@ import numpy as np
 
 from ckc_pin.control.spec import ControllerSpec, FeedbackSpec
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.kinds import require_kind, require_table
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
+from ckc_pin.simulation.cards import scene_card
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "load_scene", "scene_names", "with_changes"]
 
@@ -103,8 +105,8 @@ class SceneSpec(_Spec, frozen=True):
     event: list[EventSpec] = []
 
 
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, repr=False)
+class Scene(Shown):
     """A checked scene and where its files are.
 
     Attributes
@@ -119,6 +121,10 @@ class Scene:
     spec: SceneSpec
     name: str
     sources: Sources
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return scene_card(self)
 
     def plain(self) -> dict[str, Any]:
         """Return the scene as resolved, as plain data without absent values."""
