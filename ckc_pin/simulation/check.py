@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
-__all__ = ["Check", "check"]
+__all__ = ["Check", "check", "run_warnings"]
 
 MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
 
@@ -124,6 +125,14 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     return replace(found, branches=_branches(mechanism)) if branches else found
 
 
+def run_warnings(scene: Scene) -> list[str]:
+    """Return what of a controlled scene's check may spoil a run of it: its start, its desired trajectory."""
+    if scene.spec.controller is None:
+        return []
+    mechanism = scene_mechanism(scene)
+    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, _desired(scene, mechanism))
+
+
 def _branches(mechanism: Mechanism) -> Array:
     found = assembly_branches(mechanism)
     return np.array([mechanism.tree.to_coordinates(at.q_tree) for at in found])
@@ -132,7 +141,7 @@ def _branches(mechanism: Mechanism) -> Array:
 def _names_a_scene(name: str) -> bool:
     if is_path(name):
         return name.endswith(SUFFIX)
-    return "/" in name
+    return "/" in name or isfile(f"{name}{SUFFIX}")
 
 
 def _mechanism_check(

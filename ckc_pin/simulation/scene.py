@@ -142,7 +142,7 @@ def scene_names(mechanism: str) -> list[str]:
 
 
 def scene_file(name: str | Path) -> Path:
-    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE or a path.
+    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE, a path, or one without its ending.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def scene_file(name: str | Path) -> Path:
             path = _default(path if isdir(path) else path.parent)
         return path
     if isfile(f"{name}{SUFFIX}"):
-        raise InputError(f"no scene {name!r}; there is {name}{SUFFIX}, a path ends in .toml")
+        return Path(f"{name}{SUFFIX}")
     mechanism, _, scene = name.partition("/")
     path = library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
     if Path(name).parts in ((mechanism,), (mechanism, scene)) and isfile(path):
@@ -170,9 +170,13 @@ def scene_file(name: str | Path) -> Path:
 def _default(folder: Path) -> Path:
     path = folder / f"{DEFAULT}{SUFFIX}"
     others = sorted(p.name for p in folder.glob(f"*{SUFFIX}"))
-    if others and not isfile(path):
+    if isfile(path):
+        return path
+    if len(others) == 1:
+        return folder / others[0]
+    if others:
         raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
-    return path
+    raise InputError(f"{folder}: no scene, *{SUFFIX}, says what to run; ckc new NAME makes a folder with one to copy")
 
 
 def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scene:
@@ -196,7 +200,15 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
     path = scene_file(name)
     called = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), called)
-    return make_scene(with_changes(data, changes or {}), str(name), Sources(called, path.parent))
+    return make_scene(with_changes(data, changes or {}), _called(name, path), Sources(called, path.parent))
+
+
+def _called(name: str | Path, path: Path) -> str:
+    """Return what a scene is called: as the user did; of a folder, the folder's own name, with the scene's."""
+    if not isdir(name):
+        return str(name)
+    scene = path.name.removesuffix(SUFFIX)
+    return path.parent.resolve().name + ("" if scene == DEFAULT else f"/{scene}")
 
 
 def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
