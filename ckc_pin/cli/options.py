@@ -8,11 +8,14 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-from click.shell_completion import CompletionItem
 
 from ckc_pin.errors import InputError
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 __all__ = ["PATH", "as_json", "changes", "check_speed", "complete_scenes", "examples", "figures", "mechanism",
            "open_browser", "out", "overwrite", "port", "require_folder", "runs"]  # fmt: skip
@@ -41,6 +44,8 @@ def _of(mechanism: str, scenes: list[str]) -> list[str]:
 
 
 def _completed(names: list[str], incomplete: str) -> list[CompletionItem]:
+    from click.shell_completion import CompletionItem
+
     found = [CompletionItem(name) for name in names if name.startswith(incomplete)]
     return [*found, CompletionItem(incomplete, type="file")]
 

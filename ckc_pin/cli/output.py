@@ -82,11 +82,11 @@ class ProgressBar:
     def __init__(self, title: str, says: str = "t = {task.completed:.2f} s") -> None:
         self.title, self.says = title, says
         self.bar: Any = None
-        self.began: float | None = None  # none any more: said
+        self.first: tuple[float, float] | None = None  # when it was first heard of, and how far it was
+        self.said = False
 
     def __enter__(self) -> Callable[[float, float], None]:
         """Show the bar."""
-        self.began = perf_counter()
         if not on_terminal():
             return self._estimate
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -103,13 +103,16 @@ class ProgressBar:
             self.bar.stop()
 
     def _estimate(self, done: float, whole: float) -> None:
-        """Say once, from `FIRST_LOOK` on, how long it will take."""
-        spent = 0.0 if self.began is None else perf_counter() - self.began
-        if spent < FIRST_LOOK or not 0 < done < whole:
+        """Say once how long it will take, by what was done in the first `FIRST_LOOK` of it; preparing is no part."""
+        if self.said or not 0 <= done < whole:
             return
-        self.began = None
-        left = spent * (whole / done - 1)
-        if spent + left > LONG:
+        now = perf_counter()
+        began, at = self.first = self.first or (now, done)
+        if now - began < FIRST_LOOK or done <= at:
+            return
+        self.said = True
+        left = (now - began) * (whole - done) / (done - at)
+        if now - began + left > LONG:
             errors().print(f"{self.title}: about {left:.0f} s more")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.control.spec import Gain
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import is_number
+from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["gain_matrix", "require_positive_definite"]
@@ -36,9 +36,10 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
     elif is_number(gain):
         matrix = float(cast(float, gain)) * np.eye(d)
     else:
-        matrix = _numbers(gain, what)
+        shape = f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}"
+        matrix = _numbers(gain, what, shape)
         if matrix.shape != (d, d):
-            raise InputError(f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}")
+            raise InputError(shape)
     if not np.all(np.isfinite(matrix)):
         raise InputError(f"controller.{what}: an entry is not a finite number")
     if np.abs(matrix).max(initial=0.0) > LARGEST:
@@ -46,12 +47,14 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
     return matrix
 
 
-def _numbers(gain: Any, what: str) -> Array:
+def _numbers(gain: Any, what: str, shape: str) -> Array:
+    if not isinstance(gain, list | tuple | np.ndarray):
+        takes = "a number, a table by joint or a matrix"
+        raise InputError(f"controller.{what}: {a_kind(gain)} was given; it takes {takes}")
     try:
         return np.array(gain, dtype=float)
-    except (TypeError, ValueError):  # rows of several lengths among them
-        takes = "a number, a table by joint or a matrix"
-        raise InputError(f"controller.{what}: {gain!r:.80} was given; it takes {takes}") from None
+    except (TypeError, ValueError):  # rows of several lengths, words among the numbers
+        raise InputError(shape) from None
 
 
 def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:

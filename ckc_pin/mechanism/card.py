@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
-from textwrap import wrap
 
 import numpy as np
 
@@ -55,6 +53,8 @@ class Card:
 
     def html(self) -> str:
         """Return title and rows as a table for a notebook."""
+        from html import escape  # here, as wrap below: a run whose outcome is JSON needs neither
+
         rows = "".join(
             f'<tr><th style="text-align: left; white-space: nowrap">{escape(label)}</th>'
             f'<td style="text-align: left">{escape(GAP.join(items))}</td></tr>'
@@ -84,6 +84,8 @@ def quantities(names: Sequence[str], values: Array, units: Sequence[str] = (), d
 
 
 def _of_text(text: str, room: int, most: int | None) -> list[str]:
+    from textwrap import wrap
+
     lines = wrap(text, room, break_long_words=False, break_on_hyphens=False)
     return lines if most is None or len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1]} …"]
 

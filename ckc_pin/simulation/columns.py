@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +48,8 @@ def columns(run: Run) -> dict[str, Array]:
 
 def as_csv(run: Run) -> str:
     """Return a run as CSV, the columns t and those of `columns`; every number as it is, to its last digit."""
+    import csv
+
     table = columns(run)
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import a_kind, is_number, require_kind, require_path
@@ -20,8 +20,9 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import write_whole
 from ckc_pin.simulation.cards import run_card
 from ckc_pin.simulation.columns import as_csv, as_data_frame, as_dataset
+from ckc_pin.simulation.parts import part_of, state_of
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
-from ckc_pin.simulation.state import State, state_of
+from ckc_pin.simulation.state import State
 
 if TYPE_CHECKING:
     import pandas
@@ -144,8 +145,7 @@ class Run(Shown):
             raise InputError(
                 f"run[{a_kind(name)}]: there are the coordinates {own}, and the arrays {', '.join(others)}"
             )
-        found: Array = getattr(self, name)
-        return found
+        return np.asarray(getattr(self, name))
 
     @overload
     def sel(self, *, t: float) -> State: ...
@@ -174,24 +174,12 @@ class Run(Shown):
         """
         first, last = float(self.t[0]), float(self.t[-1])
         if isinstance(t, slice):
-            return self._part(first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
+            return part_of(self, first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
         if not is_number(t):
             raise InputError(f"Run.sel: t: {a_kind(t)} was given; it takes a time, s, or slice(start, stop)")
         if not first <= t <= last:
             raise InputError(f"Run.sel: t = {t:g} s; the run is from {first:g} to {last:g} s")
         return state_of(self, self.at(t))
-
-    def _part(self, start: Any, stop: Any, step: Any) -> Run:
-        if step is not None or not (is_number(start) and is_number(stop)):
-            raise InputError(f"Run.sel: t: slice({start!r:.40}, {stop!r:.40}); it takes two times, s, and no step")
-        rows = (start <= self.t) & (self.t <= stop)
-        if not rows.any():
-            between, whole = f"from {start:g} to {stop:g} s", f"from {self.t[0]:g} to {self.t[-1]:g} s"
-            raise InputError(f"Run.sel: no output instant {between}; the run is {whole}")
-        arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
-        kept: dict[str, Any] = {name: values if values is None else values[rows] for name, values in arrays.items()}
-        met = [event for event in self.events if start <= event["t"] <= stop]
-        return replace(self, events=met, **kept)
 
     def column(self, coordinate: str) -> int:
         """Return the column of a coordinate; InputError names the valid ones."""
@@ -233,23 +221,9 @@ class Run(Shown):
         For a point row: the force that the loop exerts on frame A, along the row's axis. NaN where J has lost rank, so
         that nothing determines them.
         """
-        from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
-        from ckc_pin.dynamics.terms import Terms
-        from ckc_pin.simulation.recorded_joints import RecordedJoints
+        from ckc_pin.simulation.recorded_joints import loop_forces
 
-        mechanism, of_joints = self.mechanism, RecordedJoints(self)
-        forces = np.empty_like(self.phi)
-        for k, numbers in enumerate(self.q_tree):
-            at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-            terms = Terms(mechanism, at, self.v_tree[k])
-            u_tree = mechanism.motors.force(self.tau[k])
-            try:
-                u_tree += of_joints(k, terms, u_tree)
-                forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
-            except NumericalError:
-                forces[k] = np.nan
-        loops = [loop for loop, _ in mechanism.closure.names]
-        return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}
+        return loop_forces(self)
 
     def summary(self) -> dict[str, Any]:
         """Return what `ckc run --json` prints (docs/reference.md): scalars, and the last instant by name."""
@@ -287,12 +261,7 @@ class Run(Shown):
         return ckc_pin.plot(self)
 
     def play(
-        self,
-        *,
-        speed: float = 1.0,
-        gap: float = 0.0,
-        meshes: str | Path | None = None,
-        inline: bool | None = None,
+        self, *, speed: float = 1.0, gap: float = 0.0, meshes: str | Path | None = None, inline: bool | None = None
     ) -> Playback | ViewServer | None:
         """Play the run: in a notebook below the cell, elsewhere in the browser until Ctrl-C; see `ckc_pin.play`."""
         import ckc_pin

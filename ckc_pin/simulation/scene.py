@@ -176,6 +176,8 @@ def _default(folder: Path) -> Path:
         return folder / others[0]
     if others:
         raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
+    if isfile(folder / "run.npz"):
+        raise InputError(f"{folder}: the folder of a run, which is over; ckc play, plot and inverse take it")
     raise InputError(f"{folder}: no scene, *{SUFFIX}, says what to run; ckc new NAME makes a folder with one to copy")
 
 

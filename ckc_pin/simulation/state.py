@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +13,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.cards import state_card
 
-if TYPE_CHECKING:
-    from ckc_pin.simulation.run import Run
-
-__all__ = ["State", "state_of"]
+__all__ = ["State"]
 
 
 class State(Shown):
@@ -82,15 +78,3 @@ class State(Shown):
     def q_dot(self) -> Array:
         """Their rates, shape (d,)."""
         return self.v_tree[self.mechanism.partition.q]
-
-
-def state_of(run: Run, k: int) -> State:
-    """Return the state at an output instant of a run, as a simulator would be in."""
-    mechanism = run.mechanism
-    split = mechanism.partition
-    q_tree = mechanism.tree.from_coordinates(run.q_tree[k])
-    v_terms = v_tree = run.v_tree[k]
-    if np.any(run.w[k]) and run.scene["coriolis_velocity"] == "rho":  # off its manifold the SPF's C has this one
-        v_terms = mechanism.kinematics(q_tree).rho @ v_tree[split.q]
-    numbers = np.concatenate([q_tree, v_tree, v_terms, run.w[k]])
-    return State(mechanism, float(run.t[k]), numbers, split.q.tolist(), split.z.tolist())

@@ -145,6 +145,8 @@ def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch)
     none = ckc("run", "mine")
     assert none.code == 2
     assert "mine: no scene, *.scene.toml, says what to run; ckc new NAME makes a folder with one" in none.err
+    simulate("five_bar/swing", {"t_end": 0.01}).save(mine / "run.npz")
+    assert "mine: the folder of a run, which is over; ckc play, plot and inverse take it" in ckc("run", "mine").err
 
 
 # --- what is drawn, what is kept ---------------------------------------------------------------------
@@ -239,16 +241,13 @@ def test_a_sign_of_work_is_for_terminals_and_only_for_what_takes_long(monkeypatc
 def test_in_a_pipe_what_takes_long_is_estimated_once(
     share: float, says: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Three seconds for a tenth are thirty in all; for half they are six, which need no words."""
+    """Three seconds for a tenth are thirty in all; for half they are six, which need no words. Preparing is no part."""
     clock = [100.0]
     monkeypatch.setattr(output, "perf_counter", lambda: clock[0])
     output.errors.cache_clear()
     with ProgressBar("the run") as progress:
-        progress(0.0, 2.0)
-        clock[0] = 101.0
-        progress(0.05, 2.0)
-        for _ in range(3):
-            clock[0] += 1.0 if clock[0] < 103.0 else 0.0
-            progress(2.0 * share * (clock[0] - 100.0) / 3.0 if clock[0] == 103.0 else 0.0, 2.0)
+        for second, part in ((60.0, 0.0), (61.0, 0.01), (63.0, share), (64.0, share + 0.01), (65.0, share + 0.02)):
+            clock[0] = 100.0 + second
+            progress(2.0 * part, 2.0)
     assert capsys.readouterr().err.splitlines() == says
     output.errors.cache_clear()
