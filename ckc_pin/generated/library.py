@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -29,6 +29,7 @@ __all__ = ["MOST_COORDINATES", "Library", "cache_folder", "compiled", "find"]
 
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler
+PER_LETTER = 2e-5  # s of the compiler for a letter of the text, as docs/reference.md has them
 MOST_COORDINATES = 40  # of a tree that is written out: a minute of the compiler where all are in one branch
 
 
@@ -66,7 +67,10 @@ def find(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> 
 
 
 def compiled(
-    mechanism: Mechanism, most: int = MOST_COORDINATES, which: Mapping[str, BoolArray] | None = None
+    mechanism: Mechanism,
+    most: int = MOST_COORDINATES,
+    which: Mapping[str, BoolArray] | None = None,
+    on_written: Callable[[float], None] | None = None,
 ) -> Library:
     """Return the mechanism's terms, from the cache or compiled now.
 
@@ -78,6 +82,8 @@ def compiled(
     which : mapping, optional
         Which numbers are arguments (`parameters.present`), where that is more than those that are not zero: what is
         varied from zero.
+    on_written : callable, optional
+        Called once before the compiler, with the seconds that it may take.
 
     Raises
     ------
@@ -95,7 +101,7 @@ def compiled(
         return found
     if compiler is None:
         raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
-    return _make(mechanism, subject, compiler)
+    return _make(mechanism, subject, compiler, on_written)
 
 
 @dataclass(frozen=True)
@@ -209,7 +215,9 @@ def _executes(folder: Path) -> bool:
     return not os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)  # a flag of Linux's
 
 
-def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Library:
+def _make(
+    mechanism: Mechanism, subject: _Subject, compiler: _Compiler, on_written: Callable[[float], None] | None
+) -> Library:
     import tempfile
 
     from ckc_pin.generated.comparison import require_equal
@@ -220,14 +228,21 @@ def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Libra
         raise InputError(f"compiled terms cannot be loaded: neither {places[0]} nor {places[1]} allows programs")
     with tempfile.TemporaryDirectory(prefix="ckc_pin-", dir=place) as made:
         library = Path(made) / "terms.so"
-        _compile(mechanism, subject, compiler, Path(made) / "terms.c", library)
+        _compile(mechanism, subject, compiler, Path(made) / "terms.c", library, on_written)
         require_equal(mechanism, Library(str(library), subject.parameters))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
         return Library(str(_put(name, content)), subject.parameters)
 
 
-def _compile(mechanism: Mechanism, subject: _Subject, compiler: _Compiler, text: Path, library: Path) -> None:
+def _compile(
+    mechanism: Mechanism,
+    subject: _Subject,
+    compiler: _Compiler,
+    text: Path,
+    library: Path,
+    on_written: Callable[[float], None] | None,
+) -> None:
     import subprocess
 
     try:
@@ -237,6 +252,8 @@ def _compile(mechanism: Mechanism, subject: _Subject, compiler: _Compiler, text:
     except ModuleNotFoundError as error:
         says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(says) from error
+    if on_written is not None:
+        on_written(len(written) * PER_LETTER)
     try:
         text.write_text(written, encoding="ascii")
         done = subprocess.run(

@@ -9,6 +9,7 @@ from typing import Any
 
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Changes
@@ -16,7 +17,7 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_toml
 
-__all__ = ["build", "load"]
+__all__ = ["as_mechanism", "build", "load"]
 
 MOST_KEPT = 32  # of the mechanisms built
 
@@ -42,7 +43,21 @@ def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Me
     MechanismError
         A mechanism that cannot exist as described.
     """
+    require_kind(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
     return build(*texts_of(name), changes)
+
+
+def as_mechanism(given: Any, who: str) -> Mechanism:
+    """Return the mechanism that a public function was given: as it is, or loaded by name or path.
+
+    Raises
+    ------
+    InputError, MechanismError
+        No mechanism; what `load` raises.
+    """
+    takes = "a mechanism: itself, its shipped name or its path"
+    require_kind(given, (Mechanism, str, Path, GeneratorSpec), f"{who}: mechanism", takes)
+    return given if isinstance(given, Mechanism) else load(given)
 
 
 def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechanism:

@@ -19,6 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.kinds import is_number
 
 __all__ = ["Array", "BoolArray", "IntArray", "Tree"]
 
@@ -254,11 +255,18 @@ class Tree:
         missing = [name for name in names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")
+        strange = next((name for name in names if not is_number(values.get(name, 0.0))), None)
+        if strange is not None:
+            raise InputError(f"{what}: {strange} = {values[strange]!r:.80}: a number is needed")
         vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
         if not np.all(np.isfinite(vector)):
             bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
             raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
         return vector
+
+    def units(self, per: str = "") -> list[str]:
+        """Return the unit of each coordinate, rad or m, ``per="/s"`` of its rate."""
+        return [f"{'m' if length else 'rad'}{per}" for length in self.in_metres]
 
     def one_freedom(self, joint: str, where: str) -> int:
         """Return where a joint of one freedom stands; MechanismError names those there are."""

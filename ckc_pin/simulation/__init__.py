@@ -12,6 +12,7 @@ from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import simulate
 from ckc_pin.simulation.simulator import Simulator
 from ckc_pin.simulation.stability import Stability
+from ckc_pin.simulation.state import State
 
 __all__ = [
     "Check",
@@ -21,6 +22,7 @@ __all__ = [
     "Scene",
     "Simulator",
     "Stability",
+    "State",
     "as_ivp",
     "check",
     "ensemble",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,13 @@ from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
+from ckc_pin.mechanism.kinds import require_flag, require_kind
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.cards import check_card
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.linear_report import stability_warning
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
@@ -26,22 +30,26 @@ from ckc_pin.simulation.scene import SUFFIX, Scene, TermsOf, load_scene
 from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
-__all__ = ["Check", "check", "names_a_scene"]
+__all__ = ["Check", "check", "names_a_scene", "run_warnings"]
 
 MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, repr=False)
+class Check(Shown):
     """Findings on a mechanism, and on a scene's desired trajectory.
 
     Attributes
     ----------
+    name : str
+        What was checked.
     n, d, rows, rank : int
         Coordinates, freedoms, rows of phi, rank of J at the assembled configuration.
     redundant : tuple of str
         Rows that the others imply, one admissible choice.
     independent, dependent, coordinates : tuple of str
+    units : tuple of str
+        "rad" or "m", by coordinate.
     q_tree : (n,) array
         The assembled configuration.
     det_phi_z : float or None
@@ -66,6 +74,7 @@ class Check:
         Closed configurations at the assembled q, when asked for; the assembled one first.
     """
 
+    name: str
     n: int
     d: int
     rows: int
@@ -74,6 +83,7 @@ class Check:
     independent: tuple[str, ...]
     dependent: tuple[str, ...]
     coordinates: tuple[str, ...]
+    units: tuple[str, ...]
     q_tree: Array
     det_phi_z: float | None
     sigma_min_phi_z: float
@@ -87,6 +97,10 @@ class Check:
     desired: DesiredCheck | None = None
     stability: Stability | None = None
     branches: Array | None = None
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return check_card(self)
 
 
 def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Check:
@@ -104,10 +118,13 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     InputError, MechanismError
         It cannot exist as described. Findings about one that can are not errors.
     """
+    require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
+    require_flag(branches, "check: branches")
     if isinstance(what, str | Path):
         what = load_scene(what) if names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, None, _limits(what, what.q_tree, "the assembled configuration"), "auto")
+        outside = _limits(what, what.q_tree, "the assembled configuration")
+        found = _mechanism_check(what, None, outside, "auto", what.name)
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
     controller = scene_controller(what, mechanism)
@@ -120,8 +137,18 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
         stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.multiplier is not None))
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
     warnings += stability_warning(stable, mechanism.independent)
-    found = replace(_mechanism_check(mechanism, desired, warnings, what.spec.solver.terms), stability=stable)
+    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
+    found = replace(found, stability=stable)
     return replace(found, branches=_branches(mechanism)) if branches else found
+
+
+def run_warnings(scene: Scene) -> list[str]:
+    """Return what of a controlled scene's check may spoil a run of it: its start, its desired trajectory."""
+    if scene.spec.controller is None:
+        return []
+    mechanism = scene_mechanism(scene)
+    desired = _desired(scene_controller(scene, mechanism), mechanism, scene.spec.t_end)
+    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, desired)
 
 
 def _branches(mechanism: Mechanism) -> Array:
@@ -133,10 +160,12 @@ def names_a_scene(name: str) -> bool:
     """Whether a name or path is meant as a scene's, not a mechanism's."""
     if is_path(name):
         return name.endswith(SUFFIX)
-    return "/" in name
+    return "/" in name or isfile(f"{name}{SUFFIX}")
 
 
-def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf) -> Check:
+def _mechanism_check(
+    mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf, name: str
+) -> Check:
     if terms == "auto":
         terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
@@ -144,6 +173,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
     mass, inertia = moving_mass(mechanism)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
     return Check(
+        name=name,
         n=mechanism.n,
         d=mechanism.d,
         rows=mechanism.closure.rows,
@@ -152,6 +182,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         independent=mechanism.independent,
         dependent=mechanism.dependent,
         coordinates=mechanism.coordinates,
+        units=tuple(mechanism.tree.units()),
         q_tree=mechanism.tree.to_coordinates(mechanism.q_tree),
         det_phi_z=float(np.linalg.det(at.phi_z)) if square else None,
         sigma_min_phi_z=float(values[-1]),

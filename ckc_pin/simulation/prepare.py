@@ -15,7 +15,15 @@ import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
+from ckc_pin.control.controllers import (
+    Controller,
+    Law,
+    SetPoint,
+    TorqueController,
+    Tracking,
+    as_controller,
+    gives_tau,
+)
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
@@ -129,7 +137,7 @@ class Prepared:
 
 def prepare(
     scene: Scene,
-    controller: Controller | TorqueController | Sampled | None = None,
+    controller: Controller | TorqueController | Sampled | Law | None = None,
     events: Sequence[Event] = (),
     *,
     free: bool = False,
@@ -140,7 +148,7 @@ def prepare(
 
     Parameters
     ----------
-    controller : Controller, TorqueController or Sampled, optional
+    controller : Controller, TorqueController, Sampled or function u(t, terms), optional
         Takes the place of the scene's.
     events : sequence of Event
         Beside those of the scene.
@@ -166,6 +174,8 @@ def prepare(
         controller = scene_controller(scene, mechanism, texts)
         if controller is not None and isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
             controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
+    elif controller is not None and not isinstance(controller, Sampled):
+        controller = as_controller(controller)
     if isinstance(controller, Sampled):
         controller.require_countable(scene.spec.t_end)
         controller.require_sensible(mechanism)

@@ -10,18 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.controllers import Controller, TorqueController
+from ckc_pin.control.controllers import Controller, Law, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import compiled
+from ckc_pin.mechanism.kinds import require_callable, require_flag
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene import Scene, as_scene
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
 __all__ = ["OnOutput", "Progress", "columns_of", "run_of", "run_prepared", "run_rows", "simulate"]
@@ -39,7 +40,7 @@ def simulate(
     scene: Scene | str | Path,
     changes: Mapping[str, Any] | None = None,
     *,
-    controller: Controller | TorqueController | Sampled | None = None,
+    controller: Controller | TorqueController | Sampled | Law | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,
@@ -53,8 +54,10 @@ def simulate(
         A scene, its shipped name ("five_bar/tracking"), or its path.
     changes : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
-    controller : Controller, TorqueController or Sampled, optional
-        Takes the place of the scene's, its sample time, delay, sensor and drive included; `Sampled` gives it its own.
+    controller : Controller, TorqueController, Sampled or function, optional
+        An object with a method u(t, terms) or tau(t, terms), or a plain function u(t, terms), whose u is eq. 6's force
+        on the independent coordinates. Takes the place of the scene's, its sample time, delay, sensor and drive
+        included; `Sampled` gives it its own.
     events : sequence of Event, optional
         Event functions of the state, beside the scene's events.
     progress : callable, optional
@@ -76,10 +79,10 @@ def simulate(
     NumericalError
         It cannot even start, because its initial state is singular.
     """
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene, changes)
-    elif changes:
-        raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
+    scene = as_scene(scene, changes, "simulate")
+    require_callable(progress, "simulate: progress", "a function of (t, t_end)")
+    require_callable(on_output, "simulate: on_output", "a function of (t, q_tree)")
+    require_flag(profile, "simulate: profile")
     run = run_prepared(prepare(scene, controller, events, profile=profile), progress, on_output)
     if controller is not None:
         run.scene.pop("controller", None)  # the caller's took its place

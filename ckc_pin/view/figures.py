@@ -6,7 +6,7 @@ Runs of one mechanism under one kind of control are drawn on each other: colour 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import require_path
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
-from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.run import Run, given_runs
 from ckc_pin.view import panels, style
 from ckc_pin.view.desired import desired_along
 from ckc_pin.view.labels import effort_units, plain, symbol
@@ -25,7 +26,7 @@ from ckc_pin.view.panels import Group
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FORMATS", "draw", "plot"]
+__all__ = ["FORMATS", "draw", "plot", "require_formats", "write_figures"]
 
 FORMATS = ("png", "svg", "pdf")
 TITLES = {
@@ -60,13 +61,30 @@ def plot(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[str] 
     InputError
         No run, an unknown format, a folder that cannot be written, matplotlib missing.
     """
+    require_formats(formats)
+    return write_figures(draw(runs), out_dir, formats)
+
+
+def write_figures(figures: Mapping[str, Figure], out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Write figures that were drawn, a file for each and each format.
+
+    Raises
+    ------
+    InputError
+        An unknown format, a folder that cannot be written.
+    """
+    require_formats(formats)
+    require_path(out_dir, "plot: out_dir", "a folder")
+    with _look():
+        return [_write(figure, Path(out_dir) / f"{name}.{suffix}")
+                for name, figure in figures.items() for suffix in formats]  # fmt: skip
+
+
+def require_formats(formats: Sequence[str]) -> None:
+    """Refuse formats that figures are not written in (InputError)."""
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         raise InputError(f"plot: format {unknown[0] if unknown else 'missing'!r}; valid: {', '.join(FORMATS)}")
-    with _look():
-        figures = draw(runs)
-        return [_write(figure, Path(out_dir) / f"{name}.{suffix}")
-                for name, figure in figures.items() for suffix in formats]  # fmt: skip
 
 
 def draw(runs: Run | Sequence[Run]) -> dict[str, Figure]:
@@ -77,9 +95,7 @@ def draw(runs: Run | Sequence[Run]) -> dict[str, Figure]:
     InputError
         No run; matplotlib missing.
     """
-    runs = [runs] if isinstance(runs, Run) else list(runs)
-    if not runs:
-        raise InputError("plot: no run given; give at least one")
+    runs = given_runs(runs, "plot")
     figures: dict[str, Figure] = {}
     groups = _groups(runs)
     with _look():

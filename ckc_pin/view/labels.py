@@ -57,9 +57,7 @@ def units(mechanism: Mechanism, coordinates: Sequence[str], angle: str, length: 
 
 def effort_units(mechanism: Mechanism) -> str:
     """Return the unit of the motors' torques, forces, or both."""
-    lengths, turns = mechanism.tree.in_metres, mechanism.motors.turns != 0
-    pushes = {bool(np.all(lengths[row])) for row in turns}
-    return " or ".join(["N m"] * (False in pushes) + ["N"] * (True in pushes)) or "N m"
+    return mechanism.effort_unit
 
 
 def run_labels(runs: Sequence[Run]) -> list[str]:

@@ -98,6 +98,23 @@ def test_the_file_plays_from_disk_without_a_network(look_at, tracking, tmp_path)
     assert_elbows(visit, tracking, "1: reduced")
 
 
+def test_a_notebook_shows_it_in_a_frame_that_can_reach_nothing(look_at, tracking, tmp_path):
+    """The cell's own markup in a page of its own: the frame plays, and its scripts have no part in that page."""
+    page = tmp_path / "cell.html"
+    shown = tracking.play(inline=True)._repr_html_()
+    cell = f"<!DOCTYPE html><title>cell</title><script>viewer = 'none here'</script><body>{shown}</body>"
+    page.write_text(cell, encoding="utf-8")
+    visit = look_at(page.as_uri(), "document.querySelector('iframe')", offline=True)
+    (frame,) = visit.page.main_frame.child_frames
+    frame.wait_for_load_state()
+    assert frame.evaluate("() => viewer.animator.duration") == pytest.approx(tracking.t[-1], abs=1e-6)
+    assert frame.evaluate("() => document.querySelector('canvas').width") > 100
+    seen = "() => { try { return parent.viewer } catch (error) { return error.name } }"
+    assert frame.evaluate(seen) == "SecurityError"
+    assert visit.page.evaluate("() => viewer") == "none here"
+    assert not [url for url in visit.requests if url.startswith(("http", "ws"))]
+
+
 def test_two_runs_meshes_and_gaps(look_at, run, tmp_path):
     mesh = '<visual><geometry><mesh filename="crank.stl"/></geometry></visual>'
     urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{mesh}')

@@ -122,6 +122,12 @@ def test_every_command_json_key_array_and_error_is_named() -> None:
     assert [name for name in errors.__all__ if f"| `{name}`" not in PAGE] == []
 
 
+def test_every_public_name_is_in_the_table() -> None:
+    table = PAGE.partition("## Python")[2].partition("## ")[0]
+    named = [name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)", row)]
+    assert sorted(named) == sorted(ckc_pin.__all__)
+
+
 def test_change_log_and_citation_are_of_this_version() -> None:
     assert f"\n## [{ckc_pin.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"\nversion: {ckc_pin.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
