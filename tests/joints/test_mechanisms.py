@@ -14,6 +14,7 @@ from ckc_pin.generated.library import compiled
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS
+from tests.joints.stepping_delta import SteppingDelta
 
 Made = Callable[..., Path]
 NAMES = ("theta_1", "theta_2", "theta_3", "theta_4")
@@ -92,6 +93,20 @@ def test_a_delta_falls_on_its_stops(with_joints: Made, restitution: float) -> No
     for name, (lower, upper) in STOPS.items():
         q = runs["dae"].q_tree[:, runs["dae"].column(name)]
         assert lower - 1e-10 <= q.min() <= q.max() <= upper + 1e-10
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.6])
+def test_a_time_stepping_scheme_converges_to_the_delta_s_impacts(with_joints: Made, restitution: float) -> None:
+    """First order, if not evenly: when an arm meets its stop is rounded to a step."""
+    folder = with_joints("delta", {name: {"stops": True, "restitution": restitution} for name in STOPS}, STOPS)
+    run = simulate(folder / "default.scene.toml", {"solver.rtol": 1e-11, "solver.output_dt": 0.0225, "t_end": 0.45})
+    assert len(run.events) > 3
+    arms = [run.column(name) for name in STOPS]
+    delta, start = SteppingDelta(folder, STOPS, restitution), run.q_tree[0, arms]
+    steps = np.array([400, 500, 640, 800, 1000, 1260, 1600, 2000])
+    errors = [np.abs(delta.run(start, 0.45, n, 20) - run.q_tree[1:, arms]).mean() for n in steps]
+    assert np.all(errors * steps < 2.5)
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] < -0.8
 
 
 def test_a_simulator_meets_what_a_run_does(with_joints: Made) -> None:
