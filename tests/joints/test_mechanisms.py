@@ -145,3 +145,15 @@ def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float
         assert run.status == "done", run.message
         assert [event["name"] for event in run.events] == [event["name"] for event in runs[0].events]
         assert_close(run.q_tree, runs[0].q_tree, 1e-8)
+
+
+def test_the_shipped_scene_that_rubs_and_stops() -> None:
+    runs = [simulate("five_bar/friction", {"formulation": f, "solver.rtol": 1e-11}) for f in FORMULATIONS]
+    one = runs[0]
+    names = [event["name"] for event in one.events]
+    assert {"theta_1 bounces", "theta_1 sticks", "theta_2 sticks", "theta_3 sticks"} < set(names)
+    for run in runs:
+        assert run.status == "done"
+        assert [event["name"] for event in run.events] == names
+        assert_close(run.q_tree, one.q_tree, 1e-8)
+        assert run.max_phi < 1e-12
