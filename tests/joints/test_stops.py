@@ -87,6 +87,18 @@ def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
     assert_close(run.events[1]["t"], np.arcsin(4.0 / 20.0 / 0.5 * rate) / rate, 1e-10)
 
 
+def test_what_goes_on_sticking_says_so_once(scene_of: Make) -> None:
+    """One block sticks all the time, another one bounces beside it."""
+    urdf = slide("a", "base", "one", 1.0) + slide("b", "base", "two", 1.0, 0.0)
+    mechanism = 'gravity = [-9.81, 0, 0]\n[[joint]]\nname = "a"\nfriction = 20.0\n' + stop("b", 0.5)
+    run = simulate(scene_of(urdf, mechanism, "q = {a = 0.0, b = 1.0}\n", 3.0), TIGHT)
+    names = [event["name"] for event in run.events]
+    assert names.count("a sticks") == 1
+    assert names.count("b bounces") > 10
+    assert names.count("b touches") == 1
+    assert set(names) == {"a sticks", "b bounces", "b touches"}
+
+
 def test_a_start_beyond_a_stop_is_refused(scene_of: Make) -> None:
     scene = scene_of(slide("x", "base", "block", 1.0, 0.0), stop("x", 0.5), "q = {x = -0.25}\n", 1.0)
     with pytest.raises(InputError, match=r"initial: x = -0.25 is beyond its stops, 0 to 1000"):
