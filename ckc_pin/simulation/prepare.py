@@ -284,7 +284,7 @@ def _require_within_stops(mechanism: Mechanism, start: Start) -> None:
     if off[worst] > AT_STOP:
         raise InputError(
             f"initial: {mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
-            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}"
+            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}; give another initial.q, or a q_guess within them"
         )
 
 

@@ -13,6 +13,7 @@ from ckc_pin.analysis.map import singularity_map, workspace_sections
 from ckc_pin.view.map_figure import draw_map, look
 from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
+from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE: ViewportSize = {"width": 720, "height": 540}
@@ -49,3 +50,5 @@ def main(chromium: Path) -> None:
         for name in ("five_bar", "five_bar_as_printed"):
             draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
+        draw_friction(IMAGES / "five_bar_friction.png", DPI)
+        draw_preload(IMAGES / "two_ur5_preload.png", DPI)

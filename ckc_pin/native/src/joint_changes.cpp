@@ -57,7 +57,8 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
     slips_ |= event.of == Event::holding;
   }
   for (int k : joints_.locked) rest_(k) = infinity;
-  if (!impact(t, y) || !grip(t, y)) return false;
+  const Indices held = joints_.locked;
+  if (!impact(t, y) || !grip(t, y, held)) return false;
   known_ = true;
   return true;
 }
@@ -101,7 +102,7 @@ bool JointChanges::impact(double t, Out y) {
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
   if (!system_.acceleration(t, a_) || !movable(at)) return false;
   const auto m = static_cast<Eigen::Index>(at.size());
-  if (!m) return true;
+  if (!m) return joints_.touch = touched, true;
   scale(at);
   b_.resize(m), low_.setConstant(m, -infinity), high_.setConstant(m, infinity);
   Vector back(m);  // speeds off the stops
@@ -149,9 +150,10 @@ bool JointChanges::impact(double t, Out y) {
 
 // Gauss' principle: of the accelerations that the loops and the stops allow, the one nearest in the metric of D' to that
 // without what holds, less what friction takes, which is the problem of least forces between their bounds.
-bool JointChanges::grip(double t, Out y) {
+bool JointChanges::grip(double t, Out y, const Indices& before) {
   Indices at, locked;
-  const Indices sign = joints_.sign, touch = joints_.touch, before = std::exchange(joints_.locked, {});
+  const Indices sign = joints_.sign, touch = joints_.touch;
+  joints_.locked.clear();
   for (int k = 0; k < core_.n; ++k) {
     const bool rubs = joints_.rubs_at(k);
     const bool touches = near_[k] && rests(k);

@@ -21,7 +21,7 @@ class JointChanges {
  private:
   bool take_state(double t, In y);
   bool impact(double t, Out y);
-  bool grip(double t, Out y);
+  bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
   bool movable(Indices& at);
   void scale(const Indices& at);  // A_, free of units: what unit forces make of the coordinates that they are on
