@@ -210,14 +210,15 @@ def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
 @app.command()
 def ensembles(
     out: Annotated[Path, typer.Option(metavar="DIR", help="gets the figures")] = Path("out/ensembles"),
+    quick: Annotated[bool, typer.Option("--quick", help="fewer members")] = False,
 ) -> None:
     """Two studies by ensembles: tolerances of lengths, and a basin of attraction."""
     from scripts.experiments import ensemble_studies
 
-    ensemble_studies.main(out)
+    ensemble_studies.main(out, quick)
 
 
-@app.command()
+@app.command("bench_ensembles")
 def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of members")] = 3) -> None:
     """Print what ensembles cost, beside MuJoCo's rollout, and what 10^9 members would on many cores."""
     from scripts.experiments import bench_ensembles, ensemble_scaling

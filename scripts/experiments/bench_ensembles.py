@@ -129,7 +129,3 @@ def main(runs: int) -> None:
     threads = os.cpu_count() or 1
     table(1000 * runs, threads)
     beside(threads)
-
-
-if __name__ == "__main__":
-    main(3)

@@ -119,7 +119,3 @@ def main() -> None:
             print(
                 f"| {cores} | {chunk:,} | {seconds:g} | {end / 3600:.2f} | {100 * busy:.0f} % | {100 * writes:.0f} % |"
             )
-
-
-if __name__ == "__main__":
-    main()
