@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.generated.library import MOST_COORDINATES, Library, compiled, find
 from ckc_pin.generated.varied import Varied
-from ckc_pin.mechanism.parameters import AXES, is_parameter, require_known, values_of
+from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
+from ckc_pin.simulation.ensembles.names import check_names
 from ckc_pin.simulation.ensembles.outputs import Function, Outputs, Recorded
 from ckc_pin.simulation.ensembles.spec import OutputSpec
 from ckc_pin.simulation.initial import branch
@@ -89,7 +90,7 @@ class Members:
         self.mechanism = self.ready.mechanism
         if self.scene.spec.initial.at is not None and any(name.startswith("initial.q.") for name in names):
             self._start_from_there()
-        self._vectors = self._check_names()
+        self._vectors = check_names(scene, self._changes, self.scene, self.mechanism, names)
         self.outputs = Outputs(outputs, self.ready)
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
         self._varied = Varied(self.mechanism, [names[k] for k in self._parameters])
@@ -257,42 +258,6 @@ class Members:
         self.scene = load_scene(self.scene_name, self._changes)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
-
-    def _check_names(self) -> dict[str, tuple[str, int]]:
-        """Refuse variables that are none; return those that are components of what the scene gives whole."""
-        own = self.mechanism
-        known = {name: None for name in self.names if is_parameter(name)}
-        require_known(own.spec, own.urdf, known, f"{self.scene.name}: variables")
-        present = values_of(own.spec, own.urdf)
-        vectors: dict[str, tuple[str, int]] = {}
-        for name in self.names:
-            if name in present and isinstance(present[name], tuple):
-                raise InputError(f"{self.scene.name}: variables: {name} has three numbers: vary {name}.x, .y or .z")
-            of, _, axis = name.rpartition(".")
-            if is_parameter(name) and name not in present and of in self.scene.spec.parameters:
-                vectors[name] = (of, AXES.index(axis))
-        for name in self.names:
-            if not is_parameter(name):
-                self._try_key(name)
-        return vectors
-
-    def _try_key(self, name: str) -> None:
-        """A key of the scene: one that takes a number."""
-        for table, names in (
-            ("initial.q.", self.mechanism.coordinates),
-            ("initial.q_dot.", self.mechanism.independent),
-        ):
-            if name.startswith(table):
-                if name.removeprefix(table) not in names:
-                    says = f"variables: {name!r}: no such coordinate; there are {', '.join(names)}"
-                    raise InputError(f"{self.scene.name}: {says}")
-                return
-        try:
-            load_scene(self.scene_name, {**self._changes, name: 1})
-        except InputError as error:
-            if "greater than" in str(error) or "at least" in str(error) or "less than" in str(error):
-                return
-            raise InputError(f"variables: {name!r} is no number of the scene: {error}") from None
 
     def _shapes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
         """Dimensions and shape of each output, a function's found by calling it on the scene itself."""
