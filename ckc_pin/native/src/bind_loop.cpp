@@ -164,7 +164,8 @@ nb::dict stats(const Run& run) {
   found["terms"] = run.core->written ? "generated" : "pinocchio";
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
   found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
-  found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;
+  found["jacobians"] = loop.work.jacobians, found["differences"] = counts.differences;
+  found["switches"] = counts.switches;
   found["method"] = loop.method() ? loop.method()->name() : "";
   found["steps_by_method"] = by_method, found["python_calls"] = run.view->calls;
   return found;

@@ -77,6 +77,7 @@ struct Places {
 // A mechanism from Python's tables; one of its terms by name.
 std::unique_ptr<Core> core_of(const nb::dict& table);
 Closure closure_of(const nb::dict& table);
+SpringTable springs_of(const nb::dict& table);
 nb::object term_of(Core& core, const std::string& name);
 
 void bind_core(nb::module_& m);

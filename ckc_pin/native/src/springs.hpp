@@ -16,6 +16,7 @@ class Springs {
  public:
   Springs(const Tree& tree, SpringTable table);
 
+  const SpringTable table;
   bool any, any_damping;
 
   void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
@@ -24,7 +25,6 @@ class Springs {
   double energy(const Tree& tree, In q) const;
 
  private:
-  SpringTable table_;
   int count_;
   std::vector<Indices> pattern_;
   Vector length_;
