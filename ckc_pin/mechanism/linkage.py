@@ -38,6 +38,8 @@ class Linkage:
 
     Attributes
     ----------
+    urdf : UrdfTree
+        All trees in one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
     motors : Motors or None
         None where the file names none.
@@ -48,9 +50,8 @@ class Linkage:
     """
 
     def __init__(self, spec: MechanismSpec, sources: Sources) -> None:
-        self.spec = spec
-        self.sources = sources
         text, urdf = merge(_tree_texts(spec, sources))
+        self.spec, self.sources, self.urdf = spec, sources, urdf
         self.warnings = list(urdf.warnings)
         self.tree = Tree(_build_model(text, sources.name))
         self.tree.model.gravity.linear = np.array(spec.gravity)

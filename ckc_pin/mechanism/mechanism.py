@@ -51,6 +51,8 @@ class Mechanism:
     actuated : tuple of str
         Names of the motors, in the order of tau.
     motors : Motors
+    urdf : Element
+        All its trees in one <robot>.
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
     partition : Partition
@@ -67,6 +69,7 @@ class Mechanism:
 
     def __init__(self, linkage: Linkage, q_tree: Array, residual: float, tolerance: float, freedoms: Freedoms) -> None:
         self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
+        self.urdf = linkage.urdf.root
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
         self.joints, self.springs = linkage.joints, linkage.springs
         self.points, self.size = linkage.points, linkage.size

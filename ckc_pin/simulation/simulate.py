@@ -21,7 +21,7 @@ from ckc_pin.simulation.run_file import MAX_BYTES
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
-__all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
+__all__ = ["OnOutput", "Progress", "run_prepared", "run_rows", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
@@ -82,6 +82,11 @@ def simulate(
 
 def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run what was prepared, from its start; errors are those of `simulate`."""
+    return run_rows(ready, progress, on_output)[0]
+
+
+def run_rows(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> tuple[Run, Array]:
+    """Do the same, and return what the loop has recorded too, a row an instant (`Recorder` in recorder.hpp)."""
     scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
     times = ready.instants
     started = perf_counter()  # loading and assembling are not the run's work
@@ -115,7 +120,7 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
         **parts,
     )
     run.__dict__["mechanism"] = mechanism
-    return run
+    return run, rows[:filled]
 
 
 def _drive(

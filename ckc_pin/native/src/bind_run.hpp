@@ -4,6 +4,7 @@
 #include "bind_control.hpp"
 #include "level_set.hpp"
 #include "loop.hpp"
+#include "variation.hpp"
 
 namespace ckc {
 
@@ -16,5 +17,7 @@ struct Run {
 };
 
 void bind_parts(nb::module_& m, nb::class_<Run>& loop);
+void bind_variation(nb::class_<Run>& loop);
+VariationTable variation_of(const nb::dict& table);
 
 }  // namespace ckc

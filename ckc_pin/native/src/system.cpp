@@ -40,8 +40,8 @@ bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) 
   joints.add_slopes(v, damping);
   u_by_v_.diagonal() += damping;
   a_.resize(n);
-  const bool held = !joints.locked.empty();
-  if (held) {
+  const bool locked = !joints.locked.empty();
+  if (locked) {
     core.set_velocity(v);
     if (!eq_1(v, correction, a_)) return false;
     for (size_t i = 0; i < joints.locked.size(); ++i) force_(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
@@ -63,13 +63,13 @@ bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) 
   } else {
     if (core.q_tree != q_tree) core.set(q_tree, true);
     core.set_velocity(v);
-    if (!held && !core.dae_acceleration(force_, correction, a_)) return false;
+    if (!locked && !core.dae_acceleration(force_, correction, a_)) return false;
     if (!core.differentiate(force_, a_)) return false;
     const Derivatives& by = core.derivatives;
     if (!core.respond(u_by_q_ - by.force_by_q, by.row_by_q, by_q) || !core.respond(u_by_v_ - by.force_by_v, by.row_by_v, by_v))
       return false;
   }
-  if (held)
+  if (locked)
     for (Matrix* by : {&by_q, &by_v})
       for (int k = 0; k < n; ++k) {
         joints.back(responses_, by->col(k), back_);
