@@ -127,3 +127,44 @@ def test_what_is_no_parameter_is_refused_with_those_there_are(tmp_path: Path) ->
 def test_motions_without_known_derivatives_are_refused(scene: str, changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
         sensitivities(scene, ["link.link_1.mass"], changes)
+
+
+@pytest.mark.parametrize("terms", ["pinocchio", "generated"])
+def test_of_the_start_under_tracking_control(terms: str) -> None:
+    """By the exact derivatives of eq. 16, on the paper's five-bar."""
+    changes = {**TIGHT, "formulation": "reduced", "t_end": 1.0, "solver.terms": terms}
+    found = sensitivities("five_bar/tracking", ["initial.q_dot.theta_1"], changes)
+
+    def ended(h: float) -> Any:
+        run = simulate("five_bar/tracking", {**changes, "initial.q_dot.theta_1": h})
+        return np.stack([run.q_tree, run.v_tree])
+
+    one, two, four = ((ended(h) - ended(-h)) / (2 * h) for h in (4e-3, 2e-3, 1e-3))
+    wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
+    ours = np.stack([found.q_tree[:, :, 0], found.v_tree[:, :, 0]])
+    assert np.abs(ours - wanted).max() <= CLOSE * np.abs(wanted).max()
+
+
+def test_of_a_start_at_the_equilibrium(tmp_path: Path) -> None:
+    """Which moves with the mechanism: without control nothing else happens."""
+
+    def rest(changes: dict[str, float], folder: str) -> str:
+        text = written(tmp_path / folder, changes)
+        path = tmp_path / folder / "bars.scene.toml"
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("initial")]
+        path.write_text("\n".join(['initial.at = "equilibrium"', *lines]) + "\n", encoding="utf-8")
+        return text
+
+    names = ["link.crank.mass", "spring.0.stiffness", "joint.c.xyz.x", "loop.knee.frame_a.xyz.x"]
+    found = sensitivities(rest({}, "x"), names, {**TIGHT, "t_end": 0.1})
+    for k, name in enumerate(names):
+        h = 1e-3
+
+        def at(x: float, name: str = name) -> Any:
+            changes = {**TIGHT, "t_end": 0.1}
+            return simulate(rest({name: NUMBERS[name] + x}, "y"), changes).q_tree[0]
+
+        one, two, four = ((at(x) - at(-x)) / (2 * x) for x in (h, h / 2, h / 4))
+        wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
+        assert np.abs(found.q_tree[0, :, k] - wanted).max() <= 1e-7 * np.abs(wanted).max(), name
+        assert np.abs(found.q_tree[-1, :, k] - wanted).max() <= 1e-7 * np.abs(wanted).max(), name
