@@ -259,11 +259,21 @@ bool Variation::rates(In v, In a, const Matrix& s, Matrix& s_dot) {
     if (!core_.responses(joints.locked, responses_)) return false;
     for (int p = 0; p < count; ++p) joints.back(responses_, change_.col(p), back_), change_.col(p) += back_;
   }
+  move(v, s, s_dot);
+  s_dot.bottomRows(n) = change_;
+  return s_dot.allFinite();
+}
+
+void Variation::move(In v, const Matrix& s, Matrix& s_dot) const {
   s_dot.resize(2 * n, count);
   s_dot.topRows(n) = s.bottomRows(n);
   if (!core_.tree.roots.empty()) s_dot.topRows(n) -= core_.tree.brackets(v) * s.topRows(n);
-  s_dot.bottomRows(n) = change_;
-  return s_dot.allFinite();
+}
+
+void Variation::rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const {
+  move(v, s, s_dot);
+  s_dot.bottomRows(n).noalias() = by_q * s.topRows(n);
+  s_dot.bottomRows(n).noalias() += by_v * s.bottomRows(n);
 }
 
 // What a change of the state adds to force_ and row_.

@@ -51,6 +51,8 @@ class Variation {
   // Of s at the core's state, where it moves with v and accelerates with a under what acts; false where what acts has no
   // known derivatives.
   bool rates(In v, In a, const Matrix& s, Matrix& s_dot);
+  // The same where nothing varies but the start, by eq. 1's derivatives.
+  void rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const;
   // Where joints change what they do.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
   bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
@@ -58,6 +60,7 @@ class Variation {
 
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
+  void move(In v, const Matrix& s, Matrix& s_dot) const;  // the places' part of the rates
   // What each parameter adds to the forces that are lacking, and to J a; `impulsive` as there.
   void add_parameters(In v, In lambda, bool impulsive, Matrix& force, Matrix& row) const;
   void add_inertia(const Parameter& of, bool impulsive, Out force) const;

@@ -1,6 +1,7 @@
 // A formulation together with how its motion changes with parameters, y = (its y, and by parameter the change of q', v').
 #pragma once
 
+#include <algorithm>
 #include <type_traits>
 
 #include "dae.hpp"
@@ -22,7 +23,11 @@ class Varied : public Base, public WithVariation {
  public:
   template <class... Given>
   Varied(VariationTable table, Given&&... given)
-      : Base(std::forward<Given>(given)...), size_(Base::size), variation_(*this, std::move(table)) {
+      : Base(std::forward<Given>(given)...),
+        size_(Base::size),
+        of_start_(std::all_of(table.parameters.begin(), table.parameters.end(),
+                              [](const Parameter& of) { return of.kind == Parameter::start; })),
+        variation_(*this, std::move(table)) {
     this->size = size_ + 2 * variation_.n * variation_.count;
     this->crosses = false;
   }
@@ -45,7 +50,13 @@ class Varied : public Base, public WithVariation {
     a_.resize(variation_.n);
     if (!Base::tree_acceleration(y_dot.head(size_), a_)) return this->fails(Trouble::open);
     take(y);
-    if (!variation_.rates(v_, a_, s_, s_dot_)) return this->fails(Trouble::infinite);
+    if (of_start_ && this->core.written) {
+      this->core.set_velocity(v_);
+      if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return this->fails(Trouble::infinite);
+      variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
+    } else if (!variation_.rates(v_, a_, s_, s_dot_)) {
+      return this->fails(Trouble::infinite);
+    }
     Eigen::Map<Matrix>(y_dot.data() + size_, rows(), variation_.count) = s_dot_;
     return true;
   }
@@ -109,8 +120,9 @@ class Varied : public Base, public WithVariation {
   void put(Out y) const { Eigen::Map<Matrix>(y.data() + size_, rows(), variation_.count) = s_; }
 
   const int size_;  // of the base's y
+  const bool of_start_;  // nothing varies but where it starts
   Variation variation_;
-  Matrix s_, s_dot_;
+  Matrix s_, s_dot_, by_q_, by_v_;
   Vector v_, a_;
 };
 
