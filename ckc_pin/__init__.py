@@ -31,12 +31,14 @@ if TYPE_CHECKING:
     from ckc_pin.simulation.check import Check, check
     from ckc_pin.simulation.ensembles.ensemble import ensemble
     from ckc_pin.simulation.events import Event
+    from ckc_pin.simulation.floquet import Floquet, floquet
     from ckc_pin.simulation.inverse import inverse_dynamics
     from ckc_pin.simulation.ivp import as_ivp
     from ckc_pin.simulation.linearize import linearize
     from ckc_pin.simulation.motion_forces import MotionForces
     from ckc_pin.simulation.run import Run
     from ckc_pin.simulation.scene import Scene, load_scene
+    from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
     from ckc_pin.simulation.simulate import simulate
     from ckc_pin.simulation.simulator import Simulator
     from ckc_pin.simulation.stability import Stability
@@ -49,6 +51,7 @@ __all__ = [
     "CkcError",
     "Controller",
     "Event",
+    "Floquet",
     "InputError",
     "LinearModel",
     "Mechanism",
@@ -59,6 +62,7 @@ __all__ = [
     "Run",
     "Sampled",
     "Scene",
+    "Sensitivities",
     "SetPoint",
     "Simulator",
     "Stability",
@@ -68,12 +72,14 @@ __all__ = [
     "as_ivp",
     "check",
     "ensemble",
+    "floquet",
     "inverse_dynamics",
     "linearize",
     "load",
     "load_scene",
     "play",
     "plot",
+    "sensitivities",
     "simulate",
     "singularity_map",
     "symbolic",

@@ -43,6 +43,8 @@ class Linkage:
 
     Attributes
     ----------
+    urdf : UrdfTree
+        All trees in one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
     motors : Motors or None
         None where the file names none.

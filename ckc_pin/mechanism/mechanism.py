@@ -57,6 +57,8 @@ class Mechanism(Shown):
     actuated : tuple of str
         Names of the motors, in the order of tau.
     motors : Motors
+    urdf : Element
+        All its trees in one <robot>.
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
     urdf : Element

@@ -41,6 +41,7 @@ from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene, SceneSpec
+from ckc_pin.simulation.varying import variation_of
 
 __all__ = ["Prepared", "output_instants", "prepare", "scene_actuation", "scene_controller", "scene_mechanism"]
 
@@ -143,6 +144,7 @@ def prepare(
     free: bool = False,
     profile: bool = False,
     library: Library | None = None,
+    parameters: Sequence[str] = (),
 ) -> Prepared:
     """Build everything that a scene needs before its first step.
 
@@ -158,6 +160,8 @@ def prepare(
         Count which terms are evaluated.
     library : Library, optional
         The mechanism's terms, compiled, in the place of those that the scene's solver.terms says.
+    parameters : sequence of str
+        What the motion's changes with are integrated beside it.
 
     Raises
     ------
@@ -196,7 +200,8 @@ def prepare(
         core_table(
             mechanism, library or _library(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
         ),
-        _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
+        _formulation(mechanism, scene.spec, np.diagonal(D_tree))
+        | (variation_of(mechanism, scene, controller, parameters) if parameters else {}),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
         [event.row for event in functions],

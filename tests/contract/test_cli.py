@@ -22,7 +22,7 @@ TERMS = """coordinates independent dependent q_tree v_tree D_tree C_tree h_tree 
            energy"""
 RUN = """status message t coordinates q_tree v_tree u tau points max_abs_u max_abs_tau max_phi max_phi_dot energy_start
          energy_end dissipated formulation epsilon stats too_fast"""
-STATS = """rhs steps rejected newton factorizations jacobians switches python_calls wall_s method
+STATS = """rhs steps rejected newton factorizations jacobians differences switches python_calls wall_s method
            steps_by_method terms rhs_by_terms"""
 
 Q, V = '{"theta_1": -1.2, "theta_3": -1.9}', '{"theta_1": 0.4, "theta_3": -0.3}'

@@ -8,6 +8,7 @@
 #include "bind_run.hpp"
 #include "written.hpp"
 #include "printed_spf.hpp"
+#include "varied.hpp"
 
 namespace ckc {
 
@@ -31,13 +32,24 @@ std::unique_ptr<System> system_of(Core& core, Control& control, const nb::dict& 
   if (kind == "dae") {
     const double alpha = get<double>(table, "alpha"), beta = get<double>(table, "beta");
     require(alpha >= 0 && beta >= 0, "alpha and beta must not be negative");
-    return std::make_unique<Dae>(core, control, tolerance, get<bool>(table, "projects"), alpha, beta);
+    const bool projects = get<bool>(table, "projects");
+    if (table.contains("variation")) {
+      require(projects && alpha == 0 && beta == 0, "variation: of a motion that is put back on the closure");
+      return std::make_unique<Varied<Dae>>(variation_of(nb::cast<nb::dict>(table["variation"])), core, control, tolerance,
+                                           projects, alpha, beta);
+    }
+    return std::make_unique<Dae>(core, control, tolerance, projects, alpha, beta);
   }
   const double epsilon = get<double>(table, "epsilon");
   const bool actual = get<bool>(table, "actual");
   require(epsilon > 0, "epsilon must be positive");
-  if (kind == "level_set")
-    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "slack"));
+  if (kind == "level_set") {
+    const double slack = get<double>(table, "slack");
+    if (!table.contains("variation"))
+      return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, slack);
+    return std::make_unique<Varied<LevelSet>>(variation_of(nb::cast<nb::dict>(table["variation"])), core, control, epsilon,
+                                              actual, tolerance, slack);
+  }
   require(kind == "printed" && core.tree.roots.empty(), "eq. 8 as printed has no free root: its place is no number");
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
@@ -185,7 +197,8 @@ nb::dict stats(const Run& run) {
   found["rhs_by_terms"] = by_terms;
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
   found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
-  found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;
+  found["jacobians"] = loop.work.jacobians, found["differences"] = counts.differences;
+  found["switches"] = counts.switches;
   found["method"] = loop.method() ? loop.method()->name() : "";
   found["steps_by_method"] = by_method, found["python_calls"] = run.view->calls;
   return found;
@@ -275,6 +288,7 @@ void bind_loop(nb::module_& m) {
       .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->y()); })
       .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });
   bind_parts(m, loop);
+  bind_variation(loop);
 }
 
 }  // namespace ckc

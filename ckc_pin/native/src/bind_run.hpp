@@ -4,6 +4,7 @@
 #include "bind_control.hpp"
 #include "level_set.hpp"
 #include "loop.hpp"
+#include "variation.hpp"
 
 namespace ckc {
 
@@ -23,5 +24,7 @@ void prepare(Run& run, const nb::dict& core, const nb::dict& formulation, const 
 extern const char* const reasons[];  // why a loop stopped, as Python has it
 
 void bind_parts(nb::module_& m, nb::class_<Run>& loop);
+void bind_variation(nb::class_<Run>& loop);
+VariationTable variation_of(const nb::dict& table);
 
 }  // namespace ckc

@@ -78,6 +78,7 @@ struct Places {
 std::unique_ptr<Core> core_of(const nb::dict& table);
 std::unique_ptr<Written> written_of(const nb::tuple& library);  // (path, parameters)
 Closure closure_of(const nb::dict& table);
+SpringTable springs_of(const nb::dict& table);
 nb::object term_of(Core& core, const std::string& name);
 
 void bind_core(nb::module_& m);

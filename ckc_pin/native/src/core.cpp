@@ -22,6 +22,7 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       scales(std::move(scales_)),
       d(0),
       written(std::move(written_)),
+      derivatives(tree, rows.closure, springs.table),
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);

@@ -6,6 +6,7 @@
 
 #include <Eigen/QR>
 
+#include "derivatives.hpp"
 #include "joints.hpp"
 #include "linear.hpp"
 #include "rows.hpp"
@@ -105,6 +106,13 @@ class Core {
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
   bool responses(const Indices& at, Matrix& columns);
+  // How the terms change at the core's state, where the tree accelerates under u'; false where nothing tells J^T lambda.
+  bool differentiate(In u_tree, In acceleration);
+  Derivatives derivatives;
+  // The least lambda for which J^T lambda is this.
+  void multipliers(In force, Out lambda);
+  // How eq. 1's acceleration changes with forces and with what J a is to lack, a column each; false where J has lost rank.
+  bool respond(const Matrix& force, const Matrix& residual, Matrix& change);
   // The same as `dae_acceleration` at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
   bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 

@@ -36,6 +36,8 @@ bool JointChanges::take_state(double t, In y) {
 bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
   if (!take_state(t, y)) return false;
   const Vector& reach = joints_.table.reach;
+  const bool known = known_ && !met.empty();
+  if (known && !system_.before_change(t, y, timed(met))) return false;
   joints_.account(coordinates);
   // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
   rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
@@ -60,7 +62,15 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   const Indices held = joints_.locked;
   if (!impact(t, y) || !grip(t, y, held)) return false;
   known_ = true;
-  return true;
+  return !known || system_.after_change(t, y);
+}
+
+// Of what was met, what comes at a time of its own: what holds gives way where nothing changes yet.
+std::vector<System::Met> JointChanges::timed(const std::vector<Event>& met) {
+  std::vector<System::Met> found;
+  for (const Event& event : met)
+    if (event.of != Event::holding) found.push_back({event.coordinate, event.of == Event::q_dot});
+  return found;
 }
 
 bool JointChanges::movable(Indices& at) {
@@ -132,6 +142,7 @@ bool JointChanges::impact(double t, Out y) {
     change += x_(i) * (v_(k) + 0.5 * step_(k));
   }
   joints_.impact_loss -= change;
+  if (!system_.at_impact(step_, at, responses_, x_, back)) return false;
   const Vector before = v_;
   system_.push(y, step_);
   if (!take_state(t, y)) return false;

@@ -4,8 +4,6 @@
 #include <cmath>
 #include <limits>
 
-#include "written.hpp"
-
 namespace ckc {
 
 constexpr double max_step = 0.5;  // rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
@@ -155,39 +153,43 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
 }
 
 bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  const bool free = core.joints.locked.empty() && !core.joints.smooth();
-  if (core.written && on_manifold_ && free && core.tree.roots.empty() && exact_jacobian(t, y, jacobian)) return true;
+  if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
   to_rounding_ = true;  // what the slack of the loops leaves open is far more than a difference moves
   const bool exists = System::jacobian(t, y, jacobian, evaluations);
   to_rounding_ = false;
   return exists;
 }
 
-// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot, d v' / d q_dot = rho.
+// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot but for a free root, whose axes turn,
+// d v' / d q_dot = rho.
 bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   const int d = core.d, n = core.n;
   if (!finite(y) || !state(t, y, tolerance_)) return false;
   core.set_velocity(v_tree);
-  if (!act(t) || !control.slopes(by_q_, by_v_)) return false;
-  if (!core.written->jacobian(core.q_tree, v_tree, acting(v_tree), by_state_, by_u_)) return false;
-  if (control.feedback()) {
-    by_state_.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
-    by_state_.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
-  }
+  if (!act(t) || !slopes(core.q_tree, v_tree, uncorrected_, by_q_, by_v_)) return false;
   core.jacobian_rate(v_tree);
   rho_dot_.resize(n, d);
   for (int k = 0; k < d; ++k) {
     unit_.setUnit(d, k);
     core.rho_dot_times(unit_, rho_dot_.col(k));
   }
+  if (!core.tree.roots.empty()) {
+    const Matrix turned = core.tree.brackets(v_tree) * core.rho;
+    for (int k = 0; k < d; ++k) {  // J x = J turned, x of z alone
+      residual_.noalias() = core.rows.J * turned.col(k);
+      core.z_step(residual_, step_);
+      rho_dot_.col(k) -= step_;
+    }
+  }
   jacobian.setZero(2 * d, 2 * d);
   jacobian.topRightCorner(d, d).setIdentity();
   for (int k = 0; k < d; ++k) {
-    const auto row = by_state_.row(n + core.q[k]);
-    jacobian.row(d + k).head(d).noalias() = row.head(n) * core.rho;
-    jacobian.row(d + k).head(d).noalias() += row.tail(n) * rho_dot_;
-    jacobian.row(d + k).tail(d).noalias() = row.tail(n) * core.rho;
+    const auto row = by_q_.row(core.q[k]), row_v = by_v_.row(core.q[k]);
+    jacobian.row(d + k).head(d).noalias() = row * core.rho;
+    jacobian.row(d + k).head(d).noalias() += row_v * rho_dot_;
+    jacobian.row(d + k).tail(d).noalias() = row_v * core.rho;
   }
+  if (!chart_.plain()) chart_.jacobian(core, core.q_tree, q_dot, jacobian);
   return jacobian.allFinite();
 }
 

@@ -16,6 +16,7 @@ class Springs {
  public:
   Springs(const Tree& tree, SpringTable table);
 
+  SpringTable table;  // changed by `vary` alone
   bool any, any_damping;
   Eigen::Index count() const { return count_; }
 
@@ -30,7 +31,6 @@ class Springs {
  private:
   void look();  // which of them there are
 
-  SpringTable table_;
   int count_;
   std::vector<Indices> pattern_;
   Vector length_;
