@@ -10,7 +10,8 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
-from ckc_pin.view.map_figure import draw_map, look
+from ckc_pin.view.canvas import look
+from ckc_pin.view.map_figure import draw_map
 from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
 
