@@ -41,7 +41,7 @@ class Curve:
 
 def draw(found: Found, work: str, folder: Path) -> str:
     """Draw one work; return the file's name."""
-    figure, axes = chart(columns=3, rows=2, size=(5.6, 4.2))
+    figure, axes = chart(columns=3, rows=2, size=(3.7, 3.1))
     rows = found.rows[found.rows.work == work]
     programs, formulations = list(_programs(rows, found.programs)), list(_formulations(rows))
     _panel(axes[0], programs, "wall_s", "error_max", "programs: error")
@@ -62,7 +62,7 @@ def draw(found: Found, work: str, folder: Path) -> str:
 def draw_main(found: Found, folder: Path) -> str:
     """Draw error against time of a few works side by side, by program; return the file's name."""
     chosen = [key for key in MAIN if key in found.works.index][:3] or list(found.works.index[:3])
-    figure, axes = chart(columns=len(chosen), size=(5.6, 4.6))
+    figure, axes = chart(columns=len(chosen), size=(3.7, 3.2))
     for ax, work in zip(axes, chosen, strict=True):
         curves = list(_programs(found.rows[found.rows.work == work], found.programs))
         _panel(ax, curves, "wall_s", "error_max", found.works.says[work])
@@ -72,7 +72,7 @@ def draw_main(found: Found, folder: Path) -> str:
 
 def draw_growth(found: Found, folder: Path) -> str:
     """Draw right-hand sides' times along each family; return the file's name."""
-    figure, axes = chart(columns=len(FAMILIES), size=(5.6, 4.2))
+    figure, axes = chart(columns=len(FAMILIES), size=(3.7, 3.1))
     for ax, family in zip(axes, FAMILIES, strict=True):
         own = found.growth[(found.growth.family == family.key) & found.growth.rhs_s.notna()]
         for k, formulation in enumerate(FORMULATIONS):
@@ -85,7 +85,7 @@ def draw_growth(found: Found, folder: Path) -> str:
         ax.set_ylabel("one right-hand side (µs)")
         whole_decades(ax)
         if ax.lines:
-            ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14))
+            ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     return save(figure, folder, "growth.png")
 
 
@@ -119,6 +119,8 @@ def _panel(ax: Any, curves: Sequence[Curve], x: str, y: str, title: str) -> None
             look = {"markersize": 4.5, "linewidth": 1.4, "clip_on": False, **curve.look}
             ax.plot(points[x], points[y].clip(lower=FLOOR), label=curve.name, **look)
     whole_decades(ax)
+    for words in (ax.title, ax.xaxis.label, ax.yaxis.label):
+        words.set_fontsize(8)
 
 
 def _name(figure: Any, axes: Sequence[Any], **where: Any) -> None:
