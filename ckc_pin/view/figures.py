@@ -244,7 +244,7 @@ _LAYOUTS = {"set_point": _set_point, "tracking": _tracking, "own": _tracking, "m
 
 def _page(group: Group, titles: Sequence[str], panel: tuple[float, float] = PANEL, what: str = "") -> list[Slot]:
     scene = group.runs[0].scene_name
-    told = [what, plain(scene) if "/" in scene else "", PAPER.get(scene, ""),
+    words = [what, plain(scene) if "/" in scene else "", PAPER.get(scene, ""),
             group.labels[0] if len(group.runs) == 1 else ""]  # fmt: skip
     columns = round(style.WIDTH / panel[0]) if len(titles) > 1 else 1
     title = f"{plain(group.mechanism.name)}: {TITLES[group.kind]}"
@@ -253,7 +253,7 @@ def _page(group: Group, titles: Sequence[str], panel: tuple[float, float] = PANE
         and len({panels.unit_of(group, name) for name in group.shown_names if name in group.runs[0].coordinates}) > 1
     ):
         panel = (PANEL[0], PANEL[1] + TALLER)  # an axes for each unit
-    return page(title, ", ".join(filter(None, told)), titles, columns, panel)
+    return page(title, ", ".join(filter(None, words)), titles, columns, panel)
 
 
 def _thin(figure: Figure, columns: int) -> None:

@@ -32,6 +32,7 @@ def play(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
     open_browser: bool = False,
     port: int = 0,
     block: bool = True,
@@ -50,6 +51,8 @@ def play(
     meshes : path, optional
         The mechanism's folder, where the URDF's mesh files are: a run file has none. Links whose meshes are missing
         are drawn as sticks.
+    forces : bool
+        Draw what the loops carry and what the motors give as arrows; the page can hide them.
     open_browser : bool
         Also open the address.
     port : int
@@ -66,12 +69,12 @@ def play(
     InputError
         No run, a speed that is not above zero, a port in use, meshcat missing, a drawing that cannot be.
     """
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
     try:
         from ckc_pin.view.server import ViewServer
     except ModuleNotFoundError:
         raise InputError("playback needs meshcat and its tornado: pip install 'ckc_pin[view]'") from None
-    server = ViewServer(page(*caption(ordered, gap)), port)
+    server = ViewServer(page(*caption(ordered, gap, forces)), port)
     for command in drawing:
         server.send(command)
     if open_browser:
@@ -94,6 +97,7 @@ def save_html(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
 ) -> Path:
     """Write runs as one HTML file that plays from disk, without a network. Parameters as for `play`.
 
@@ -103,8 +107,8 @@ def save_html(
         As for `play`; a file that cannot be written.
     """
     path = Path(path)
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
-    text = standalone(*caption(ordered, gap), drawing)
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
+    text = standalone(*caption(ordered, gap, forces), drawing)
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
     write_whole(path, text)
@@ -112,7 +116,7 @@ def save_html(
 
 
 def _drawing(
-    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None
+    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None, forces: bool
 ) -> tuple[list[Run], list[Command]]:
     runs = [runs] if isinstance(runs, Run) else list(runs)
     if not runs:
@@ -125,7 +129,7 @@ def _drawing(
     if folder is not None and not folder.is_dir():
         raise InputError(f"play: meshes = {folder}: no such folder; give the one that the mechanism.toml is in")
     ordered = drawing_order(runs)
-    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder)
+    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder, forces=forces)
     missing = list(dict.fromkeys(name for run in ordered for name in missing_meshes(run.mechanism, folder)))
     if missing:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
@@ -133,11 +137,13 @@ def _drawing(
     return ordered, drawing
 
 
-def caption(runs: Sequence[Run], gap: float = 0.0) -> tuple[str, list[str]]:
+def caption(runs: Sequence[Run], gap: float = 0.0, forces: bool = False) -> tuple[str, list[str]]:
     """Return the title of a page that shows runs, and the lines below it."""
     lines = [f"{'translucent: ' if k else ''}{label}" for k, label in enumerate(run_labels(runs))]
     if any("controller" in run.scene for run in runs):
         lines.append("gray: desired")
     if gap > 0:
         lines.append(f"red: gaps of the loops, {gap:g} times larger")
+    if forces:
+        lines.append("green: forces of the loops; purple: of the motors")
     return runs[0].scene_name, lines

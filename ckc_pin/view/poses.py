@@ -16,7 +16,7 @@ from ckc_pin.view.canvas import Slot
 from ckc_pin.view.group import Group, columns
 from ckc_pin.view.labels import rate_symbol, symbol, with_unit
 from ckc_pin.view.panels import unit_of
-from ckc_pin.view.skeleton import Placements, Plane, placements, slides, sticks
+from ckc_pin.view.skeleton import Placements, Projection, placements, slides, sticks
 
 __all__ = ["INITIAL", "PATH", "TARGET", "configuration_space", "linkage", "snapshots"]
 
@@ -56,7 +56,7 @@ def _two(run: Run, q: Array, q_dot: Array) -> tuple[Array, Array]:
     return (q[:, 0], q_dot[:, 0]) if len(run.independent) == 1 else (q[:, 0], q[:, 1])
 
 
-def linkage(slot: Slot, group: Group, plane: Plane) -> None:
+def linkage(slot: Slot, group: Group, plane: Projection) -> None:
     """Draw the initial configuration in blue, the desired ones in red, and the ways of the points between."""
     mechanism, run = group.mechanism, group.runs[0]
     (ax,) = slot.axes()
@@ -75,7 +75,7 @@ def linkage(slot: Slot, group: Group, plane: Plane) -> None:
     _frame(ax, plane)
 
 
-def snapshots(slots: Sequence[Slot], group: Group, planes: Sequence[Plane]) -> Any:
+def snapshots(slots: Sequence[Slot], group: Group, planes: Sequence[Projection]) -> Any:
     """Draw the first run's poses at equal times on planes, the first and the last broader; return the colours."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -102,7 +102,7 @@ def snapshots(slots: Sequence[Slot], group: Group, planes: Sequence[Plane]) -> A
 # --- parts ---------------------------------------------------------------------------------------
 
 
-def _base(ax: Any, mechanism: Mechanism, moved: Placements, plane: Plane) -> None:
+def _base(ax: Any, mechanism: Mechanism, moved: Placements, plane: Projection) -> None:
     """Draw what stands still: the base, and its rails as far as sliders go on them in the poses shown."""
     rails = [slide for slide in slides(mechanism) if not slide.parent]
     for stick in sticks(mechanism):
@@ -116,7 +116,7 @@ def _base(ax: Any, mechanism: Mechanism, moved: Placements, plane: Plane) -> Non
         ax.plot(*(plane.axes @ span.T), color="black", linewidth=1.0, zorder=2, marker="|", markersize=5)
 
 
-def _pose(ax: Any, mechanism: Mechanism, at: Placements, plane: Plane, colour: Any, thick: float) -> None:
+def _pose(ax: Any, mechanism: Mechanism, at: Placements, plane: Projection, colour: Any, thick: float) -> None:
     sliding = {slide.joint: slide for slide in slides(mechanism)}
     rings: list[Array] = []
     for stick in sticks(mechanism):
@@ -141,7 +141,7 @@ def _pose(ax: Any, mechanism: Mechanism, at: Placements, plane: Plane, colour: A
                 markerfacecolor="white", markeredgewidth=min(thick, 1.0), zorder=4)  # fmt: skip
 
 
-def _block(ax: Any, plane: Plane, where: Array, along: Array, size: float, colour: Any) -> None:
+def _block(ax: Any, plane: Projection, where: Array, along: Array, size: float, colour: Any) -> None:
     from matplotlib.patches import Polygon
 
     middle, way = plane.axes @ where, plane.axes @ along
@@ -151,7 +151,7 @@ def _block(ax: Any, plane: Plane, where: Array, along: Array, size: float, colou
     ax.add_patch(Polygon(corners, facecolor="white", edgecolor=colour, linewidth=1.1, zorder=4))
 
 
-def _frame(ax: Any, plane: Plane) -> None:
+def _frame(ax: Any, plane: Projection) -> None:
     ax.set_xlabel(with_unit(plane.names[0], "m"))
     ax.set_ylabel(with_unit(plane.names[1], "m"))
     ax.margins(0.06)

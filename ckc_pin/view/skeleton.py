@@ -12,7 +12,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Placements", "Plane", "Slide", "Stick", "configurations", "is_planar", "placements", "planes", "slides",
+__all__ = ["Placements", "Projection", "Slide", "Stick", "configurations", "is_planar", "placements", "planes", "slides",
            "sticks", "upward", "viewpoint"]  # fmt: skip
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
@@ -55,7 +55,7 @@ class Slide:
 
 
 @dataclass(frozen=True)
-class Plane:
+class Projection:
     """A plane to draw on: the side it is seen from, its axes (2, 3) in the world, and their names."""
 
     title: str
@@ -160,21 +160,21 @@ def viewpoint(mechanism: Mechanism) -> Array:
     return np.array([right, up, normal])
 
 
-def planes(mechanism: Mechanism) -> list[Plane]:
+def planes(mechanism: Mechanism) -> list[Projection]:
     """Return where to draw a mechanism: its own plane, or from the front, from the side and from above.
 
     The three are the world's coordinate planes, with the axis upwards that is nearest to up.
     """
     if is_planar(mechanism):
         axes = viewpoint(mechanism)[:2]
-        return [Plane("", axes, (_axis_name(axes[0], "across"), _axis_name(axes[1], "up")))]
+        return [Projection("", axes, (_axis_name(axes[0], "across"), _axis_name(axes[1], "up")))]
     up = upward(mechanism)
     k = int(np.argmax(np.abs(up)))
     vertical = np.sign(up[k]) * np.eye(3)[k]
     right = np.eye(3)[(k + 1) % 3]
     forward = np.cross(vertical, right)  # away from who looks from the front
     views = (("front", right, vertical), ("side", forward, vertical), ("top", right, forward))
-    return [Plane(title, np.array([x, y]), (_axis_name(x, ""), _axis_name(y, ""))) for title, x, y in views]
+    return [Projection(title, np.array([x, y]), (_axis_name(x, ""), _axis_name(y, ""))) for title, x, y in views]
 
 
 def _axis_name(direction: Array, otherwise: str) -> str:
