@@ -12,8 +12,8 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Placements", "Projection", "Slide", "Stick", "configurations", "is_planar", "placements", "planes", "slides",
-           "sticks", "upward", "viewpoint"]  # fmt: skip
+__all__ = ["Placements", "Projection", "Slide", "Stick", "configurations", "is_planar", "placements", "planes",
+           "slides", "sticks", "upward", "viewpoint"]  # fmt: skip
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
 

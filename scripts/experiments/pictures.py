@@ -17,7 +17,7 @@ from ckc_pin.view.sections_figure import draw_sections
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE: ViewportSize = {"width": 720, "height": 540}
-DPI = 100
+DPI = 170
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.getuid() else ["--no-sandbox"])]
 
 
@@ -29,8 +29,8 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
         page.goto(server.url)
         while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
             time.sleep(0.1)
-        page.evaluate("viewer.animator.pause(); viewer.gui.domElement.style.display = 'none'")
-        page.evaluate(f"viewer.animator.seek({t}); viewer.render()")
+        page.evaluate("player.pause(); viewer.gui.domElement.style.display = 'none'")
+        page.evaluate(f"player.go({t}); document.getElementById('bar').style.display = 'none'; viewer.render()")
         time.sleep(0.5)
         page.screenshot(path=path)
 
