@@ -60,8 +60,10 @@ def draw_sections(found: Sequence[SingularityMap]) -> Figure:
         for k, (ax, one) in enumerate(zip(panels, found, strict=True)):
             shown = draw_aspect(ax, one, 0, most)
             say(ax, f"${fixed}$ = {one.fixed[fixed]:.3f} m", f"reaches {cell * np.sum(one.aspects[0].reached):.3f} m²")
+            ax.locator_params(nbins=4)
             if k % columns:
                 ax.set_ylabel("")
+                ax.tick_params(labelleft=False)
             if k + columns < len(found):
                 ax.set_xlabel("")
         figure.colorbar(shown, ax=panels, label=det_label(first), shrink=0.85)
