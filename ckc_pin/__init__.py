@@ -110,6 +110,7 @@ def play(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
     open_browser: bool = False,
     port: int = 0,
     block: bool = True,
@@ -127,6 +128,8 @@ def play(
         Above zero: how many times larger the gaps of the loops are drawn.
     meshes : path, optional
         The mechanism's folder, where the URDF's mesh files are.
+    forces : bool
+        Draw what the loops carry and what the motors give as arrows; the page can hide them.
     open_browser, port, block
         In the browser: open the address too; a port of 127.0.0.1, 0 for any free one; wait until Ctrl-C, or return the
         server at once, which plays until its `stop`.
@@ -142,8 +145,10 @@ def play(
     from ckc_pin.view.player import play as play_runs
 
     if in_notebook() if inline is None else inline:
-        return Playback(runs, speed=speed, gap=gap, meshes=meshes)
-    return play_runs(runs, speed=speed, gap=gap, meshes=meshes, open_browser=open_browser, port=port, block=block)
+        return Playback(runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
+    return play_runs(
+        runs, speed=speed, gap=gap, meshes=meshes, forces=forces, open_browser=open_browser, port=port, block=block
+    )
 
 
 def plot(*runs: Run) -> Figures:

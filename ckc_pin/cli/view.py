@@ -37,6 +37,7 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
 @click.option("--html", metavar="FILE", type=options.PATH, help="Write one file that plays from disk instead.")
 @click.option("--speed", metavar="FACTOR", type=float, default=1.0, help="Playback speed, 1 is real time.")
 @click.option("--gap", metavar="FACTOR", type=float, default=0.0, help="Draw the loops' gaps so much larger.")
+@click.option("--forces", is_flag=True, help="Draw the forces of loops and motors as arrows.")
 @click.option("--meshes", metavar="DIR", type=options.PATH, help="The mechanism's folder, for its mesh files.")
 @options.port
 @options.open_browser
@@ -45,6 +46,7 @@ def play(
     html: Path | None,
     speed: float,
     gap: float,
+    forces: bool,
     meshes: Path | None,
     port: int,
     open_browser: bool,
@@ -53,10 +55,10 @@ def play(
     options.check_speed(speed)
     loaded = [ckc_pin.Run.load(path) for path in runs]
     if html is None:
-        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, port=port, open_browser=open_browser)
+        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, forces=forces, port=port, open_browser=open_browser)
         return
     from ckc_pin.view.player import save_html
 
     with Working(f"writing {html.name}"):
-        written = save_html(loaded, html, speed=speed, gap=gap, meshes=meshes)
+        written = save_html(loaded, html, speed=speed, gap=gap, meshes=meshes, forces=forces)
     print(f"written: {written}")

@@ -263,12 +263,18 @@ class Run(Shown):
         return ckc_pin.plot(self)
 
     def play(
-        self, *, speed: float = 1.0, gap: float = 0.0, meshes: str | Path | None = None, inline: bool | None = None
+        self,
+        *,
+        speed: float = 1.0,
+        gap: float = 0.0,
+        meshes: str | Path | None = None,
+        forces: bool = False,
+        inline: bool | None = None,
     ) -> Playback | ViewServer | None:
         """Play the run: in a notebook below the cell, elsewhere in the browser until Ctrl-C; see `ckc_pin.play`."""
         import ckc_pin
 
-        return ckc_pin.play(self, speed=speed, gap=gap, meshes=meshes, inline=inline)
+        return ckc_pin.play(self, speed=speed, gap=gap, meshes=meshes, forces=forces, inline=inline)
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the run as xarray's Dataset, by t, coordinate, independent, motor, row and point (extra `data`)."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ckc_pin.simulation.run import Run
 from ckc_pin.view.figures import draw, write_figures
-from ckc_pin.view.player import html, save_html
+from ckc_pin.view.player import html, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,15 +74,21 @@ class Playback:
     Parameters
     ----------
     runs : sequence of Run
-    speed, gap, meshes
+    speed, gap, meshes, forces
         As for `play`.
     """
 
     def __init__(
-        self, runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: str | Path | None = None
+        self,
+        runs: Sequence[Run],
+        *,
+        speed: float = 1.0,
+        gap: float = 0.0,
+        meshes: str | Path | None = None,
+        forces: bool = False,
     ) -> None:
-        self._runs, self._speed, self._gap, self._meshes = tuple(runs), speed, gap, meshes
-        self.html = html(self._runs, speed=speed, gap=gap, meshes=meshes)
+        self._runs = tuple(runs)
+        self.html = html(self._runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
 
     def __repr__(self) -> str:
         return f"Playback({', '.join(run.scene_name for run in self._runs)}); save(FILE) writes a page that plays"
@@ -96,7 +102,7 @@ class Playback:
 
     def save(self, path: str | Path) -> Path:
         """Write one HTML file that plays from disk, without a network; errors are those of `save_html`."""
-        return save_html(self._runs, path, speed=self._speed, gap=self._gap, meshes=self._meshes)
+        return write_page(self.html, path)
 
 
 def _image(name: str, figure: Figure) -> str:

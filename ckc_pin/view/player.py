@@ -24,7 +24,7 @@ from ckc_pin.view.style import drawing_order
 if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
-__all__ = ["caption", "html", "play", "save_html"]
+__all__ = ["caption", "html", "play", "save_html", "write_page"]
 
 
 def play(
@@ -33,6 +33,7 @@ def play(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
     open_browser: bool = False,
     port: int = 0,
     block: bool = True,
@@ -51,6 +52,8 @@ def play(
     meshes : path, optional
         The mechanism's folder, where the URDF's mesh files are: a run file has none. Links whose meshes are missing
         are drawn as sticks.
+    forces : bool
+        Draw what the loops carry and what the motors give as arrows; the page can hide them.
     open_browser : bool
         Also open the address.
     port : int
@@ -69,13 +72,14 @@ def play(
     """
     require_flag(open_browser, "play: open_browser")
     require_flag(block, "play: block")
+    require_flag(forces, "play: forces")
     require_kind(port, int, "play: port", "a port from 1 to 65535, or 0 for any free one")
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
     try:
         from ckc_pin.view.server import ViewServer
     except ModuleNotFoundError:
         raise InputError("playback needs meshcat and its tornado: pip install 'ckc_pin[view]'") from None
-    server = ViewServer(page(*caption(ordered, gap)), port)
+    server = ViewServer(page(*caption(ordered, gap, forces)), port)
     for command in drawing:
         server.send(command)
     if open_browser:
@@ -98,6 +102,7 @@ def save_html(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
 ) -> Path:
     """Write runs as one HTML file that plays from disk, without a network. Parameters as for `play`.
 
@@ -106,23 +111,34 @@ def save_html(
     InputError
         As for `play`; a file that cannot be written.
     """
+    return write_page(html(runs, speed=speed, gap=gap, meshes=meshes, forces=forces), path)
+
+
+def write_page(text: str, path: str | Path) -> Path:
+    """Write a page as `save_html` does."""
     require_path(path, "save_html: path")
     path = Path(path)
-    text = html(runs, speed=speed, gap=gap, meshes=meshes)
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
     write_whole(path, text)
     return path
 
 
-def html(runs: Run | Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: str | Path | None = None) -> str:
+def html(
+    runs: Run | Sequence[Run],
+    *,
+    speed: float = 1.0,
+    gap: float = 0.0,
+    meshes: str | Path | None = None,
+    forces: bool = False,
+) -> str:
     """Return the page that `save_html` writes, for what shows pages in a place of its own."""
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
-    return standalone(*caption(ordered, gap), drawing)
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
+    return standalone(*caption(ordered, gap, forces), drawing)
 
 
 def _drawing(
-    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None
+    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None, forces: bool
 ) -> tuple[list[Run], list[Command]]:
     runs = given_runs(runs, "play")
     if not (is_number(speed) and math.isfinite(speed) and speed > 0):
@@ -136,7 +152,7 @@ def _drawing(
     if folder is not None and not folder.is_dir():
         raise InputError(f"play: meshes = {folder}: no such folder; give the one that the mechanism.toml is in")
     ordered = drawing_order(runs)
-    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder)
+    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder, forces=forces)
     missing = list(dict.fromkeys(name for run in ordered for name in missing_meshes(run.mechanism, folder)))
     if missing:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
@@ -155,11 +171,13 @@ def _require_one_tree(runs: Sequence[Run]) -> None:
         )
 
 
-def caption(runs: Sequence[Run], gap: float = 0.0) -> tuple[str, list[str]]:
+def caption(runs: Sequence[Run], gap: float = 0.0, forces: bool = False) -> tuple[str, list[str]]:
     """Return the title of a page that shows runs, and the lines below it."""
     lines = [f"{'translucent: ' if k else ''}{label}" for k, label in enumerate(run_labels(runs))]
     if any("controller" in run.scene for run in runs):
         lines.append("gray: desired")
     if gap > 0:
         lines.append(f"red: gaps of the loops, {gap:g} times larger")
+    if forces:
+        lines.append("green: forces of the loops; purple: of the motors")
     return runs[0].scene_name, lines

@@ -9,8 +9,8 @@ import numpy as np
 
 from ckc_pin.simulation.sensitivities import Sensitivities
 from ckc_pin.view import style
+from ckc_pin.view.canvas import look, write
 from ckc_pin.view.labels import plain, symbol
-from ckc_pin.view.map_figure import look, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,14 +10,15 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
-from ckc_pin.view.map_figure import draw_map, look
+from ckc_pin.view.canvas import look
+from ckc_pin.view.map_figure import draw_map
 from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
 from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE: ViewportSize = {"width": 720, "height": 540}
-DPI = 100
+DPI = 170
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.getuid() else ["--no-sandbox"])]
 
 
@@ -29,8 +30,8 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
         page.goto(server.url)
         while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
             time.sleep(0.1)
-        page.evaluate("viewer.animator.pause(); viewer.gui.domElement.style.display = 'none'")
-        page.evaluate(f"viewer.animator.seek({t}); viewer.render()")
+        page.evaluate("player.pause(); viewer.gui.domElement.style.display = 'none'")
+        page.evaluate(f"player.go({t}); document.getElementById('bar').style.display = 'none'; viewer.render()")
         time.sleep(0.5)
         page.screenshot(path=path)
 

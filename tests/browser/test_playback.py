@@ -73,8 +73,9 @@ def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracki
         )
         expected = [np.interp(played, tracking.t, column) for column in elbow(tracking, "theta_1").T]
         np.testing.assert_allclose(elements, expected, atol=1e-6)  # between keyframes the browser interpolates
-        labels = visit.page.locator(".dg .property-name").all_inner_texts()
-        assert {"play", "pause", "reset", "time, s", "speed"} <= set(labels)
+        labels = visit.page.locator(".dg .property-name").all_text_contents()
+        assert {"play", "pause", "reset", "time (s)", "speed"} <= set(labels)
+        assert visit.page.input_value("#speed") == "0.5"
         assert visit.page.evaluate("viewer.animator.duration") == pytest.approx(9.5)
 
 
