@@ -12,10 +12,13 @@ Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ckc_pin.control.controllers import Controller, SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.dynamics.linearization import LinearModel
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.kinematics import load
@@ -25,25 +28,32 @@ from ckc_pin.mechanism import Mechanism
 if TYPE_CHECKING:
     from ckc_pin.generated.symbolic import Symbolic
     from ckc_pin.kinematics.mapped import SingularityMap
-    from ckc_pin.simulation import (
-        Check,
-        Event,
-        MotionForces,
-        Run,
-        Scene,
-        Simulator,
-        as_ivp,
-        check,
-        inverse_dynamics,
-        load_scene,
-        simulate,
-    )
+    from ckc_pin.simulation.check import Check, check
+    from ckc_pin.simulation.ensembles.ensemble import ensemble
+    from ckc_pin.simulation.events import Event
+    from ckc_pin.simulation.floquet import Floquet, floquet
+    from ckc_pin.simulation.inverse import inverse_dynamics
+    from ckc_pin.simulation.ivp import as_ivp
+    from ckc_pin.simulation.linearize import linearize
+    from ckc_pin.simulation.motion_forces import MotionForces
+    from ckc_pin.simulation.run import Run
+    from ckc_pin.simulation.scene import Scene, load_scene
+    from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+    from ckc_pin.simulation.simulate import simulate
+    from ckc_pin.simulation.simulator import Simulator
+    from ckc_pin.simulation.stability import Stability
+    from ckc_pin.simulation.state import State
+    from ckc_pin.view.inline import Figures, Playback
+    from ckc_pin.view.server import ViewServer
 
 __all__ = [
     "Check",
     "CkcError",
+    "Controller",
     "Event",
+    "Floquet",
     "InputError",
+    "LinearModel",
     "Mechanism",
     "MechanismError",
     "MotionForces",
@@ -52,14 +62,24 @@ __all__ = [
     "Run",
     "Sampled",
     "Scene",
+    "Sensitivities",
+    "SetPoint",
     "Simulator",
+    "Stability",
+    "State",
     "Terms",
+    "Tracking",
     "as_ivp",
     "check",
+    "ensemble",
+    "floquet",
     "inverse_dynamics",
+    "linearize",
     "load",
     "load_scene",
     "play",
+    "plot",
+    "sensitivities",
     "simulate",
     "singularity_map",
     "symbolic",
@@ -85,18 +105,89 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def play(*runs: Run, **options: Any) -> Any:
-    """Play runs in meshcat; see `ckc_pin.view.player.play`, which this loads when called."""
+def play(
+    *runs: Run,
+    speed: float = 1.0,
+    gap: float = 0.0,
+    meshes: str | Path | None = None,
+    forces: bool = False,
+    open_browser: bool = False,
+    port: int = 0,
+    block: bool = True,
+    inline: bool | None = None,
+) -> Playback | ViewServer | None:
+    """Play runs: in a notebook below the cell, elsewhere in the browser, on this machine only.
+
+    Parameters
+    ----------
+    runs : Run
+        They lie on each other; all of one mechanism.
+    speed : float
+        Seconds of the run in a second of playback, to begin with.
+    gap : float
+        Above zero: how many times larger the gaps of the loops are drawn.
+    meshes : path, optional
+        The mechanism's folder, where the URDF's mesh files are.
+    forces : bool
+        Draw what the loops carry and what the motors give as arrows; the page can hide them.
+    open_browser, port, block
+        In the browser: open the address too; a port of 127.0.0.1, 0 for any free one; wait until Ctrl-C, or return the
+        server at once, which plays until its `stop`.
+    inline : bool, optional
+        Return a page that a notebook shows, and `save` writes; absent: in a notebook.
+
+    Raises
+    ------
+    InputError
+        No run, runs of several mechanisms, numbers that cannot be, a port in use, meshcat missing.
+    """
+    from ckc_pin.view.inline import Playback, in_notebook
     from ckc_pin.view.player import play as play_runs
 
-    return play_runs(runs, **options)
+    if in_notebook() if inline is None else inline:
+        return Playback(runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
+    return play_runs(
+        runs, speed=speed, gap=gap, meshes=meshes, forces=forces, open_browser=open_browser, port=port, block=block
+    )
 
 
-def singularity_map(mechanism: Mechanism | str | Path, **options: Any) -> SingularityMap:
+def plot(*runs: Run) -> Figures:
+    """Draw runs; a notebook shows the figures, `save(folder)` writes them.
+
+    Parameters
+    ----------
+    runs : Run
+        Those of one mechanism under one kind of control share a figure.
+
+    Returns
+    -------
+    Figures
+        matplotlib's figures by name.
+
+    Raises
+    ------
+    InputError
+        No run; matplotlib missing.
+    """
+    from ckc_pin.view.inline import Figures
+
+    return Figures(runs)
+
+
+def singularity_map(
+    mechanism: Mechanism | str | Path,
+    *,
+    scene: Scene | str | Path | None = None,
+    space: str = "joint",
+    over: Sequence[str] | None = None,
+    point: str | None = None,
+    cells: int = 200,
+    progress: Callable[[float], None] | None = None,
+) -> SingularityMap:
     """Map where a mechanism can go and is singular; see `ckc_pin.analysis.map.singularity_map`, which this loads."""
     from ckc_pin.analysis.map import singularity_map as compute
 
-    return compute(mechanism, **options)
+    return compute(mechanism, scene=scene, space=space, over=over, point=point, cells=cells, progress=progress)
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:

@@ -33,7 +33,12 @@ class CkcError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(message if message.isprintable() else "".join(map(_shown, message)))
+        super().__init__(printable(message))
+
+
+def printable(text: str) -> str:
+    """Return a line of text whose letters can all be printed: the others stand as escapes, and move no cursor."""
+    return text if text.isprintable() else "".join(map(_shown, text))
 
 
 def _shown(letter: str) -> str:

@@ -150,14 +150,14 @@ def figure(found: Plan, replayed: Array) -> Any:
     angles.axhline(UP[0], color=BLACK, lw=0.8, ls=":", label="upright")
     for sign in (-1, 1):
         torques.axhline(sign * TORQUE, color=BLACK, lw=0.8, ls="--", label="limit" if sign > 0 else None)
-    angles.set(xlabel="t / s", ylabel="angle / rad", title="arms: planned (lines), replayed (dots)")
-    torques.set(xlabel="t / s", ylabel="torque / N m", title="torques")
+    angles.set(xlabel="t (s)", ylabel="angle (rad)", title="arms: planned (lines), replayed (dots)")
+    torques.set(xlabel="t (s)", ylabel="torque (N m)", title="torques")
     path = _pins(found)[:, :, :2]
     for pins in path[:: (len(path) - 1) // (POSES - 1)]:
         for ends, colour in ((pins[:3], COLOURS[0]), (pins[2:], COLOURS[1])):
             poses.plot(*ends.T, "-o", color=colour, lw=1.2, ms=2.5, alpha=0.55)
     poses.plot(*path[:, 2].T, color=BLACK, lw=1.5)
-    poses.set(xlabel="x / m", ylabel="y / m", aspect="equal", title=f"poses every {T_END / (POSES - 1):.1f} s")
+    poses.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"poses every {T_END / (POSES - 1):.1f} s")
     for ax in (angles, torques):
         ax.legend(fontsize=8)
     return drawn

@@ -10,6 +10,7 @@ from typing import NoReturn
 
 import click
 
+import ckc_pin
 from ckc_pin.cli.exits import DONE, STOPPED, WRONG_INPUT, interrupted, interrupts
 from ckc_pin.cli.output import errors, print_json
 from ckc_pin.errors import CkcError, NumericalError
@@ -22,18 +23,26 @@ BEGIN = """Dynamics and control of closed kinematic chains.
 Begin with
   ckc list                                     what is shipped
   ckc check five_bar                           freedoms, partition, assembled configuration
-  ckc run five_bar/tracking --out runs/first   simulate; run.npz and figures go to the folder
+  ckc run five_bar/tracking --out runs/first   simulate; run.npz goes to the folder
   ckc play runs/first                          watch it in the browser
+  ckc plot runs/first --out figures            draw it
+  ckc new mine                                 a folder with a mechanism of your own to change
   ckc COMMAND --help                           what a command does, with examples
 """
 
+# What a shell asks by, once its own file has: eval "$(_CKC_COMPLETE=bash_source ckc)", or zsh_source, fish_source.
+COMPLETE = "_CKC_COMPLETE"
+
 COMMANDS = {
+    "new": "new:new",
     "list": "look:list_",
     "check": "look:check",
     "terms": "look:terms",
     "compile": "look:compile_",
     "run": "run:run",
     "inverse": "inverse:inverse",
+    "linearize": "linearize:linearize",
+    "sweep": "sweep:sweep",
     "plot": "view:plot",
     "play": "view:play",
     "map": "map:map_",
@@ -66,6 +75,7 @@ class _Commands(click.Group):
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
+@click.version_option(ckc_pin.__version__, message="%(prog)s %(version)s")
 @click.pass_context
 def ckc(context: click.Context) -> None:
     """Say where to begin when no command is given."""
@@ -75,6 +85,10 @@ def ckc(context: click.Context) -> None:
 
 def main() -> NoReturn:
     """Entry point of the `ckc` command."""
+    if COMPLETE in os.environ:
+        from click.shell_completion import shell_complete
+
+        sys.exit(shell_complete(ckc, {}, "ckc", COMPLETE, os.environ[COMPLETE]))
     as_json = "--json" in sys.argv
     interrupts.install()
     if isinstance(sys.stdout, io.TextIOWrapper):

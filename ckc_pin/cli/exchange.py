@@ -8,21 +8,27 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.cli.output import Working, errors, print_card, print_json
 from ckc_pin.formats import exporting, importing
-from ckc_pin.simulation.report import check_plain, check_table
+from ckc_pin.simulation.report import check_plain
 
 __all__ = ["export", "import_"]
 
 
 @click.command("import", epilog=options.examples("ckc import cassie.xml --out mechanisms/cassie"))
-@click.argument("file", metavar="FILE", type=Path, help="MuJoCo's MJCF, a URDF, or a robot.yaml beside its URDF.")
-@click.option("--out", metavar="DIR", type=Path, help="Folder to write to; absent: one named after it.")
+@click.argument(
+    "file",
+    metavar="FILE",
+    type=options.PATH,
+    help="MuJoCo's MJCF, a URDF, or a robot.yaml beside its URDF.",
+)
+@options.out(help="Folder to write to; absent: one named after it.")
 @options.overwrite
 @options.as_json
 def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> None:
     """Take a robot from another format. Writes a mechanism.toml and a URDF, and says what was guessed and left out."""
-    draft = importing.read(file)
+    with Working(f"reading {file.name}"):
+        draft = importing.read(file)
     written = importing.write(draft, out or Path(draft.name), overwrite)
     found, problem = None, ""
     try:
@@ -38,20 +44,24 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
     for verb, items in (("written", written), ("guessed", draft.guessed), ("left out", draft.left_out)):
         for item in items:
             print(f"{verb}: {item}")
-    print_table(check_table(found) if found else f"check: {problem}")
+    if found:
+        print_card(found.card())
+    else:
+        print(f"check: {problem}")
 
 
 @click.command(
     epilog=options.examples("ckc export five_bar --to mjcf > five_bar.xml", "ckc export mine --to mjcf --out models")
 )
 @options.mechanism
-@click.option("--to", default="mjcf", help="mjcf: a model of MuJoCo.")
-@click.option("--out", metavar="DIR", type=Path, help="Folder to write to; absent: print it.")
+@click.option("--to", type=click.Choice(["mjcf"]), default="mjcf", help="mjcf: a model of MuJoCo.")
+@options.out(help="Folder to write to; absent: print it.")
 @options.overwrite
 @options.as_json
 def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: bool) -> None:
     """Write a mechanism for another program. Says what moves otherwise there."""
-    found = exporting.export(ckc_pin.load(mechanism), to)
+    with Working(f"export of {mechanism}"):
+        found = exporting.export(ckc_pin.load(mechanism), to)
     written = [] if out is None else [exporting.write(found, out, overwrite)]
     if as_json:
         text = {} if written else {"text": found.text}

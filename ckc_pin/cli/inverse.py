@@ -11,7 +11,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
-from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table
+from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes
@@ -22,40 +22,48 @@ __all__ = ["inverse"]
 
 @click.command(
     epilog=options.examples(
-        "ckc inverse five_bar/tracking --out forces",
+        "ckc inverse five_bar/tracking --out forces --figures",
         "ckc inverse five_bar/tracking --set controller.torque_limit=1.2 --json",
         "ckc inverse runs/spf",
     )
 )
-@click.argument("what", metavar="SCENE|RUN", help="A scene with a desired motion, or a run: its file or its folder.")
+@click.argument(
+    "what",
+    metavar="SCENE|RUN",
+    shell_complete=options.complete_scenes,
+    help="A scene with a desired motion, or a run: its file or its folder.",
+)
 @options.changes
-@click.option("--out", metavar="DIR", type=Path, help="Folder for inverse.npz and the figure.")
+@options.out(help="Folder for inverse.npz.")
+@options.figures
 @options.as_json
-def inverse(what: str, changes: tuple[str, ...], out: Path | None, as_json: bool) -> None:
+def inverse(what: str, changes: tuple[str, ...], out: Path | None, figures: bool, as_json: bool) -> None:
     """Motor torques, loop and joint forces along a motion. The scene's desired one, or that of a run."""
+    options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
     with ProgressBar(what) as progress:
         found = ckc_pin.inverse_dynamics(what, read_changes("--set", changes), progress=progress)
     if out is not None:
-        _write(found, out)
+        _write(found, out, figures)
     if as_json:
         print_json(inverse_plain(found))
     else:
         print_table(inverse_table(found))
-        if out is not None:
-            print(f"written to {out}")
+        print(kept(out, "inverse.npz, for other programs"))
     sys.stdout.flush()
     if found.status != "done":
         errors().print(found.message)
         raise click.exceptions.Exit(STOPPED if found.status == "stopped" else interrupted(found.message))
 
 
-def _write(found: ckc_pin.MotionForces, out: Path) -> None:
-    """Save the forces, whatever signals come, then draw them."""
+def _write(found: ckc_pin.MotionForces, out: Path, figures: bool) -> None:
+    """Save the forces, whatever signals come, then draw them if that is asked for."""
     with interrupts.deferred(), ExitStack() as stack:
         stack.enter_context(alone_in(out))
         found.save(out / "inverse.npz")
+        if not figures:
+            return
         try:
             from ckc_pin.view.inverse_figure import save_inverse
 

@@ -6,9 +6,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.cli.output import LONG, Working, errors, print_card, print_json, print_table
 from ckc_pin.simulation.arguments import read_table
-from ckc_pin.simulation.report import check_plain, check_table, terms_plain, terms_table
+from ckc_pin.simulation.report import check_plain, terms_plain, terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
 
@@ -30,26 +30,30 @@ def list_(as_json: bool) -> None:
 
 
 @click.command(epilog=options.examples("ckc check five_bar", "ckc check five_bar_as_printed/tracking"))
-@click.argument("what", metavar="MECHANISM|SCENE", help="A mechanism or a scene.")
+@click.argument(
+    "what",
+    metavar="MECHANISM|SCENE",
+    shell_complete=options.complete_scenes,
+    help="A shipped name, a folder or a file; of a folder, the mechanism.",
+)
 @click.option("--branches", is_flag=True, help="List the assembly branches too.")
 @options.as_json
 def check(what: str, branches: bool, as_json: bool) -> None:
     """Freedoms, rank, redundant rows, partition. For a scene also whether its trajectory stays in the workspace."""
-    found = ckc_pin.check(what, branches=branches)
+    with Working(f"checking {what}"):
+        found = ckc_pin.check(what, branches=branches)
     if as_json:
-        for warning in found.warnings:
-            errors().print(f"warning: {warning}")
         print_json(check_plain(found))
     else:
-        print_table(check_table(found))
+        print_card(found.card())
 
 
 @click.command(
     epilog=options.examples('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'')
 )
 @options.mechanism
-@click.option("--q", metavar="JSON", required=True, help="Table of coordinates.")
-@click.option("--v", metavar="JSON", default="{}", help="Table of rates; absent: at rest.")
+@click.option("--q", metavar="JSON", required=True, help="Table of coordinates, rad or m.")
+@click.option("--v", metavar="JSON", default="{}", help="Table of rates, rad/s or m/s; absent: at rest.")
 @options.as_json
 def terms(mechanism: str, q: str, v: str, as_json: bool) -> None:
     """All terms at one state. Independent coordinates alone: sigma closes the loops, v_tree = rho q_dot."""
@@ -61,7 +65,13 @@ def terms(mechanism: str, q: str, v: str, as_json: bool) -> None:
         print_table(terms_table(found))
 
 
-@click.command("compile", epilog=options.examples("ckc compile five_bar"))
+def _expected(seconds: float) -> None:
+    """Say before it begins that the compiler will take long."""
+    if seconds > LONG:
+        errors().print(f"the compiler may take {seconds:.0f} s")
+
+
+@click.command("compile", epilog=options.examples("ckc compile delta", "ckc run delta"))
 @options.mechanism
 @options.as_json
 def compile_(mechanism: str, as_json: bool) -> None:
@@ -72,7 +82,8 @@ def compile_(mechanism: str, as_json: bool) -> None:
 
     loaded, started = ckc_pin.load(mechanism), perf_counter()
     there = find(loaded)
-    library = there or compiled(loaded)
+    with Working(f"compiling {mechanism}"):
+        library = there or compiled(loaded, on_written=_expected)
     seconds = perf_counter() - started
     if as_json:
         print_json({"mechanism": loaded.name, "file": library.path, "compiled": there is None, "seconds": seconds})

@@ -24,13 +24,20 @@ __all__ = ["map_"]
     ),
 )
 @options.mechanism
-@click.option("--scene", help="Draw this scene's desired trajectory on top.")
+@click.option(
+    "--scene",
+    metavar="SCENE",
+    shell_complete=options.complete_scenes,
+    help="Draw this scene's desired trajectory on top.",
+)
 @click.option("--over", metavar="A,B", help="The axes; all others are fixed.")
-@click.option("--space", default="joint", help="joint, or cartesian: where a point goes.")
-@click.option("--point", help="A [[point]]; absent: the first one.")
-@click.option("--cells", type=int, default=200, help="Along each axis.")
+@click.option(
+    "--space", type=click.Choice(["joint", "cartesian"]), default="joint", help="cartesian: where a point goes."
+)
+@click.option("--point", metavar="POINT", help="A [[point]]; absent: the first one.")
+@click.option("--cells", metavar="N", type=int, default=200, help="Along each axis.")
 @click.option("--sections", metavar="N", type=int, help="With three freedoms: N heights of the point.")
-@click.option("--out", metavar="DIR", type=Path, help="Folder for the figure.")
+@options.out(help="Folder for the figure.")
 @options.as_json
 def map_(
     mechanism: str,
@@ -55,7 +62,10 @@ def map_(
         raise InputError("--sections goes with --space cartesian, and without --scene")
     axes = None if over is None else [name.strip() for name in over.split(",")]
     with ProgressBar(f"map of {mechanism}", "{task.percentage:.0f} %") as bar:
-        progress = None if bar is None else lambda part: bar(part, 1.0)
+
+        def progress(part: float) -> None:
+            bar(part, 1.0)
+
         if sections is None:
             one = ckc_pin.singularity_map(
                 mechanism, scene=scene, space=space, over=axes, point=point, cells=cells, progress=progress
@@ -68,6 +78,8 @@ def map_(
         print_json(maps.map_plain(one) if sections is None else maps.sections_plain(stack))
     else:
         print_table(maps.map_table(one) if sections is None else maps.sections_table(stack))
-    if out is not None:
+    if out is None and not as_json:
+        print("not drawn: --out DIR draws the map there")
+    elif out is not None:
         for path in save_map(one, out) if sections is None else save_sections(stack, out):
             (errors().print if as_json else print)(f"written: {path}")

@@ -1,15 +1,54 @@
-"""Options and arguments that several commands share."""
+"""Options and arguments that several commands share, what stands for their values, and how a shell completes them.
+
+A value's name says what it is, in capitals: DIR, FILE, N, SECONDS; a choice of few is written out, [joint|cartesian].
+"""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ckc_pin.errors import InputError
 
-__all__ = ["as_json", "changes", "check_speed", "examples", "mechanism", "open_browser", "overwrite", "port", "runs"]
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
+__all__ = ["PATH", "as_json", "changes", "check_speed", "complete_scenes", "examples", "figures", "mechanism",
+           "open_browser", "out", "overwrite", "port", "require_folder", "runs"]  # fmt: skip
+
+
+PATH = click.Path(path_type=Path)
+
+
+def complete_mechanisms(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete a shipped mechanism's name, or a path."""
+    from ckc_pin.mechanism.library import shipped
+
+    return _completed(shipped(), incomplete)
+
+
+def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Complete a shipped mechanism's or scene's name, or a path."""
+    from ckc_pin.mechanism.library import shipped
+    from ckc_pin.simulation.scene import scene_names
+
+    return _completed([name for one in shipped() for name in (one, *_of(one, scene_names(one)))], incomplete)
+
+
+def _of(mechanism: str, scenes: list[str]) -> list[str]:
+    return [f"{mechanism}/{scene}" for scene in scenes]
+
+
+def _completed(names: list[str], incomplete: str) -> list[CompletionItem]:
+    from click.shell_completion import CompletionItem
+
+    found = [CompletionItem(name) for name in names if name.startswith(incomplete)]
+    return [*found, CompletionItem(incomplete, type="file")]
+
 
 as_json = click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
 changes = click.option(
@@ -19,12 +58,21 @@ changes = click.option(
     multiple=True,
     help="Change a key of the scene; may be given many times.",
 )
-mechanism = click.argument("mechanism", metavar="MECHANISM", help="A mechanism.")
+mechanism = click.argument(
+    "mechanism", metavar="MECHANISM", shell_complete=complete_mechanisms, help="A shipped name, a folder or a file."
+)
 runs = click.argument(
-    "runs", metavar="RUN...", type=Path, nargs=-1, required=True, help="Run files, or folders that hold a run.npz."
+    "runs",
+    metavar="RUN...",
+    type=PATH,
+    nargs=-1,
+    required=True,
+    help="Run files, or folders that hold a run.npz.",
 )
 overwrite = click.option("--overwrite", is_flag=True, help="Replace what is there already.")
-port = click.option("--port", type=int, default=0, help="Port on 127.0.0.1; 0: any free one.")
+figures = click.option("--figures", is_flag=True, help="With --out: draw figures there too.")
+out = partial(click.option, "--out", metavar="DIR", type=PATH)
+port = click.option("--port", metavar="PORT", type=int, default=0, help="Of 127.0.0.1; 0: any free one.")
 open_browser = click.option("--open", "open_browser", is_flag=True, help="Open your browser too.")
 
 
@@ -37,3 +85,9 @@ def check_speed(speed: float) -> None:
     """Refuse a speed that playback cannot have."""
     if not (math.isfinite(speed) and speed > 0):
         raise InputError(f"--speed {speed:g}: it must be above zero, 1 is real time")
+
+
+def require_folder(out: Path | None, figures: bool) -> None:
+    """Refuse figures that have no place."""
+    if figures and out is None:
+        raise InputError("--figures goes with --out DIR; give both")

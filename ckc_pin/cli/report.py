@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
-from ckc_pin.cli.output import ProgressBar, errors, make_folder, print_json, print_table
+from ckc_pin.cli.output import LONG, ProgressBar, errors, kept, make_folder, on_terminal, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["report"]
 
-LONG = 10.0  # s: what may take longer is told before
-
 
 @click.command(
     epilog=options.examples(
@@ -36,11 +35,16 @@ LONG = 10.0  # s: what may take longer is told before
     )
 )
 @click.argument(
-    "scenes", metavar="SCENE...", nargs=-1, required=True, help="Scenes, or mechanisms for their default scenes."
+    "scenes",
+    metavar="SCENE...",
+    nargs=-1,
+    required=True,
+    shell_complete=options.complete_scenes,
+    help="Scenes, or mechanisms for their default scenes.",
 )
 @options.changes
-@click.option("--budget", type=float, default=20.0, help="What each scene may take, s.")
-@click.option("--out", metavar="DIR", type=Path, help="Folder for report.md, rows.csv and the figures.")
+@click.option("--budget", metavar="SECONDS", type=float, default=20.0, help="What each scene may take.")
+@options.out(help="Folder for report.md, rows.csv and the figures.")
 @options.as_json
 def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
     """Error against run time of your own scenes. Formulations, methods and tolerances, and which of them to take."""
@@ -59,7 +63,7 @@ def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out
     for scene, mechanism in zip(loaded, mechanisms, strict=True):
         mjcf, note = _mjcf(mechanism)
         with ProgressBar(scene.name, "{task.percentage:.0f} %") as bar:
-            progress = None if bar is None else lambda part, bar=bar: bar(part, 1.0)
+            progress = partial(_part, bar) if on_terminal() else None  # how long it takes was said
             found = work_precision(scene, budget=budget, mjcf=mjcf, progress=progress)
         if not mjcf or any(row.program == "MuJoCo" for row in found.rows):
             found.notes += note
@@ -79,9 +83,15 @@ def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out
     else:
         for path in written:
             print(f"written: {path}")
+        if out is None:
+            print(kept(None, "report.md, rows.csv and figures"))
     if status != "done":
         errors().print(message)
         raise click.exceptions.Exit(STOPPED if status == "stopped" else interrupted(message))
+
+
+def _part(bar: Callable[[float, float], None], part: float) -> None:
+    bar(part, 1.0)
 
 
 def _print(found: WorkPrecision) -> None:

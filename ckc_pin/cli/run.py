@@ -13,11 +13,12 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted, interrupts
-from ckc_pin.cli.output import ProgressBar, errors, make_folder, on_terminal, print_json, print_table
+from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_card, print_json
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.report import profile_table, run_table
+from ckc_pin.simulation.check import run_warnings
+from ckc_pin.simulation.report import profile_table
 
 __all__ = ["run"]
 
@@ -27,14 +28,23 @@ __all__ = ["run"]
         "ckc run five_bar/tracking --out runs/spf",
         "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
         "ckc run five_bar/tracking --meshcat --speed 1",
+        "ckc run . --out first --figures",
     )
 )
-@click.argument("what", metavar="SCENE", help="A scene, or a mechanism for its default scene.")
+@click.argument(
+    "what",
+    metavar="SCENE",
+    shell_complete=options.complete_scenes,
+    help="A shipped name or a file; or a mechanism's name or folder, for its default scene.",
+)
 @options.changes
-@click.option("--out", metavar="DIR", type=Path, help="Folder for run.npz, figures and the scene as resolved.")
+@options.out(help="Folder for run.npz and the scene as resolved.")
+@options.figures
 @click.option("--profile", is_flag=True, help="Print which terms were evaluated, how often.")
-@click.option("--meshcat", is_flag=True, help="Show it in the browser while it computes.")
-@click.option("--speed", type=float, help="With --meshcat: 1 is real time; absent: as it is computed.")
+@click.option("--meshcat", is_flag=True, help="Show it in the browser while it computes, then play it, until Ctrl-C.")
+@click.option(
+    "--speed", metavar="FACTOR", type=float, help="With --meshcat: 1 is real time; absent: as it is computed."
+)
 @options.port
 @options.open_browser
 @options.as_json
@@ -42,6 +52,7 @@ def run(
     what: str,
     changes: tuple[str, ...],
     out: Path | None,
+    figures: bool,
     profile: bool,
     meshcat: bool,
     speed: float | None,
@@ -49,12 +60,12 @@ def run(
     open_browser: bool,
     as_json: bool,
 ) -> None:
-    """Simulate a scene."""
+    """Simulate a scene. Its outcome is printed; --out DIR keeps it."""
+    options.require_folder(out, figures)
     _check_view_options(meshcat, speed, port, open_browser)
     scene = ckc_pin.load_scene(what, read_changes("--set", changes))
-    if scene.spec.controller is not None:
-        for warning in ckc_pin.check(scene).warnings:
-            errors().print(f"warning: {warning}")
+    for warning in run_warnings(scene):
+        errors().print(f"warning: {warning}")
     if out is not None:
         make_folder(out)
     with ExitStack() as stack:
@@ -62,25 +73,24 @@ def run(
         with ProgressBar(scene.name) as progress:
             on_output = None if view is None else view.on_output
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
-        code = _report(finished, out, profile, as_json)
+        code = _report(finished, out, figures, profile, as_json)
         if view is not None and finished.status != "interrupted":
             with suppress(KeyboardInterrupt):
-                view.finish(finished, stay=on_terminal())
+                view.finish(finished, stay=True)
     if code != DONE:
         raise click.exceptions.Exit(code)
 
 
-def _report(finished: ckc_pin.Run, out: Path | None, profile: bool, as_json: bool) -> int:
+def _report(finished: ckc_pin.Run, out: Path | None, figures: bool, profile: bool, as_json: bool) -> int:
     """Write and print a run; return the exit code."""
-    stop = _write(finished, out) if out is not None else None
+    stop = _write(finished, out, figures) if out is not None else None
     if profile:
         errors().print(profile_table(finished))
     if as_json:
         print_json(finished.summary())
     else:
-        print_table(run_table(finished))
-        if out is not None:
-            print(f"written to {out}")
+        print_card(finished.card())
+        print(kept(out, "the run, for ckc play, plot and inverse"))
     sys.stdout.flush()  # a view may keep the command alive
     if finished.status != "done":
         errors().print(finished.message)
@@ -102,18 +112,20 @@ def _view(scene: ckc_pin.Scene, speed: float | None, port: int, open_browser: bo
     return live_view(scene, speed, port, open_browser)
 
 
-def _write(finished: ckc_pin.Run, out: Path) -> KeyboardInterrupt | None:
-    """Save a run, whatever signals come, then draw its figures; return what interrupted that."""
+def _write(finished: ckc_pin.Run, out: Path, figures: bool) -> KeyboardInterrupt | None:
+    """Save a run, whatever signals come, then draw it if that is asked for; return what interrupted that."""
     try:
         with ExitStack() as stack:
             with interrupts.deferred():
                 stack.enter_context(alone_in(out))
                 finished.save(out / "run.npz")
                 write_whole(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")
-            _draw(finished, out)
+            if figures:
+                with Working("drawing"):
+                    _draw(finished, out)
     except KeyboardInterrupt as stop:
         by = f" by {stop}" if str(stop) else ""
-        errors().print(f"no figures: interrupted{by}; the run is saved")
+        errors().print(f"interrupted{by}; the run is saved{', without figures' if figures else ''}")
         return stop
     return None
 

@@ -8,19 +8,22 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
+from ckc_pin.cli.output import Working
 
 __all__ = ["play", "plot"]
 
 
 @click.command(epilog=options.examples("ckc plot runs/reduced runs/spf --out figures"))
 @options.runs
-@click.option("--out", type=Path, default=".", help="Folder for the figures.")
+@options.out(default=Path(), help="Folder for the figures.")
 def plot(runs: tuple[Path, ...], out: Path) -> None:
     """Figures of one or several runs, PNG and SVG."""
     from ckc_pin.view.figures import plot as plot_runs
 
-    for path in plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg")):
-        print(path)
+    with Working("drawing"):
+        written = plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg"))
+    for path in written:
+        print(f"written: {path}")
 
 
 @click.command(
@@ -31,10 +34,11 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
     )
 )
 @options.runs
-@click.option("--html", metavar="FILE", type=Path, help="Write one file that plays from disk instead.")
-@click.option("--speed", type=float, default=1.0, help="Playback speed, 1 is real time.")
-@click.option("--gap", type=float, default=0.0, help="Draw the gaps of the loops so many times larger.")
-@click.option("--meshes", metavar="FOLDER", type=Path, help="The mechanism's folder, for its mesh files.")
+@click.option("--html", metavar="FILE", type=options.PATH, help="Write one file that plays from disk instead.")
+@click.option("--speed", metavar="FACTOR", type=float, default=1.0, help="Playback speed, 1 is real time.")
+@click.option("--gap", metavar="FACTOR", type=float, default=0.0, help="Draw the loops' gaps so much larger.")
+@click.option("--forces", is_flag=True, help="Draw the forces of loops and motors as arrows.")
+@click.option("--meshes", metavar="DIR", type=options.PATH, help="The mechanism's folder, for its mesh files.")
 @options.port
 @options.open_browser
 def play(
@@ -42,6 +46,7 @@ def play(
     html: Path | None,
     speed: float,
     gap: float,
+    forces: bool,
     meshes: Path | None,
     port: int,
     open_browser: bool,
@@ -50,8 +55,10 @@ def play(
     options.check_speed(speed)
     loaded = [ckc_pin.Run.load(path) for path in runs]
     if html is None:
-        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, port=port, open_browser=open_browser)
+        ckc_pin.play(*loaded, speed=speed, gap=gap, meshes=meshes, forces=forces, port=port, open_browser=open_browser)
         return
     from ckc_pin.view.player import save_html
 
-    print(f"written: {save_html(loaded, html, speed=speed, gap=gap, meshes=meshes)}")
+    with Working(f"writing {html.name}"):
+        written = save_html(loaded, html, speed=speed, gap=gap, meshes=meshes, forces=forces)
+    print(f"written: {written}")

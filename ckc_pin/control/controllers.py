@@ -6,21 +6,30 @@ Errors are q - q_d everywhere. A controller sees the plant's measured state thro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from inspect import signature
+from typing import Any, Protocol
 
 import numpy as np
 
 from ckc_pin.control.desired import Desired
-from ckc_pin.control.gains import require_positive_definite
+from ckc_pin.control.gains import gain_matrix, require_positive_definite
+from ckc_pin.control.spec import Gain
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.kinds import a_kind, require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Controller", "Model", "SetPoint", "TorqueController", "Tracking", "gives_tau"]
+__all__ = ["Controller", "Law", "Model", "SetPoint", "TorqueController", "Tracking", "as_controller", "gives_tau"]
+
+
+TAKES = (
+    "an object with one of the methods u(t, terms), for the force on the independent coordinates, and tau(t, terms), "
+    "for the motors' torques; or a function u(t, terms)"
+)
 
 
 class Controller(Protocol):
@@ -35,6 +44,58 @@ class TorqueController(Protocol):
 
     def tau(self, t: float, terms: Terms) -> Array | Mapping[str, float]:
         """Return tau at time t (s) by motor, N m or N: shape (motors,), or a table; motors not in it have none."""
+
+
+Law = Callable[[float, Terms], Any]  # a controller that is a plain function: (t, terms) to u
+
+
+class FunctionController:
+    """A plain function as a controller.
+
+    Parameters
+    ----------
+    function : callable
+        (t, terms) to u.
+    """
+
+    def __init__(self, function: Law) -> None:
+        self.u: Law = function
+
+
+def as_controller(given: Any) -> Controller | TorqueController:
+    """Return what a caller gave as a controller: an object that is one, or a plain function u(t, terms).
+
+    Raises
+    ------
+    InputError
+        A class in the place of an object of it, a function of other arguments, anything else.
+    """
+    if isinstance(given, type):
+        name = given.__name__
+        raise InputError(f"controller: the class {name} was given; give an object of it, as {name}() makes one")
+    own = [name for name in ("u", "tau") if callable(getattr(given, name, None))]
+    if not own and not callable(given):
+        raise InputError(f"controller: {a_kind(given)} was given; it takes {TAKES}")
+    for name in own or [""]:
+        law = getattr(given, name) if name else given
+        called = name or getattr(given, "__name__", type(given).__name__)
+        if not _takes_two(law):
+            raise InputError(
+                f"controller: {called}({', '.join(signature(law).parameters)}) was given; it must take (t, terms)"
+            )
+    found: Controller | TorqueController = given if own else FunctionController(given)
+    gives_tau(found)
+    return found
+
+
+def _takes_two(law: Callable[..., Any]) -> bool:
+    try:
+        signature(law).bind(0.0, None)
+    except TypeError:
+        return False
+    except ValueError:  # of some builtins it is not known
+        pass
+    return True
 
 
 def gives_tau(controller: Controller | TorqueController) -> bool:
@@ -94,9 +155,9 @@ class SetPoint:
     ----------
     mechanism : Mechanism
         Whose h is compensated: the plant, or the controller's own model.
-    K_P, K_V : (d, d) arrays
-        Symmetric positive definite; K_V may be semi-definite.
-    q_d : (d,) array
+    K_P, K_V : number, {joint: number} or (d, d) array
+        Symmetric positive definite, in the order of `independent`; K_V may be semi-definite.
+    q_d : (d,) array or {coordinate: number}
         The target.
 
     Raises
@@ -105,10 +166,20 @@ class SetPoint:
         Gains that are not as required, a target that the mechanism cannot reach.
     """
 
-    def __init__(self, mechanism: Mechanism, K_P: Array, K_V: Array, q_d: Array) -> None:
-        require_positive_definite(K_P, "K_P")
-        require_positive_definite(K_V, "K_V", semi=True)
-        self.K_P, self.K_V, self.q_d = K_P, K_V, q_d
+    def __init__(
+        self, mechanism: Mechanism, K_P: Gain | Array, K_V: Gain | Array, q_d: Array | Mapping[str, float]
+    ) -> None:
+        require_kind(mechanism, Mechanism, "SetPoint: mechanism", "a Mechanism, as load returns it")
+        names = mechanism.independent
+        self.K_P, self.K_V = gain_matrix(K_P, names, "K_P"), gain_matrix(K_V, names, "K_V")
+        require_positive_definite(self.K_P, "K_P")
+        require_positive_definite(self.K_V, "K_V", semi=True)
+        if not isinstance(q_d, Mapping):
+            require_kind(q_d, (np.ndarray, list, tuple), "SetPoint: q_d", "a number for each independent coordinate")
+            if len(q_d) != len(names):
+                raise InputError(f"SetPoint: q_d has {len(q_d)} numbers; {len(names)} are needed: {', '.join(names)}")
+            q_d = dict(zip(names, q_d, strict=True))
+        self.q_d = q_d = mechanism.vector(q_d, names, "controller.q_d")
         target = sigma(mechanism, q_d)
         if target.verdict != "converged":
             wanted = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
@@ -135,9 +206,10 @@ class Tracking:
 
     Parameters
     ----------
-    Lambda, K_D : (d, d) arrays
-        K_D and Lambda^T K_D symmetric positive definite (eq. 18 needs both).
+    Lambda, K_D : number or (d, d) array
+        In the order of `independent`. K_D and Lambda^T K_D symmetric positive definite (eq. 18 needs both).
     desired : Desired
+        A function of t (s) that returns q_d, its rate and its acceleration, each of shape (d,).
     model : Model, optional
         The controller's own idea of the plant.
 
@@ -147,7 +219,11 @@ class Tracking:
         Gains that are not as required.
     """
 
-    def __init__(self, Lambda: Array, K_D: Array, desired: Desired, model: Model | None = None) -> None:
+    def __init__(self, Lambda: float | Array, K_D: float | Array, desired: Desired, model: Model | None = None) -> None:
+        of_each = [f"coordinate {k + 1}" for k in range(_dimension(desired))]
+        if model is not None:
+            require_kind(model, Model, "Tracking: model", "a Model")
+        Lambda, K_D = gain_matrix(Lambda, of_each, "Lambda"), gain_matrix(K_D, of_each, "K_D")
         require_positive_definite(K_D, "K_D")
         try:
             require_positive_definite(Lambda.T @ K_D, "Lambda^T K_D")
@@ -180,3 +256,15 @@ class Tracking:
         r = terms.q_dot - q_d_dot + self.Lambda @ error
         on_manifold = 0.5 * r @ terms.D @ r + error @ self.Lambda.T @ self.K_D @ error
         return float(on_manifold + 0.5 * w @ w)
+
+
+def _dimension(desired: Any) -> int:
+    """Return how many coordinates a trajectory is of; refuse what is none."""
+    takes = "a function of t that returns q_d, its rate and its acceleration, each of shape (d,)"
+    if not callable(desired) or isinstance(desired, type):
+        raise InputError(f"Tracking: desired: {a_kind(desired)} was given; it takes {takes}")
+    at_start = desired(0.0)
+    shapes = [np.shape(part) for part in at_start] if isinstance(at_start, tuple | list | np.ndarray) else []
+    if len(shapes) != 3 or len(set(shapes)) != 1 or len(shapes[0]) != 1:
+        raise InputError(f"Tracking: desired(0) is {at_start!r:.80}; it takes {takes}")
+    return int(shapes[0][0])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 
 from ckc_pin.control.spec import Gain
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["gain_matrix", "require_positive_definite"]
@@ -15,7 +17,7 @@ __all__ = ["gain_matrix", "require_positive_definite"]
 LARGEST = 1e100  # of a gain: its products with others, and their squares, do not overflow
 
 
-def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
+def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
     """Return a gain as a (d, d) matrix.
 
     Raises
@@ -31,17 +33,28 @@ def gain_matrix(gain: Gain, names: Sequence[str], what: str) -> Array:
             problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
             raise InputError(f"controller.{what}: a table needs the joints {', '.join(names)}; {problem}")
         matrix = np.diag([float(gain[name]) for name in names])
-    elif isinstance(gain, list):
-        if len(gain) != d or any(len(row) != d for row in gain):
-            raise InputError(f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}")
-        matrix = np.array(gain, dtype=float)
+    elif is_number(gain):
+        matrix = float(cast(float, gain)) * np.eye(d)
     else:
-        matrix = float(gain) * np.eye(d)
+        shape = f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}"
+        matrix = _numbers(gain, what, shape)
+        if matrix.shape != (d, d):
+            raise InputError(shape)
     if not np.all(np.isfinite(matrix)):
         raise InputError(f"controller.{what}: an entry is not a finite number")
     if np.abs(matrix).max(initial=0.0) > LARGEST:
         raise InputError(f"controller.{what}: an entry is above {LARGEST:g}")
     return matrix
+
+
+def _numbers(gain: Any, what: str, shape: str) -> Array:
+    if not isinstance(gain, list | tuple | np.ndarray):
+        takes = "a number, a table by joint or a matrix"
+        raise InputError(f"controller.{what}: {a_kind(gain)} was given; it takes {takes}")
+    try:
+        return np.array(gain, dtype=float)
+    except (TypeError, ValueError):  # rows of several lengths, words among the numbers
+        raise InputError(shape) from None
 
 
 def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:

@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from ckc_pin.control.controllers import Controller, TorqueController
+from ckc_pin.control.controllers import Controller, Law, TorqueController, as_controller
 from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import is_number, require_table
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.toml import convert
 
@@ -31,7 +32,7 @@ class Sampled:
 
     Parameters
     ----------
-    controller : Controller or TorqueController
+    controller : Controller, TorqueController or function u(t, terms)
         It is evaluated at t = k sample_time only.
     sample_time : float
         s, greater than 0.
@@ -49,7 +50,7 @@ class Sampled:
 
     def __init__(
         self,
-        controller: Controller | TorqueController,
+        controller: Controller | TorqueController | Law,
         sample_time: float,
         delay: float = 0.0,
         sensor: SensorSpec | Mapping[str, Any] | None = None,
@@ -60,10 +61,9 @@ class Sampled:
             ("delay", delay, "of at least 0"),
         ]
         for name, value, least in given:
-            number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-            if not number or not 0 <= value < np.inf or (name == "sample_time" and value == 0):
+            if not is_number(value) or not 0 <= value < np.inf or (name == "sample_time" and value == 0):
                 raise InputError(f"{name} = {value!r:.80}: a number {least} is needed, in seconds")
-        self.controller = controller
+        self.controller = as_controller(controller)
         self.sample_time, self.delay = float(sample_time), float(delay)
         self.sensor, self.drive = _table(sensor, SensorSpec, "sensor"), _table(drive, DriveSpec, "drive")
 
@@ -100,4 +100,7 @@ class Sampled:
 
 
 def _table(given: Any, kind: type[T], name: str) -> T | None:
-    return given if given is None or isinstance(given, kind) else convert(dict(given), kind, "Sampled", name)
+    if given is None or isinstance(given, kind):
+        return given
+    require_table(given, f"Sampled: {name}", f"a table as a scene's [controller.{name}]")
+    return convert(dict(given), kind, "Sampled", name)

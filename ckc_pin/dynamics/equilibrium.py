@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.dynamics.derivatives import multiplier_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
@@ -22,10 +23,8 @@ def h_gradient(mechanism: Mechanism, at: Kinematics) -> Array:
     rho its derivative is rho^T (dh'/dq' rho_k + Jdot(rho_k)^T y): symmetric, as a Hessian is.
     """
     terms = Terms(mechanism, at, np.zeros(mechanism.n))
-    h_tree_gradient = _h_tree_gradient(terms)
     y = at.phi_z_factor.solve_transposed(-terms.h_tree[at.partition.z])
-    columns = [at.rho.T @ (h_tree_gradient @ at.rho[:, k] + at.J_dot(at.rho[:, k]).T @ y) for k in range(mechanism.d)]
-    return np.array(columns).reshape(mechanism.d, mechanism.d).T
+    return at.rho.T @ (_h_tree_gradient(terms) @ at.rho + multiplier_gradient(terms, y, at.rho))
 
 
 def _h_tree_gradient(terms: Terms) -> Array:

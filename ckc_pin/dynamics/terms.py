@@ -8,13 +8,17 @@ controller that needs C' asks for it, and it is computed then.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.kinds import require_table
 from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -23,7 +27,7 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["Terms", "terms"]
 
 
-class Terms:
+class Terms(Shown):
     """Dynamics of a mechanism at one state.
 
     Parameters
@@ -44,6 +48,20 @@ class Terms:
         self.at = at
         self.q_tree = at.q_tree
         self.v_tree = v_tree
+
+    def card(self) -> Card:
+        """Return what there is to see of it: the state, and what it can be asked for."""
+        mechanism, tree = self.mechanism, self.mechanism.tree
+        names, n, d = mechanism.coordinates, mechanism.n, mechanism.d
+        rows: list[Row] = [
+            ("q_tree", quantities(names, tree.to_coordinates(self.q_tree), tree.units())),
+            ("v_tree", quantities(names, self.v_tree, tree.units("/s"))),
+            ("energy", f"{self.energy:.9g} J"),
+            ("largest |phi|", f"{np.abs(self.phi).max(initial=0.0):.2g}"),
+            ("of the tree", [f"D_tree {n, n}", f"C_tree {n, n}", f"h_tree ({n},)"]),
+            ("reduced", [f"D {d, d}", f"C {d, d}", f"h ({d},)", f"rho {n, d}", f"rho_dot {n, d}"]),
+        ]
+        return Card(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
 
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 
@@ -158,12 +176,12 @@ class Terms:
         return self.rho.T @ (self.D_tree @ self.rho_dot_times(x) + self.C_tree @ (self.rho @ x))
 
 
-def terms(mechanism: Mechanism, q: Mapping[str, float], v: Mapping[str, float] | None = None) -> Terms:
+def terms(mechanism: Mechanism | str | Path, q: Mapping[str, float], v: Mapping[str, float] | None = None) -> Terms:
     """Return all terms at one state.
 
     Parameters
     ----------
-    mechanism : Mechanism
+    mechanism : Mechanism, or a name or path as for `load`
     q : {coordinate: value}
         The independent coordinates alone: sigma closes the loops, on the assembled branch. All
         coordinates: taken as they are, on the closure or off it.
@@ -177,8 +195,11 @@ def terms(mechanism: Mechanism, q: Mapping[str, float], v: Mapping[str, float] |
     NumericalError
         q is singular.
     """
+    mechanism = as_mechanism(mechanism, "terms")
+    v = {} if v is None else v
+    for name, table in (("q", q), ("v", v)):
+        require_table(table, f"terms: {name}", f"a table by coordinate, as {{{mechanism.coordinates[0]!r}: 0.4}}")
     at = _kinematics_at(mechanism, q)
-    v = v or {}
     if set(v) >= set(mechanism.coordinates) and mechanism.dependent:
         return Terms(mechanism, at, mechanism.vector(v, mechanism.coordinates, "v"))
     q_dot = mechanism.vector(v, mechanism.independent, "v", fill=0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.expressions import Expressions, expressions
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import BoolArray
 
 __all__ = ["FUNCTIONS", "functions", "source"]
 
@@ -30,7 +32,7 @@ FUNCTIONS = {
 LARGEST_JACOBIAN = 3e4  # operations of the acceleration times n, about twice those of its derivatives: above, none
 
 
-def functions(mechanism: Mechanism) -> dict[str, Any]:
+def functions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> dict[str, Any]:
     """Return CasADi functions: `numbers`, from what may be varied to what the others take last, and `FUNCTIONS`.
 
     Left out are `coriolis` of a tree with a free root, whose twist has several C', and `jacobian` where it would be too
@@ -38,7 +40,7 @@ def functions(mechanism: Mechanism) -> dict[str, Any]:
     """
     import casadi as cs
 
-    terms = expressions(mechanism)
+    terms = expressions(mechanism, which)
     symbols = {
         "q": terms.angles.q,
         "trig": terms.angles.trig,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
 from ckc_pin.generated.parameters import Parameters, numbers, present
 from ckc_pin.generated.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import BoolArray
 
 __all__ = ["Expressions", "expressions", "kept_rows"]
 
@@ -61,11 +63,11 @@ def kept_rows(mechanism: Mechanism) -> list[int]:
     return [k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant]
 
 
-def expressions(mechanism: Mechanism) -> Expressions:
-    """Write a mechanism's terms out."""
+def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> Expressions:
+    """Write a mechanism's terms out, of the numbers that are arguments (`parameters.present`)."""
     import casadi as cs
 
-    tree, parameters = mechanism.tree, Parameters(present(numbers(mechanism)))
+    tree, parameters = mechanism.tree, Parameters(which or present(numbers(mechanism)))
     angles, v = Angles(tree.nq), cs.SX.sym("v", tree.n)
     q, found = angles.q, bodies(tree, angles, v, parameters)
     gravity = parameters.column("gravity")

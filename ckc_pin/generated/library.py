@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -29,6 +29,7 @@ __all__ = ["MOST_COORDINATES", "Library", "cache_folder", "compiled", "find"]
 
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler
+PER_LETTER = 2e-5  # s of the compiler for a letter of the text, as docs/theory/generated.md has them
 MOST_COORDINATES = 40  # of a tree that is written out: a minute of the compiler where all are in one branch
 
 
@@ -54,15 +55,23 @@ def cache_folder() -> Path:
     return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "ckc_pin" / "terms"
 
 
-def find(mechanism: Mechanism) -> Library | None:
-    """Return the mechanism's terms if they were compiled before; None if not, or if the file has changed since."""
+def find(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> Library | None:
+    """Return the mechanism's terms if they were compiled before; None if not, or if the file has changed since.
+
+    `which` as of `compiled`.
+    """
     folder = cache_folder()
     if mechanism.n > MOST_COORDINATES or not folder.is_dir():
         return None
-    return _look(_Subject.of(mechanism), folder, _compiler())
+    return _look(_Subject.of(mechanism, which), folder, _compiler())
 
 
-def compiled(mechanism: Mechanism, most: int = MOST_COORDINATES) -> Library:
+def compiled(
+    mechanism: Mechanism,
+    most: int = MOST_COORDINATES,
+    which: Mapping[str, BoolArray] | None = None,
+    on_written: Callable[[float], None] | None = None,
+) -> Library:
     """Return the mechanism's terms, from the cache or compiled now.
 
     Parameters
@@ -70,6 +79,11 @@ def compiled(mechanism: Mechanism, most: int = MOST_COORDINATES) -> Library:
     mechanism : Mechanism
     most : int
         Coordinates, above which terms are not written out.
+    which : mapping, optional
+        Which numbers are arguments (`parameters.present`), where that is more than those that are not zero: what is
+        varied from zero.
+    on_written : callable, optional
+        Called once before the compiler, with the seconds that it may take.
 
     Raises
     ------
@@ -81,13 +95,13 @@ def compiled(mechanism: Mechanism, most: int = MOST_COORDINATES) -> Library:
         raise InputError(
             f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {most}"
         )
-    subject, compiler = _Subject.of(mechanism), _compiler()
+    subject, compiler = _Subject.of(mechanism, which), _compiler()
     found = _look(subject, cache_folder(), compiler)
     if found is not None:
         return found
     if compiler is None:
         raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
-    return _make(mechanism, subject, compiler)
+    return _make(mechanism, subject, compiler, on_written)
 
 
 @dataclass(frozen=True)
@@ -96,12 +110,13 @@ class _Subject:
 
     key: str
     parameters: Array
+    which: Mapping[str, BoolArray]
 
     @classmethod
-    def of(cls, mechanism: Mechanism) -> _Subject:
+    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None) -> _Subject:
         given = numbers(mechanism)
-        which = present(given)
-        return cls(_key(mechanism, which), values(given, which))
+        which = which or present(given)
+        return cls(_key(mechanism, which), values(given, which), which)
 
 
 @dataclass(frozen=True)
@@ -200,7 +215,9 @@ def _executes(folder: Path) -> bool:
     return not os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)  # a flag of Linux's
 
 
-def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Library:
+def _make(
+    mechanism: Mechanism, subject: _Subject, compiler: _Compiler, on_written: Callable[[float], None] | None
+) -> Library:
     import tempfile
 
     from ckc_pin.generated.comparison import require_equal
@@ -211,23 +228,32 @@ def _make(mechanism: Mechanism, subject: _Subject, compiler: _Compiler) -> Libra
         raise InputError(f"compiled terms cannot be loaded: neither {places[0]} nor {places[1]} allows programs")
     with tempfile.TemporaryDirectory(prefix="ckc_pin-", dir=place) as made:
         library = Path(made) / "terms.so"
-        _compile(mechanism, compiler, Path(made) / "terms.c", library)
+        _compile(mechanism, subject, compiler, Path(made) / "terms.c", library, on_written)
         require_equal(mechanism, Library(str(library), subject.parameters))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
         return Library(str(_put(name, content)), subject.parameters)
 
 
-def _compile(mechanism: Mechanism, compiler: _Compiler, text: Path, library: Path) -> None:
+def _compile(
+    mechanism: Mechanism,
+    subject: _Subject,
+    compiler: _Compiler,
+    text: Path,
+    library: Path,
+    on_written: Callable[[float], None] | None,
+) -> None:
     import subprocess
 
     try:
         from ckc_pin.generated.code import functions, source
 
-        written = source(functions(mechanism))
+        written = source(functions(mechanism, subject.which))
     except ModuleNotFoundError as error:
         says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(says) from error
+    if on_written is not None:
+        on_written(len(written) * PER_LETTER)
     try:
         text.write_text(written, encoding="ascii")
         done = subprocess.run(

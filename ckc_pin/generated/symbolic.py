@@ -12,15 +12,19 @@ from ckc_pin.errors import InputError
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.expressions import expressions
 from ckc_pin.generated.parameters import labels, numbers, present, values
-from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.loading import as_mechanism
+from ckc_pin.mechanism.card import Card, Row, Shown
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Symbolic", "symbolic"]
 
 
-@dataclass(frozen=True)
-class Symbolic:
+FUNCTIONS = ("phi", "J", "J_dot_v", "D_tree", "potential", "bias_tree", "damping", "kinetic", "q_dot", "v_dot")
+
+
+@dataclass(frozen=True, repr=False)
+class Symbolic(Shown):
     """CasADi functions of a mechanism; SI units, vectors in the order of `coordinates`.
 
     q is Pinocchio's q' (nq numbers, a free root's rotation a quaternion x, y, z, w of unit length), v is v' (n numbers,
@@ -65,6 +69,17 @@ class Symbolic:
     q_dot: Any
     v_dot: Any
 
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        functions = [str(getattr(self, name)) for name in FUNCTIONS]
+        rows: list[Row] = [
+            ("coordinates", self.coordinates),
+            ("independent q", self.independent),
+            ("parameters", self.parameters),
+            *zip(FUNCTIONS, functions, strict=True),
+        ]
+        return Card(f"CasADi functions of {len(self.coordinates)} coordinates", rows)
+
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     """Write a mechanism's terms out as CasADi functions.
@@ -83,12 +98,11 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     >>> five_bar.v_dot(five_bar.q_tree, np.zeros(4), np.zeros(4), five_bar.values).shape
     (4, 1)
     """
+    mechanism = as_mechanism(mechanism, "symbolic")
     try:
         import casadi as cs
     except ModuleNotFoundError as error:
         raise InputError("symbolic needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
-    if not isinstance(mechanism, Mechanism):
-        mechanism = load(mechanism)
     terms, given = expressions(mechanism), numbers(mechanism)
     q, v, p = terms.angles.q, terms.v, terms.parameters.vector
     u = cs.SX.sym("u", mechanism.n)

@@ -13,6 +13,7 @@ from ckc_pin.mechanism.freedoms import count_freedoms
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
@@ -37,7 +38,13 @@ class Assembly:
 
 
 def assemble(
-    tree: Tree, closure: Closure, q_tree: Array, free: Array, tolerance: float, restarts: int = RESTARTS
+    tree: Tree,
+    closure: Closure,
+    q_tree: Array,
+    free: Array,
+    tolerance: float,
+    restarts: int = RESTARTS,
+    within: tuple[Array, Array] | None = None,
 ) -> Assembly:
     """Close the loops from a guess by damped Gauss-Newton, moving as little as it takes.
 
@@ -52,6 +59,8 @@ def assemble(
         Largest |phi| that counts as closed.
     restarts : int
         How many perturbed starts to try when the guess itself does not lead there.
+    within : pair of (n,) arrays, or None
+        Bounds of the coordinates. What one is beyond them counts as open too, in its own unit.
 
     Returns
     -------
@@ -61,11 +70,17 @@ def assemble(
 
     def at(q: Array) -> tuple[Array, Callable[[], Array]]:
         pose = Pose(tree, closure.anchors, q)
-        return closure.phi(pose), lambda: closure.jacobian(pose) * free
+        phi = closure.phi(pose)
+        if within is None:
+            return phi, lambda: closure.jacobian(pose) * free
+        numbers = tree.to_coordinates(q)
+        beyond = numbers - np.clip(numbers, *within)
+        rows = np.eye(tree.n)[beyond != 0]
+        return np.concatenate([phi, beyond[beyond != 0]]), lambda: np.vstack([closure.jacobian(pose), rows]) * free
 
     def outcome(q: Array) -> Assembly:
         phi, _ = at(q)
-        return Assembly(q, float(np.abs(phi).max(initial=0.0)), closure.misses(phi))
+        return Assembly(q, float(np.abs(phi).max(initial=0.0)), closure.misses(phi[: closure.rows]))
 
     random = np.random.default_rng(0)  # the same answer every time
     best = outcome(_gauss_newton(tree, q_tree, at, tolerance))
@@ -103,15 +118,15 @@ def _gauss_newton(
     return q
 
 
-def assembled(spec: MechanismSpec, sources: Sources) -> Mechanism:
-    """Assemble a mechanism from what its files say.
+def assembled(spec: MechanismSpec, sources: Sources, changes: Changes | None = None) -> Mechanism:
+    """Assemble a mechanism from what its files say, with numbers changed by name.
 
     Raises
     ------
     MechanismError
         Unknown names, loops that cannot be closed from q_guess, coordinates that cannot serve as q.
     """
-    linkage = Linkage(spec, sources)
+    linkage = Linkage(spec, sources, changes)
     tree, closure, size = linkage.tree, linkage.closure, linkage.size
     with one_blas_thread():
         guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)
@@ -142,15 +157,9 @@ def _nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept:
 
 
 def _close(linkage: Linkage, start: Array) -> Assembly:
-    """Assemble with the independent coordinates held at their guess; if that fails, with all free."""
-    closed: Assembly | None = None
+    """Assemble near a guess, within the joints' stops where that can be."""
     scale = linkage.size
-    if linkage.spec.independent is not None:
-        free = np.ones(linkage.tree.n)
-        free[linkage.tree.indices(tuple(linkage.spec.independent), "independent")] = 0.0
-        closed = assemble(linkage.tree, linkage.closure, start, free, EXACT * scale)
-    if closed is None or closed.residual > ROUNDED * scale:
-        closed = assemble(linkage.tree, linkage.closure, start, np.ones(linkage.tree.n), EXACT * scale)
+    closed = _nearest(linkage, start)
     if closed.residual > ROUNDED * scale:
         raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}")
     reversed_ = linkage.closure.reversed_hinges(Pose(linkage.tree, linkage.closure.anchors, closed.q_tree))
@@ -159,12 +168,43 @@ def _close(linkage: Linkage, start: Array) -> Assembly:
             f"{linkage.sources.name}: loop {reversed_[0]!r} closes with its axes against each other (a . b < 0); "
             "turn axis_b around, or give a [q_guess] on the other branch"
         )
+    closed = _within_stops(linkage, closed)
     if closed.residual > EXACT * scale:
         linkage.warnings.append(
             f"the loops close to {closed.residual:.2g} only, not to rounding: "
             "numbers in the files are rounded, or redundant rows contradict each other slightly"
         )
     return closed
+
+
+def _nearest(linkage: Linkage, start: Array, within: tuple[Array, Array] | None = None) -> Assembly:
+    """Assemble with the independent coordinates held at their guess; if that fails, with all free."""
+    closed: Assembly | None = None
+    tree, exact = linkage.tree, EXACT * linkage.size
+    if linkage.spec.independent is not None:
+        free = np.ones(tree.n)
+        free[tree.indices(tuple(linkage.spec.independent), "independent")] = 0.0
+        closed = assemble(tree, linkage.closure, start, free, exact, within=within)
+    if closed is None or closed.residual > ROUNDED * linkage.size:
+        closed = assemble(tree, linkage.closure, start, np.ones(tree.n), exact, within=within)
+    return closed
+
+
+def _within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
+    """Go from a configuration beyond stops, where no run can start, to one within them near it, if there is one."""
+    tree, joints = linkage.tree, linkage.joints
+    numbers = tree.to_coordinates(closed.q_tree)
+    beyond = np.abs(numbers - np.clip(numbers, joints.lower, joints.upper)) > EXACT * tree.reach
+    if not np.any(beyond):
+        return closed
+    inside = _nearest(linkage, closed.q_tree, (joints.lower, joints.upper))
+    pose = Pose(tree, linkage.closure.anchors, inside.q_tree)
+    if inside.residual > ROUNDED * linkage.size or linkage.closure.reversed_hinges(pose):
+        return closed
+    there = tree.to_coordinates(inside.q_tree)
+    moved = [f"{tree.coordinates[k]} = {there[k]:.4g} (without them {numbers[k]:.4g})" for k in np.flatnonzero(beyond)]
+    linkage.warnings.append(f"q_guess leads beyond joints' stops; assembled within them: {', '.join(moved)}")
+    return inside
 
 
 def _why_not_closed(linkage: Linkage, best: Assembly, start: Array) -> str:

@@ -5,24 +5,27 @@ from __future__ import annotations
 from copy import deepcopy
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_toml
 
-__all__ = ["build", "load"]
+__all__ = ["as_mechanism", "build", "load"]
 
 MOST_KEPT = 32  # of the mechanisms built
 
-_built: dict[tuple[str, str, Path | None], Mechanism] = {}  # never handed out, only copied
+_built: dict[Any, Mechanism] = {}  # never handed out, only copied
 _building = Lock()
 
 
-def load(name: str | Path | GeneratorSpec) -> Mechanism:
+def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
     Parameters
@@ -30,6 +33,8 @@ def load(name: str | Path | GeneratorSpec) -> Mechanism:
     name : str, Path or GeneratorSpec
         For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
         usual number of links.
+    changes : mapping, optional
+        Numbers that are other ones, by name, e.g. ``{"link.link_2.mass": 0.3}``.
 
     Raises
     ------
@@ -38,23 +43,37 @@ def load(name: str | Path | GeneratorSpec) -> Mechanism:
     MechanismError
         A mechanism that cannot exist as described.
     """
-    return build(*texts_of(name))
+    require_kind(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
+    return build(*texts_of(name), changes)
 
 
-def build(text: str, sources: Sources) -> Mechanism:
+def as_mechanism(given: Any, who: str) -> Mechanism:
+    """Return the mechanism that a public function was given: as it is, or loaded by name or path.
+
+    Raises
+    ------
+    InputError, MechanismError
+        No mechanism; what `load` raises.
+    """
+    takes = "a mechanism: itself, its shipped name or its path"
+    require_kind(given, (Mechanism, str, Path, GeneratorSpec), f"{who}: mechanism", takes)
+    return given if isinstance(given, Mechanism) else load(given)
+
+
+def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechanism:
     """Build a mechanism from the text of its file; the text is kept among its sources.
 
     One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
     many a run.
     """
     sources.texts[MECHANISM_FILE] = text
-    key = (text, sources.name, sources.folder)
+    key = (text, sources.name, sources.folder, tuple(sorted((changes or {}).items())))
     built = _built.get(key)
     if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
         twin = deepcopy(built)
         twin.sources = sources
         return twin
-    mechanism = _build(text, sources)
+    mechanism = _build(text, sources, changes)
     built = deepcopy(mechanism)
     built.tree.rest()
     with _building:
@@ -64,8 +83,8 @@ def build(text: str, sources: Sources) -> Mechanism:
     return mechanism
 
 
-def _build(text: str, sources: Sources) -> Mechanism:
+def _build(text: str, sources: Sources, changes: Changes | None) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    return assembled(spec, sources)
+    return assembled(spec, sources, changes)

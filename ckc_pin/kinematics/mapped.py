@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
@@ -148,8 +149,8 @@ class Path:
     approaches: tuple[Approach, ...]
 
 
-@dataclass(frozen=True)
-class SingularityMap:
+@dataclass(frozen=True, repr=False)
+class SingularityMap(Shown):
     """Fig. 2 of any mechanism.
 
     Attributes
@@ -188,6 +189,18 @@ class SingularityMap:
     path: Path | None
     seconds: float
     notes: tuple[str, ...] = field(default=())
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        rows: list[Row] = [(a.name, f"{a.low:.4g} to {a.high:.4g} {a.unit}, {len(a.values)} cells") for a in self.axes]
+        rows += [("fixed", quantities(list(self.fixed), np.array(list(self.fixed.values()))))] if self.fixed else []
+        rows.append(("branches", f"{len(self.aspects)}{', and more' if self.more_branches else ''}"))
+        rows.append(("loci", f"{len(self.loci)}: where {self.measure} or J is singular"))
+        if self.path is not None:
+            rows.append(("desired", self.path.name))
+        rows += [("note", note) for note in self.notes]
+        where = "independent coordinates" if self.point is None or self.space == "joint" else f"place of {self.point}"
+        return Card(f"Singularity map of {self.mechanism} over {where}", rows)
 
     @property
     def counts(self) -> IntArray:

@@ -15,6 +15,7 @@ from ckc_pin.kinematics.nodes import solutions
 from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.closure import Closure, Selected
 from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.many import evaluate, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
@@ -66,6 +67,7 @@ class Point:
     """
 
     def __init__(self, mechanism: Mechanism, name: str | None = None) -> None:
+        require_kind(mechanism, Mechanism, "Point: mechanism", "a Mechanism, as load returns it")
         self.mechanism = mechanism
         self.name = find_point(mechanism, name)
         self.extended: Extended = extend(mechanism, self.name)

@@ -49,6 +49,8 @@ def mechanism_file(name: str | Path) -> Path:
         return path / MECHANISM_FILE if isdir(path) else path
     path = library() / name / MECHANISM_FILE
     if Path(name).name != name or not isfile(path):
+        if isfile(library() / f"{name}.scene.toml"):
+            raise InputError(f"{name!r} is a scene; its mechanism is {Path(name).parts[0]!r}")
         raise InputError(
             f"no mechanism {name!r}; shipped: {', '.join(shipped())}; or give the path of a {MECHANISM_FILE}"
         )

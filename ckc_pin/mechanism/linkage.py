@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from xml.etree import ElementTree
+
 import numpy as np
 import pinocchio as pin
 
@@ -10,6 +12,7 @@ from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.motors import motors_of
+from ckc_pin.mechanism.parameters import Changes, changed
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
@@ -31,6 +34,8 @@ class Linkage:
         The content of ``mechanism.toml``.
     sources : Sources
         Where the texts of its URDFs come from.
+    changes : mapping
+        Numbers that are other ones, by name (`mechanism.parameters`).
 
     Raises
     ------
@@ -39,20 +44,27 @@ class Linkage:
 
     Attributes
     ----------
+    urdf : UrdfTree
+        All trees in one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
     motors : Motors or None
         None where the file names none.
     points : dict of str to Frame
+    urdf : UrdfTree
+        All trees in one.
     size : float
         Characteristic length, metres.
     warnings : list of str
     """
 
-    def __init__(self, spec: MechanismSpec, sources: Sources) -> None:
-        self.spec = spec
-        self.sources = sources
+    def __init__(self, spec: MechanismSpec, sources: Sources, changes: Changes | None = None) -> None:
         text, urdf = merge(_tree_texts(spec, sources))
         self.warnings = list(urdf.warnings)
+        if changes:
+            spec, warnings = changed(spec, urdf.root, changes, sources.name)
+            self.warnings += warnings
+            text = ElementTree.tostring(urdf.root, encoding="unicode")
+        self.spec, self.sources, self.urdf = spec, sources, urdf
         self.tree = Tree(_build_model(text, sources.name))
         self.tree.model.gravity.linear = np.array(spec.gravity)
         self.frames = Frames(self.tree.model)

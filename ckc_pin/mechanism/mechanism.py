@@ -7,15 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
-from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
+__all__ = ["CONSTRAINED_IN_PART", "Mechanism", "efforts"]
 
 CONSTRAINED_IN_PART = (
     "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
@@ -23,7 +24,12 @@ CONSTRAINED_IN_PART = (
 )
 
 
-class Mechanism:
+def efforts(lengths: set[bool]) -> str:
+    """Return the unit of forces along lengths, angles, or both."""
+    return " or ".join(["N m"] * (False in lengths) + ["N"] * (True in lengths)) or "N m"
+
+
+class Mechanism(Shown):
     """A closed chain: everything that does not depend on the state. `load` makes one.
 
     Parameters
@@ -51,8 +57,12 @@ class Mechanism:
     actuated : tuple of str
         Names of the motors, in the order of tau.
     motors : Motors
+    urdf : Element
+        All its trees in one <robot>.
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
+    urdf : Element
+        All trees in one <robot>, as Pinocchio got them.
     partition : Partition
     q_tree : (nq,) array
         The assembled configuration (Pinocchio's q).
@@ -67,6 +77,7 @@ class Mechanism:
 
     def __init__(self, linkage: Linkage, q_tree: Array, residual: float, tolerance: float, freedoms: Freedoms) -> None:
         self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
+        self.urdf = linkage.urdf.root
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
         self.joints, self.springs = linkage.joints, linkage.springs
         self.points, self.size = linkage.points, linkage.size
@@ -79,8 +90,22 @@ class Mechanism:
         self._split(linkage.motors)
         self._actuate(linkage.motors)
 
-    def __repr__(self) -> str:
-        return f"Mechanism({self.name!r}, n={self.n}, d={self.d}, independent={list(self.independent)})"
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        tree = self.tree
+        loops = [f"{loop.name} ({loop.type})" for loop in self.spec.loop]
+        loops += [f"{one.joint} = {one.ratio:g} {one.other} + {one.offset:g}" for one in self.spec.coupling]
+        rows: list[Row] = [
+            ("closure", f"{self.closure.rows} rows of rank {self.rank}"),
+            ("loops", loops or "none"),
+            ("independent q", ", ".join(self.independent) or "none"),
+            ("dependent z", ", ".join(self.dependent) or "none"),
+            ("motors", ", ".join(self.actuated) or "none"),
+            ("assembled at", quantities(self.coordinates, tree.to_coordinates(self.q_tree), tree.units())),
+        ]
+        rows += [("points", list(self.points))] if self.points else []
+        rows += [("warning", warning) for warning in self.warnings]
+        return Card(f"Mechanism {self.name}: {self.n} coordinates, {self.d} freedoms", rows)
 
     # --- one configuration -----------------------------------------------------------------------
 
@@ -103,6 +128,12 @@ class Mechanism:
         """Whether the motors turn the independent joints themselves, so that tau is u of eq. 6."""
         return np.array_equal(self.motors.turns, np.eye(self.n)[self.partition.q])
 
+    @property
+    def effort_unit(self) -> str:
+        """The unit of the motors' torques, forces, or both."""
+        lengths, turns = self.tree.in_metres, self.motors.turns != 0
+        return efforts({bool(np.all(lengths[row])) for row in turns})
+
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]
@@ -122,6 +153,19 @@ class Mechanism:
         return {
             name: pose.rotation[f.joint] @ f.translation + pose.translation[f.joint] for name, f in self.points.items()
         }
+
+    def point_jacobians(self, q_tree: Array) -> dict[str, Array]:
+        """Derivatives of the named points' world positions along the tangent coordinates, (3, n) each."""
+        frames = list(self.points.values())
+        if not frames:
+            return {}
+        ends = Anchors(
+            np.array([f.joint for f in frames], dtype=np.intp),
+            np.array([f.translation for f in frames]).reshape(-1, 3),
+            np.zeros(0, dtype=np.intp),
+            np.zeros((0, 3)),
+        )
+        return dict(zip(self.points, Pose(self.tree, ends, q_tree).p_jacobian, strict=True))
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
         """Turn a table by coordinate into a vector, as `Tree.vector` does."""

@@ -1,4 +1,4 @@
-"""The primitives that every closure is a table of: phi, J and J's time derivative, once each.
+"""The primitives that every closure is a table of: phi, J, J's time derivative and what phi_ddot depends on.
 
 A primitive is a group of rows evaluated with array operations, whatever the number of loops. Groups
 refer to a closure's `Anchors` by number and read them from a `Pose` and a `Rate`.
@@ -23,7 +23,9 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.mechanism.pose import Pose, Rate, cross
+from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_change, log_jacobian_dot, skew
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.mechanism.variation import Variation
 
 __all__ = ["Affine", "Component", "Distance", "Dot", "RelativeLog", "Rows"]
 
@@ -46,6 +48,9 @@ class Rows(Protocol):
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         """Time derivative of the Jacobian along the rate's velocity, shape (rows, n)."""
+
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
+        """Derivative of phi_ddot = J a + J_dot v along the tangent coordinates, v and a constant: shape (rows, n)."""
 
 
 def _along(e: Array, jacobian: Array) -> Array:
@@ -85,6 +90,17 @@ class Component:
             jacobian_dot += _along(cross(e, r), rate.e_angular_dot[self.direction])
         return jacobian_dot
 
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
+        e, (r_dot, r_ddot) = pose.e[self.direction], (x[self.pair] for x in by.r)
+        r_by, r_dot_by, r_ddot_by = (x[self.pair] for x in (pose.r_jacobian, *by.r_gradient))
+        gradient = _along(e, r_ddot_by)
+        if self.turning:
+            e_dot, e_ddot = (x[self.direction] for x in by.e)
+            e_by, e_dot_by, e_ddot_by = (x[self.direction] for x in by.e_gradient)
+            gradient += _along(e_ddot, r_by) + 2 * _along(e_dot, r_dot_by)
+            gradient += _along(pose.r[self.pair], e_ddot_by) + 2 * _along(r_dot, e_dot_by) + _along(r_ddot, e_by)
+        return gradient
+
 
 @dataclass(frozen=True)
 class Dot:
@@ -112,6 +128,13 @@ class Dot:
             cross(a, b), rate.e_angular_dot[self.a] - rate.e_angular_dot[self.b]
         )
 
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
+        gradient = np.zeros((len(self.out), pose.tree.n))
+        for one, other in ((self.a, self.b), (self.b, self.a)):  # (a . b)_ddot = a . b_ddot + 2 a_dot . b_dot + ...
+            for factor, rates, by_q in zip((1, 2, 1), (pose.e, *by.e), reversed(by.e_gradient), strict=True):
+                gradient += factor * _along(rates[one], by_q[other])
+        return gradient
+
 
 @dataclass(frozen=True)
 class Distance:
@@ -137,6 +160,12 @@ class Distance:
             pose.r[self.pair] / length, rate.r_jacobian_dot[self.pair]
         )
 
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
+        r_dot, r_ddot = (x[self.pair] for x in by.r)
+        r_by, r_dot_by, r_ddot_by = (x[self.pair] for x in (pose.r_jacobian, *by.r_gradient))
+        gradient = 2 * _along(r_dot, r_dot_by) + _along(r_ddot, r_by) + _along(pose.r[self.pair], r_ddot_by)
+        return gradient / self.length[:, None]
+
 
 @dataclass(frozen=True)
 class Affine:
@@ -156,6 +185,9 @@ class Affine:
         return self.matrix
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        return np.zeros_like(self.matrix)
+
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
         return np.zeros_like(self.matrix)
 
 
@@ -185,50 +217,39 @@ class RelativeLog:
 
     def jacobian(self, pose: Pose) -> Array:
         u, r_b_transposed, angular = self._relative(pose)
-        return (_log_jacobian(u) @ r_b_transposed @ angular).reshape(self.out.size, -1)
+        return (log_jacobian(u) @ r_b_transposed @ angular).reshape(self.out.size, -1)
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         u, r_b_transposed, angular = self._relative(pose)
-        body, j_log = r_b_transposed @ angular, _log_jacobian(u)
+        body, j_log = r_b_transposed @ angular, log_jacobian(u)
         u_dot = (j_log @ body) @ rate.v
         omega_b = pose.angular(self.joint_b) @ rate.v
         # d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
         body_dot = r_b_transposed @ (
-            rate.angular_dot(self.joint_b) - rate.angular_dot(self.joint_a) - _skew(omega_b) @ angular
+            rate.angular_dot(self.joint_b) - rate.angular_dot(self.joint_a) - skew(omega_b) @ angular
         )
-        return (_log_jacobian_dot(u, u_dot) @ body + j_log @ body_dot).reshape(self.out.size, -1)
+        return (log_jacobian_dot(u, u_dot) @ body + j_log @ body_dot).reshape(self.out.size, -1)
 
+    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
+        """Differentiate u_ddot = Jlog_dot(u, u_dot) w + Jlog(u) w_dot, w = R_B^T (omega_B - omega_A)."""
+        u, r_b_transposed, angular = self._relative(pose)
+        (omega_a, alpha_a), (omega_b, alpha_b) = by.spin(self.joint_a), by.spin(self.joint_b)
+        (omega_a_by, alpha_a_by), (omega_b_by, alpha_b_by) = (by.spin_gradient(x) for x in (self.joint_a, self.joint_b))
+        turning = pose.angular(self.joint_b)
+        w_world = omega_b - omega_a
+        w_dot_world = alpha_b - alpha_a + cross(omega_b, omega_a)
 
-def _skew(a: Array) -> Array:
-    """Cross-product matrices of vectors (k, 3)."""
-    m = np.zeros((len(a), 3, 3))
-    m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -a[:, 2], a[:, 1], -a[:, 0]
-    return m - np.swapaxes(m, 1, 2)
+        def in_b(vectors: Array, by_q: Array) -> tuple[Array, Array]:
+            """R_B^T x and its derivative."""
+            moved = by_q - cross(turning, vectors[:, :, None])
+            return (r_b_transposed @ vectors[:, :, None])[:, :, 0], r_b_transposed @ moved
 
-
-def _log_coefficient(u: Array) -> tuple[Array, Array]:
-    """Return c(theta) of Jlog(u) = 1 + [u]/2 + c [u]^2, and c'(theta)/theta; series near zero."""
-    square = np.sum(u * u, axis=1)
-    near = square < 0.01
-    t = np.where(near, 1.0, np.sqrt(square))
-    cotangent, sine = 1 / np.tan(t / 2), np.sin(t / 2)
-    c = 1 / t**2 - cotangent / (2 * t)
-    c_rate = (-2 / t**3 + cotangent / (2 * t**2) + 1 / (4 * t * sine**2)) / t
-    series = 1 / 12 + square / 720 + square**2 / 30240 + square**3 / 1209600 + square**4 / 47900160
-    series_rate = 1 / 360 + square / 7560 + square**2 / 201600 + square**3 / 5987520
-    return np.where(near, series, c), np.where(near, series_rate, c_rate)
-
-
-def _log_jacobian(u: Array) -> Array:
-    """Inverse right Jacobian of SO(3), shape (k, 3, 3): u_dot = Jlog(u) omega, omega in body axes."""
-    c, _ = _log_coefficient(u)
-    s = _skew(u)
-    return np.eye(3) + s / 2 + c[:, None, None] * (s @ s)
-
-
-def _log_jacobian_dot(u: Array, u_dot: Array) -> Array:
-    """Time derivative of `_log_jacobian` along u_dot."""
-    c, c_rate = _log_coefficient(u)
-    c_dot = c_rate * np.sum(u * u_dot, axis=1)
-    s, s_dot = _skew(u), _skew(u_dot)
-    return s_dot / 2 + c_dot[:, None, None] * (s @ s) + c[:, None, None] * (s_dot @ s + s @ s_dot)
+        crossed = cross(omega_b_by, omega_a[:, :, None]) + cross(omega_b[:, :, None], omega_a_by)
+        w, w_by = in_b(w_world, omega_b_by - omega_a_by)
+        w_dot, w_dot_by = in_b(w_dot_world, alpha_b_by - alpha_a_by + crossed)
+        G, u_by = log_jacobian(u), log_jacobian(u) @ r_b_transposed @ angular
+        u_dot = (G @ w[:, :, None])[:, :, 0]
+        u_dot_by = log_jacobian_change(u, u_by, w) + G @ w_by
+        gradient = log_jacobian_change(u, u_by, w_dot) + G @ w_dot_by + log_jacobian_dot(u, u_dot) @ w_by
+        gradient += log_jacobian_change(u, u_dot_by, w) + log_jacobian_change(u, u_by, w, along=u_dot)
+        return gradient.reshape(self.out.size, -1)

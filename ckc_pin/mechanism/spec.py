@@ -152,7 +152,8 @@ class MechanismSpec(_Spec, frozen=True):
         absent both: the independent ones.
         ``actuated = ["theta_1", "theta_3"]``
     q_guess : rad, m
-        Where assembly starts; it picks the assembly branch; 0 for what is not named.
+        Where assembly starts; it picks the assembly branch; 0 for what is not named. Where it leads beyond stops:
+        the nearest within them.
         ``q_guess = {theta_1 = -1.4, "root.z" = 0.5}``
     loop
         Loop closures.

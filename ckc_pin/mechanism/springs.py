@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -83,20 +83,16 @@ class Springs:
     def elastic_gradient(self, q_tree: Array) -> Array:
         """Minus the derivative of `elastic_force` along the tangent coordinates, shape (n, n).
 
-        The geometric part, d(length Jacobian)/dq, comes from the Jacobian's rate along each coordinate.
+        The geometric part is how the lengths' Jacobian changes along each coordinate.
         """
         gradient = np.diag(self.joint_stiffness)
         if not self.between_frames:
             return gradient
-        pose = Pose(self.tree, self.anchors, q_tree)
         length, length_jacobian = self._lengths(q_tree)
         gradient += length_jacobian.T @ (self.stiffness[:, None] * length_jacobian)
-        pull = self.stiffness * (length - self.rest_length) / np.where(length > 0, length, 1.0)
-        for k in range(self.tree.n):
-            rate = Rate(pose, np.eye(self.tree.n)[k])
-            # d/dq_k of (r . r_jacobian / length), the stretching of length itself taken off
-            turned = (rate.r_dot[:, None, :] @ pose.r_jacobian + pose.r[:, None, :] @ rate.r_jacobian_dot)[:, 0, :]
-            gradient[:, k] += pull @ (turned - length_jacobian * length_jacobian[:, k : k + 1])
+        pull = self.stiffness * (length - self.rest_length)
+        for k, bent in enumerate(self._bending(q_tree)):
+            gradient[:, k] += pull @ bent
         return gradient
 
     def damping_force(self, q_tree: Array, v_tree: Array) -> Array:
@@ -106,6 +102,17 @@ class Springs:
             _, length_jacobian = self._lengths(q_tree)
             force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
         return force
+
+    def damping_gradient(self, q_tree: Array, v_tree: Array) -> tuple[Array, Array]:
+        """Derivatives of `damping_force` along the tangent coordinates and by v', shape (n, n) each."""
+        by_q, by_v = np.zeros((self.tree.n, self.tree.n)), -np.diag(self.joint_damping)
+        if not self.damping.any():
+            return by_q, by_v
+        _, length_jacobian = self._lengths(q_tree)
+        stretched = self.damping * (length_jacobian @ v_tree)
+        for k, bent in enumerate(self._bending(q_tree)):
+            by_q[:, k] = -stretched @ bent - (self.damping * (bent @ v_tree)) @ length_jacobian
+        return by_q, by_v - length_jacobian.T @ (self.damping[:, None] * length_jacobian)
 
     def body_wrenches(self, pose: Pose, v_tree: Array) -> Array:
         """What springs and dampers between frames do to the bodies that they hold on to.
@@ -136,6 +143,17 @@ class Springs:
             length = np.sqrt(np.sum(Pose(self.tree, self.anchors, q_tree).r ** 2, axis=1))
             energy += 0.5 * float(self.stiffness @ (length - self.rest_length) ** 2)
         return energy
+
+    def _bending(self, q_tree: Array) -> Iterator[Array]:
+        """Derivative of the lengths' Jacobian along each tangent coordinate, (k, n) each."""
+        pose = Pose(self.tree, self.anchors, q_tree)
+        length, length_jacobian = self._lengths(q_tree)
+        along = np.where(length > 0, length, 1.0)[:, None]
+        for k in range(self.tree.n):
+            rate = Rate(pose, np.eye(self.tree.n)[k])
+            # d/dq_k of (r . r_jacobian / length), the stretching of length itself taken off
+            turned = (rate.r_dot[:, None, :] @ pose.r_jacobian + pose.r[:, None, :] @ rate.r_jacobian_dot)[:, 0, :]
+            yield (turned - length_jacobian * length_jacobian[:, k : k + 1]) / along
 
     def _lengths(self, q_tree: Array) -> tuple[Array, Array]:
         """Lengths (k,) and their Jacobian (k, n)."""

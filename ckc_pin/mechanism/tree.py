@@ -19,6 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.kinds import is_number
 
 __all__ = ["Array", "BoolArray", "IntArray", "Tree"]
 
@@ -73,9 +74,11 @@ class Tree:
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
+        self.carrier = np.zeros(self.n, dtype=np.intp)  # by coordinate: the joint whose body its own is fixed to
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
+            self.carrier[joint.idx_v : joint.idx_v + joint.nv] = parents[k]
 
     def measure(self, size: float) -> None:
         """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
@@ -182,6 +185,16 @@ class Tree:
             )
         return rate
 
+    def bracket(self, v_tree: Array) -> Array:
+        """Return the (n, n) matrix that makes [v', x] of x; zero but for free roots, whose motions do not commute.
+
+        A tangent step x beside a motion v' changes at its own rate less [v', x].
+        """
+        matrix = np.zeros((self.n, self.n))
+        for _, at in self.free:
+            matrix[at : at + 6, at : at + 6] = pin.Motion(v_tree[at : at + 6]).action
+        return matrix
+
     def axis(self, joint: int) -> tuple[Array, bool]:
         """Return the axis of a one-freedom joint in its body, shape (3,), and whether it turns; else it slides."""
         model = self.model.joints[joint]
@@ -242,11 +255,18 @@ class Tree:
         missing = [name for name in names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")
+        strange = next((name for name in names if not is_number(values.get(name, 0.0))), None)
+        if strange is not None:
+            raise InputError(f"{what}: {strange} = {values[strange]!r:.80}: a number is needed")
         vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
         if not np.all(np.isfinite(vector)):
             bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
             raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
         return vector
+
+    def units(self, per: str = "") -> list[str]:
+        """Return the unit of each coordinate, rad or m, ``per="/s"`` of its rate."""
+        return [f"{'m' if length else 'rad'}{per}" for length in self.in_metres]
 
     def one_freedom(self, joint: str, where: str) -> int:
         """Return where a joint of one freedom stands; MechanismError names those there are."""

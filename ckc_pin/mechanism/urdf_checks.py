@@ -15,7 +15,7 @@ import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
 
-__all__ = ["Mimic", "by_name", "check_connected", "check_inertial", "check_joint"]
+__all__ = ["INERTIA", "Mimic", "by_name", "check_connected", "check_inertial", "check_joint", "floats"]
 
 Mimic = tuple[str, str, float, float]  # joint, other, ratio, offset
 
@@ -41,7 +41,7 @@ def by_name(root: ElementTree.Element, tag: str, source: str) -> dict[str, Eleme
     return found
 
 
-def _floats(
+def floats(
     element: ElementTree.Element | None, attribute: str, count: int, default: str | None, where: str
 ) -> list[float]:
     """Read an attribute's numbers; without a default it must be there."""
@@ -61,8 +61,8 @@ def _finite_numbers(count: int) -> str:
 
 def _origin(element: ElementTree.Element, where: str) -> None:
     origin = element.find("origin")
-    _floats(origin, "xyz", 3, "0 0 0", f"{where}, <origin>")
-    _floats(origin, "rpy", 3, "0 0 0", f"{where}, <origin>")
+    floats(origin, "xyz", 3, "0 0 0", f"{where}, <origin>")
+    floats(origin, "rpy", 3, "0 0 0", f"{where}, <origin>")
 
 
 def _needed(element: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
@@ -79,11 +79,11 @@ def check_inertial(name: str, link: ElementTree.Element, source: str, warnings: 
         return
     where = f"{source}: link {name!r}"
     _origin(inertial, where)
-    (mass,) = _floats(_needed(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
+    (mass,) = floats(_needed(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
     if mass < 0:
         raise MechanismError(f"{where}: negative mass {mass:g} kg")
     tensor = _needed(inertial, "inertia", f"{where}, <inertial>")
-    xx, yy, zz, xy, xz, yz = (_floats(tensor, key, 1, None, f"{where}, <inertia>")[0] for key in INERTIA)
+    xx, yy, zz, xy, xz, yz = (floats(tensor, key, 1, None, f"{where}, <inertia>")[0] for key in INERTIA)
     principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     size = float(np.abs(principal).max())
     if principal[0] < -(1e-9 * size + ROUNDING):
@@ -112,7 +112,7 @@ def check_joint(
     _origin(joint, where)
     if kind in ("revolute", "continuous", "prismatic"):
         element = joint.find("axis")
-        axis = _floats(element, "xyz", 3, "1 0 0" if element is None else None, f"{where}, <axis>")
+        axis = floats(element, "xyz", 3, "1 0 0" if element is None else None, f"{where}, <axis>")
         if math.hypot(*axis) < SHORTEST:
             raise MechanismError(f"{where}: its axis is zero")
         _limits(joint, kind, where)
@@ -129,8 +129,8 @@ def _mimic(name: str, joint: ElementTree.Element, where: str, mimics: list[Mimic
     other = mimic.get("joint")
     if not other:
         raise MechanismError(f"{where}: its <mimic> names no joint")
-    (ratio,) = _floats(mimic, "multiplier", 1, "1", f"{where}, <mimic>")
-    (offset,) = _floats(mimic, "offset", 1, "0", f"{where}, <mimic>")
+    (ratio,) = floats(mimic, "multiplier", 1, "1", f"{where}, <mimic>")
+    (offset,) = floats(mimic, "offset", 1, "0", f"{where}, <mimic>")
     mimics.append((name, other, ratio, offset))
 
 
@@ -140,7 +140,7 @@ def _damping(joint: ElementTree.Element, where: str) -> None:
     if dynamics is None:
         return
     for key in ("damping", "friction"):
-        (value,) = _floats(dynamics, key, 1, "0", f"{where}, <dynamics>")
+        (value,) = floats(dynamics, key, 1, "0", f"{where}, <dynamics>")
         if value < 0:
             raise MechanismError(f"{where}: negative {key} {value:g}")
         dynamics.set(key, dynamics.get(key, "0"))
@@ -155,14 +155,14 @@ def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
     if limit is None:
         limit = ElementTree.SubElement(joint, "limit")
     for key, default in (("effort", "0"), ("velocity", "0")):
-        _floats(limit, key, 1, default, f"{where}, <limit>")
+        floats(limit, key, 1, default, f"{where}, <limit>")
         limit.set(key, limit.get(key, default))
     if unbounded:
         limit.set("lower", "-1e308")
         limit.set("upper", "1e308")
     else:
-        (lower,) = _floats(limit, "lower", 1, "0", f"{where}, <limit>")
-        (upper,) = _floats(limit, "upper", 1, "0", f"{where}, <limit>")
+        (lower,) = floats(limit, "lower", 1, "0", f"{where}, <limit>")
+        (upper,) = floats(limit, "upper", 1, "0", f"{where}, <limit>")
         if lower > upper:
             raise MechanismError(f"{where}: its lower limit {lower:g} is above the upper one {upper:g}")
 

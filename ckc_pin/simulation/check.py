@@ -3,41 +3,54 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.sampling import MOST_DELAYED
+from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
+from ckc_pin.mechanism.kinds import require_flag, require_kind
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.cards import check_card
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.linear_report import stability_warning
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
 from ckc_pin.simulation.scene_spec import TermsOf
+from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
-__all__ = ["Check", "check"]
+__all__ = ["Check", "check", "names_a_scene", "run_warnings"]
 
 MARGIN = 0.1  # of sigma_min(phi_z) at the assembled configuration: nearer to singular than that is worth a warning
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, repr=False)
+class Check(Shown):
     """Findings on a mechanism, and on a scene's desired trajectory.
 
     Attributes
     ----------
+    name : str
+        What was checked.
     n, d, rows, rank : int
         Coordinates, freedoms, rows of phi, rank of J at the assembled configuration.
     redundant : tuple of str
         Rows that the others imply, one admissible choice.
     independent, dependent, coordinates : tuple of str
+    units : tuple of str
+        "rad" or "m", by coordinate.
     q_tree : (n,) array
         The assembled configuration.
     det_phi_z : float or None
@@ -56,10 +69,13 @@ class Check:
         Whose terms a run takes: the scene's choice; without one, "generated" where they were compiled before.
     desired : DesiredCheck or None
         For a scene with a controller.
+    stability : Stability or None
+        Of its closed loop, where its target or its motion can be reached.
     branches : (k, n) array or None
         Closed configurations at the assembled q, when asked for; the assembled one first.
     """
 
+    name: str
     n: int
     d: int
     rows: int
@@ -68,6 +84,7 @@ class Check:
     independent: tuple[str, ...]
     dependent: tuple[str, ...]
     coordinates: tuple[str, ...]
+    units: tuple[str, ...]
     q_tree: Array
     det_phi_z: float | None
     sigma_min_phi_z: float
@@ -79,7 +96,12 @@ class Check:
     warnings: tuple[str, ...]
     terms: str
     desired: DesiredCheck | None = None
+    stability: Stability | None = None
     branches: Array | None = None
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return check_card(self)
 
 
 def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Check:
@@ -97,16 +119,37 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     InputError, MechanismError
         It cannot exist as described. Findings about one that can are not errors.
     """
+    require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
+    require_flag(branches, "check: branches")
     if isinstance(what, str | Path):
-        what = load_scene(what) if _names_a_scene(str(what)) else load(what)
+        what = load_scene(what) if names_a_scene(str(what)) else load(what)
     if isinstance(what, Mechanism):
-        found = _mechanism_check(what, None, _limits(what, what.q_tree, "the assembled configuration"), "auto")
+        outside = _limits(what, what.q_tree, "the assembled configuration")
+        found = _mechanism_check(what, None, outside, "auto", what.name)
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
-    desired = _desired(what, mechanism)
+    controller = scene_controller(what, mechanism)
+    desired = _desired(controller, mechanism, what.spec.t_end)
+    stable = None
+    if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
+        sampling = _sampling(what) if isinstance(controller, SetPoint) else None
+        stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing, sampling)
+    if stable is not None:
+        stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.multiplier is not None))
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
-    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms)
+    warnings += stability_warning(stable, mechanism.independent)
+    found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
+    found = replace(found, stability=stable)
     return replace(found, branches=_branches(mechanism)) if branches else found
+
+
+def run_warnings(scene: Scene) -> list[str]:
+    """Return what of a controlled scene's check may spoil a run of it: its start, its desired trajectory."""
+    if scene.spec.controller is None:
+        return []
+    mechanism = scene_mechanism(scene)
+    desired = _desired(scene_controller(scene, mechanism), mechanism, scene.spec.t_end)
+    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, desired)
 
 
 def _branches(mechanism: Mechanism) -> Array:
@@ -114,13 +157,16 @@ def _branches(mechanism: Mechanism) -> Array:
     return np.array([mechanism.tree.to_coordinates(at.q_tree) for at in found])
 
 
-def _names_a_scene(name: str) -> bool:
+def names_a_scene(name: str) -> bool:
+    """Whether a name or path is meant as a scene's, not a mechanism's."""
     if is_path(name):
         return name.endswith(SUFFIX)
-    return "/" in name
+    return "/" in name or isfile(f"{name}{SUFFIX}")
 
 
-def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf) -> Check:
+def _mechanism_check(
+    mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf, name: str
+) -> Check:
     if terms == "auto":
         terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
@@ -128,6 +174,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
     mass, inertia = moving_mass(mechanism)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
     return Check(
+        name=name,
         n=mechanism.n,
         d=mechanism.d,
         rows=mechanism.closure.rows,
@@ -136,6 +183,7 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
         independent=mechanism.independent,
         dependent=mechanism.dependent,
         coordinates=mechanism.coordinates,
+        units=tuple(mechanism.tree.units()),
         q_tree=mechanism.tree.to_coordinates(mechanism.q_tree),
         det_phi_z=float(np.linalg.det(at.phi_z)) if square else None,
         sigma_min_phi_z=float(values[-1]),
@@ -150,13 +198,36 @@ def _mechanism_check(mechanism: Mechanism, desired: DesiredCheck | None, warning
     )
 
 
-def _desired(scene: Scene, mechanism: Mechanism) -> DesiredCheck | None:
-    controller = scene_controller(scene, mechanism)
+def _desired(
+    controller: SetPoint | Tracking | Torques | None, mechanism: Mechanism, t_end: float
+) -> DesiredCheck | None:
     if isinstance(controller, Tracking):
-        return follow_desired(mechanism, controller.desired, scene.spec.t_end)
+        return follow_desired(mechanism, controller.desired, t_end)
     if isinstance(controller, SetPoint):
         return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
     return None
+
+
+def _sampling(scene: Scene) -> tuple[float, float] | None:
+    """Sample time and delay of a scene's controller; None without, or where more is under way than can be listed."""
+    spec = scene.spec.controller
+    if not isinstance(spec, FeedbackSpec) or spec.sample_time is None or spec.delay > MOST_DELAYED * spec.sample_time:
+        return None
+    return spec.sample_time, spec.delay
+
+
+def _leaves_out(scene: Scene, mechanism: Mechanism, sampled_in: bool) -> tuple[str, ...]:
+    """What of a scene stands between a run and the linear model of its closed loop."""
+    spec = scene.spec.controller
+    sampled = spec if isinstance(spec, FeedbackSpec) and spec.sample_time is not None else None
+    there = {
+        "sampling": sampled is not None and not sampled_in,
+        "delay": sampled is not None and sampled.delay > 0 and not sampled_in,
+        "sensor and drive": sampled is not None and (sampled.sensor is not None or sampled.drive is not None),
+        "torque limits": bool(np.isfinite(scene_actuation(scene, mechanism).limit).any()),
+        "dry friction": bool(mechanism.joints.friction.any()) and scene.spec.friction_smoothing is None,
+    }
+    return tuple(name for name, is_there in there.items() if is_there)
 
 
 def _start_warnings(scene: Scene, mechanism: Mechanism) -> list[str]:

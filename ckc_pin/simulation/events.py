@@ -14,6 +14,7 @@ import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.loop_terms import event_call
 from ckc_pin.simulation.scene_spec import EventSpec
@@ -94,6 +95,7 @@ def event_functions(specs: Sequence[EventSpec], own: Sequence[Event], mechanism:
     InputError
         An unknown coordinate, one without limits, a margin that this mechanism does not have, no `Event`.
     """
+    require_kind(own, (list, tuple), "events", "a list of Event")
     found: list[EventFunction] = []
     for k, spec in enumerate(specs):
         found += _of_scene(spec, mechanism, f"event[{k}]")

@@ -15,7 +15,7 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["Start", "find_start"]
+__all__ = ["Start", "branch", "find_start"]
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
         mechanism.independent,
         "initial.q",
     )
-    return Start(_close(mechanism, q, _branch(mechanism, initial.q), w), q_dot, w)
+    return Start(_close(mechanism, q, branch(mechanism, initial.q), w), q_dot, w)
 
 
-def _branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
+def branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
     """Return the assembled configuration, or the one that given dependent coordinates pick."""
     if not any(name in mechanism.dependent for name in given):
         return mechanism.assembled

@@ -23,6 +23,7 @@ from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrench
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.kinds import require_callable, require_table
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
@@ -32,7 +33,7 @@ from ckc_pin.simulation.motion_forces import MotionForces, collected
 from ckc_pin.simulation.prepare import output_instants, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run, Status
-from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.scene import CHANGES, Scene, as_scene, make_scene, with_changes
 from ckc_pin.simulation.workspace import leaving
 
 __all__ = ["inverse_dynamics"]
@@ -93,15 +94,18 @@ def inverse_dynamics(
     """
     if isinstance(what, str | Path) and _names_a_run(str(what)):
         what = Run.load(what)
-    if isinstance(what, Scene) and changes:
-        raise InputError("inverse_dynamics: changes go with a name or a run; a Scene is complete")
+    if not isinstance(what, Run):
+        what = as_scene(what, changes, "inverse_dynamics")
+    elif changes is not None:
+        require_table(changes, "inverse_dynamics: changes", CHANGES)
+    require_callable(progress, "inverse_dynamics: progress", "a function of (t, t_end)")
     with one_blas_thread():
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, changes or {}), what.mechanism
             actuation = scene_actuation(scene, mechanism)
             motion, t_end = _recorded(what, mechanism), float(what.t[-1])
         else:
-            scene = what if isinstance(what, Scene) else load_scene(what, changes)
+            scene = what
             mechanism, t_end = scene_mechanism(scene), scene.spec.t_end
             actuation = scene_actuation(scene, mechanism)
             motion = _prescribed(scene, mechanism, actuation)

@@ -42,7 +42,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene import Scene, as_scene
 
 __all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
 
@@ -102,10 +102,7 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     >>> solution = solve_ivp(problem.f, problem.t_span, problem.y0, "LSODA", rtol=1e-8, atol=1e-10)
     >>> problem.terms(2.0, solution.y[:, -1]).q_tree
     """
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene, changes)
-    elif changes:
-        raise InputError("as_ivp: changes go with the name of a scene; a Scene is complete")
+    scene = as_scene(scene, changes, "as_ivp")
     spec, mechanism = scene.spec, scene_mechanism(scene)
     if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
         raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")

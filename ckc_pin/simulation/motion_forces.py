@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.simulation.cards import forces_card
 from ckc_pin.simulation.run import Status
 
 __all__ = ["MotionForces", "collected"]
@@ -20,8 +22,8 @@ __all__ = ["MotionForces", "collected"]
 BEYOND = 1e-9  # of a limit: what was cut off there stands at it, but for rounding
 
 
-@dataclass(frozen=True, eq=False)
-class MotionForces:
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionForces(Shown):
     """What acts in a mechanism along a motion; a row of each array is an instant.
 
     Attributes
@@ -67,6 +69,10 @@ class MotionForces:
     loop_wrenches: dict[str, Array]
     joint_forces: dict[str, Array]
     exceeded: list[dict[str, Any]]
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return forces_card(self)
 
     @property
     def coordinates(self) -> tuple[str, ...]:

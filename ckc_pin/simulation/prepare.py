@@ -15,7 +15,15 @@ import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
+from ckc_pin.control.controllers import (
+    Controller,
+    Law,
+    SetPoint,
+    TorqueController,
+    Tracking,
+    as_controller,
+    gives_tau,
+)
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
@@ -34,6 +42,7 @@ from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.scene_spec import SceneSpec
+from ckc_pin.simulation.varying import variation_of
 
 __all__ = ["Prepared", "output_instants", "prepare", "scene_actuation", "scene_controller", "scene_mechanism"]
 
@@ -49,7 +58,7 @@ MAX_OUTPUTS = 1_000_000
 def scene_mechanism(scene: Scene) -> Mechanism:
     """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
     mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism)
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, scene.spec.parameters)
 
 
 def _beside(scene: Scene, name: str) -> str | Path:
@@ -100,6 +109,8 @@ class Prepared:
     start : Start
     texts : dict of str to str
         The files of mechanism, scene and controller.
+    tables : tuple
+        What the loop is made of: core, formulation, control, solver, events.
     loop : native Loop
     """
 
@@ -111,6 +122,7 @@ class Prepared:
     instants: Array
     start: Start
     texts: dict[str, str]
+    tables: tuple[Any, ...]
     loop: Any
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
@@ -127,18 +139,19 @@ class Prepared:
 
 def prepare(
     scene: Scene,
-    controller: Controller | TorqueController | Sampled | None = None,
+    controller: Controller | TorqueController | Sampled | Law | None = None,
     events: Sequence[Event] = (),
     *,
     free: bool = False,
     profile: bool = False,
     library: Library | None = None,
+    parameters: Sequence[str] = (),
 ) -> Prepared:
     """Build everything that a scene needs before its first step.
 
     Parameters
     ----------
-    controller : Controller, TorqueController or Sampled, optional
+    controller : Controller, TorqueController, Sampled or function u(t, terms), optional
         Takes the place of the scene's.
     events : sequence of Event
         Beside those of the scene.
@@ -148,6 +161,8 @@ def prepare(
         Count which terms are evaluated.
     library : Library, optional
         The mechanism's terms, compiled, in the place of those that the scene's solver.terms says.
+    parameters : sequence of str
+        What the motion's changes with are integrated beside it.
 
     Raises
     ------
@@ -164,6 +179,8 @@ def prepare(
         controller = scene_controller(scene, mechanism, texts)
         if controller is not None and isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
             controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
+    elif controller is not None and not isinstance(controller, Sampled):
+        controller = as_controller(controller)
     if isinstance(controller, Sampled):
         controller.require_countable(scene.spec.t_end)
         controller.require_sensible(mechanism)
@@ -180,17 +197,19 @@ def prepare(
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not gives_tau(law):
         actuation.require_transmission(start.at)
-    loop = _core.Loop(
+    tables = (
         core_table(
             mechanism, library or _library(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
         ),
-        _formulation(mechanism, scene.spec, np.diagonal(D_tree)),
+        _formulation(mechanism, scene.spec, np.diagonal(D_tree))
+        | (variation_of(mechanism, scene, controller, parameters) if parameters else {}),
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
         [event.row for event in functions],
     )
+    loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, loop)
+    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop)
 
 
 def _library(mechanism: Mechanism, terms: str) -> Library | None:
@@ -271,7 +290,7 @@ def _require_within_stops(mechanism: Mechanism, start: Start) -> None:
     if off[worst] > AT_STOP:
         raise InputError(
             f"initial: {mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
-            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}"
+            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}; give another initial.q, or a q_guess within them"
         )
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ckc_pin.dynamics.formulations import dae_acceleration, tangent_basis
+from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 
-__all__ = ["RecordedJoints"]
+__all__ = ["RecordedJoints", "loop_forces"]
 
 IDLE = 1e-9  # of the forces that hold: what follows from others, of least norm
 
@@ -57,3 +58,20 @@ class RecordedJoints:
         moved = dae_acceleration(terms, u_tree + force)[at]
         force[at] -= np.linalg.lstsq(responses, moved, rcond=IDLE)[0]
         return force
+
+
+def loop_forces(run: Run) -> dict[str, Array]:
+    """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
+    mechanism, of_joints = run.mechanism, RecordedJoints(run)
+    forces = np.empty_like(run.phi)
+    for k, numbers in enumerate(run.q_tree):
+        at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
+        terms = Terms(mechanism, at, run.v_tree[k])
+        u_tree = mechanism.motors.force(run.tau[k])
+        try:
+            u_tree += of_joints(k, terms, u_tree)
+            forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
+        except NumericalError:
+            forces[k] = np.nan
+    loops = [loop for loop, _ in mechanism.closure.names]
+    return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}

@@ -5,28 +5,46 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
-from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import build
+from ckc_pin.mechanism.card import Card, Shown
+from ckc_pin.mechanism.kinds import a_kind, is_number, require_kind, require_path
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import plain_values
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import write_whole
+from ckc_pin.simulation.cards import run_card
+from ckc_pin.simulation.columns import as_csv, as_data_frame, as_dataset
+from ckc_pin.simulation.parts import part_of, state_of
 from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
+from ckc_pin.simulation.state import State
 
-__all__ = ["Run", "Status"]
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from ckc_pin.view.inline import Figures, Playback
+    from ckc_pin.view.server import ViewServer
+
+__all__ = ["Run", "Status", "given_runs"]
 
 Status = Literal["done", "stopped", "interrupted"]
 
 META = tuple(name for name in RunMeta.__struct_fields__ if name not in ("format", "hashes"))
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
+@dataclass(frozen=True, eq=False, repr=False)
+class Run(Shown):
     """A simulated motion; a row of each array is an output instant.
+
+    ``run["theta_1"]`` is a coordinate along the motion, ``run.sel(t=0.5)`` the state at an instant, ``run.plot()`` and
+    ``run.play()`` show it, `to_xarray`, `to_pandas` and `to_csv` hand it over.
 
     Attributes
     ----------
@@ -56,7 +74,7 @@ class Run:
         touches a stop, leaves it or bounces off it (of "stop").
     stats : dict
         rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (of a
-        caller's controller and events), terms, wall_s.
+        caller's controller and events), terms (at the end), rhs_by_terms, wall_s.
     scene : dict
         The scene as resolved.
     texts : dict of str to str
@@ -95,7 +113,8 @@ class Run:
 
         InputError: it is not the one that the numbers are of.
         """
-        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts))
+        changes = plain_values(self.scene.get("parameters", {}))
+        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), changes)
         for what in ("coordinates", "independent", "actuated"):
             own, theirs = getattr(self, what), getattr(mechanism, what)
             if own != theirs:
@@ -106,6 +125,64 @@ class Run:
             raise InputError(f"{self.scene_name}: damaged: the run's phi has {rows}")
         return mechanism
 
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return run_card(self)
+
+    # --- by name, by time ------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a coordinate along the run, shape (m,), or an array by its name, as ``run["energy"]``.
+
+        Raises
+        ------
+        InputError
+            Neither; names those there are.
+        """
+        if name in self.coordinates:
+            return self.q_tree[:, self.coordinates.index(name)]
+        others = [other for other in (*ARRAYS, *OPTIONAL) if getattr(self, other) is not None]
+        if name not in others:
+            own = ", ".join(self.coordinates)
+            raise InputError(
+                f"run[{a_kind(name)}]: there are the coordinates {own}, and the arrays {', '.join(others)}"
+            )
+        return np.asarray(getattr(self, name))
+
+    @overload
+    def sel(self, *, t: float) -> State: ...
+
+    @overload
+    def sel(self, *, t: slice) -> Run: ...
+
+    def sel(self, *, t: float | slice) -> State | Run:
+        """Return the run at an instant, or from one time to another.
+
+        Parameters
+        ----------
+        t : float or slice
+            s. A number: the state at the output instant nearest to it, whose own t says which that is. A slice: the
+            run's instants from its start to its stop, both included.
+
+        Returns
+        -------
+        State or Run
+            Of a part of a run `stats`, `max_phi` and `max_phi_dot` are those of the whole.
+
+        Raises
+        ------
+        InputError
+            A time before the run's start or after its end, or none between the two.
+        """
+        first, last = float(self.t[0]), float(self.t[-1])
+        if isinstance(t, slice):
+            return part_of(self, first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
+        if not is_number(t):
+            raise InputError(f"Run.sel: t: {a_kind(t)} was given; it takes a time, s, or slice(start, stop)")
+        if not first <= t <= last:
+            raise InputError(f"Run.sel: t = {t:g} s; the run is from {first:g} to {last:g} s")
+        return state_of(self, self.at(t))
+
     def column(self, coordinate: str) -> int:
         """Return the column of a coordinate; InputError names the valid ones."""
         if coordinate not in self.coordinates:
@@ -113,7 +190,9 @@ class Run:
         return self.coordinates.index(coordinate)
 
     def at(self, t: float) -> int:
-        """Return the row of the output instant nearest to t."""
+        """Return the row of the output instant nearest to t, s."""
+        if not is_number(t):
+            raise InputError(f"Run.at: {a_kind(t)} was given; it takes a time, s")
         return int(np.argmin(np.abs(self.t - t)))
 
     @cached_property
@@ -144,23 +223,9 @@ class Run:
         For a point row: the force that the loop exerts on frame A, along the row's axis. NaN where J has lost rank, so
         that nothing determines them.
         """
-        from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
-        from ckc_pin.dynamics.terms import Terms
-        from ckc_pin.simulation.recorded_joints import RecordedJoints
+        from ckc_pin.simulation.recorded_joints import loop_forces
 
-        mechanism, of_joints = self.mechanism, RecordedJoints(self)
-        forces = np.empty_like(self.phi)
-        for k, numbers in enumerate(self.q_tree):
-            at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-            terms = Terms(mechanism, at, self.v_tree[k])
-            u_tree = mechanism.motors.force(self.tau[k])
-            try:
-                u_tree += of_joints(k, terms, u_tree)
-                forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
-            except NumericalError:
-                forces[k] = np.nan
-        loops = [loop for loop, _ in mechanism.closure.names]
-        return {loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)}
+        return loop_forces(self)
 
     def summary(self) -> dict[str, Any]:
         """Return what `ckc run --json` prints (docs/reference/json.md): scalars, and the last instant by name."""
@@ -189,6 +254,50 @@ class Run:
             "stats": self.stats,
         }
 
+    # --- to look at, to hand over -------------------------------------------------------------------
+
+    def plot(self) -> Figures:
+        """Draw the run: figures that a notebook shows and `save(folder)` writes; see `ckc_pin.plot`."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def play(
+        self,
+        *,
+        speed: float = 1.0,
+        gap: float = 0.0,
+        meshes: str | Path | None = None,
+        forces: bool = False,
+        inline: bool | None = None,
+    ) -> Playback | ViewServer | None:
+        """Play the run: in a notebook below the cell, elsewhere in the browser until Ctrl-C; see `ckc_pin.play`."""
+        import ckc_pin
+
+        return ckc_pin.play(self, speed=speed, gap=gap, meshes=meshes, forces=forces, inline=inline)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the run as xarray's Dataset, by t, coordinate, independent, motor, row and point (extra `data`)."""
+        return as_dataset(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the run as pandas' DataFrame by t, with the columns of `to_csv` (extra `data`)."""
+        return as_data_frame(self)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the run as CSV: t, each coordinate by its name, v.NAME, u.NAME, tau.MOTOR, phi.ROW, w.ROW, energy.
+
+        Points are POINT.x, .y, .z. Every number is written to its last digit.
+
+        Raises
+        ------
+        InputError
+            It cannot be written; a joint is called as another column is.
+        """
+        require_path(path, "Run.to_csv: path")
+        write_whole(Path(path), as_csv(self))
+        return Path(path)
+
     # --- files -----------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:
@@ -199,6 +308,7 @@ class Run:
         InputError
             It cannot be written; what was there is still there.
         """
+        require_path(path, "Run.save: path")
         path = Path(path)
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL) if getattr(self, name) is not None}
         write_run(path, self.coordinates, arrays, self._meta())
@@ -213,6 +323,7 @@ class Run:
         InputError
             No such file, not a run file, damaged, too large, or of another version.
         """
+        require_path(path, "Run.load: path", "the path of a run file, or of a folder that holds a run.npz")
         path = Path(path)
         if path.is_dir():
             path = path / "run.npz"
@@ -229,3 +340,19 @@ class Run:
 
     def _meta(self) -> RunMeta:
         return RunMeta(**{name: getattr(self, name) for name in META})
+
+
+def given_runs(given: Any, who: str) -> list[Run]:
+    """Return the runs that a public function was given, one or several.
+
+    Raises
+    ------
+    InputError
+        None at all, or something else among them.
+    """
+    runs = list(given) if isinstance(given, list | tuple) else [given]
+    if not runs:
+        raise InputError(f"{who}: no run given; give at least one")
+    for run in runs:
+        require_kind(run, Run, f"{who}: runs", "runs, as simulate and Run.load return them")
+    return runs

@@ -13,6 +13,7 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
+from ckc_pin.mechanism.spec import Vector3
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
 
@@ -67,6 +68,7 @@ class _Stats(msgspec.Struct):
     python_calls: int
     wall_s: float
     terms: Literal["pinocchio", "generated"] = "pinocchio"  # of files from before there were others
+    rhs_by_terms: dict[str, int] = {}
 
 
 class _Controller(msgspec.Struct):
@@ -78,6 +80,7 @@ class _Scene(msgspec.Struct):
     epsilon: Annotated[float, msgspec.Meta(gt=0)]
     spf_coordinates: Literal["w", "z"]
     controller: _Controller | None = None
+    parameters: dict[str, float | Vector3] = {}
 
 
 class _Cost(msgspec.Struct):

@@ -15,19 +15,27 @@ import numpy as np
 
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.card import Card, Shown
+from ckc_pin.mechanism.kinds import require_kind, require_table
 from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
+from ckc_pin.simulation.cards import scene_card
 from ckc_pin.simulation.scene_spec import EventSpec, SceneSpec, SolverSpec
 
-__all__ = ["Scene", "SceneSpec", "SolverSpec", "load_scene", "scene_names", "with_changes"]
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "load_scene", "scene_names", "with_changes"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
+BY_NAME = (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("parameters",))  # tables with dots in keys
+TAKES = 'a scene: its shipped name, as "five_bar/swing", its path, or what load_scene returns'
+CHANGES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
 
 
-@dataclass(frozen=True)
-class Scene:
+@dataclass(frozen=True, repr=False)
+class Scene(Shown):
     """A checked scene and where its files are.
 
     Attributes
@@ -42,6 +50,10 @@ class Scene:
     spec: SceneSpec
     name: str
     sources: Sources
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return scene_card(self)
 
     def plain(self) -> dict[str, Any]:
         """Return the scene as resolved, as plain data without absent values."""
@@ -59,7 +71,7 @@ def scene_names(mechanism: str) -> list[str]:
 
 
 def scene_file(name: str | Path) -> Path:
-    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE or a path.
+    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE, a path, or one without its ending.
 
     Raises
     ------
@@ -72,7 +84,7 @@ def scene_file(name: str | Path) -> Path:
             path = _default(path if isdir(path) else path.parent)
         return path
     if isfile(f"{name}{SUFFIX}"):
-        raise InputError(f"no scene {name!r}; there is {name}{SUFFIX}, a path ends in .toml")
+        return Path(f"{name}{SUFFIX}")
     mechanism, _, scene = name.partition("/")
     path = library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
     if Path(name).parts in ((mechanism,), (mechanism, scene)) and isfile(path):
@@ -87,9 +99,15 @@ def scene_file(name: str | Path) -> Path:
 def _default(folder: Path) -> Path:
     path = folder / f"{DEFAULT}{SUFFIX}"
     others = sorted(p.name for p in folder.glob(f"*{SUFFIX}"))
-    if others and not isfile(path):
+    if isfile(path):
+        return path
+    if len(others) == 1:
+        return folder / others[0]
+    if others:
         raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
-    return path
+    if isfile(folder / "run.npz"):
+        raise InputError(f"{folder}: the folder of a run, which is over; ckc play, plot and inverse take it")
+    raise InputError(f"{folder}: no scene, *{SUFFIX}, says what to run; ckc new NAME makes a folder with one to copy")
 
 
 def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scene:
@@ -100,22 +118,70 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
     name : str or Path
         ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path.
     changes : mapping, optional
-        Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``.
+        Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``; names of the mechanism's numbers too, e.g.
+        ``{"link.link_2.mass": 0.3}``.
 
     Raises
     ------
     InputError
         A missing file, malformed TOML, an unknown key, a wrong type or value.
     """
+    require_kind(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
+    if changes is not None:
+        require_table(changes, "load_scene: changes", CHANGES)
     path = scene_file(name)
     called = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), called)
-    return make_scene(with_changes(data, changes or {}), str(name), Sources(called, path.parent))
+    return make_scene(with_changes(data, changes or {}), _called(name, path), Sources(called, path.parent))
+
+
+def _called(name: str | Path, path: Path) -> str:
+    """Return what a scene is called: as the user did; of a folder, the folder's own name, with the scene's."""
+    if not isdir(name):
+        return str(name)
+    scene = path.name.removesuffix(SUFFIX)
+    return path.parent.resolve().name + ("" if scene == DEFAULT else f"/{scene}")
+
+
+def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
+    """Return the scene that a public function was given: as it is, or loaded by name or path, with changes.
+
+    Parameters
+    ----------
+    given
+        What it was given.
+    changes : mapping or None
+        They go with a name or path.
+    who : str
+        The function.
+
+    Raises
+    ------
+    InputError, MechanismError
+        No scene; changes of a Scene, which is complete; what `load_scene` raises.
+    """
+    if isinstance(given, Mechanism):
+        folder = given.sources.folder
+        beside = [] if folder is None else sorted(path.name.removesuffix(SUFFIX) for path in folder.glob(f"*{SUFFIX}"))
+        known = folder is not None and folder.parent == library()
+        names = ", ".join(f"{folder.name}/{name}" if known and folder else f"{name}{SUFFIX}" for name in beside)
+        raise InputError(
+            f"{who}: a Mechanism was given, which does not say from where and how long it moves; it takes {TAKES}"
+            + (f"; those of {given.name}: {names}" if names else "")
+        )
+    require_kind(given, (Scene, str, Path), f"{who}: scene", TAKES)
+    if changes is not None:
+        require_table(changes, f"{who}: changes", CHANGES)
+    if not isinstance(given, Scene):
+        return load_scene(given, changes)
+    if changes:
+        raise InputError(f"{who}: changes go with the name of a scene; a Scene is complete")
+    return given
 
 
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     """Check parsed data; where msgspec's checks end, ours begin."""
-    for table in (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d")):
+    for table in BY_NAME:
         by_coordinate(data, *table)
     spec = convert(data, SceneSpec, sources.name)
     if spec.initial.at is not None and spec.initial.q:
@@ -157,10 +223,16 @@ def _check_event(event: EventSpec, where: str) -> None:
 
 
 def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scene's data with values replaced by dotted key; None removes a key."""
+    """Return a scene's data with values replaced by dotted key; None removes a key.
+
+    A name of the mechanism's numbers stands for its entry in the table of parameters; so does a coordinate's in those
+    by coordinate, whatever dots are in it.
+    """
     changed = deepcopy(data)
+    for path in BY_NAME:
+        by_coordinate(changed, *path)
     for key, value in changes.items():
-        *tables, last = key.split(".")
+        *tables, last = _place_of(f"parameters.{key}" if is_parameter(key) else key)
         at = changed
         for k, table in enumerate(tables):
             at = at.setdefault(table, {})
@@ -171,6 +243,15 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
         else:
             at[last] = _plain(value)
     return changed
+
+
+def _place_of(key: str) -> list[str]:
+    """Take a dotted key apart, but for the name of what a table by name has."""
+    for path in BY_NAME:
+        start = ".".join([*path, ""])
+        if key.startswith(start):
+            return [*path, key.removeprefix(start)]
+    return key.split(".")
 
 
 def _plain(value: Any) -> Any:

@@ -8,6 +8,7 @@ import msgspec
 
 from ckc_pin.control.spec import ControllerSpec
 from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.spec_frames import Vector3
 
 __all__ = ["EventSpec", "InitialSpec", "Method", "SceneSpec", "SolverSpec", "TermsOf"]
 
@@ -82,8 +83,8 @@ class SolverSpec(_Spec, frozen=True):
         ``projection = false``
     terms
         Whose D', C', h', φ, J: Pinocchio's, or those written out and compiled for the mechanism; ``auto``
-        takes the latter where ``ckc compile`` has left them, compiles nothing while a run waits, and says
-        after a run of more than 10 s that it would pay.
+        takes the latter where ``ckc compile`` has left them, and compiles them itself once a run has evaluated
+        2,000,000 right-hand sides with half of its time or more still ahead: a short run never waits.
         ``terms = "pinocchio"``
     baumgarte : 1/s
         α and β, of a DAE with ``projection = false``.
@@ -159,6 +160,9 @@ class SceneSpec(_Spec, frozen=True):
     friction_smoothing : rad/s, m/s
         Dry friction grows as tanh over such a rate, instead of joints that stick.
         ``friction_smoothing = 1e-3``
+    parameters : as in the files
+        Numbers of the mechanism that are other ones, by name (see "parameters").
+        ``parameters = {"link.link_2.mass" = 0.3}``
     initial
         Where it starts.
         ``initial = {at = "equilibrium"}``
@@ -180,6 +184,7 @@ class SceneSpec(_Spec, frozen=True):
     spf_coordinates: Literal["w", "z"] = "w"
     coriolis_velocity: Literal["rho", "actual"] = "rho"
     friction_smoothing: Positive | None = None
+    parameters: dict[str, float | Vector3] = {}
     initial: InitialSpec = InitialSpec()
     solver: SolverSpec = SolverSpec()
     controller: ControllerSpec | None = None

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from ckc_pin.control.controllers import Controller, TorqueController
+from ckc_pin.control.controllers import Controller, Law, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.library import compiled
+from ckc_pin.mechanism.kinds import require_callable, require_flag
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene import Scene, as_scene
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
-__all__ = ["OnOutput", "Progress", "run_prepared", "simulate"]
+__all__ = ["OnOutput", "Progress", "columns_of", "run_of", "run_prepared", "run_rows", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
+# Right-hand sides that cost what writing terms out and compiling them does, of whatever mechanism
+# (docs/theory/generated.md); a run with as many still ahead takes them then, wherever it runs.
+REPAYS, NEVER = 2_000_000, 2**62
 SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
 
 
@@ -33,7 +40,7 @@ def simulate(
     scene: Scene | str | Path,
     changes: Mapping[str, Any] | None = None,
     *,
-    controller: Controller | TorqueController | Sampled | None = None,
+    controller: Controller | TorqueController | Sampled | Law | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,
@@ -47,8 +54,10 @@ def simulate(
         A scene, its shipped name ("five_bar/tracking"), or its path.
     changes : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
-    controller : Controller, TorqueController or Sampled, optional
-        Takes the place of the scene's, its sample time, delay, sensor and drive included; `Sampled` gives it its own.
+    controller : Controller, TorqueController, Sampled or function, optional
+        An object with a method u(t, terms) or tau(t, terms), or a plain function u(t, terms), whose u is eq. 6's force
+        on the independent coordinates. Takes the place of the scene's, its sample time, delay, sensor and drive
+        included; `Sampled` gives it its own.
     events : sequence of Event, optional
         Event functions of the state, beside the scene's events.
     progress : callable, optional
@@ -70,10 +79,10 @@ def simulate(
     NumericalError
         It cannot even start, because its initial state is singular.
     """
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene, changes)
-    elif changes:
-        raise InputError("simulate: changes go with the name of a scene; a Scene is complete")
+    scene = as_scene(scene, changes, "simulate")
+    require_callable(progress, "simulate: progress", "a function of (t, t_end)")
+    require_callable(on_output, "simulate: on_output", "a function of (t, q_tree)")
+    require_flag(profile, "simulate: profile")
     run = run_prepared(prepare(scene, controller, events, profile=profile), progress, on_output)
     if controller is not None:
         run.scene.pop("controller", None)  # the caller's took its place
@@ -82,9 +91,16 @@ def simulate(
 
 def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run what was prepared, from its start; errors are those of `simulate`."""
-    scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
-    times = ready.instants
     started = perf_counter()  # loading and assembling are not the run's work
+    rows, status, message = run_rows(ready, progress, on_output)
+    return run_of(ready, rows, status, message, perf_counter() - started)
+
+
+def run_rows(
+    ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None
+) -> tuple[Array, Status, str]:
+    """Run what was prepared, and return what the loop has recorded, how it ended and why."""
+    loop, times = ready.loop, ready.instants
     rows = np.empty((len(times) + 1, loop.width))
     if rows.nbytes > MAX_BYTES:
         raise InputError(
@@ -94,7 +110,13 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
     ready.begin()
     loop.record(times, rows)
     status, message, filled = _drive(ready, rows, progress, on_output)
-    parts = _parts(ready, rows[:filled])
+    return rows[:filled], status, message
+
+
+def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: float) -> Run:
+    """Make a `Run` of what was recorded."""
+    scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
+    parts = _parts(ready, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
     run = Run(
         status=status,
@@ -107,7 +129,7 @@ def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: O
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=events_met(ready.events, mechanism, loop),
-        stats={**loop.stats(), "wall_s": perf_counter() - started},
+        stats={**loop.stats(), "wall_s": wall_s},
         scene_name=scene.name,
         scene=scene.plain(),
         texts=ready.texts,
@@ -125,9 +147,16 @@ def _drive(
     loop, solver, t_end = ready.loop, ready.scene.spec.solver, ready.scene.spec.t_end
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
     n, shown, filled = ready.mechanism.n, 0, 0
+    may_compile = solver.terms == "auto" and loop.stats()["terms"] == "pinocchio"
+    loop.pause_at(REPAYS if may_compile else NEVER)
     try:
         while True:
             stop = Stop(*loop.advance(t_end, True, PAUSE, deadline - perf_counter()))
+            if may_compile and stop.why == "pause" and loop.stats()["rhs"] >= REPAYS:
+                may_compile = False
+                loop.pause_at(NEVER)
+                if loop.t <= t_end / 2:
+                    _compile(ready)
             filled = stop.filled
             if on_output is not None:
                 for row in rows[shown:filled]:
@@ -155,18 +184,29 @@ def _drive(
     return status, message, filled
 
 
+def _compile(ready: Prepared) -> None:
+    """Give the loop terms that are written out, where they can be."""
+    with suppress(InputError):  # too many coordinates, no CasADi, no compiler: it goes on as it is
+        library = compiled(ready.mechanism)
+        ready.loop.write((library.path, library.parameters))
+
+
 def _parts(ready: Prepared, rows: Array) -> dict[str, Array]:
-    """Split what the loop has recorded, a row an instant (`Recorder` in recorder.hpp)."""
-    mechanism = ready.mechanism
+    """Split what the loop has recorded, a row an instant."""
+    parts: dict[str, Array] = {}
+    for name, at in columns_of(ready.mechanism).items():
+        part = rows[:, at].copy()
+        parts[name] = part[:, 0] if name in SCALARS else part
+    return parts
+
+
+def columns_of(mechanism: Mechanism) -> dict[str, slice]:
+    """Return where what the loop records stands in a row (`Recorder` in recorder.hpp)."""
     n, m = mechanism.n, mechanism.closure.rows
     widths = {"t": 1, "q_tree": n, "v_tree": n, "u": mechanism.d, "tau": len(mechanism.actuated), "phi": m, "w": m,
               "energy": 1, "dissipated": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
-    parts: dict[str, Array] = {}
-    at = 0
-    for name, width in widths.items():
-        part = rows[:, at : at + width].copy()
-        parts[name], at = part[:, 0] if name in SCALARS else part, at + width
-    return parts
+    ends = np.cumsum([0, *widths.values()]).tolist()
+    return {name: slice(ends[k], ends[k + 1]) for k, name in enumerate(widths)}
 
 
 def _lyapunov(ready: Prepared, found: Array, parts: dict[str, Array]) -> Array | None:

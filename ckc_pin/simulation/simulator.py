@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,83 +11,25 @@ import numpy as np
 
 from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController
-from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.configuration import Kinematics, Partition
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.card import Card, Shown
+from ckc_pin.mechanism.kinds import is_number
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
+from ckc_pin.simulation.cards import simulator_card
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller
-from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.simulation.state import State
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 
-__all__ = ["Simulator", "State"]
+__all__ = ["Simulator"]
 
 AT_WORK = "this simulator is at work on another call; it takes one at a time, and none from an event's function"
 
 
-class State:
-    """Where a simulator is. It stays as it is when the simulator goes on; its arrays are read-only.
-
-    Attributes
-    ----------
-    t : float
-        Time, s.
-    """
-
-    def __init__(self, mechanism: Mechanism, t: float, numbers: Array, q: list[int], z: list[int]) -> None:
-        self._mechanism, self._numbers, self._q, self._z = mechanism, numbers, q, z
-        self.t = t
-        numbers.setflags(write=False)
-
-    @cached_property
-    def _q_tree(self) -> Array:
-        return self._numbers[: self._mechanism.tree.nq]
-
-    @cached_property
-    def v_tree(self) -> Array:
-        """Rates by coordinate, shape (n,); off its manifold the SPF's z_dot differs from what q_dot implies."""
-        return self._part(0)
-
-    @cached_property
-    def _v_terms(self) -> Array:
-        return self._part(1)
-
-    @cached_property
-    def w(self) -> Array:
-        """What phi is, shape (rows,): zero but for the SPF started off its manifold."""
-        return self._numbers[self._mechanism.tree.nq + 2 * self._mechanism.n :]
-
-    def _part(self, k: int) -> Array:
-        start = self._mechanism.tree.nq + k * self._mechanism.n
-        return self._numbers[start : start + self._mechanism.n]
-
-    @cached_property
-    def terms(self) -> Terms:
-        """Every term of the mechanism at this state, each computed when first asked for."""
-        mechanism = self._mechanism
-        partition = Partition(np.array(self._q, np.intp), np.array(self._z, np.intp))
-        return Terms(mechanism, Kinematics(mechanism.tree, mechanism.closure, partition, self._q_tree), self._v_terms)
-
-    @property
-    def q_tree(self) -> Array:
-        """Values by coordinate, in the order of `coordinates`, shape (n,)."""
-        return self._mechanism.tree.to_coordinates(self._q_tree)
-
-    @property
-    def q(self) -> Array:
-        """The independent ones, in the user's order, shape (d,)."""
-        return self._mechanism.independent_part(self._q_tree)
-
-    @property
-    def q_dot(self) -> Array:
-        """Their rates, shape (d,)."""
-        return self.v_tree[self._mechanism.partition.q]
-
-
-class Simulator:
+class Simulator(Shown):
     """A scene that is stepped by its caller, who gives u; as accurate as `simulate`, and it stops for the same reasons.
 
     Parameters
@@ -103,6 +44,7 @@ class Simulator:
 
     Attributes
     ----------
+    scene : Scene
     mechanism : Mechanism
     controller : Controller, TorqueController or None
         The scene's own, for who wants to call it: ``controller.u(state.t, state.terms)``.
@@ -141,10 +83,8 @@ class Simulator:
         *,
         events: Sequence[Event] = (),
     ) -> None:
-        if not isinstance(scene, Scene):
-            scene = load_scene(scene, changes)
-        elif changes:
-            raise InputError("Simulator: changes go with the name of a scene; a Scene is complete")
+        scene = as_scene(scene, changes, "Simulator")
+        self.scene = scene
         self._ready = prepare(scene, events=events, free=True)
         self._loop = self._ready.loop
         self.mechanism = self._ready.mechanism
@@ -156,6 +96,10 @@ class Simulator:
             gate.turn(f"{what}: {AT_WORK}") for what in ("step", "reset", "events", "stats")
         )
         self.reset()
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return simulator_card(self)
 
     @property
     def state(self) -> State:
@@ -260,7 +204,7 @@ class Simulator:
         return self._state if reached is None else State(self.mechanism, *reached)
 
     def _start(self, state: State) -> Start:
-        theirs = state._mechanism
+        theirs = state.mechanism
         if theirs.coordinates != self.mechanism.coordinates or len(state.w) != self.mechanism.closure.rows:
             raise InputError(f"reset: a state of {theirs.name}, this is {self.mechanism.name}")
         if np.any(state.w) and self._ready.scene.spec.formulation != "spf":
@@ -276,7 +220,6 @@ class Simulator:
         return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 
     def _require_dt(self, dt: Any) -> float:
-        number = isinstance(dt, int | float | np.integer | np.floating) and not isinstance(dt, bool)
-        if not number or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:
+        if not is_number(dt) or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:
             raise InputError(f"dt = {dt!r:.80}: a number greater than 0 is needed, in seconds")
         return float(dt)

@@ -111,6 +111,8 @@ def _sticks(
     thick = 0.03 * mechanism.size
     for joint in range(1, mechanism.tree.model.njoints):
         if joint not in drawn:
+            if _hidden_ball(mechanism, joint, drawn):
+                continue
             ball = f"{body_path(mechanism, root, joint)}/ball"
             yield commands.body(ball, "sphere", [1.4 * thick], np.eye(4), look.of(colours[joint]))
     for k, stick in enumerate(sticks(mechanism)):
@@ -123,6 +125,14 @@ def _sticks(
             path = f"{body_path(mechanism, root, stick.joint)}/{'rail' if rail else 'rod'}:{k}"
             size = [0.5 * thick if rail else thick, length]
             yield commands.body(path, "cylinder", size, _along(start, end), look.of(colours[stick.joint]))
+
+
+def _hidden_ball(mechanism: Mechanism, joint: int, drawn: set[int]) -> bool:
+    """Whether a joint's ball is at the same place, in every pose, as that of the body it is on: they would flicker."""
+    model = mechanism.tree.model
+    parent = model.parents[joint]
+    there = np.linalg.norm(model.jointPlacements[joint].translation) < 1e-9 * mechanism.size
+    return bool(there and parent and parent not in drawn and model.joints[joint].shortname().startswith("JointModelR"))
 
 
 def _rail(stick: Stick, moved: Placements) -> tuple[Array, Array]:
@@ -147,13 +157,17 @@ def _along(start: Array, end: Array) -> Array:
 
 def draw_loop_frames(mechanism: Mechanism, root: str, look: Look) -> Iterator[Command]:
     """Draw frames A (dark, small) and B (light, larger) of every loop, seen through everything else."""
+    sides = (("B", "frame_b", FRAME_B, 0.03), ("A", "frame_a", FRAME_A, 0.018))  # A on B, or they would flicker
     for loop in mechanism.spec.loop:
-        for side, frame, colour, radius in (("B", loop.frame_b, FRAME_B, 0.03), ("A", loop.frame_a, FRAME_A, 0.018)):
+        for order, (side, end, colour, radius) in enumerate(sides, 1):
+            frame = getattr(loop, end)
             at = mechanism.frames.find(frame, f"loop {loop.name!r}")
             placement = np.eye(4)
             placement[:3, :3], placement[:3, 3] = at.rotation, at.translation
             path = f"{body_path(mechanism, root, at.joint)}/loop:{safe(loop.name)}:{side}"
-            yield commands.body(path, "sphere", [radius * mechanism.size], placement, look.of(colour, on_top=True))
+            yield commands.body(
+                path, "sphere", [radius * mechanism.size], placement, look.of(colour, on_top=True), order
+            )
 
 
 def gap_path(root: str, loop: str) -> str:

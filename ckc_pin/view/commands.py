@@ -24,6 +24,7 @@ __all__ = [
     "body",
     "delete",
     "material",
+    "name_runs",
     "polyline",
     "say",
     "set_animation",
@@ -99,18 +100,27 @@ def material(colour: Colour, opacity: float = 1.0, on_top: bool = False) -> dict
     return plain | ({"transparent": True, "depthTest": False} if on_top else {})
 
 
-def body(path: str, shape: str, size: Iterable[float], placement: Array, look: dict[str, Any]) -> Command:
-    """Draw a box (x, y, z), a cylinder along z (radius, length) or a sphere (radius)."""
+def body(
+    path: str, shape: str, size: Iterable[float], placement: Array, look: dict[str, Any], order: int = 0
+) -> Command:
+    """Draw a box (x, y, z), a cylinder or a cone along z (radius, length) or a sphere (radius).
+
+    Of what is drawn on top of everything, the higher in `order` lies on the lower, whatever the side it is seen from.
+    """
     size = [float(x) for x in size]
     if shape == "box":
         geometry = dict(zip(("type", "width", "height", "depth"), ("BoxGeometry", *size), strict=True))
-    elif shape == "cylinder":
-        geometry = {"type": "CylinderGeometry", "radiusTop": size[0], "radiusBottom": size[0], "height": size[1],
+    elif shape in ("cylinder", "cone"):
+        top = size[0] if shape == "cylinder" else 0.0
+        geometry = {"type": "CylinderGeometry", "radiusTop": top, "radiusBottom": size[0], "height": size[1],
                     "radialSegments": 40}  # fmt: skip
         placement = placement @ _TURN
     else:
         geometry = {"type": "SphereGeometry", "radius": size[0], "widthSegments": 24, "heightSegments": 16}
-    return _object(path, "Mesh", geometry, look, placement)
+    command = _object(path, "Mesh", geometry, look, placement)
+    if order:
+        command["object"]["object"]["renderOrder"] = order
+    return command
 
 
 def polyline(path: str, points: Array, colour: Colour, opacity: float = 1.0) -> Command:
@@ -155,6 +165,19 @@ def several(these: Sequence[Command]) -> Command:
 def say(text: str) -> Command:
     """Write a line of plain text below the caption; understood by our page, not by the viewer."""
     return {"type": "say", "path": "", "text": text}
+
+
+def name_runs(runs: Sequence[Mapping[str, Any]], forces: Sequence[str]) -> Command:
+    """Tell our page what there is to show and to hide.
+
+    Parameters
+    ----------
+    runs : sequence of mappings
+        Each with its path, label, last instant `t_end`, and what is `said` from then on.
+    forces : sequence of str
+        Paths of the arrows.
+    """
+    return {"type": "runs", "path": "", "runs": [dict(run) for run in runs], "forces": list(forces)}
 
 
 def set_animation(tracks: Iterable[Track], speed: float = 1.0) -> Command:

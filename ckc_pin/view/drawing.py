@@ -17,6 +17,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import bodies, commands
+from ckc_pin.view.arrows import arrow_scales, arrow_tracks, arrows, draw_arrows, forces_path
 from ckc_pin.view.camera import WORLD, extent_of_motions, surroundings
 from ckc_pin.view.commands import Command, Track
 from ckc_pin.view.desired import desired_poses
@@ -32,7 +33,9 @@ FEWEST, MOST = 2000, 20_000  # of a run: the first so that it can be slowed down
 TRACE: Colour = (0.25, 0.25, 0.28)
 
 
-def scene(runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: Path | None = None) -> list[Command]:
+def scene(
+    runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: Path | None = None, forces: bool = False
+) -> list[Command]:
     """Return the commands that draw and animate runs, the first one solid and the others translucent.
 
     Parameters
@@ -44,6 +47,8 @@ def scene(runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: 
         Above zero: how many times larger the gaps of the loops are drawn.
     meshes : Path, optional
         Folder of the URDFs' mesh files.
+    forces : bool
+        Draw the forces of loops and motors as arrows.
 
     Raises
     ------
@@ -66,7 +71,34 @@ def scene(runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: 
             drawing += bodies.draw_gaps(run.mechanism, root, look)
             tracks += _gap_tracks(run.mechanism, root, t, q, moved, gap)
     drawing, tracks = _with_ghost(runs, rows, drawing, tracks, meshes)
-    return [*drawing, commands.set_animation(tracks, speed)]
+    drawing, tracks = _with_forces(runs, rows, motions, drawing, tracks) if forces else (drawing, tracks)
+    names = [{"path": run_path(runs, k), "label": label, "t_end": float(run.t[-1]), "said": _ending(run)}
+             for k, (run, label) in enumerate(zip(runs, run_labels(runs), strict=True))]  # fmt: skip
+    arrows_of = [forces_path(run_path(runs, k)) for k in range(len(runs))] if forces else []
+    return [*drawing, commands.name_runs(names, arrows_of), commands.set_animation(tracks, speed)]
+
+
+def _ending(run: Run) -> str:
+    if run.status == "done":
+        return ""
+    return run.message if run.message.startswith(run.status) else f"{run.status} at {run.t[-1]:.4g} s: {run.message}"
+
+
+def _with_forces(
+    runs: Sequence[Run], rows: Sequence[IntArray], motions: Sequence[Placements], drawing: list[Command],
+    tracks: list[Track],
+) -> tuple[list[Command], list[Track]]:  # fmt: skip
+    """Add the arrows of all runs, at one scale, and say what it is."""
+    found = [arrows(run, at, moved) for run, at, moved in zip(runs, rows, motions, strict=True)]
+    scales = arrow_scales(found)
+    for k, (run, at, own) in enumerate(zip(runs, rows, found, strict=True)):
+        root, look = run_path(runs, k), bodies.ACROSS if k else bodies.SOLID
+        drawing += draw_arrows(root, own, look.opacity)
+        tracks += arrow_tracks(root, own, run.t[at], run.mechanism.size, scales)
+    sizes = [f"{scales[turns]:.3g} {'N m' if turns else 'N'}" for turns in sorted(scales)]
+    if sizes:
+        drawing.append(commands.say(f"long arrows: {', '.join(sizes)}"))
+    return drawing, tracks
 
 
 def run_path(runs: Sequence[Run], k: int) -> str:

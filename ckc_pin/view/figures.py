@@ -6,36 +6,42 @@ Runs of one mechanism under one kind of control are drawn on each other: colour 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import require_path
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.mechanism.whole_file import written_whole
-from ckc_pin.simulation.run import Run
-from ckc_pin.view import panels, style
+from ckc_pin.simulation.run import Run, given_runs
+from ckc_pin.view import panels, poses, style
+from ckc_pin.view.canvas import Slot, fit_legend, line, look, page, write
 from ckc_pin.view.desired import desired_along
-from ckc_pin.view.labels import effort_units, plain, symbol
-from ckc_pin.view.panels import Group
+from ckc_pin.view.group import Group
+from ckc_pin.view.labels import effort_units, plain, residual_units, symbol, with_unit
+from ckc_pin.view.skeleton import planes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FORMATS", "draw", "plot"]
+__all__ = ["FORMATS", "draw", "plot", "require_formats", "write_figures"]
 
 FORMATS = ("png", "svg", "pdf")
 TITLES = {
-    "set_point": "set-point control (eq. 14)",
-    "tracking": "tracking control (eq. 16)",
+    "set_point": "set-point control",
+    "tracking": "tracking control",
     "own": "own controller",
     "motion": "motion without control",
 }
-LEGEND_MAX = 12  # coordinates; more would need a page of their own
+PAPER = {"five_bar/set_point": "Fig. 3, eq. 14", "five_bar/tracking": "Fig. 4, eq. 16"}  # its own scenes
 STEADY = 4.0  # s, from when on the paper speaks of steady state
+ALL_MAX = 12  # coordinates of a motion; of more only the independent ones are shown
+PANEL = (style.WIDTH / 2, 1.95)  # in
+TALLER = 0.6  # in, of a panel of two units
+SMALL = 1.15  # in, the height of one of many panels
+LEAST = 0.01  # of the largest of them, how much any one shows
 
 
 def plot(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
@@ -53,20 +59,36 @@ def plot(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[str] 
     -------
     list of Path
         The files: ``set_point``, ``tracking``, ``own`` or ``motion``; each with ``_snapshots``; for controlled runs
-        with ``_checks``, what tells whether to trust them.
+        with ``_checks``, what tells whether to trust them; with ``_coordinates`` and ``_efforts``, a small panel for
+        each, where they are more than have a colour of their own.
 
     Raises
     ------
     InputError
         No run, an unknown format, a folder that cannot be written, matplotlib missing.
     """
+    require_formats(formats)
+    return write_figures(draw(runs), out_dir, formats)
+
+
+def write_figures(figures: Mapping[str, Figure], out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+    """Write figures that were drawn, a file for each and each format.
+
+    Raises
+    ------
+    InputError
+        An unknown format, a folder that cannot be written.
+    """
+    require_formats(formats)
+    require_path(out_dir, "plot: out_dir", "a folder")
+    return [path for name, figure in figures.items() for path in write(figure, Path(out_dir), name, formats)]
+
+
+def require_formats(formats: Sequence[str]) -> None:
+    """Refuse formats that figures are not written in (InputError)."""
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         raise InputError(f"plot: format {unknown[0] if unknown else 'missing'!r}; valid: {', '.join(FORMATS)}")
-    with _look():
-        figures = draw(runs)
-        return [_write(figure, Path(out_dir) / f"{name}.{suffix}")
-                for name, figure in figures.items() for suffix in formats]  # fmt: skip
 
 
 def draw(runs: Run | Sequence[Run]) -> dict[str, Figure]:
@@ -77,28 +99,17 @@ def draw(runs: Run | Sequence[Run]) -> dict[str, Figure]:
     InputError
         No run; matplotlib missing.
     """
-    runs = [runs] if isinstance(runs, Run) else list(runs)
-    if not runs:
-        raise InputError("plot: no run given; give at least one")
+    runs = given_runs(runs, "plot")
     figures: dict[str, Figure] = {}
     groups = _groups(runs)
-    with _look():
+    with look():
         for stem, group in zip(_stems(groups), groups, strict=True):
             figures[stem] = _LAYOUTS[group.kind](group)
             if group.kind != "motion":
                 figures[f"{stem}_checks"] = _checks(group)
             figures[f"{stem}_snapshots"] = _snapshots(group)
+            figures |= {f"{stem}_{more}": figure for more, figure in _each(group).items()}
     return figures
-
-
-def _look() -> AbstractContextManager[None]:
-    """Our style on matplotlib's defaults, whatever the user has set, and that as it was afterwards."""
-    try:
-        from matplotlib import style as styles
-    except ModuleNotFoundError:
-        raise InputError("figures need matplotlib: pip install 'ckc_pin[view]'") from None
-    context: AbstractContextManager[None] = styles.context(["default", style.RC])
-    return context
 
 
 def _groups(runs: Iterable[Run]) -> list[Group]:
@@ -126,85 +137,119 @@ def _stems(groups: Sequence[Group]) -> list[str]:
     return stems
 
 
-def _write(figure: Figure, path: Path) -> Path:
-    dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # the same run gives the same file
-    kind = path.suffix[1:]
-    with written_whole(path) as file:
-        figure.savefig(file, dpi=style.DPI, format=kind, metadata=dates.get(kind))
-    return path
-
-
 # --- layouts -------------------------------------------------------------------------------------
 
 
 def _set_point(group: Group) -> Figure:
     """Fig. 3: a the configurations, b torques, c errors, d velocities."""
-    figure, axes = _panels(group, ["configurations", _efforts_title(group), "errors", "velocities"])
-    panels.linkage(axes[0], group)
-    panels.efforts(axes[1], group)
-    panels.errors(axes[2], group)
-    panels.rates(axes[3], group, group.independent)
-    poses = [_line(panels.INITIAL, "initial"), _line(panels.TARGET, "desired")]
-    axes[0].legend(handles=poses, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
-    _legend(figure, group, [*group.independent, *group.runs[0].actuated])
-    return figure
+    slots = _page(group, ["configurations", _efforts_title(group), "errors", "velocities"])
+    poses.linkage(slots[0], group, planes(group.mechanism)[0])
+    panels.efforts(slots[1], group, group.runs[0].actuated, _peaks(group))
+    panels.errors(slots[2], group, group.independent)
+    panels.rates(slots[3], group, group.independent)
+    ends = [line(poses.INITIAL, "initial"), line(poses.TARGET, "desired")]
+    fit_legend(slots[0].figure.axes[0], ends)
+    _legend(slots[0].figure, group)
+    return slots[0].figure
 
 
 def _tracking(group: Group) -> Figure:
-    """Fig. 4: a configuration space, b torques, c angles, d velocities."""
-    space = "configuration space" if len(group.independent) > 1 else "phase plane"
-    if len(group.independent) > 2:
-        space += f", 2 of its {len(group.independent)} dimensions"
-    figure, axes = _panels(group, [space, _efforts_title(group), "coordinates", "velocities"])
-    panels.configuration_space(axes[0], group)
-    panels.efforts(axes[1], group)
-    panels.coordinates(axes[2], group, group.independent)
-    panels.rates(axes[3], group, group.independent)
-    desired = [_line("black", "desired", linestyle="none", marker=".", markersize=6)] if group.desired else []
-    _legend(figure, group, [*group.independent, *group.runs[0].actuated], desired)
-    return figure
+    """Fig. 4: a configuration space, b torques, c angles, d velocities; of more than two freedoms a has the errors."""
+    d = len(group.independent)
+    first = ("phase plane" if d == 1 else "configuration space" if d == 2
+             else "errors" if group.desired else "energy")  # fmt: skip
+    slots = _page(group, [first, _efforts_title(group), "coordinates", "velocities"])
+    if d <= 2:
+        poses.configuration_space(slots[0], group)
+    elif group.desired:
+        panels.errors(slots[0], group, group.independent)
+    else:
+        panels.scalar(slots[0], group, lambda run: run.energy, with_unit("$E$", "J"))
+    panels.efforts(slots[1], group, group.runs[0].actuated, _peaks(group))
+    panels.coordinates(slots[2], group, group.independent)
+    panels.rates(slots[3], group, group.independent)
+    desired = [line("black", "desired", linestyle="none", marker=".", markersize=4)] if group.desired else []
+    _legend(slots[0].figure, group, more=desired)
+    return slots[0].figure
 
 
 def _motion(group: Group) -> Figure:
     """Without control: coordinates, rates, energy drift, closure residual."""
-    names = group.runs[0].coordinates if len(group.runs[0].coordinates) <= LEGEND_MAX else group.independent
-    figure, axes = _panels(group, ["coordinates", "velocities", "energy drift", "closure residual"])
-    panels.coordinates(axes[0], group, names)
-    panels.rates(axes[1], group, names)
+    every = group.runs[0].coordinates
+    names = every if len(every) <= ALL_MAX else group.independent
+    slots = _page(group, ["coordinates", "velocities", "energy drift", "closure residual"])
+    panels.coordinates(slots[0], group, names)
+    panels.rates(slots[1], group, names)
     drift = max(float(np.abs(run.energy - run.energy[0]).max()) for run in group.runs)
     power = math.floor(math.log10(drift)) if drift > 0 else 0
-    label = rf"$E - E(0)$, $10^{{{power}}}$ J" if power else "$E - E(0)$, J"
-    panels.scalar(axes[2], group, lambda run: (run.energy - run.energy[0]) / 10.0**power, label)
-    _residual(axes[3], group)
-    _legend(figure, group, names, by_run=True)
-    return figure
+    unit = rf"$10^{{{power}}}$ J" if power else "J"
+    panels.scalar(slots[2], group, lambda run: (run.energy - run.energy[0]) / 10.0**power,
+                  with_unit("$E - E(0)$", unit), cut=False)  # fmt: skip
+    _residual(slots[3], group)
+    _legend(slots[0].figure, group, names, by_run=True)
+    return slots[0].figure
 
 
 def _checks(group: Group) -> Figure:
     """What tells whether to trust a run: residual, loop forces, energy, Lyapunov function."""
     monitored = any(run.lyapunov is not None for run in group.runs)
     titles = ["closure residual", "loop forces", "energy"] + ["Lyapunov function"] * monitored
-    figure, axes = _panels(group, titles)
-    _residual(axes[0], group)
-    panels.loop_forces(axes[1], group)
-    panels.scalar(axes[2], group, lambda run: run.energy, "$E$, J")
+    slots = _page(group, titles)
+    _residual(slots[0], group)
+    panels.loop_forces(slots[1], group)
+    panels.scalar(slots[2], group, lambda run: run.energy, with_unit("$E$", "J"))
     if monitored:
-        panels.scalar(axes[3], group, _lyapunov, "$V$, J")
-        _logarithmic(axes[3])
-    _legend(figure, group, [], by_run=True)
-    return figure
+        _logarithmic(panels.scalar(slots[3], group, _lyapunov, with_unit("$V$", "J"), cut=False))
+    _legend(slots[0].figure, group, [], by_run=True)
+    return slots[0].figure
 
 
 def _snapshots(group: Group) -> Figure:
     """Poses at equal times; of a motion without control, which has no checks, the loop forces too."""
-    which = f", {group.labels[0]}" if len(group.runs) > 1 else ""
-    forces = ["loop forces"] * (group.kind == "motion")
-    figure, axes = _panels(group, [f"snapshots{which}", *forces], (7.2 + 5.0 * len(forces), 5.4))
-    figure.colorbar(panels.snapshots(axes[0], group), ax=axes[0], label="t, s", shrink=0.85)
-    if forces:
-        panels.loop_forces(axes[1], group)
+    where = planes(group.mechanism)
+    titles = [plane.title or "snapshots" for plane in where] + ["loop forces"] * (group.kind == "motion")
+    single = len(titles) == 1
+    which = f"snapshots of {group.labels[0]}" if len(group.runs) > 1 else ""
+    slots = _page(group, titles, (3.6, 3.3) if single else (PANEL[0], 2.3), which)
+    figure = slots[0].figure
+    shades = poses.snapshots(slots[: len(where)], group, where)
+    beside = figure.axes[: len(where)] if len(where) == 1 else [figure.axes[-1]]
+    if group.kind == "motion":
+        panels.loop_forces(slots[-1], group)
+        beside = figure.axes[:1]
+    figure.colorbar(shades, ax=beside, label=with_unit("$t$", "s"), shrink=0.85, aspect=30)
+    if group.kind == "motion":
         _legend(figure, group, [])
     return figure
+
+
+def _each(group: Group) -> dict[str, Figure]:
+    """A small panel for each coordinate and each motor, where they are too many for colours."""
+    from matplotlib import rc_context
+
+    every = group.runs[0].coordinates if group.kind == "motion" else group.independent
+    kinds: dict[str, tuple[Sequence[str], Callable[[Slot, Group, Sequence[str]], None]]] = {
+        "coordinates": (every, panels.coordinates),
+        "efforts": (group.runs[0].actuated if group.kind != "motion" else (), panels.efforts),
+    }
+    found = {}
+    for what, (names, draw_one) in kinds.items():
+        if len(names) <= style.MOST:
+            continue
+        beside = 3 if len(names) <= 2 * ALL_MAX else 4
+        letters = int(13 * style.WIDTH / beside)
+        shown = [name if len(name) <= letters else f"{name[: letters - 8]}…{name[-7:]}" for name in names]
+        one = group.in_one_colour()
+        with rc_context({"axes.titlesize": style.NOTE, "axes.titlelocation": "right"}):
+            slots = _page(group, [symbol(name) for name in shown], (style.WIDTH / beside, SMALL), what)
+            for slot, name in zip(slots, names, strict=True):
+                draw_one(slot, one, [name])
+                unit = slot.figure.axes[-1].get_ylabel().rpartition("(")[2]
+                slot.figure.axes[-1].set_ylabel(f"({unit}")  # the title has the name
+        _thin(slots[0].figure, beside)
+        _legend(slots[0].figure, group, [])
+        found[what] = slots[0].figure
+    return found
 
 
 _LAYOUTS = {"set_point": _set_point, "tracking": _tracking, "own": _tracking, "motion": _motion}
@@ -213,40 +258,62 @@ _LAYOUTS = {"set_point": _set_point, "tracking": _tracking, "own": _tracking, "m
 # --- parts ---------------------------------------------------------------------------------------
 
 
-def _panels(group: Group, titles: Sequence[str], size: tuple[float, float] | None = None) -> tuple[Figure, list[Any]]:
-    from matplotlib.figure import Figure
+def _page(group: Group, titles: Sequence[str], panel: tuple[float, float] = PANEL, what: str = "") -> list[Slot]:
+    scene = group.runs[0].scene_name
+    words = [what, plain(scene) if "/" in scene else "", PAPER.get(scene, ""),
+            group.labels[0] if len(group.runs) == 1 else ""]  # fmt: skip
+    columns = round(style.WIDTH / panel[0]) if len(titles) > 1 else 1
+    title = f"{plain(group.mechanism.name)}: {TITLES[group.kind]}"
+    if (
+        panel == PANEL
+        and len({panels.unit_of(group, name) for name in group.shown_names if name in group.runs[0].coordinates}) > 1
+    ):
+        panel = (PANEL[0], PANEL[1] + TALLER)  # an axes for each unit
+    return page(title, ", ".join(filter(None, words)), titles, columns, panel)
 
-    rows, columns = (2, 2) if len(titles) == 4 else (1, len(titles))
-    figure = Figure(figsize=size or (5.2 * columns, 3.7 * rows + 0.7), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.09, h_pad=0.07)  # type: ignore[union-attr, call-arg]
-    name = plain(group.mechanism.name)
-    figure.suptitle(f"{name}: {TITLES[group.kind]}", x=0.01, ha="left", fontsize=12, fontweight="bold")
-    axes = [figure.add_subplot(rows, columns, k) for k in range(1, len(titles) + 1)]
-    for letter, ax, title in zip("abcd", axes, titles, strict=False):
-        ax.set_title(f"{letter})  {title}" if len(titles) > 1 else title)
-    return figure, axes
+
+def _thin(figure: Figure, columns: int) -> None:
+    """Of many small panels label the time only below, let numbers be few, and magnify no rounding."""
+    spans: dict[str, float] = {}
+    for ax in figure.axes:
+        low, high = ax.get_ylim()
+        spans[ax.get_ylabel()] = max(spans.get(ax.get_ylabel(), 0.0), high - low)
+    for k, ax in enumerate(figure.axes):
+        ax.locator_params(axis="x", nbins=3)
+        (low, high), least = ax.get_ylim(), LEAST * spans[ax.get_ylabel()]
+        if high - low < least and ax.get_autoscaley_on():  # else it was cut
+            ax.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
+        if k + columns < len(figure.axes):
+            ax.set_xlabel("")
 
 
 def _efforts_title(group: Group) -> str:
-    """Name the efforts and their maxima, beside the paper's where it gives some."""
-    unit = effort_units(group.mechanism)
-    kind = {"N m": "torques", "N": "forces"}.get(unit, "torques and forces")
-    peak = max(float(np.abs(run.tau).max(initial=0.0)) for run in group.runs)
-    title = f"{kind}: max $|{panels.effort_symbol(group)}|$ = {peak:.3g} {unit}"
+    units = {effort_units(group.mechanism, k) for k in range(len(group.runs[0].actuated))}
+    return "torques and forces" if len(units) > 1 else "forces" if units == {"N"} else "torques"
+
+
+def _peaks(group: Group) -> str:
+    """Name the largest efforts, beside the paper's where it gives some."""
+    sizes: dict[str, float] = {}
+    for k in range(len(group.runs[0].actuated)):
+        unit = effort_units(group.mechanism, k)
+        sizes[unit] = max(sizes.get(unit, 0.0), *(float(np.abs(run.tau[:, k]).max()) for run in group.runs))
+    name = panels.effort_symbol(group)
+    said = f"max $|{name}|$ = {', '.join(f'{size:.3g} {unit}' for unit, size in sizes.items())}"
     late = [run.tau[run.t >= STEADY] for run in group.runs if run.t[-1] > STEADY]
-    if group.kind == "tracking" and group.mechanism.name.startswith("five_bar") and late:
+    if late and all(run.scene_name == "five_bar/tracking" for run in group.runs):
         steady = max(float(np.abs(tau).max(initial=0.0)) for tau in late)
-        return f"{title} (paper: at most 30),\n      after {STEADY:.0f} s {steady:.3g} {unit} (paper: at most 5)"
-    return title
+        return f"{said} (paper: ≤ 30)\nafter {STEADY:.0f} s {steady:.3g} N m (paper: ≤ 5)"
+    return said
 
 
-def _residual(ax: Any, group: Group) -> None:
+def _residual(slot: Slot, group: Group) -> None:
     def residual(run: Run) -> Array:
         size = np.abs(run.phi - run.w).max(axis=1, initial=0.0)
         return np.where(size > 0, size, np.nan)  # zero has no logarithm
 
-    panels.scalar(ax, group, residual, r"max $|\varphi - w|$, m or rad", dots=True)
-    _logarithmic(ax)
+    name = with_unit(r"max $|\varphi - w|$", residual_units(group.mechanism))
+    _logarithmic(panels.scalar(slot, group, residual, name, dots=True, cut=False))
 
 
 def _logarithmic(ax: Any) -> None:
@@ -264,17 +331,20 @@ def _lyapunov(run: Run) -> Array:
     return np.where(run.lyapunov > floor, run.lyapunov, np.nan)
 
 
-def _line(colour: Any, label: str, **look: Any) -> Any:
-    from matplotlib.lines import Line2D
+def _legend(
+    figure: Figure, group: Group, names: Sequence[str] | None = None, more: Sequence[Any] = (), by_run: bool = False
+) -> None:
+    """One legend below all panels: colours, then lines. `by_run`: some panels have a colour for each run.
 
-    return Line2D([], [], color=colour, label=label, **({"linewidth": 2.4} | look))
-
-
-def _legend(figure: Figure, group: Group, names: Sequence[str], more: Sequence[Any] = (), by_run: bool = False) -> None:
-    """One legend below all panels: colours, then lines. `by_run`: some panels have a colour for each run."""
-    names = list(dict.fromkeys(names))
-    shown = names if len(names) <= LEGEND_MAX else [names[0], names[-1]]
-    handles = [_line(group.colours[name], symbol(name)) for name in shown] + list(more)
-    for k, (label, line) in enumerate(zip(group.labels, group.lines, strict=True)):
-        handles.append(_line(style.COLOURS[k % len(style.COLOURS)] if by_run else "black", label, **line))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6), handlelength=3.2)
+    One name stands on its axes, and one run below the title.
+    """
+    names = group.shown_names if names is None else names
+    own = [name for name in names if group.colours[name] != style.REST]
+    handles = [line(group.colours[name], symbol(name)) for name in own] if len(names) > 1 else []
+    if len(own) < len(names):
+        handles.append(line(style.REST, f"{len(names) - len(own)} more"))
+    handles += more
+    if len(group.runs) > 1:
+        for k, (label, shape) in enumerate(zip(group.labels, group.lines, strict=True)):
+            handles.append(line(style.COLOURS[k % len(style.COLOURS)] if by_run else "black", label, **shape))
+    fit_legend(figure, handles)

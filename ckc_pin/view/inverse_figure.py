@@ -9,8 +9,8 @@ import numpy as np
 
 from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.view import style
-from ckc_pin.view.labels import effort_units, plain, symbol
-from ckc_pin.view.map_figure import look, write
+from ckc_pin.view.canvas import fit_legend, line, look, note_on, page, write
+from ckc_pin.view.labels import effort_units, plain, symbol, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 __all__ = ["draw_inverse", "save_inverse"]
 
 TITLED = 3  # motors; more would be longer than their panel
-NAMED = 12  # curves; more would hide what their legend names
 
 
 def save_inverse(found: MotionForces, folder: Path) -> list[Path]:
@@ -35,46 +34,48 @@ def save_inverse(found: MotionForces, folder: Path) -> list[Path]:
 def draw_inverse(found: MotionForces) -> Figure:
     """Return the figure: efforts over time, the sizes of loop forces below (InputError where matplotlib is missing)."""
     with look():
-        from matplotlib.figure import Figure
+        unit = [effort_units(found.mechanism, k) for k in range(len(found.actuated))]
+        kinds = list(dict.fromkeys(unit))
+        titles = ["motors", "forces that the loops transmit"]
+        efforts, loops = page(f"{plain(found.name)}: what the motion asks for", "", titles, 1, (style.WIDTH, 2.4))
+        panels = efforts.axes(len(kinds))
+        _efforts(panels, found, {kind: [k for k, own in enumerate(unit) if own == kind] for kind in kinds})
+        _loops(loops.axes()[0], found)
+        return efforts.figure
 
-        figure = Figure(figsize=(8.4, 6.4), layout="constrained")
-        efforts, loops = figure.subplots(2, 1, sharex=True)
-        figure.suptitle(f"{plain(found.name)}: what the motion asks for", x=0.01, ha="left", fontweight="bold")
-        _efforts(efforts, found)
-        _loops(loops, found)
-        loops.set_xlabel("t, s")
-        return figure
 
-
-def _efforts(ax: Any, found: MotionForces) -> None:
-    colours = style.colours(found.actuated)
+def _efforts(panels: list[Any], found: MotionForces, kinds: dict[str, list[int]]) -> None:
+    largest = dict(zip(found.actuated, np.abs(found.tau).max(axis=0), strict=True))
+    named = style.foremost(largest)
+    colours = style.colours(named)
     beyond = {entry["motor"]: entry for entry in found.exceeded}
-    for k, motor in enumerate(found.actuated):
-        ax.plot(found.t, found.tau[:, k], color=colours[motor], label=symbol(motor))
-        if motor in beyond:  # a limit that is far away would flatten the curves
-            for side in (-1, 1):
-                limit = beyond[motor]["limit"]
-                if np.any(side * found.tau[:, k] > limit):
-                    ax.axhline(side * limit, color=colours[motor], linestyle="--", linewidth=0.9)
+    for ax, (unit, own) in zip(panels, kinds.items(), strict=True):
+        for k in sorted(own, key=lambda k: found.actuated[k] in named):  # those without a colour lie behind
+            motor = found.actuated[k]
+            ax.plot(found.t, found.tau[:, k], color=colours.get(motor, style.REST))
+            if motor in beyond:  # a limit that is far away would flatten the curves
+                for side in (-1, 1):
+                    limit = beyond[motor]["limit"]
+                    if np.any(side * found.tau[:, k] > limit):
+                        ax.axhline(side * limit, color=colours.get(motor, style.GREY), linestyle="--", linewidth=0.9)
+        ax.set_ylabel(with_unit(r"$\tau$", unit))
     names = ", ".join(symbol(motor) for motor in beyond) if len(beyond) <= TITLED else f"{len(beyond)} of them"
-    ax.set(
-        title=f"motors, beyond their limits (dashed): {names}" if beyond else "motors",
-        ylabel=rf"$\tau$, {effort_units(found.mechanism)}",
-    )
-    _legend(ax)
+    if beyond:
+        note_on(panels[0], f"beyond their limits (dashed): {names}")
+    _finish(panels[-1], {symbol(motor): colours[motor] for motor in named}, len(found.actuated))
 
 
 def _loops(ax: Any, found: MotionForces) -> None:
-    colours = style.colours(list(found.loop_wrenches))
-    for loop, wrench in found.loop_wrenches.items():
-        ax.plot(found.t, np.linalg.norm(wrench[:, :3], axis=1), color=colours[loop], label=plain(loop))
-    ax.set(title="forces that the loops transmit", ylabel="N")
-    _legend(ax)
+    sizes = {loop: np.linalg.norm(wrench[:, :3], axis=1) for loop, wrench in found.loop_wrenches.items()}
+    named = style.foremost({loop: float(size.max(initial=0.0)) for loop, size in sizes.items()})
+    colours = style.colours(named)
+    for loop in sorted(sizes, key=lambda loop: loop in named):
+        ax.plot(found.t, sizes[loop], color=colours.get(loop, style.REST))
+    ax.set_ylabel(with_unit("force", "N"))
+    _finish(ax, {plain(loop): colours[loop] for loop in named}, len(sizes))
 
 
-def _legend(ax: Any) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    if len(labels) > NAMED:
-        handles, labels = handles[:: len(labels) - 1], labels[:: len(labels) - 1]
-    if labels:
-        ax.legend(handles, labels, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+def _finish(ax: Any, named: dict[str, str], count: int) -> None:
+    ax.set_xlabel(with_unit("$t$", "s"))
+    rest = [line(style.REST, f"{count - len(named)} more")] if count > len(named) else []
+    fit_legend(ax, [line(colour, name) for name, colour in named.items()] + rest)

@@ -11,7 +11,7 @@ import numpy as np
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.run import Run
 
-__all__ = ["effort_units", "is_length", "plain", "run_labels", "symbol", "units"]
+__all__ = ["effort_units", "is_length", "plain", "rate_symbol", "residual_units", "run_labels", "symbol", "with_unit"]
 
 GREEK = (
     "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
@@ -28,6 +28,15 @@ def symbol(coordinate: str) -> str:
     if letter is None:
         return plain(coordinate)
     return rf"$\{letter[1]}_{{{letter[2]}}}$" if letter[2] else rf"$\{letter[1]}$"
+
+
+def rate_symbol(coordinate: str) -> str:
+    """Return a coordinate's rate as mathtext: a dot on the paper's letters, a word after any other name."""
+    letter = _PAPER.fullmatch(coordinate)
+    if letter is None:
+        return f"{plain(coordinate)} rate"
+    dotted = rf"\dot{{\{letter[1]}}}"
+    return f"${dotted}_{{{letter[2]}}}$" if letter[2] else f"${dotted}$"
 
 
 def plain(name: str) -> str:
@@ -49,17 +58,20 @@ def is_length(mechanism: Mechanism, coordinate: str) -> bool:
     return not np.any(jacobian[3:, mechanism.tree.index[coordinate]])
 
 
-def units(mechanism: Mechanism, coordinates: Sequence[str], angle: str, length: str) -> str:
-    """Return the unit of several coordinates, or both: units(m, names, "N m", "N")."""
-    lengths = {is_length(mechanism, name) for name in coordinates}
-    return " or ".join([angle] * (False in lengths) + [length] * (True in lengths)) or angle
+def with_unit(name: str, unit: str) -> str:
+    """Return what an axis shows, and in what: θ (rad). One notation for every figure."""
+    return f"{name} ({unit})" if unit else name
 
 
-def effort_units(mechanism: Mechanism) -> str:
-    """Return the unit of the motors' torques, forces, or both."""
-    lengths, turns = mechanism.tree.in_metres, mechanism.motors.turns != 0
-    pushes = {bool(np.all(lengths[row])) for row in turns}
-    return " or ".join(["N m"] * (False in pushes) + ["N"] * (True in pushes)) or "N m"
+def residual_units(mechanism: Mechanism) -> str:
+    """Return the unit of the rows of phi, or both."""
+    return " or ".join(["m"] * (True in (rows := set(mechanism.closure.in_metres(mechanism.tree).tolist())))
+                       + ["rad"] * (False in rows)) or "m"  # fmt: skip
+
+
+def effort_units(mechanism: Mechanism, motor: int) -> str:
+    """Return the unit of what a motor gives: "N" where it pushes slides alone, "N m" otherwise."""
+    return "N" if np.all(mechanism.tree.in_metres[mechanism.motors.turns[motor] != 0]) else "N m"
 
 
 def run_labels(runs: Sequence[Run]) -> list[str]:

@@ -8,27 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.errors import InputError
 from ckc_pin.kinematics.mapped import LABELS, Axis, Kind, Locus, SingularityMap
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.view import style
-from ckc_pin.view.labels import plain, symbol
+from ckc_pin.view.canvas import fit_legend, head, look, say, write
+from ckc_pin.view.labels import plain, symbol, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["det_label", "draw_aspect", "draw_map", "handles", "look", "require_figures", "save_map", "write"]
+__all__ = ["det_label", "draw_aspect", "draw_map", "handles", "require_figures", "save_map"]
 
 UNREACHED = "#C9C9C9"
 COLOURS = "PuOr"  # its middle is singular, and its sides are told apart by every eye
 LOOKS: dict[Kind, dict[str, Any]] = {
-    "locked": {"color": style.COLOURS[1], "linewidth": 2.2},
-    "fold": {"color": "black", "linewidth": 2.2},
-    "rank loss": {"color": style.COLOURS[3], "linewidth": 2.2},
-    "serial": {"color": style.COLOURS[2], "linewidth": 1.7, "linestyle": (0, (4.0, 1.6))},
+    "locked": {"color": style.COLOURS[1], "linewidth": 1.6},
+    "fold": {"color": "black", "linewidth": 1.6},
+    "rank loss": {"color": style.COLOURS[3], "linewidth": 1.6},
+    "serial": {"color": style.COLOURS[2], "linewidth": 1.3, "linestyle": (0, (4.0, 1.6))},
 }
-DESIRED: dict[str, Any] = {"color": style.COLOURS[0], "linewidth": 1.8}
+DESIRED: dict[str, Any] = {"color": style.COLOURS[0], "linewidth": 1.4}
 PALER = 1.5  # so that lines stand out
 POINT = 1e-9  # of the map's units: a locus no larger is drawn as a dot
 
@@ -42,16 +41,6 @@ def save_map(found: SingularityMap, folder: Path, formats: Sequence[str] = ("png
         A folder that cannot be written, matplotlib missing.
     """
     return write(draw_map(found), folder, f"map_{found.space}", formats)
-
-
-def write(figure: Figure, folder: Path, stem: str, formats: Sequence[str]) -> list[Path]:
-    """Write a figure in several formats (InputError where the folder cannot be written)."""
-    paths = [folder / f"{stem}.{suffix}" for suffix in formats]
-    for path in paths:
-        kind = path.suffix[1:]
-        with look(), written_whole(path) as file:
-            figure.savefig(file, dpi=style.DPI, format=kind, metadata={"Date": None} if kind == "svg" else None)
-    return paths
 
 
 def draw_map(found: SingularityMap) -> Figure:
@@ -71,15 +60,6 @@ def require_figures() -> None:
     look()
 
 
-def look() -> Any:
-    """Our style on matplotlib's defaults (InputError where matplotlib is missing)."""
-    try:
-        from matplotlib import style as styles
-    except ModuleNotFoundError:
-        raise InputError("figures need matplotlib: pip install 'ckc_pin[view]'") from None
-    return styles.context(["default", style.RC])
-
-
 # --- over two coordinates ------------------------------------------------------------------------
 
 
@@ -88,17 +68,18 @@ def _plane(found: SingularityMap) -> Figure:
 
     columns = min(len(found.aspects), 2)
     rows = -(-len(found.aspects) // columns)
-    figure = Figure(figsize=(4.7 * columns + 1.3, 4.2 * rows * _tall(found) + 1.4), layout="constrained")
-    figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    wide = style.WIDTH / 2 - 0.35
+    figure = Figure(figsize=(wide * columns + 0.7, wide * rows * _tall(found) + 1.4), layout="constrained")
+    head(figure, *_title(found))
     most = max(float(np.nanmax(np.abs(aspect.det_phi_z))) for aspect in found.aspects)
     panels = []
     for k in range(len(found.aspects)):
         ax = figure.add_subplot(rows, columns, k + 1)
         panels.append(ax)
         shown = draw_aspect(ax, found, k, most)
-        ax.set_title(_panel_title(found, k))
+        say(ax, *_panel_title(found, k))
     figure.colorbar(shown, ax=panels, label=det_label(found), shrink=0.85)
-    figure.legend(handles=handles(found), loc="outside lower left", ncols=columns, handlelength=2.8)
+    fit_legend(figure, handles(found))
     return figure
 
 
@@ -127,7 +108,7 @@ def det_label(found: SingularityMap) -> str:
     """Label the colours."""
     unit = found.measure_unit.replace("^", "$^{") + "}$" * ("^" in found.measure_unit)
     name = r"$\det \varphi_z$" if found.measure.startswith("det") else r"$\sigma_{min}(\varphi_z)$"
-    return f"{name}, {unit}" if unit else name
+    return with_unit(name, unit)
 
 
 def _tall(found: SingularityMap) -> float:
@@ -141,7 +122,7 @@ def _tall(found: SingularityMap) -> float:
 def _locus(ax: Any, axes: Sequence[Axis], locus: Locus, aspect: int) -> None:
     if np.ptp(locus.at, axis=0).max() < POINT:
         if locus.on[aspect].any():
-            _curve(ax, axes, locus.at[:1], marker="o", markersize=7, markeredgecolor="white", zorder=4,
+            _curve(ax, axes, locus.at[:1], marker="o", markersize=5, markeredgecolor="white", zorder=4,
                    color=LOOKS[locus.kind]["color"])  # fmt: skip
         return
     _curve(ax, axes, np.where(locus.on[aspect][:, None], locus.at, np.nan), zorder=3, **LOOKS[locus.kind])
@@ -154,7 +135,7 @@ def _path(ax: Any, found: SingularityMap, aspect: int) -> None:
     at = np.where(path.on[aspect][:, None], path.at, np.nan)
     _curve(ax, found.axes, at, zorder=5, **DESIRED)
     if path.on[aspect][0]:
-        _curve(ax, found.axes, path.at[:1], zorder=6, marker="s", markersize=5.5, markeredgecolor="white",
+        _curve(ax, found.axes, path.at[:1], zorder=6, marker="s", markersize=4.5, markeredgecolor="white",
                color=DESIRED["color"])  # fmt: skip
 
 
@@ -174,7 +155,7 @@ def _curve(ax: Any, axes: Sequence[Axis], at: Array, **look: Any) -> None:
     for x in turns[0]:
         for y in turns[1]:
             (line,) = ax.plot(at[:, 0] + x, at[:, 1] + y, **look)
-            line.set_path_effects([Stroke(linewidth=line.get_linewidth() + 1.6, foreground="white", alpha=0.75),
+            line.set_path_effects([Stroke(linewidth=line.get_linewidth() + 1.2, foreground="white", alpha=0.75),
                                    Normal()] if look.get("linestyle", "-") == "-" else [Normal()])  # fmt: skip
 
 
@@ -186,14 +167,14 @@ def _line(found: SingularityMap) -> Figure:
 
     axis = found.axes[0]
     place = found.space == "cartesian"
-    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
-    figure.suptitle(_title(found), x=0.01, ha="left", fontsize=12, fontweight="bold")
+    figure = Figure(figsize=(style.WIDTH, 3.8), layout="constrained")
+    head(figure, *_title(found))
     ax = figure.add_subplot()
     if place:
         _point_curves(ax, found)
     else:
         for k, aspect in enumerate(found.aspects):
-            ax.plot(axis.values, aspect.det_phi_z[:, 0], color=style.COLOURS[k], linewidth=1.8)
+            ax.plot(axis.values, aspect.det_phi_z[:, 0], color=style.COLOURS[k], linewidth=1.4)
         _gray(ax, axis, found.counts[:, 0] == 0)
         for locus in found.loci:
             if locus.on.any():
@@ -205,7 +186,7 @@ def _line(found: SingularityMap) -> Figure:
             _curve(ax, [axis, Axis("", "", 0, 0, False, level)], np.column_stack([found.path.at, level]), zorder=5,
                    **DESIRED)  # fmt: skip
         ax.set(xlabel=_axis_label(found, axis), ylabel=det_label(found), xlim=(axis.low, axis.high))
-    figure.legend(handles=handles(found), loc="outside lower left", ncols=2, handlelength=2.8)
+    fit_legend(figure, handles(found))
     return figure
 
 
@@ -215,12 +196,12 @@ def _point_curves(ax: Any, found: SingularityMap) -> None:
     first, second = np.sort(np.argsort(-np.ptp(every, axis=0), kind="stable")[:2])
     for k, aspect in enumerate(found.aspects):
         if aspect.point is not None:
-            ax.plot(*aspect.point[:, 0, [first, second]].T, color=style.COLOURS[k], linewidth=1.8)
+            ax.plot(*aspect.point[:, 0, [first, second]].T, color=style.COLOURS[k], linewidth=1.4)
     for locus in found.loci:
         if locus.point is not None and locus.on.any():
-            ax.plot(*locus.point[0, [first, second]], "o", markersize=7, markeredgecolor="white", zorder=4,
+            ax.plot(*locus.point[0, [first, second]], "o", markersize=5, markeredgecolor="white", zorder=4,
                     color=LOOKS[locus.kind]["color"])  # fmt: skip
-    ax.set(xlabel=f"${'xyz'[first]}$, m", ylabel=f"${'xyz'[second]}$, m", aspect="equal")
+    ax.set(xlabel=f"${'xyz'[first]}$ (m)", ylabel=f"${'xyz'[second]}$ (m)", aspect="equal")
     ax.margins(0.08)
 
 
@@ -234,18 +215,15 @@ def _gray(ax: Any, axis: Axis, unreached: Array) -> None:
 # --- words ---------------------------------------------------------------------------------------
 
 
-def _title(found: SingularityMap) -> str:
-    name = plain(found.mechanism)
+def _title(found: SingularityMap) -> tuple[str, str]:
     fixed = ", ".join(f"{symbol(k)} = {x:.4g}" for k, x in found.fixed.items())
-    where = f", workspace of {found.point}" if found.space == "cartesian" else ", singularity map"
-    return f"{name}{where}{f' at {fixed}' if fixed else ''}"
+    where = f"workspace of {found.point}" if found.space == "cartesian" else "singularity map"
+    return f"{plain(found.mechanism)}: {where}", f"at {fixed}" if fixed else ""
 
 
-def _panel_title(found: SingularityMap, k: int) -> str:
-    what = _what(found)
-    aspect = found.aspects[k]
-    which = f"{what} {k + 1}{' (as assembled)' if k == 0 else ''}"
-    return f"{which}: reaches {100 * float(np.mean(aspect.reached)):.1f} %"
+def _panel_title(found: SingularityMap, k: int) -> tuple[str, str]:
+    assembled = " (as assembled)" if k == 0 else ""
+    return f"{_what(found)} {k + 1}{assembled}", f"reaches {100 * float(np.mean(found.aspects[k].reached)):.1f} %"
 
 
 def _what(found: SingularityMap) -> str:
@@ -253,7 +231,7 @@ def _what(found: SingularityMap) -> str:
 
 
 def _axis_label(found: SingularityMap, axis: Axis) -> str:
-    return f"${axis.name}$, m" if found.space == "cartesian" else f"{symbol(axis.name)}, {axis.unit}"
+    return with_unit(f"${axis.name}$", "m") if found.space == "cartesian" else with_unit(symbol(axis.name), axis.unit)
 
 
 def handles(found: SingularityMap) -> list[Any]:
@@ -270,7 +248,7 @@ def handles(found: SingularityMap) -> list[Any]:
             shown.append(Line2D([], [], label=LABELS[kind], **look))
     if len(found.axes) == 1:
         what = _what(found)
-        shown += [Line2D([], [], color=style.COLOURS[k], linewidth=1.8, label=f"{what} {k + 1}")
+        shown += [Line2D([], [], color=style.COLOURS[k], linewidth=1.4, label=f"{what} {k + 1}")
                     for k in range(len(found.aspects))]  # fmt: skip
     if found.path is not None:
         name = plain(found.path.name)

@@ -16,6 +16,7 @@ from ckc_pin.mechanism.tree import Array, IntArray
 __all__ = ["Surface", "load_surface"]
 
 MAX_BYTES = 2**26  # of a file
+NEAR = 5e-4  # of a surface's size
 MAX_FACES = 2**20  # of a surface: a browser still turns that
 
 Surface = tuple[Array, IntArray]  # corners (m, 3), metres; faces (k, 3), three corners each
@@ -75,4 +76,16 @@ def _read(path: Path, scale: tuple[float, ...]) -> Surface | None:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     corners = np.concatenate([np.asarray(part.vertices, dtype=float) for part in parts])
     faces = np.concatenate([np.asarray(part.faces) + start for part, start in zip(parts, starts, strict=False)])
-    return (corners, faces) if np.all(np.isfinite(corners)) else None
+    return _joined(corners, faces) if np.all(np.isfinite(corners)) else None
+
+
+def _joined(corners: Array, faces: IntArray) -> Surface:
+    """Make corners one that are nearer than anybody sees: files have each as often as it has triangles or normals."""
+    size = float(np.ptp(corners, axis=0).max(initial=0.0))
+    if size == 0:
+        return corners, faces
+    grid = np.unique(np.round((corners - corners.min(axis=0)) / (NEAR * size)).astype(np.int64), axis=0,
+                     return_index=True, return_inverse=True)  # fmt: skip
+    own = grid[2].reshape(-1)[faces]
+    flat = (own[:, 0] == own[:, 1]) | (own[:, 1] == own[:, 2]) | (own[:, 2] == own[:, 0])
+    return corners[grid[1]], own[~flat]

@@ -2,80 +2,72 @@
 
 from __future__ import annotations
 
+import gzip
 from base64 import b64encode
 from collections.abc import Sequence
 from hashlib import sha256
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from ckc_pin.errors import InputError
 from ckc_pin.view.commands import Command, several
+from ckc_pin.view.controls import BAR, CONTROLS, STYLE
 
-__all__ = ["START_SCRIPT", "page", "standalone", "viewer_script"]
+__all__ = ["START_SCRIPT", "packed", "page", "standalone", "viewer_script"]
+
+SHORT = 64  # bytes of an array that is not worth a table's entry
 
 # Strings from files only ever come in as escaped text, or in a scene as base64; the scripts are fixed.
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">{head}
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
 <link rel="icon" href="data:,">
-<style>
-body {{ margin: 0; font: 14px/1.5 system-ui, sans-serif; color: #222; }}
-#meshcat-pane {{ width: 100vw; height: 100vh; overflow: hidden; }}
-#caption {{ position: absolute; left: 16px; top: 12px; pointer-events: none; }}
-#caption h1 {{ font-size: 17px; margin: 0; }}
-#caption p {{ margin: 0; }}
-#said {{ font-variant-numeric: tabular-nums; }}
-</style>
+<style>{style}</style>
 </head>
 <body>
 <div id="meshcat-pane"></div>
 <div id="caption"><h1>{title}</h1>{lines}<p id="said"></p></div>
+{bar}
 {scripts}
 </body>
 </html>
 """
 
-# The viewer knows most commands. Ours are "several" in one message, "say", and a speed for the animation.
-# Its controls hold the time slider: they are opened, and the long list of objects is closed.
-_PREPARE = """"use strict";
-var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
-function say(text) { document.getElementById("said").textContent = text; }
-viewer.handle_command = function (command) {
-  if (command.type === "several") {
-    command.commands.forEach(viewer.handle_command);
-    if (viewer.connection) { requestAnimationFrame(function () { viewer.connection.send("shown"); }); }
-    return;
-  }
-  if (command.type === "say") { say(command.text); return; }
-  MeshCat.Viewer.prototype.handle_command.call(viewer, command);
-  if (command.type === "set_animation") {
-    viewer.animator.mixer.timeScale = command.options.timeScale;
-    viewer.animator.folder.__folders["default"].__controllers.forEach(function (controller) {
-      if (controller.property === "time") { controller.name("time, s"); }
-      if (controller.property === "timeScale") { controller.name("speed").updateDisplay(); }
-    });
-  }
-};
-viewer.gui.open();
-viewer.gui.__folders["Scene"].close();
-"""
-
 START_SCRIPT = (
-    _PREPARE
+    CONTROLS
     + """viewer.connect();
 viewer.connection.onclose = function () { say("the program that sent this has ended"); };
 """
 )
 
+# The scene is compressed, and arrays that occur several times are in it once, in a table that is resolved here.
 _START_FROM_PAGE = (
-    _PREPARE
-    + """viewer.handle_command_bytearray(Uint8Array.from(
-  atob(document.getElementById("scene").textContent), function (letter) { return letter.charCodeAt(0); }));
+    CONTROLS
+    + """var packed = Uint8Array.from(atob(document.getElementById("scene").textContent), function (letter) {
+  return letter.charCodeAt(0);
+});
+new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer()
+  .then(function (found) {
+    function resolved(value, arrays) {
+      if (value === null || typeof value !== "object" || ArrayBuffer.isView(value)) { return value; }
+      if (typeof value.shared === "number") { return arrays[value.shared]; }
+      for (var key of Object.keys(value)) { value[key] = resolved(value[key], arrays); }
+      return value;
+    }
+    var handle = viewer.handle_command;
+    viewer.handle_command = function (whole) {
+      viewer.handle_command = handle;
+      handle({type: "several", commands: resolved(whole.commands, whole.arrays)});
+    };
+    viewer.handle_command_bytearray(new Uint8Array(found));
+  }).catch(function (error) { say("this browser cannot read the scene: " + error); });
 """
 )
 
@@ -97,7 +89,7 @@ def standalone(title: str, lines: Sequence[str], drawing: Sequence[Command]) -> 
         meshcat is not installed.
     """
     viewer = viewer_script().decode()
-    data = b64encode(msgspec.msgpack.encode(several(drawing))).decode()
+    data = b64encode(packed(drawing)).decode()
     scripts = "\n".join(
         [
             f'<script type="text/plain" id="licenses">\n{_licenses()}</script>',
@@ -111,6 +103,26 @@ def standalone(title: str, lines: Sequence[str], drawing: Sequence[Command]) -> 
     )
     policy = f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:"
     return _page(title, lines, scripts, f'\n<meta http-equiv="Content-Security-Policy" content="{policy}">')
+
+
+def packed(drawing: Sequence[Command]) -> bytes:
+    """Return commands as one compressed message, in which each array is once: meshes and times occur in every run."""
+    arrays: dict[bytes, int] = {}
+    table: list[msgspec.msgpack.Ext] = []
+
+    def shared(value: Any) -> Any:
+        if isinstance(value, msgspec.msgpack.Ext) and memoryview(value.data).nbytes > SHORT:
+            key = bytes([value.code]) + bytes(value.data)
+            if key not in arrays:
+                arrays[key] = len(table)
+                table.append(value)
+            return {"shared": arrays[key]}
+        if isinstance(value, dict):
+            return {name: shared(one) for name, one in value.items()}
+        return [shared(one) for one in value] if isinstance(value, list) else value
+
+    commands = [shared(command) for command in drawing]
+    return gzip.compress(msgspec.msgpack.encode(several(commands) | {"arrays": table}), 9, mtime=0)
 
 
 def viewer_script() -> bytes:
@@ -142,4 +154,4 @@ def _viewer_folder() -> Path:
 
 def _page(title: str, lines: Sequence[str], scripts: str, head: str = "") -> str:
     shown = "".join(f"<p>{escape(line)}</p>" for line in lines)
-    return _PAGE.format(title=escape(title), lines=shown, scripts=scripts, head=head)
+    return _PAGE.format(title=escape(title), lines=shown, scripts=scripts, head=head, style=STYLE, bar=BAR)

@@ -1,175 +1,99 @@
-"""The panels that figures are made of. Each takes an axes and a `Group`, draws, and labels its axes."""
+"""Panels over time. Each takes a `Slot` and a `Group`, draws an axes for each unit, and labels them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
+from ckc_pin.view.canvas import Slot, fit_legend, limit, line, note_on, say
 from ckc_pin.view.desired import DesiredPath
-from ckc_pin.view.labels import effort_units, plain, run_labels, symbol, units
-from ckc_pin.view.skeleton import Placements, placements, sticks, viewpoint
+from ckc_pin.view.group import Group, columns
+from ckc_pin.view.labels import effort_units, is_length, plain, rate_symbol, symbol, with_unit
 
-__all__ = ["Group", "configuration_space", "coordinates", "efforts", "errors", "linkage", "loop_forces", "rates",
-           "scalar", "snapshots"]  # fmt: skip
+__all__ = ["coordinates", "effort_symbol", "efforts", "errors", "loop_forces", "rates", "scalar", "unit_of"]
 
-SETTLED = 0.01  # of the error at the start
-DOTS = 40  # of a desired curve
-SNAPSHOTS = 9
-LOOPS_NAMED = 6  # more would hide their curves
-INITIAL, TARGET, PATH = style.COLOURS[:3]
+DOTS = 25  # of a desired curve
+SPIN = 2 * np.pi  # of a hinge's way: what turns further is wrapped
+TURNS = 20  # more would be stripes: these are counted
+NAMED = 3  # in a note
 
 
-@dataclass(frozen=True)
-class Group:
-    """Runs of one mechanism under one kind of control, to be drawn on each other.
-
-    Attributes
-    ----------
-    kind : "set_point", "tracking", "own" (a controller that is not the scene's) or "motion"
-    runs : list of Run
-        In drawing order.
-    wanted : list of DesiredPath or None
-    """
-
-    kind: str
-    runs: list[Run]
-    wanted: list[DesiredPath | None]
-
-    @property
-    def mechanism(self) -> Mechanism:
-        """The first run's; the others have the same coordinates."""
-        return self.runs[0].mechanism
-
-    @property
-    def independent(self) -> tuple[str, ...]:
-        """The independent coordinates."""
-        return self.runs[0].independent
-
-    @cached_property
-    def lines(self) -> list[dict[str, Any]]:
-        """Each run's line."""
-        return style.lines(self.runs)
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """Each run's name."""
-        ends = ["" if r.status == "done" else f" ({r.status} at {r.t[-1]:.4g} s)" for r in self.runs]
-        return [plain(label) + end for label, end in zip(run_labels(self.runs), ends, strict=True)]
-
-    @cached_property
-    def colours(self) -> dict[str, Any]:
-        """A colour for each coordinate, the independent ones first, and for motors that have names of their own."""
-        rest = [name for name in self.runs[0].coordinates if name not in self.independent]
-        named = style.colours([*self.independent, *rest])
-        own = [name for name in self.runs[0].actuated if name not in named]
-        return {**named, **style.colours(own)}
-
-    @cached_property
-    def shown(self) -> float:
-        """How much time the panels show, s: of a motion that settles early, its first part."""
-        end = max(float(run.t[-1]) for run in self.runs)
-        if self.kind != "set_point":
-            return end
-        settled = 0.0
-        for run, wanted in zip(self.runs, self.wanted, strict=True):
-            if wanted is not None:
-                size = np.abs(run.q_tree[:, _columns(run, run.independent)] - wanted.q).max(axis=1)
-                settled = max(settled, float(run.t[np.flatnonzero(size >= SETTLED * size[0])[-1]]))
-        return min(end, 2.0 * settled) or end
-
-    @cached_property
-    def desired(self) -> list[tuple[Run, DesiredPath]]:
-        """What was wanted, once where several runs want the same, as long as the longest of them."""
-        found: dict[str, tuple[Run, DesiredPath]] = {}
-        for run, wanted in sorted(zip(self.runs, self.wanted, strict=True), key=lambda pair: -pair[0].t[-1]):
-            if wanted is not None:
-                controller = run.scene["controller"]
-                found.setdefault(repr(controller.get("desired", controller.get("q_d"))), (run, wanted))
-        return list(found.values())
+# --- what moves ----------------------------------------------------------------------------------
 
 
-# --- over time -----------------------------------------------------------------------------------
+def coordinates(slot: Slot, group: Group, names: Sequence[str]) -> None:
+    """Draw coordinates over time, what was wanted as dots; hinges that spin are wrapped, or counted in turns."""
+    ways = {name: max(float(np.ptp(run.q_tree[:, run.column(name)])) for run in group.runs) for name in names}
+    kinds: dict[str, list[str]] = {}
+    for name in names:
+        free = name in group.mechanism.tree.free_coordinates
+        unit = unit_of(group, name)
+        counted = unit == "rad" and not free and ways[name] > TURNS * 2 * np.pi
+        kinds.setdefault("turns" if counted else unit, []).append(name)
+    wrapped = [name for name in kinds.get("rad", []) if ways[name] > SPIN
+               and name not in group.mechanism.tree.free_coordinates]  # fmt: skip
+    for (unit, own), ax in zip(kinds.items(), slot.axes(len(kinds)), strict=True):
+
+        def shown(q: Array, name: str, unit: str = unit) -> Array:
+            return q / (2 * np.pi) if unit == "turns" else _wrapped(q) if name in wrapped else q
+
+        _curves(ax, group, own, lambda run, name: shown(run.q_tree[:, run.column(name)], name))
+        _dots(ax, group, own, lambda wanted, k, name: shown(wanted.q[:, k], name))
+        ax.set_ylabel(with_unit(symbol(own[0]) if len(own) == 1 else "$q$", unit))
+        if wrapped and unit == "rad":
+            ax.set_yticks([-np.pi, 0, np.pi], ["$-π$", "0", "$π$"])
+            every = len(wrapped) == len(own)
+            spin = ", ".join(map(symbol, wrapped)) if len(wrapped) <= NAMED else f"{len(wrapped)} that spin"
+            note_on(ax, f"{'' if every else f'{spin}: '}wrapped to $±π$")
+    _time(slot, group, list(kinds))
 
 
-def coordinates(ax: Any, group: Group, names: Sequence[str]) -> None:
-    """Draw coordinates over time, what was wanted as dots."""
-    _curves(ax, group, names, lambda run: run.q_tree[:, _columns(run, names)])
-    _dots(ax, group, names, lambda wanted: wanted.q)
-    _time(ax, group, f"$q$, {units(group.mechanism, names, 'rad', 'm')}")
-
-
-def rates(ax: Any, group: Group, names: Sequence[str]) -> None:
+def rates(slot: Slot, group: Group, names: Sequence[str]) -> None:
     """Draw rates over time, what was wanted as dots where it moves."""
-    _curves(ax, group, names, lambda run: run.v_tree[:, _columns(run, names)])
-    if group.kind == "tracking":
-        _dots(ax, group, names, lambda wanted: wanted.q_dot)
-    _time(ax, group, rf"$\dot q$, {units(group.mechanism, names, 'rad/s', 'm/s')}")
+    kinds = _by_unit(names, lambda name: f"{unit_of(group, name)}/s")
+    for (unit, own), ax in zip(kinds.items(), slot.axes(len(kinds)), strict=True):
+        _curves(ax, group, own, lambda run, name: run.v_tree[:, run.column(name)])
+        if group.kind == "tracking":
+            _dots(ax, group, own, lambda wanted, k, _: wanted.q_dot[:, k])
+        note = limit(ax, [(run.t, run.v_tree[:, columns(run, own)]) for run in group.runs], group.shown, group.small)
+        note_on(ax, note)
+        ax.set_ylabel(with_unit(rate_symbol(own[0]) if len(own) == 1 else r"$\dot q$", unit))
+    _time(slot, group, list(kinds))
 
 
-def errors(ax: Any, group: Group) -> None:
+def errors(slot: Slot, group: Group, names: Sequence[str]) -> None:
     """Draw q - q_d over time."""
-    for run, wanted, line in zip(group.runs, group.wanted, group.lines, strict=True):
-        if wanted is not None:
-            error = run.q_tree[:, _columns(run, run.independent)] - wanted.q
-            for name, values in zip(run.independent, error.T, strict=True):
-                ax.plot(run.t, values, color=group.colours[name], **line)
-    _time(ax, group, rf"$q - q_d$, {units(group.mechanism, group.independent, 'rad', 'm')}")
+    kinds = _by_unit(names, lambda name: unit_of(group, name))
+    for (unit, own), ax in zip(kinds.items(), slot.axes(len(kinds)), strict=True):
+        for name in _behind_first(group, own):
+            for run, wanted, shape in zip(group.runs, group.wanted, group.lines, strict=True):
+                if wanted is not None:
+                    error = run.q_tree[:, run.column(name)] - wanted.q[:, run.independent.index(name)]
+                    ax.plot(run.t, error, **_look(group, name, shape))
+        ax.set_ylabel(with_unit("$q - q_d$", unit))
+    _time(slot, group, list(kinds))
 
 
-def efforts(ax: Any, group: Group) -> None:
-    """Draw the actuators' efforts over time; where a short peak dwarfs the rest, the rest again, enlarged."""
-    names = group.runs[0].actuated
-    _curves(ax, group, names, lambda run: run.tau)
-    _time(ax, group, f"${effort_symbol(group)}$, {effort_units(group.mechanism)}")
-    after = _peak_ends(group.runs, group.shown)
-    if after is None:
-        return
-    later = np.concatenate([run.tau[run.t >= after].ravel() for run in group.runs])
-    low, high = ax.get_ylim()
-    room_above = high - later.max() > later.min() - low
-    inset = ax.inset_axes((0.17, 0.44, 0.8, 0.46) if room_above else (0.17, 0.1, 0.8, 0.46))
-    _curves(inset, group, names, lambda run: np.where((run.t >= after)[:, None], run.tau, np.nan))
-    inset.set_title(f"the same from t = {after:.2g} s on", fontsize=8, color=style.GREY, pad=3)
-    inset.tick_params(labelsize=8)
+# --- what pushes ---------------------------------------------------------------------------------
 
 
-def scalar(ax: Any, group: Group, values: Callable[[Run], Array], label: str, dots: bool = False) -> None:
-    """Draw one number over all of the time, a colour for each run; as dots where it is mostly rounding."""
-    for k, (run, line) in enumerate(zip(group.runs, group.lines, strict=True)):
-        look = {"linestyle": "none", "marker": ".", "markersize": 2.5 * line["linewidth"]} if dots else line
-        ax.plot(run.t, values(run), color=style.COLOURS[k % len(style.COLOURS)], **look)
-    _time(ax, group, label, max(float(run.t[-1]) for run in group.runs))
-
-
-def loop_forces(ax: Any, group: Group) -> None:
-    """Draw the size of each loop's force over time, N: of its multipliers those of rows that are lengths."""
-    mechanism = group.mechanism
-    metres = mechanism.closure.in_metres(mechanism.tree)
-    loops = [loop for loop, _ in mechanism.closure.names]
-    holding = list(dict.fromkeys(loop for loop, counted in zip(loops, metres, strict=True) if counted))
-    colours = style.colours(holding)
-    for run, line in zip(group.runs, group.lines, strict=True):
-        for loop, forces in run.loop_forces().items():
-            if loop in holding:
-                own = metres[[name == loop for name in loops]]
-                ax.plot(run.t, np.linalg.norm(forces[:, own], axis=1), color=colours[loop], **line)
-    _time(ax, group, r"$|\lambda|$, N")
-    if not holding:
-        ax.text(0.5, 0.5, "no loop holds points together", ha="center", va="center", transform=ax.transAxes)
-    shown = holding if len(holding) <= LOOPS_NAMED else [holding[0], holding[-1]]
-    for loop in shown:
-        ax.plot([], [], color=colours[loop], label=plain(loop))
-    if shown:
-        ax.legend(loc="upper right", ncols=min(len(shown), 3), fontsize=8)
+def efforts(slot: Slot, group: Group, names: Sequence[str], note: str = "") -> None:
+    """Draw the motors' efforts over time; a short peak at either end is marked instead of flattening the rest."""
+    run = group.runs[0]
+    kinds = _by_unit(names, lambda name: effort_units(group.mechanism, run.actuated.index(name)))
+    for (unit, own), ax in zip(kinds.items(), slot.axes(len(kinds)), strict=True):
+        _curves(ax, group, own, lambda run, name: run.tau[:, run.actuated.index(name)])
+        rows = [run.actuated.index(name) for name in own]
+        cut = limit(ax, [(run.t, run.tau[:, rows]) for run in group.runs], group.shown, group.small)
+        note_on(ax, "\n".join(filter(None, [note, cut])))
+        note = ""
+        ax.set_ylabel(with_unit(f"${effort_symbol(group)}$", unit))
+    _time(slot, group, list(kinds))
 
 
 def effort_symbol(group: Group) -> str:
@@ -177,130 +101,114 @@ def effort_symbol(group: Group) -> str:
     return "u" if group.mechanism.driven_directly else r"\tau"
 
 
-def _curves(ax: Any, group: Group, names: Sequence[str], values: Callable[[Run], Array]) -> None:
-    for run, line in zip(group.runs, group.lines, strict=True):
-        for name, column in zip(names, values(run).T, strict=True):
-            ax.plot(run.t, column, color=group.colours[name], **line)
+def loop_forces(slot: Slot, group: Group) -> None:
+    """Draw the size of each loop's force over time, N: of its multipliers those of rows that are lengths."""
+    mechanism = group.mechanism
+    (ax,) = slot.axes()
+    metres = mechanism.closure.in_metres(mechanism.tree)
+    loops = [loop for loop, _ in mechanism.closure.names]
+    curves = [{loop: np.linalg.norm(forces[:, own], axis=1) for loop, forces in run.loop_forces().items()
+               if any(own := metres[[name == loop for name in loops]])} for run in group.runs]  # fmt: skip
+    holding = list(curves[0])
+    largest = {loop: max(float(np.nanmax(sizes[loop], initial=0.0)) for sizes in curves) for loop in holding}
+    named = style.foremost(largest)
+    colours = style.colours(named)
+    for loop in [*(loop for loop in holding if loop not in named), *named]:
+        for run, shape, sizes in zip(group.runs, group.lines, curves, strict=True):
+            look = shape if loop in colours else shape | {"linewidth": 0.7}
+            ax.plot(run.t, sizes[loop], color=colours.get(loop, style.REST), **look)
+    every = [(run.t, np.column_stack(list(sizes.values()))) for run, sizes in zip(group.runs, curves, strict=True)
+             if sizes]  # fmt: skip
+    say(ax, slot.title, limit(ax, every, group.end))
+    _axis(ax, group.end)
+    ax.set_ylabel(with_unit(r"$|\lambda|$", "N"))
+    if not holding:
+        ax.text(0.5, 0.5, "no loop holds points together", ha="center", va="center", transform=ax.transAxes)
+    if len(holding) == 1:
+        say(ax, slot.title.replace("loop forces", f"force in loop {plain(holding[0])}"), limit(ax, every, group.end))
+        return
+    handles = [line(colours[loop], plain(loop)) for loop in named]
+    if len(named) < len(holding):
+        handles.append(line(style.REST, f"{len(holding) - len(named)} more"))
+    fit_legend(ax, handles)
 
 
-def _dots(ax: Any, group: Group, names: Sequence[str], values: Callable[[DesiredPath], Array]) -> None:
+# --- one number ----------------------------------------------------------------------------------
+
+
+def scalar(
+    slot: Slot, group: Group, values: Callable[[Run], Array], name: str, dots: bool = False, cut: bool = True
+) -> Any:
+    """Draw one number over all of the time, a colour for each run; as dots where it is mostly rounding."""
+    (ax,) = slot.axes()
+    for k, (run, shape) in enumerate(zip(group.runs, group.lines, strict=True)):
+        look = {"linestyle": "none", "marker": ".", "markersize": 2.0 * shape["linewidth"]} if dots else shape
+        ax.plot(run.t, values(run), color=style.COLOURS[k % len(style.COLOURS)], **look)
+    if cut:
+        say(ax, slot.title, limit(ax, [(run.t, values(run)[:, None]) for run in group.runs], group.end))
+    ax.set_ylabel(name)
+    _axis(ax, group.end)
+    return ax
+
+
+def unit_of(group: Group, name: str) -> str:
+    """Return the unit of a coordinate."""
+    return "m" if is_length(group.mechanism, name) else "rad"
+
+
+# --- parts ---------------------------------------------------------------------------------------
+
+
+def _by_unit(names: Sequence[str], unit: Callable[[str], str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(unit(name), []).append(name)
+    return found
+
+
+def _behind_first(group: Group, names: Sequence[str]) -> list[str]:
+    """Names in the order that puts those without a colour of their own behind the others."""
+    return sorted(names, key=lambda name: group.colours[name] != style.REST)
+
+
+def _look(group: Group, name: str, shape: dict[str, Any]) -> dict[str, Any]:
+    colour = group.colours[name]
+    return shape | {"color": colour} | ({"linewidth": 0.7} if colour == style.REST else {})
+
+
+def _curves(ax: Any, group: Group, names: Sequence[str], values: Callable[[Run, str], Array]) -> None:
+    ordered = _behind_first(group, names)
+    for run, shape in zip(group.runs, group.lines, strict=True):
+        for name in ordered:
+            ax.plot(run.t, values(run, name), **_look(group, name, shape))
+
+
+def _dots(ax: Any, group: Group, names: Sequence[str], values: Callable[[DesiredPath, int, str], Array]) -> None:
     for run, wanted in group.desired:
-        rows = np.unique(np.linspace(0, len(run.t) - 1, DOTS).astype(int))
-        for name, column in zip(run.independent, values(wanted).T, strict=True):
-            if name in names:
-                ax.plot(run.t[rows], column[rows], linestyle="none", marker=".", markersize=5, color="black")
+        rows = np.unique(np.linspace(0, len(run.t) - 1, 10 if group.small else DOTS).astype(int))
+        for k, name in enumerate(run.independent):
+            if name in names and group.colours[name] != style.REST:
+                column = values(wanted, k, name)
+                ax.plot(run.t[rows], column[rows], linestyle="none", marker=".", markersize=3, color="black")
 
 
-def _time(ax: Any, group: Group, label: str, end: float | None = None) -> None:
-    whole = max(float(run.t[-1]) for run in group.runs)
-    shown = end or group.shown
-    ax.set_xlabel("t, s" if shown == whole else f"t, s (settled; {whole:g} s simulated)")
-    ax.set_ylabel(label)
-    if shown > 0:
-        ax.set_xlim(-0.02 * shown, 1.02 * shown)
+def _wrapped(q: Array) -> Array:
+    """Angles within ±pi, without the lines that their jumps would draw."""
+    around = np.remainder(q + np.pi, 2 * np.pi) - np.pi
+    jumps = np.flatnonzero(np.abs(np.diff(around)) > np.pi)
+    around[jumps] = np.nan
+    return around
 
 
-def _columns(run: Run, names: Sequence[str]) -> list[int]:
-    return [run.column(name) for name in names]
+def _time(slot: Slot, group: Group, units: Sequence[str]) -> None:
+    """Label the lowest of a panel's axes."""
+    for ax in slot.figure.axes[-len(units) :]:
+        _axis(ax, group.shown)
+        ax.set_xlabel("")
+    slot.figure.axes[-1].set_xlabel(with_unit("$t$", "s"))
 
 
-def _peak_ends(runs: Sequence[Run], shown: float) -> float | None:
-    """Return when the efforts fall below a fifth of their peak for good, if within a tenth of what is shown."""
-    ends = []
-    for run in runs:
-        size = np.abs(run.tau).max(axis=1, initial=0.0)
-        above = np.flatnonzero(size > 0.2 * size.max())
-        if size.max() == 0 or above[-1] + 1 >= len(run.t) or run.t[above[-1] + 1] > 0.1 * shown:
-            return None
-        ends.append(float(run.t[above[-1] + 1]))
-    return max(ends)
-
-
-# --- in space ------------------------------------------------------------------------------------
-
-
-def configuration_space(ax: Any, group: Group) -> None:
-    """Draw the first two independent coordinates against each other, or the phase plane of a single one."""
-    single = len(group.independent) == 1
-    for run, line in zip(group.runs, group.lines, strict=True):
-        x, y = _plane(run, run.q_tree[:, _columns(run, run.independent)], run.v_tree[:, _columns(run, run.independent)])
-        ax.plot(x, y, color=PATH, **line)
-        ax.plot(x[:1], y[:1], linestyle="none", marker="o", markersize=6, color=PATH)
-    for run, wanted in group.desired:
-        x, y = _plane(run, wanted.q, wanted.q_dot)
-        if len(np.unique(np.column_stack([x, y]), axis=0)) == 1:
-            ax.plot(x[:1], y[:1], linestyle="none", marker="x", markersize=7, color="black")
-        else:
-            ax.plot(x, y, linestyle=":", linewidth=1.4, color="black")
-    names = group.independent[:2]
-    own = [f"{symbol(name)}, {units(group.mechanism, [name], 'rad', 'm')}" for name in names]
-    ax.set_xlabel(own[0])
-    ax.set_ylabel(rf"$\dot q$, {units(group.mechanism, names, 'rad/s', 'm/s')}" if single else own[1])
-    ax.margins(0.08)
-    if not single:
-        ax.set_aspect("equal", adjustable="datalim")
-
-
-def _plane(run: Run, q: Array, q_dot: Array) -> tuple[Array, Array]:
-    return (q[:, 0], q_dot[:, 0]) if len(run.independent) == 1 else (q[:, 0], q[:, 1])
-
-
-def linkage(ax: Any, group: Group) -> None:
-    """Draw the initial configuration in blue, the desired ones in red, and the ways of the points between."""
-    mechanism, run = group.mechanism, group.runs[0]
-    view = viewpoint(mechanism)[:2]
-    for path in run.points.values():
-        x, y = view @ path.T
-        ax.plot(x, y, color=style.GREY, linewidth=1.0, linestyle=":")
-    start = mechanism.tree.from_coordinates(run.q_tree[0])
-    poses = [(start, INITIAL)]
-    for _, wanted in group.desired:
-        target = sigma(mechanism, wanted.q[-1])
-        if target.verdict == "converged":
-            poses.append((target.at.q_tree, TARGET))
-    for q_tree, colour in poses:
-        _draw_linkage(ax, mechanism, placements(mechanism, q_tree[None]), view, colour)
-    ax.set_xlabel(_axis_name(view[0], "across"))
-    ax.set_ylabel(_axis_name(view[1], "up"))
-    ax.margins(0.06)
-    ax.set_aspect("equal", adjustable="datalim")
-
-
-def snapshots(ax: Any, group: Group) -> Any:
-    """Draw the first run's poses at equal times, from dark to light, and the ways of its points; return the colours."""
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    mechanism, run = group.mechanism, group.runs[0]
-    view = viewpoint(mechanism)[:2]
-    for path in run.points.values():
-        ax.plot(*(view @ path[run.t <= group.shown].T), color=style.GREY, linewidth=1.0, linestyle=":")
-    shades = ScalarMappable(Normalize(0.0, group.shown or 1.0), colormaps["viridis"])
-    for t in np.linspace(0.0, group.shown, SNAPSHOTS):
-        row = run.at(float(t))
-        q_tree = mechanism.tree.from_coordinates(run.q_tree[row])
-        _draw_linkage(ax, mechanism, placements(mechanism, q_tree[None]), view, shades.to_rgba(run.t[row]))
-    ax.set_xlabel(_axis_name(view[0], "across"))
-    ax.set_ylabel(_axis_name(view[1], "up"))
-    ax.margins(0.06)
-    ax.set_aspect("equal", adjustable="datalim")
-    return shades
-
-
-def _draw_linkage(ax: Any, mechanism: Mechanism, at: Placements, view: Array, colour: Any) -> None:
-    for stick in sticks(mechanism):
-        ends = view @ np.vstack([at.of(stick.joint, stick.start), at.of(stick.end_joint, stick.end)]).T
-        base = stick.joint == stick.end_joint == 0
-        ax.plot(*ends, color=style.GREY if base else colour, linewidth=4.0 if base else 2.4, zorder=1 if base else 3)
-        if not base:
-            ax.plot(
-                *ends, color=colour, linestyle="none", marker="o", markersize=5.5, markerfacecolor="white", zorder=4
-            )
-
-
-def _axis_name(direction: Array, otherwise: str) -> str:
-    for k, name in enumerate("xyz"):
-        if abs(abs(direction[k]) - 1.0) < 1e-9:
-            return f"{'-' if direction[k] < 0 else ''}{name}, m"
-    return f"{otherwise}, m"
+def _axis(ax: Any, end: float) -> None:
+    ax.set_xlabel(with_unit("$t$", "s"))
+    if end > 0:
+        ax.set_xlim(-0.02 * end, 1.02 * end)

@@ -10,8 +10,9 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import is_number, require_flag, require_kind, require_path
 from ckc_pin.mechanism.whole_file import write_whole
-from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.run import Run, given_runs
 from ckc_pin.view.bodies import missing_meshes
 from ckc_pin.view.browser import open_in_browser
 from ckc_pin.view.commands import Command
@@ -23,7 +24,7 @@ from ckc_pin.view.style import drawing_order
 if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
-__all__ = ["caption", "play", "save_html"]
+__all__ = ["caption", "html", "play", "save_html", "write_page"]
 
 
 def play(
@@ -32,6 +33,7 @@ def play(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
     open_browser: bool = False,
     port: int = 0,
     block: bool = True,
@@ -50,6 +52,8 @@ def play(
     meshes : path, optional
         The mechanism's folder, where the URDF's mesh files are: a run file has none. Links whose meshes are missing
         are drawn as sticks.
+    forces : bool
+        Draw what the loops carry and what the motors give as arrows; the page can hide them.
     open_browser : bool
         Also open the address.
     port : int
@@ -66,12 +70,16 @@ def play(
     InputError
         No run, a speed that is not above zero, a port in use, meshcat missing, a drawing that cannot be.
     """
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
+    require_flag(open_browser, "play: open_browser")
+    require_flag(block, "play: block")
+    require_flag(forces, "play: forces")
+    require_kind(port, int, "play: port", "a port from 1 to 65535, or 0 for any free one")
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
     try:
         from ckc_pin.view.server import ViewServer
     except ModuleNotFoundError:
         raise InputError("playback needs meshcat and its tornado: pip install 'ckc_pin[view]'") from None
-    server = ViewServer(page(*caption(ordered, gap)), port)
+    server = ViewServer(page(*caption(ordered, gap, forces)), port)
     for command in drawing:
         server.send(command)
     if open_browser:
@@ -94,6 +102,7 @@ def save_html(
     speed: float = 1.0,
     gap: float = 0.0,
     meshes: str | Path | None = None,
+    forces: bool = False,
 ) -> Path:
     """Write runs as one HTML file that plays from disk, without a network. Parameters as for `play`.
 
@@ -102,30 +111,48 @@ def save_html(
     InputError
         As for `play`; a file that cannot be written.
     """
+    return write_page(html(runs, speed=speed, gap=gap, meshes=meshes, forces=forces), path)
+
+
+def write_page(text: str, path: str | Path) -> Path:
+    """Write a page as `save_html` does."""
+    require_path(path, "save_html: path")
     path = Path(path)
-    ordered, drawing = _drawing(runs, speed, gap, meshes)
-    text = standalone(*caption(ordered, gap), drawing)
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
     write_whole(path, text)
     return path
 
 
+def html(
+    runs: Run | Sequence[Run],
+    *,
+    speed: float = 1.0,
+    gap: float = 0.0,
+    meshes: str | Path | None = None,
+    forces: bool = False,
+) -> str:
+    """Return the page that `save_html` writes, for what shows pages in a place of its own."""
+    ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
+    return standalone(*caption(ordered, gap, forces), drawing)
+
+
 def _drawing(
-    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None
+    runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None, forces: bool
 ) -> tuple[list[Run], list[Command]]:
-    runs = [runs] if isinstance(runs, Run) else list(runs)
-    if not runs:
-        raise InputError("play: no run given; give at least one")
-    if not (math.isfinite(speed) and speed > 0):
-        raise InputError(f"play: speed = {speed}; it must be above zero, 1 is real time")
-    if not (math.isfinite(gap) and gap >= 0):
-        raise InputError(f"play: gap = {gap}; it says how many times larger gaps are drawn, 0 draws none")
+    runs = given_runs(runs, "play")
+    if not (is_number(speed) and math.isfinite(speed) and speed > 0):
+        raise InputError(f"play: speed = {speed!r:.80}; it must be a number above zero, 1 is real time")
+    if not (is_number(gap) and math.isfinite(gap) and gap >= 0):
+        raise InputError(f"play: gap = {gap!r:.80}; it says how many times larger gaps are drawn, 0 draws none")
+    _require_one_tree(runs)
+    if meshes is not None:
+        require_path(meshes, "play: meshes", "the mechanism's folder")
     folder = None if meshes is None else Path(meshes)
     if folder is not None and not folder.is_dir():
         raise InputError(f"play: meshes = {folder}: no such folder; give the one that the mechanism.toml is in")
     ordered = drawing_order(runs)
-    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder)
+    drawing = scene(ordered, speed=speed, gap=gap, meshes=folder, forces=forces)
     missing = list(dict.fromkeys(name for run in ordered for name in missing_meshes(run.mechanism, folder)))
     if missing:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
@@ -133,11 +160,24 @@ def _drawing(
     return ordered, drawing
 
 
-def caption(runs: Sequence[Run], gap: float = 0.0) -> tuple[str, list[str]]:
+def _require_one_tree(runs: Sequence[Run]) -> None:
+    first = runs[0]
+    other = next((run for run in runs if run.coordinates != first.coordinates), None)
+    if other is not None:
+        raise InputError(
+            f"play: {first.scene_name} is a run of {first.mechanism.name}, {other.scene_name} of "
+            f"{other.mechanism.name}, which has other coordinates; only runs of one mechanism lie on each other: play "
+            "them one by one"
+        )
+
+
+def caption(runs: Sequence[Run], gap: float = 0.0, forces: bool = False) -> tuple[str, list[str]]:
     """Return the title of a page that shows runs, and the lines below it."""
     lines = [f"{'translucent: ' if k else ''}{label}" for k, label in enumerate(run_labels(runs))]
     if any("controller" in run.scene for run in runs):
         lines.append("gray: desired")
     if gap > 0:
         lines.append(f"red: gaps of the loops, {gap:g} times larger")
+    if forces:
+        lines.append("green: forces of the loops; purple: of the motors")
     return runs[0].scene_name, lines

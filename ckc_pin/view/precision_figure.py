@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.view import style
-from ckc_pin.view.map_figure import look, write
+from ckc_pin.view.canvas import fit_legend, look, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,7 +44,7 @@ def draw_precision(found: Mapping[str, Any]) -> Figure:
     with look():
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(8.4, 5.2), layout="constrained")
+        figure = Figure(figsize=(style.WIDTH, 4.6), layout="constrained")
         ax = figure.add_subplot()
         rows = [row for row in found["rows"] if row["error"] is not None]
         for name, own in _families(rows).items():
@@ -56,9 +56,9 @@ def draw_precision(found: Mapping[str, Any]) -> Figure:
             ax.axhspan(min(low, accuracy) / 2, 10 * accuracy, color=style.GREY, alpha=0.15, linewidth=0)
             ax.text(0.01, 10 * accuracy, "the reference's own uncertainty", color=style.GREY, va="top",
                     transform=ax.get_yaxis_transform())  # fmt: skip
-        ax.set(xscale="log", yscale="log", xlabel="time of a run, ms", ylabel="largest error of q_tree and v_tree")
+        ax.set(xscale="log", yscale="log", xlabel="time of a run (ms)", ylabel="largest error of q_tree and v_tree")
         ax.set_title(f"{_plain(found['scene'])}, up to t = {found['reference']['t_end']:.4g} s")
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+        fit_legend(figure, ax.get_legend_handles_labels()[0], fontsize=style.NOTE)
         return figure
 
 

@@ -12,7 +12,8 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.simulation.run import Run
 
-__all__ = ["Placements", "Stick", "configurations", "is_planar", "placements", "sticks", "upward", "viewpoint"]
+__all__ = ["Placements", "Projection", "Slide", "Stick", "configurations", "is_planar", "placements", "planes",
+           "slides", "sticks", "upward", "viewpoint"]  # fmt: skip
 
 PARALLEL = 1e-9  # sine of the angle below which two joint axes are parallel
 
@@ -37,6 +38,29 @@ class Placements:
     def of(self, joint: int, local: Array) -> Array:
         """World positions of a body's point, shape (m, 3)."""
         return np.asarray(self.rotation[:, joint] @ local + self.translation[:, joint])
+
+    def row(self, k: int) -> Placements:
+        """Return one configuration's placements, with m = 1."""
+        return Placements(self.rotation[k : k + 1], self.translation[k : k + 1])
+
+
+@dataclass(frozen=True)
+class Slide:
+    """A prismatic joint: where its rail begins, and along what, in the axes of the body that carries it."""
+
+    joint: int
+    parent: int
+    origin: Array
+    along: Array
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A plane to draw on: the side it is seen from, its axes (2, 3) in the world, and their names."""
+
+    title: str
+    axes: Array
+    names: tuple[str, str]
 
 
 def placements(mechanism: Mechanism, q_tree: Array) -> Placements:
@@ -65,10 +89,18 @@ def sticks(mechanism: Mechanism) -> list[Stick]:
             continue
         ends = nodes or [model.inertias[joint].lever.copy()]
         found += [Stick(joint, np.zeros(3), joint, end) for end in ends if np.any(end)]
-    for joint in range(1, mechanism.tree.model.njoints):
+    return found + [Stick(slide.parent, slide.origin, slide.joint, np.zeros(3)) for slide in slides(mechanism)]
+
+
+def slides(mechanism: Mechanism) -> list[Slide]:
+    """Return the prismatic joints."""
+    model = mechanism.tree.model
+    found = []
+    for joint in range(1, model.njoints):
         if model.joints[joint].shortname().startswith("JointModelP"):
-            rail = model.jointPlacements[joint].translation.copy()
-            found.append(Stick(model.parents[joint], rail, joint, np.zeros(3)))
+            placement = model.jointPlacements[joint]
+            along, _ = mechanism.tree.axis(joint)  # a slide does not turn: the same axes in both bodies
+            found.append(Slide(joint, model.parents[joint], placement.translation.copy(), placement.rotation @ along))
     return found
 
 
@@ -126,6 +158,30 @@ def viewpoint(mechanism: Mechanism) -> Array:
     if is_planar(mechanism) and right[int(np.argmax(np.abs(right)))] < 0:  # from the side where x grows to the right
         right, normal = -right, -normal
     return np.array([right, up, normal])
+
+
+def planes(mechanism: Mechanism) -> list[Projection]:
+    """Return where to draw a mechanism: its own plane, or from the front, from the side and from above.
+
+    The three are the world's coordinate planes, with the axis upwards that is nearest to up.
+    """
+    if is_planar(mechanism):
+        axes = viewpoint(mechanism)[:2]
+        return [Projection("", axes, (_axis_name(axes[0], "across"), _axis_name(axes[1], "up")))]
+    up = upward(mechanism)
+    k = int(np.argmax(np.abs(up)))
+    vertical = np.sign(up[k]) * np.eye(3)[k]
+    right = np.eye(3)[(k + 1) % 3]
+    forward = np.cross(vertical, right)  # away from who looks from the front
+    views = (("front", right, vertical), ("side", forward, vertical), ("top", right, forward))
+    return [Projection(title, np.array([x, y]), (_axis_name(x, ""), _axis_name(y, ""))) for title, x, y in views]
+
+
+def _axis_name(direction: Array, otherwise: str) -> str:
+    for k, name in enumerate("xyz"):
+        if abs(abs(direction[k]) - 1.0) < 1e-9:
+            return f"${'-' if direction[k] < 0 else ''}{name}$"
+    return otherwise
 
 
 def _normal(mechanism: Mechanism) -> Array | None:

@@ -197,6 +197,27 @@ def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
 
 
 @app.command()
+def ensembles(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="gets the figures")] = Path("out/ensembles"),
+    quick: Annotated[bool, typer.Option("--quick", help="fewer members")] = False,
+) -> None:
+    """Two studies by ensembles: tolerances of lengths, and a basin of attraction."""
+    from scripts.experiments import ensemble_studies
+
+    ensemble_studies.main(out, quick)
+
+
+@app.command("bench_ensembles")
+def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of members")] = 3) -> None:
+    """Print what ensembles cost, beside MuJoCo's rollout, and what 10^9 members would on many cores."""
+    from scripts.experiments import bench_ensembles, ensemble_scaling
+
+    bench_ensembles.main(runs)
+    print()
+    ensemble_scaling.main()
+
+
+@app.command()
 def bench(
     only: Annotated[str, typer.Option(metavar="WORDS", help="lines that have these words")] = "",
 ) -> None:

@@ -19,7 +19,7 @@ def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6
     """Return a figure with rows of axes, each of a size in inches: (Figure, flat array of Axes)."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=110, layout="constrained")
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=110 if size[0] > 5 else 160, layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, columns)).flatten()
     for ax in axes:
         ax.grid(True, which="major", alpha=0.3)

@@ -10,13 +10,15 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
-from ckc_pin.view.map_figure import draw_map, look
+from ckc_pin.view.canvas import look
+from ckc_pin.view.map_figure import draw_map
 from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
+from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE: ViewportSize = {"width": 720, "height": 540}
-DPI = 100
+DPI = 170
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.getuid() else ["--no-sandbox"])]
 
 
@@ -28,8 +30,8 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
         page.goto(server.url)
         while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
             time.sleep(0.1)
-        page.evaluate("viewer.animator.pause(); viewer.gui.domElement.style.display = 'none'")
-        page.evaluate(f"viewer.animator.seek({t}); viewer.render()")
+        page.evaluate("player.pause(); viewer.gui.domElement.style.display = 'none'")
+        page.evaluate(f"player.go({t}); document.getElementById('bar').style.display = 'none'; viewer.render()")
         time.sleep(0.5)
         page.screenshot(path=path)
 
@@ -49,3 +51,5 @@ def main(chromium: Path) -> None:
         for name in ("five_bar", "five_bar_as_printed"):
             draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
+        draw_friction(IMAGES / "five_bar_friction.png", DPI)
+        draw_preload(IMAGES / "two_ur5_preload.png", DPI)

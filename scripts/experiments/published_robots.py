@@ -138,6 +138,7 @@ SHORT = {
     "idle freedoms": "{n} idle",
     "links that move without mass": "{n} without mass",
     "from q_guess: ": "assembled far from the guess",
+    "leads beyond joints' stops": "{n} moved within stops",
     "outside joint limits": "{n} beyond limits",
     "the assembled configuration is singular": "singular where it is drawn",
     "the loops close to": "{first}",

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from types import NoneType
+from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin
 
 import msgspec
@@ -20,11 +20,12 @@ from ckc_pin.control.point_path import PointPathSpec
 from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
 from ckc_pin.mechanism.faults import expected
 from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.simulation.ensembles.spec import SweepSpec
 from ckc_pin.simulation.scene_spec import SceneSpec
 
 __all__ = ["FILES", "Key", "Table", "markdown", "tables"]
 
-FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec}
+FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec, "sweep": SweepSpec}
 # Tables that a structure leaves open, since what stands in them decides how they are read.
 OPEN = {(TrackingSpec, "desired"): (HarmonicsSpec, PointPathSpec)}
 # What the path of an open table says beside its structure's name.
@@ -63,7 +64,7 @@ class Table:
 @cache
 def tables(file: str) -> tuple[Table, ...]:
     """Return the tables of a file, the file itself first, each structure once."""
-    return tuple(_walk(FILES[file], "", f"{file}.toml" if file == "mechanism" else "NAME.scene.toml", set()))
+    return tuple(_walk(FILES[file], "", "mechanism.toml" if file == "mechanism" else f"NAME.{file}.toml", set()))
 
 
 def _walk(structure: Any, path: str, heading: str, seen: set[Any]) -> Iterator[Table]:
@@ -73,11 +74,12 @@ def _walk(structure: Any, path: str, heading: str, seen: set[Any]) -> Iterator[T
     keys = tuple(_key(field, entries.get(field.encode_name, ("", "", ""))) for field in fields)
     yield Table(path, heading, structure, about, keys)
     for field in fields:
-        many = get_origin(field.type) is list
-        inner = OPEN.get((structure, field.encode_name)) or _structures(field.type)
+        opened = OPEN.get((structure, field.encode_name))
+        many, named = get_origin(field.type) is list, get_origin(field.type) is dict and not opened
+        inner = opened or _structures(field.type)
         for member in inner:
             if member not in seen:
-                where = f"{path}.{field.encode_name}".lstrip(".") + PLACES.get(member, "")
+                where = f"{path}.{field.encode_name}".lstrip(".") + PLACES.get(member, ".NAME" if named else "")
                 tag = member.__struct_config__.tag
                 says = f' with type = "{tag}"' if tag else ""
                 yield from _walk(member, where, (f"[[{where}]]" if many else f"[{where}]") + says, seen)
@@ -100,7 +102,7 @@ def _kind(kind: Any) -> str:
     if choices:
         return ", ".join(f'"{value}"' if isinstance(value, str) else str(value) for value in get_args(choices[0]))
     if get_origin(kind) is dict:
-        return "table of numbers" if get_args(kind)[1] is not Any else "table"
+        return _by_name(get_args(kind)[1])
     if get_origin(kind) is list and _structures(kind):
         return "list of tables"
     members = [member for member in get_args(kind) if member is not NoneType]
@@ -110,6 +112,22 @@ def _kind(kind: Any) -> str:
     if get_origin(inner) is list and get_args(inner)[0] is not list and not _nested(inner):
         return "list of numbers" if get_args(inner)[0] is float else "list of names"
     return re.sub(r"^an? ", "", expected(kind))
+
+
+def _by_name(values: Any) -> str:
+    if values is Any:
+        return "table"
+    many = {str: "strings", float: "numbers"}
+    members = get_args(values) if get_origin(values) is UnionType else (values,)
+    said = [
+        "tables"
+        if _structures(member)
+        else "lists of 3 numbers"
+        if get_origin(member) is tuple
+        else many.get(member, "numbers")
+        for member in members
+    ]
+    return f"table of {' or '.join(said)} by name"
 
 
 def _nested(kind: Any) -> bool:

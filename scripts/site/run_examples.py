@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
-import json
+import re
 import sys
+from base64 import b64decode
 from importlib import import_module
+from io import BytesIO
 from typing import Any
 
 from scripts.site.gallery import Example, examples
 
-__all__ = ["main", "run"]
+__all__ = ["main", "picture", "run"]
 
 DPI = 90
 
 
 def run(example: Example) -> Any:
-    """Run an example and return its figure; what is wrong with it is an AssertionError."""
-    if example.path.suffix == ".ipynb":
-        return _run_cells(example)
+    """Run an example in Python and return its figure; what is wrong with it is an AssertionError."""
     return import_module(f"examples.{example.name}").main()
 
 
-def _run_cells(example: Example) -> Any:
-    space: dict[str, Any] = {}
-    for cell in json.loads(example.path.read_text(encoding="utf-8"))["cells"]:
-        if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), f"{example.path.name}, {cell['id']}", "exec"), space)
-    return space["figure"]
+def picture(example: Example) -> bytes:
+    """Run an example and return its picture, as PNG: of a notebook the first that it shows."""
+    if example.path.suffix == ".ipynb":
+        return _first_shown(example)
+    drawn = BytesIO()
+    run(example).savefig(drawn, dpi=DPI)
+    return drawn.getvalue()
+
+
+def _first_shown(example: Example) -> bytes:
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(example.path, as_version=4)  # type: ignore[no-untyped-call]
+    NotebookClient(notebook, timeout=120).execute()
+    shown = "".join(str(output.get("data", {})) for cell in notebook.cells for output in cell.get("outputs", []))
+    found = re.search(r"data:image/png;base64,([\w+/=]+)", shown)
+    assert found, "a notebook shows a figure"
+    return b64decode(found[1])
 
 
 def main() -> None:
@@ -37,7 +50,7 @@ def main() -> None:
     for example in examples():
         if not sys.argv[1:] or example.name in sys.argv[1:]:
             example.picture.parent.mkdir(parents=True, exist_ok=True)
-            run(example).savefig(example.picture, dpi=DPI)
+            example.picture.write_bytes(picture(example))
             print(f"written: {example.picture}")
 
 

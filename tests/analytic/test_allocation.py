@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+from scipy.optimize import linprog, lsq_linear
 
 from ckc_pin.control.allocation import allocate
 from tests.conftest import assert_close
@@ -48,6 +48,16 @@ def feasible(T: Array, u: Array, limit: Array) -> bool:
     return bool(linprog(np.zeros(len(limit)), A_eq=T, b_eq=u, bounds=bounds, method="highs").status == 0)
 
 
+def at_a_price(T: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array:
+    """The tau within limits with the least sum weights (tau - preload)^2 + |T tau - u|^2 / give, rows of one size."""
+    rows = 1 / np.linalg.norm(T, axis=1)
+    A = T * rows[:, None]
+    price = 1 / np.sqrt(1e-7 * ((A**2).sum(axis=0) / weights).sum())
+    left = np.vstack([price * A, np.diag(np.sqrt(weights))])
+    right = np.r_[price * rows * u, np.sqrt(weights) * preload]
+    return np.asarray(lsq_linear(left, right, (-limit, limit), method="bvls", tol=1e-15).x)
+
+
 def test_it_is_the_nearest_within_limits() -> None:
     kinds = {"free": 0, "limited": 0, "out of reach": 0}
     for seed in range(110):
@@ -57,7 +67,9 @@ def test_it_is_the_nearest_within_limits() -> None:
         if not feasible(T, u, limit):
             kinds["out of reach"] += 1
             assert nearest(*problem) is None
-            assert_close(tau, np.clip(alone, -limit, limit), 1e-10)
+            assert_close(tau, at_a_price(*problem), 1e-7 * np.abs(tau).max())
+            miss = np.linalg.norm((T @ tau - u) / np.linalg.norm(T, axis=1))
+            assert miss < np.linalg.norm((T @ np.clip(alone, -limit, limit) - u) / np.linalg.norm(T, axis=1)) + 1e-6
             continue
         kinds["free" if np.all(np.abs(alone) <= limit) else "limited"] += 1
         best = nearest(*problem)
@@ -84,3 +96,20 @@ def test_a_preload_is_its_projection_on_the_null_space() -> None:
     assert_close(tau, [2.0 + 3.0, 2.0 - 3.0, 3.0], 1e-14)
     weighted = allocate(T, np.array([4.0, 6.0]), endless, np.array([1.0, 3.0, 1.0]), np.zeros(3))
     assert_close(weighted, [3.0, 1.0, 3.0], 1e-14)
+
+
+def test_it_hardly_jumps_where_u_goes_out_of_reach() -> None:
+    """By about give times the multipliers at the edge, in what the motors do together."""
+    jumps = []
+    for seed in range(60):
+        T, u, limit, weights, preload = problems(seed)
+        bounds = [(-x, x) if np.isfinite(x) else (None, None) for x in limit]
+        cost = np.r_[np.zeros(len(limit)), -1.0]
+        found = linprog(cost, A_eq=np.c_[T, -u], b_eq=0 * u, bounds=[*bounds, (0, 1e3)], method="highs")
+        if found.x[-1] > 999:
+            continue
+        before, after = (allocate(T, found.x[-1] * (1 + s) * u, limit, weights, preload) for s in (-1e-9, 1e-9))
+        jumps.append(np.abs(T @ (after - before)).max() / (limit[np.isfinite(limit)].max() * np.abs(T).max()))
+    assert len(jumps) > 30
+    assert np.median(jumps) < 1e-5
+    assert max(jumps) < 1e-3

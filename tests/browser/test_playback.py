@@ -73,8 +73,9 @@ def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracki
         )
         expected = [np.interp(played, tracking.t, column) for column in elbow(tracking, "theta_1").T]
         np.testing.assert_allclose(elements, expected, atol=1e-6)  # between keyframes the browser interpolates
-        labels = visit.page.locator(".dg .property-name").all_inner_texts()
-        assert {"play", "pause", "reset", "time, s", "speed"} <= set(labels)
+        labels = visit.page.locator(".dg .property-name").all_text_contents()
+        assert {"play", "pause", "reset", "time (s)", "speed"} <= set(labels)
+        assert visit.page.input_value("#speed") == "0.5"
         assert visit.page.evaluate("viewer.animator.duration") == pytest.approx(9.5)
 
 
@@ -96,6 +97,23 @@ def test_the_file_plays_from_disk_without_a_network(look_at, tracking, tmp_path)
     assert visit.requests == [path.as_uri()]
     assert visit.caption() == ["five_bar/tracking", "reduced", "gray: desired"]
     assert_elbows(visit, tracking, "1: reduced")
+
+
+def test_a_notebook_shows_it_in_a_frame_that_can_reach_nothing(look_at, tracking, tmp_path):
+    """The cell's own markup in a page of its own: the frame plays, and its scripts have no part in that page."""
+    page = tmp_path / "cell.html"
+    shown = tracking.play(inline=True)._repr_html_()
+    cell = f"<!DOCTYPE html><title>cell</title><script>viewer = 'none here'</script><body>{shown}</body>"
+    page.write_text(cell, encoding="utf-8")
+    visit = look_at(page.as_uri(), "document.querySelector('iframe')", offline=True)
+    (frame,) = visit.page.main_frame.child_frames
+    frame.wait_for_load_state()
+    assert frame.evaluate("() => viewer.animator.duration") == pytest.approx(tracking.t[-1], abs=1e-6)
+    assert frame.evaluate("() => document.querySelector('canvas').width") > 100
+    seen = "() => { try { return parent.viewer } catch (error) { return error.name } }"
+    assert frame.evaluate(seen) == "SecurityError"
+    assert visit.page.evaluate("() => viewer") == "none here"
+    assert not [url for url in visit.requests if url.startswith(("http", "ws"))]
 
 
 def test_two_runs_meshes_and_gaps(look_at, run, tmp_path):

@@ -20,7 +20,11 @@ def _set(*changes: str) -> tuple[str, ...]:
 
 CASES = [
     # the command itself
-    Bad("unknown command", ["rnu"], ["No such command 'rnu'", "list, check, terms, compile, run, inverse, plot, play"]),
+    Bad(
+        "unknown command",
+        ["rnu"],
+        ["No such command 'rnu'", "check, terms, compile, run, inverse, linearize, plot, play"],
+    ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
     Bad("missing argument", ["check"], ["ckc check: Missing argument 'MECHANISM|SCENE'", "--help"]),
     Bad("too many arguments", ["check", "five_bar", "again"], ["unexpected extra argument", "again"]),
@@ -35,18 +39,27 @@ CASES = [
     Bad("a way out of the library", ["run", "five_bar/../five_bar/swing"], ["has no scene '../five_bar/swing'"]),
     Bad("a name of control characters", ["check", "five\nbar\0"], [r"no mechanism 'five\nbar\x00'"]),
     Bad("a name like markup", ["check", "[red]"], ["no mechanism '[red]'"]),
-    Bad("a scene without its suffix", ["run", "bar/swing"], ["no scene 'bar/swing'", "there is bar/swing.scene.toml"]),
     Bad("missing scene file", ["run", "nowhere/x.scene.toml"], ["nowhere/x.scene.toml: no such scene"]),
     Bad("missing mechanism file", ["check", "nowhere.toml"], ["nowhere.toml: no such mechanism file"]),
     Bad("folder without mechanism", ["check", "empty"], ["empty/mechanism.toml: no such"], files=EMPTY),
-    Bad("folder without scene", ["run", "empty"], ["empty/default.scene.toml: no such scene"], files=EMPTY),
+    Bad(
+        "folder without scene",
+        ["run", "empty"],
+        ["empty: no scene, *.scene.toml, says what to run"],
+        files=EMPTY,
+    ),
     Bad(
         "folder without default scene",
         ["run", "own"],
         ["own: no default.scene.toml", "name one of its scenes: a.scene.toml, b.scene.toml"],
         files={"own/a.scene.toml": "", "own/b.scene.toml": ""},
     ),
-    Bad("folder as scene file", ["run", "own.scene.toml"], ["default.scene.toml"], files={"own.scene.toml/x": ""}),
+    Bad(
+        "folder as scene file",
+        ["run", "own.scene.toml"],
+        ["own.scene.toml: no scene, "],
+        files={"own.scene.toml/x": ""},
+    ),
     Bad("URDF as scene", ["run", "bar/five_bar.urdf"], ["malformed TOML", "line 1", "named in a mechanism.toml"]),
     Bad("scene as mechanism", [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"], ["unknown key 'mechanism'"]),
     Bad("a name that no file can have", ["check", "\0.toml"], [r"'\x00.toml'", "no name of a file"]),

@@ -324,4 +324,4 @@ loop = [{{name = "hold", type = "{kind}", frame_a = "world", frame_b = "b", axis
 def test_another_format_is_refused() -> None:
     refused = ckc("export", "five_bar", "--to", "sdf")
     assert refused.code == 2
-    assert "no format 'sdf'; there are mjcf" in refused.err
+    assert "'sdf' is not 'mjcf'" in refused.err

@@ -136,6 +136,16 @@ def test_ranges_are_limits_and_stops_where_they_act(tmp_path: Path) -> None:
     ]
 
 
+def test_a_reference_pose_beyond_ranges_is_assembled_within_them(tmp_path: Path) -> None:
+    bodies = "".join(
+        f"<body name='b{k}'><joint name='j{k}' range='{r}'/><geom size='.1'/></body>"
+        for k, r in enumerate(("-3 -1", "0 2"))
+    )
+    mechanism = model(tmp_path, bodies).mechanism()
+    assert_close(mechanism.q_tree, [-1.0, 0.0], EXACT)
+    assert said(mechanism.warnings, "beyond joints' stops", "j0 = -1 (without them 0)")
+
+
 @pytest.mark.parametrize("flag", ["frictionloss='disable'", "limit='disable'", "constraint='disable'"])
 def test_friction_and_ranges_that_are_switched_off(tmp_path: Path, flag: str) -> None:
     """Named, as springs are; they act here until the file is corrected."""

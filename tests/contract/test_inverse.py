@@ -67,7 +67,7 @@ def test_table_names_the_largest_of_each_and_what_exceeds_its_limit() -> None:
 
 
 def test_files(tmp_path: Path) -> None:
-    answer = ckc("inverse", "delta/circle", *SHORT, "--out", str(tmp_path / "forces"))
+    answer = ckc("inverse", "delta/circle", *SHORT, "--out", str(tmp_path / "forces"), "--figures")
     assert answer.code == 0
     assert (tmp_path / "forces" / "inverse.png").read_bytes().startswith(b"\x89PNG")
     found = inverse_dynamics("delta/circle", {"t_end": 0.2})
@@ -230,5 +230,5 @@ def test_a_passive_run_of_too_few_motors_is_no_mistake(bar: Path) -> None:
 
 
 def test_changes_go_with_a_name() -> None:
-    with pytest.raises(InputError, match="changes go with a name"):
+    with pytest.raises(InputError, match="changes go with the name of a scene"):
         inverse_dynamics(ckc_pin.load_scene("five_bar/tracking"), {"t_end": 1.0})

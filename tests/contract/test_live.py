@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import signal
 import socket
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any
+from urllib.request import urlopen
 
 import msgspec
 import numpy as np
@@ -188,11 +191,25 @@ def test_the_view_waits_for_the_slower_speed_and_not_longer(monkeypatch, run):
 # --- the command ---------------------------------------------------------------------------------
 
 
-def test_run_with_a_view_ends_by_itself_in_a_pipe():
-    found = ckc("run", SWING, "--set", "t_end=0.1", "--meshcat", "--json")
-    assert found.code == 0
-    assert found.json["status"] == "done"
-    assert found.err.startswith("watch it at http://127.0.0.1:")
+@pytest.mark.parametrize(("setting", "status", "code"), [("t_end=0.1", "done", 0), ("solver.max_rhs=40", "stopped", 3)])
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a_view_stays_until_it_is_ended_and_the_run_is_the_same_as_without(setting, status, code, sent):
+    """In a pipe too: what it says is there when the run has ended, the page as long as nobody ends it."""
+    with command(["run", SWING, "--set", setting, "--meshcat", "--json"], stderr=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            url = process.stderr.readline().split()[-1]
+            assert json.loads(process.stdout.readline())["status"] == status
+            lines = [process.stderr.readline()] if code == 0 else [process.stderr.readline() for _ in range(2)]
+            assert lines[-1] == f"played back at {url}  (Ctrl-C ends)\n"
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(1.0)
+            assert urlopen(url).status == 200
+            process.send_signal(sent)
+            assert process.wait(20) == code
+        finally:
+            process.kill()
 
 
 def test_a_port_in_use_ends_no_run():
@@ -233,11 +250,6 @@ def test_options_that_cannot_be(words, says):
     assert says in found.err
 
 
-def test_a_stop_in_a_run_is_the_same_as_without_a_view():
-    found = ckc("run", SWING, "--set", "solver.max_rhs=40", "--meshcat", "--json")
-    assert (found.code, found.json["status"]) == (3, "stopped")
-
-
 @pytest.mark.parametrize("words", [["run", SWING, "--meshcat", "--speed", "0.01"], ["play", "RUN"]])
 def test_a_view_listens_on_one_port_of_loopback_and_has_no_children(words, run, tmp_path):
     """As a command of its own, read from outside."""
@@ -266,6 +278,6 @@ def test_the_map_listens_on_nothing():
     assert seen == set()
 
 
-def command(words: list[str]) -> subprocess.Popen[str]:
-    whole = [sys.executable, "-W", "error", "-m", "ckc_pin.cli", *words]
-    return subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+def command(words: list[str], stderr: int = subprocess.STDOUT) -> subprocess.Popen[str]:
+    whole = [sys.executable, "-W", "error", "-m", "ckc_pin", *words]
+    return subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=stderr, text=True)

@@ -20,7 +20,7 @@ from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import by_coordinate, convert
-from ckc_pin.simulation.report import profile_table, run_table, to_json
+from ckc_pin.simulation.report import profile_table, to_json
 from ckc_pin.simulation.run_file import RunMeta, hashes_of
 from ckc_pin.simulation.scene import make_scene
 
@@ -140,4 +140,4 @@ def test_run_files(tmp_path: Path) -> None:
 
 def _read(path: Path) -> None:
     run = Run.load(path)
-    to_json(run.summary()), run_table(run), profile_table(run), run.loop_forces(), run.points
+    to_json(run.summary()), run.card().text(), profile_table(run), run.loop_forces(), run.points

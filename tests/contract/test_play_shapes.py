@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import struct
 from pathlib import Path
 
@@ -193,9 +194,28 @@ def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)&lt;" in text.split("</title>")[0]
     data = text.split('<script type="text/plain" id="scene">')[1].split("</script>")[0]
-    several = msgspec.msgpack.decode(base64.b64decode(data, validate=True))
+    several = msgspec.msgpack.decode(gzip.decompress(base64.b64decode(data, validate=True)))
     assert several["type"] == "several"
-    assert several["commands"] == msgspec.msgpack.decode(msgspec.msgpack.encode(scene([run], speed=0.5)))
+    arrays = several["arrays"]
+    assert len({(array.code, bytes(array.data)) for array in arrays}) == len(arrays)  # each once
+    found = _resolved(several["commands"], arrays)
+    assert found == msgspec.msgpack.decode(msgspec.msgpack.encode(scene([run], speed=0.5)))
+
+
+def _resolved(value, arrays):
+    if isinstance(value, dict):
+        return (
+            arrays[value["shared"]] if set(value) == {"shared"} else {k: _resolved(v, arrays) for k, v in value.items()}
+        )
+    return [_resolved(one, arrays) for one in value] if isinstance(value, list) else value
+
+
+def test_corners_that_nobody_can_tell_apart_are_one(tmp_path):
+    run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
+    tetrahedron(tmp_path / "m" / "crank.stl")  # STL has each corner once for each of its triangles
+    (drawn,) = [obj for path, obj in objects(scene([run])).items() if "/link:crank/" in path]
+    position = drawn["geometries"][0]["data"]["attributes"]["position"]["array"]
+    assert len(position.data) == 4 * 3 * 4
 
 
 def test_the_command_writes_the_same_file(run, tmp_path):

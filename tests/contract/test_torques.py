@@ -281,9 +281,15 @@ class Both(Spring):
         return np.zeros(2)
 
 
-@pytest.mark.parametrize(("controller", "has"), [(Both(True), "both u and tau"), (object(), "neither u nor tau")])
-def test_a_controller_has_one_method(controller: Any, has: str) -> None:
-    with pytest.raises(InputError, match=f"has {has}; a controller has one of the methods"):
+@pytest.mark.parametrize(
+    ("controller", "says"),
+    [
+        (Both(True), "Both has both u and tau; a controller has one of the methods"),
+        (object(), "an object was given; it takes an object with one of the methods"),
+    ],
+)
+def test_a_controller_has_one_method(controller: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
         simulate("five_bar/swing", controller=controller)
 
 

@@ -8,8 +8,8 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PARTS = {"__init__.py", "errors.py", "py.typed", "analysis", "cli", "control", "dynamics", "formats", "generated",
-         "kinematics", "mechanism", "native", "simulation", "urdf", "view"}  # fmt: skip
+PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "cli", "control", "dynamics", "formats",
+         "generated", "kinematics", "mechanism", "native", "simulation", "urdf", "view"}  # fmt: skip
 
 
 def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> None:
@@ -25,4 +25,7 @@ def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> Non
     shipped = {path.parent.name for path in (ROOT / "urdf").glob("*/*.toml")}
     assert {file.parts[2] for file in files if file.parts[1] == "urdf"} == shipped
     code = {file for file in files if file.parts[1] != "urdf"}
+    new = {file.name for file in code if file.parts[1:3] == ("cli", "new_files")}
+    assert new == {"NAME.urdf", "mechanism.toml", "default.scene.toml"}
+    code = {file for file in code if file.name not in new}
     assert {file.suffix for file in code} <= {".py", ".pyi", ".typed", ".html", ".js", ".css"}

@@ -7,9 +7,11 @@ only shown.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import tomllib
+from contextlib import chdir
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +56,7 @@ def run(snippet: Snippet, space: dict[str, Any]) -> None:
         exec(compile(text, f"line {snippet.line}", "exec"), space)
     elif language == "sh":
         for line in text.replace("\\\n", " ").splitlines():
-            _command(line)
+            _line(line)
     elif language in ("toml", "xml"):
         named = FILE.match(text)
         if named:
@@ -66,6 +68,17 @@ def run(snippet: Snippet, space: dict[str, Any]) -> None:
             check_part(text)
     else:
         assert language in SHOWN, f"line {snippet.line}: no language {language!r}"
+
+
+def _line(line: str) -> None:
+    """Run commands joined by &&, in the folders that they change to."""
+    parts = line.split(" && ")
+    with chdir("."):
+        for part in parts:
+            if part.startswith("cd ") and len(parts) > 1:
+                os.chdir(part.removeprefix("cd "))
+            else:
+                _command(part)
 
 
 def _command(line: str) -> None:

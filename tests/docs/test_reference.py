@@ -17,11 +17,12 @@ from scripts.site import api, commands, keys
 from scripts.site.gallery import ROOT
 from scripts.site.insert import INSERTS, LINE
 from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
+from tests.contract.test_linearize_command import KEYS
 
 TABLES = [(file, table) for file in keys.FILES for table in keys.tables(file)]
 # Of keys that measure nothing. Every other number has a unit.
 WITHOUT_UNIT = {"axis_a", "axis_b", "restitution", "N", "rtol", "atol", "max_rhs", "direction", "seed", "weights",
-                "normal", "joints"}  # fmt: skip
+                "normal", "joints", "members", "count"}  # fmt: skip
 
 
 def page(name: str) -> str:
@@ -107,7 +108,7 @@ def test_every_loop_type_has_its_rows() -> None:
 
 
 def test_every_json_key_array_and_error_is_named() -> None:
-    wanted = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS}
+    wanted = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS, "linearize": " ".join(KEYS)}
     for name, named in wanted.items():
         row = next(line for line in page("reference/json.md").splitlines() if line.startswith(f"| `{name}`"))
         assert [key for key in named.split() if not re.search(rf"\b{key}\b", row)] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ from ckc_pin import Mechanism, Simulator, load, simulate
 from ckc_pin.generated.library import compiled
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
+from ckc_pin.simulation.report import run_table
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import FIVE_BAR
+from tests.conftest import assert_close
 
+RUNNING = import_module("ckc_pin.simulation.simulate")  # whose name is also a function's
 SHIPPED = ["five_bar", "slider_crank_spatial", "bricard", "flyball", "andrews"]
 FREE, COUPLED = 18, 14  # of random ones: a free root on a damped spring; redundant rows, a coupling
 
@@ -110,3 +114,34 @@ def test_a_simulator_steps_with_them() -> None:
         u = np.array([0.1 * np.sin(k), 0.0])
         assert np.abs(ours.step(u, 2e-3).v_tree - theirs.step(u, 2e-3).v_tree).max() < 1e-7
     assert ours.stats["terms"] == "generated"
+
+
+def test_a_long_run_compiles_on_its_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once it has cost what compiling does, and from where it is; the motion is the same."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(RUNNING, "REPAYS", 300)
+    scene, changes = "five_bar/set_point", {"formulation": "reduced", "solver.rtol": 1e-9}
+    usual = simulate(scene, {**changes, "solver.terms": "pinocchio"})
+    assert usual.stats["rhs_by_terms"] == {"pinocchio": usual.stats["rhs"]}
+    long = simulate(scene, changes)
+    by_terms = long.stats["rhs_by_terms"]
+    assert long.stats["terms"] == "generated"
+    assert 300 <= by_terms["pinocchio"] < 330  # up to the end of a step
+    assert sum(by_terms.values()) == long.stats["rhs"] <= 1.1 * usual.stats["rhs"]
+    assert f"compiled after {by_terms['pinocchio']}" in " ".join(map(str, run_table(long).columns[1].cells))
+    assert_close(long.q_tree, usual.q_tree, 1e-8)
+    assert simulate(scene, changes).stats["rhs_by_terms"] == {"generated": pytest.approx(long.stats["rhs"], rel=0.1)}
+
+
+def test_a_run_that_is_nearly_done_does_not_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    changes = {"formulation": "reduced", "solver.rtol": 1e-9}
+    usual = simulate("five_bar/set_point", changes)
+    monkeypatch.setattr(RUNNING, "REPAYS", usual.stats["rhs"] - 30)
+    late = simulate("five_bar/set_point", changes)
+    assert late.stats["rhs_by_terms"] == usual.stats["rhs_by_terms"]
+    assert np.array_equal(late.q_tree, usual.q_tree)
+    monkeypatch.setattr(RUNNING, "REPAYS", 300)
+    monkeypatch.setattr("ckc_pin.generated.library._compiler", lambda: None)  # and neither does one that cannot
+    late = simulate("five_bar/set_point", changes)
+    assert np.array_equal(late.q_tree, usual.q_tree)

@@ -14,6 +14,7 @@ from ckc_pin.generated.library import compiled
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS
+from tests.joints.stepping_delta import SteppingDelta
 
 Made = Callable[..., Path]
 NAMES = ("theta_1", "theta_2", "theta_3", "theta_4")
@@ -94,6 +95,20 @@ def test_a_delta_falls_on_its_stops(with_joints: Made, restitution: float) -> No
         assert lower - 1e-10 <= q.min() <= q.max() <= upper + 1e-10
 
 
+@pytest.mark.parametrize("restitution", [0.0, 0.6])
+def test_a_time_stepping_scheme_converges_to_the_delta_s_impacts(with_joints: Made, restitution: float) -> None:
+    """First order, if not evenly: when an arm meets its stop is rounded to a step."""
+    folder = with_joints("delta", {name: {"stops": True, "restitution": restitution} for name in STOPS}, STOPS)
+    run = simulate(folder / "default.scene.toml", {"solver.rtol": 1e-11, "solver.output_dt": 0.0225, "t_end": 0.45})
+    assert len(run.events) > 3
+    arms = [run.column(name) for name in STOPS]
+    delta, start = SteppingDelta(folder, STOPS, restitution), run.q_tree[0, arms]
+    steps = np.array([400, 500, 640, 800, 1000, 1260, 1600, 2000])
+    errors = [np.abs(delta.run(start, 0.45, n, 20) - run.q_tree[1:, arms]).mean() for n in steps]
+    assert np.all(errors * steps < 2.5)
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] < -0.8
+
+
 def test_a_simulator_meets_what_a_run_does(with_joints: Made) -> None:
     scene = rubbing(with_joints) / "swing.scene.toml"
     run = simulate(scene, {"solver.rtol": 1e-11, "t_end": 1.0})
@@ -130,3 +145,15 @@ def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float
         assert run.status == "done", run.message
         assert [event["name"] for event in run.events] == [event["name"] for event in runs[0].events]
         assert_close(run.q_tree, runs[0].q_tree, 1e-8)
+
+
+def test_the_shipped_scene_that_rubs_and_stops() -> None:
+    runs = [simulate("five_bar/friction", {"formulation": f, "solver.rtol": 1e-11}) for f in FORMULATIONS]
+    one = runs[0]
+    names = [event["name"] for event in one.events]
+    assert {"theta_1 bounces", "theta_1 sticks", "theta_2 sticks", "theta_3 sticks"} < set(names)
+    for run in runs:
+        assert run.status == "done"
+        assert [event["name"] for event in run.events] == names
+        assert_close(run.q_tree, one.q_tree, 1e-8)
+        assert run.max_phi < 1e-12

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
-from ckc_pin import InputError, Run, simulate
+from ckc_pin import InputError, Run, load, simulate
+from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide
 
@@ -86,6 +87,18 @@ def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
     assert_close(run.events[1]["t"], np.arcsin(4.0 / 20.0 / 0.5 * rate) / rate, 1e-10)
 
 
+def test_what_goes_on_sticking_says_so_once(scene_of: Make) -> None:
+    """One block sticks all the time, another one bounces beside it."""
+    urdf = slide("a", "base", "one", 1.0) + slide("b", "base", "two", 1.0, 0.0)
+    mechanism = 'gravity = [-9.81, 0, 0]\n[[joint]]\nname = "a"\nfriction = 20.0\n' + stop("b", 0.5)
+    run = simulate(scene_of(urdf, mechanism, "q = {a = 0.0, b = 1.0}\n", 3.0), TIGHT)
+    names = [event["name"] for event in run.events]
+    assert names.count("a sticks") == 1
+    assert names.count("b bounces") > 10
+    assert names.count("b touches") == 1
+    assert set(names) == {"a sticks", "b bounces", "b touches"}
+
+
 def test_a_start_beyond_a_stop_is_refused(scene_of: Make) -> None:
     scene = scene_of(slide("x", "base", "block", 1.0, 0.0), stop("x", 0.5), "q = {x = -0.25}\n", 1.0)
     with pytest.raises(InputError, match=r"initial: x = -0.25 is beyond its stops, 0 to 1000"):
@@ -110,3 +123,33 @@ def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
     after = run.v_tree[run.t > 1.0][0]
     assert after[0] >= 0.6 - 1e-12
     assert np.all(after >= -1e-12)
+
+
+def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
+    """The guess closes with theta_2 at 0.248: beyond either pair of stops, in reach of them or not."""
+    joints, free = {"theta_2": {"stops": True}}, load("five_bar")
+    for lower, upper in [(0.4, 2.0), (-2.0, -0.3)]:
+        folder = with_joints("five_bar", joints, {"theta_2": (lower, upper)})
+        bar = load(folder)
+        there = bar.tree.to_coordinates(bar.q_tree)
+        assert lower - 1e-9 < there[1] < upper + 1e-9
+        assert np.abs(FIVE_BAR.phi(there)).max() < 1e-12
+        assert any("theta_2 = " in said and "without them 0.2478" in said for said in bar.warnings)
+        if lower > 0:
+            # as near as can be: no further off than from there along theta_2 alone, the others following
+            assert np.linalg.norm(there - free.tree.to_coordinates(free.q_tree)) < 0.5
+        run = simulate(folder / "swing.scene.toml", {"initial": {"at": "assembled"}, "t_end": 0.1})
+        assert run.status == "done"
+        assert run.max_phi < 1e-12
+        column = run.q_tree[:, run.column("theta_2")]
+        assert lower - 1e-10 < column.min() <= column.max() < upper + 1e-10
+
+
+def test_stops_that_the_loops_cannot_keep_are_left(with_joints: Make) -> None:
+    folder = with_joints("delta", {"swing_1a": {"stops": True}, "arm_1": {"stops": True}}, {
+        "swing_1a": (2.5, 2.6), "arm_1": (1.5, 1.6),
+    })  # fmt: skip
+    delta = load(folder)
+    assert_close(delta.q_tree, load("delta").q_tree, 0)
+    with pytest.raises(InputError, match=r"is beyond its stops, .* give another initial.q, or a q_guess within them"):
+        simulate(folder / "default.scene.toml")

@@ -25,6 +25,7 @@ CONTROLLED = [
     if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
 ]
 T_END = {"andrews": 0.01}  # s; open loop, what is off grows by e in 2 ms there, and rounding differs by machine
+AT_REST = 1e-12  # of the fastest coordinate: rounding of a rate that is zero, as at a turn
 ROUNDED = 1e-9  # of the largest row of J: a row of zeros
 
 
@@ -50,7 +51,8 @@ def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
     """Eq. 1 and its closure, differentiated twice, as one linear system in a and lambda; rows of one size."""
     J, n = terms.at.J, mechanism.n
     u_tree = mechanism.motors.force(tau)
-    u_tree -= mechanism.joints.friction * np.sign(terms.v_tree)
+    resting = np.abs(terms.v_tree) <= AT_REST * np.abs(terms.v_tree).max(initial=0.0)
+    u_tree -= mechanism.joints.friction * np.where(resting, 0.0, np.sign(terms.v_tree))
     force = u_tree + terms.damping_force - terms.bias_tree
     unit = np.sqrt(np.abs(terms.D_tree).max() or 1.0)
     size = np.linalg.norm(J, axis=1, keepdims=True)

@@ -16,13 +16,14 @@ from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.value import located, map_value, name_of
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
-from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import nodes_at, solutions
+from ckc_pin.mechanism.kinds import require_callable, require_kind
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene import TAKES, Scene, load_scene
 
 __all__ = ["singularity_map"]
 
@@ -69,8 +70,15 @@ def singularity_map(
     InputError
         d = 0, no loops, no point for the Cartesian space, unknown names, a scene without a desired trajectory.
     """
+    found = as_mechanism(mechanism, "singularity_map")
+    if scene is not None:
+        require_kind(scene, (Scene, str, FilePath), "singularity_map: scene", TAKES)
+    require_kind(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
+    if isinstance(over, str):
+        raise InputError(f"singularity_map: over: {over!r} was given; it takes one or two names, as [{over!r}]")
+    require_callable(progress, "singularity_map: progress", "a function of the part that is done")
     named = mechanism if isinstance(mechanism, str | FilePath) else mechanism.name
-    mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
+    mechanism = found
     if mechanism.d == 0:
         raise InputError(
             f"{mechanism.name}: d = 0, the loops leave no freedom, there is nothing to map; leave out a loop"

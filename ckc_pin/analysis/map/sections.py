@@ -20,7 +20,7 @@ from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.value import located, map_value
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Task, extend, find_point
-from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import SHORTEST, follow, nodes_at
 from ckc_pin.mechanism.linear import one_blas_thread
@@ -74,7 +74,7 @@ def workspace_sections(
     InputError
         No loops, no such point, or one whose three coordinates do not tell the configuration.
     """
-    mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
+    mechanism = as_mechanism(mechanism, "workspace_sections")
     if not mechanism.dependent:
         raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere; map one that has")
     for name, value, (least, most) in (("sections", count, COUNTS), ("cells", cells, CELLS)):

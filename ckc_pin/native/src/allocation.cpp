@@ -8,6 +8,8 @@ namespace ckc {
 constexpr double infinity = std::numeric_limits<double>::infinity();
 constexpr double rounding = 1e-13;  // of u, scaled: what a tau may miss it by
 constexpr double flat = 1e-12;      // of the dual's largest curvature: a direction in which it has none
+constexpr double gives = 1e-7;      // of that curvature: added where u is out of reach
+constexpr double settled = 1e-6;    // how far from 1 the length of Newton's last step is
 constexpr int most = 50;            // steps; random problems take at most 10
 
 Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector preload)
@@ -39,11 +41,12 @@ void Allocation::share(const Matrix& transmission, In u, Out tau) {
   }
   if (!(tau.array().abs() > limit.array()).any()) return;
   unlimited_ = tau;
-  if (redundant_ && within_limits(transmission, u, tau)) return;
+  if (redundant_ && (within_limits(transmission, u, tau, 0.0) || within_limits(transmission, u, tau, gives))) return;
   tau = unlimited_, clip(tau);
 }
 
-bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {
+// With `give`, of the largest curvature, u may be missed, at a price of the miss squared by `give`.
+bool Allocation::within_limits(const Matrix& transmission, In u, Out tau, double give) {
   const auto m = transmission.rows();
   for (Eigen::Index i = 0; i < row_scale_.size(); ++i) row_scale_(i) = 1.0 / std::max(transmission.col(i).norm(), 1e-300);
   scaled_ = transmission, scaled_.array().rowwise() *= row_scale_.array().transpose();
@@ -53,18 +56,23 @@ bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {
     if (std::isfinite(limit(k))) size += limit(k) * scaled_.row(k).norm();
     steepest += scaled_.row(k).squaredNorm() / weights_(k);
   }
-  multiplier_.setZero();
+  multiplier_.setZero(), free_.assign(m, 0), give *= steepest;
+  bool whole = false;
   for (int step = 0; step < most; ++step) {
     raw_.noalias() = scaled_ * multiplier_;
-    if (step && beyond(u, rounding * size)) return false;
+    if (step && give == 0.0 && beyond(u, rounding * size)) return false;
     raw_ = preload_ + raw_.cwiseQuotient(weights_);
     tau = raw_, clip(tau);
-    rest_ = u.cwiseProduct(row_scale_), rest_.noalias() -= scaled_.transpose() * tau;
-    if (rest_.norm() <= rounding * size) return true;
+    rest_ = u.cwiseProduct(row_scale_) - give * multiplier_, rest_.noalias() -= scaled_.transpose() * tau;
+    const bool solved = rest_.norm() <= rounding * size;
+    bool same = whole;
     curvature_.setZero();
-    for (Eigen::Index k = 0; k < m; ++k)
-      if (std::abs(raw_(k)) < limit(k))
-        curvature_.noalias() += (1.0 / weights_(k)) * scaled_.row(k).transpose() * scaled_.row(k);
+    for (Eigen::Index k = 0; k < m; ++k) {
+      const int is_free = std::abs(raw_(k)) < limit(k);
+      same &= free_[k] == is_free, free_[k] = is_free;
+      if (is_free) curvature_.noalias() += (1.0 / weights_(k)) * scaled_.row(k).transpose() * scaled_.row(k);
+    }
+    if (solved || same) return true;
     eigen_.compute(curvature_);
     coefficients_.noalias() = eigen_.eigenvectors().transpose() * rest_;
     const Vector& values = eigen_.eigenvalues();
@@ -74,7 +82,9 @@ bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {
     const bool straight = std::sqrt(level) > rounding * size;
     for (Eigen::Index i = 0; i < values.size(); ++i) {
       const bool curved = values(i) > flat * steepest;
-      if (straight)
+      if (give > 0.0)
+        coefficients_(i) /= values(i) + give;
+      else if (straight)
         coefficients_(i) = curved ? 0.0 : coefficients_(i);
       else
         coefficients_(i) = curved ? coefficients_(i) / values(i) : 0.0;
@@ -83,9 +93,10 @@ bool Allocation::within_limits(const Matrix& transmission, In u, Out tau) {
     rise_ = direction_.dot(rest_);
     slope_.noalias() = scaled_ * direction_;
     slope_ = slope_.cwiseQuotient(weights_);
-    const double length = along();
+    const double length = along(give * direction_.squaredNorm());
     if (!std::isfinite(length)) return false;
     multiplier_ += length * direction_;
+    whole = give > 0.0 && std::abs(length - 1.0) < settled;
   }
   return false;
 }
@@ -104,8 +115,8 @@ bool Allocation::beyond(In u, double least) const {
   return multiplier_.dot(u.cwiseProduct(row_scale_)) > most;
 }
 
-// Along direction_ the dual's slope falls from rise_ by w slope^2 for every motor while it is within its limits.
-double Allocation::along() {
+// Along direction_ the dual's slope falls from rise_ by w slope^2 for every motor while it is within its limits, and `bent`.
+double Allocation::along(double bent) {
   const auto m = slope_.size();
   Eigen::Index count = 0;
   for (Eigen::Index k = 0; k < m; ++k) {
@@ -120,7 +131,7 @@ double Allocation::along() {
   for (Eigen::Index i = 0; i <= count; ++i) {
     const double end = i < count ? ends_(i) : infinity;
     if (!(end > at)) continue;
-    double bend = 0.0;
+    double bend = bent;
     for (Eigen::Index k = 0; k < m; ++k)
       if (enters_(k) <= at && leaves_(k) > at) bend += weights_(k) * slope_(k) * slope_(k);
     if (bend > 0.0 && left <= bend * (end - at)) return at + left / bend;

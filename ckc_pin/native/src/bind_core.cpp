@@ -66,8 +66,6 @@ Closure closure_of(const nb::dict& table) {
   return c;
 }
 
-namespace {
-
 SpringTable springs_of(const nb::dict& table) {
   SpringTable s;
   s.point_joint = get<Indices>(table, "point_joint");
@@ -82,6 +80,8 @@ SpringTable springs_of(const nb::dict& table) {
   return s;
 }
 
+namespace {
+
 JointTable joints_of(const nb::dict& table) {
   return {get<Vector>(table, "friction"),    get<Vector>(table, "lower"), get<Vector>(table, "upper"),
           get<Vector>(table, "restitution"), get<Vector>(table, "reach"), get<double>(table, "smoothing")};
@@ -89,13 +89,14 @@ JointTable joints_of(const nb::dict& table) {
 
 }  // namespace
 
+std::unique_ptr<Written> written_of(const nb::tuple& library) {
+  return std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
+}
+
 std::unique_ptr<Core> core_of(const nb::dict& table) {
   Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
   std::unique_ptr<Written> written;
-  if (table.contains("written")) {
-    const auto library = nb::cast<nb::tuple>(table["written"]);
-    written = std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
-  }
+  if (table.contains("written")) written = written_of(nb::cast<nb::tuple>(table["written"]));
   auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
                                      closure_of(nb::cast<nb::dict>(table["closure"])),
                                      springs_of(nb::cast<nb::dict>(table["springs"])),
@@ -149,6 +150,24 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   return acceleration;
 }
 
+// How eq. 1's acceleration changes by (q', v', u'), tangent, and the rows' parts; none where J has lost rank.
+nb::object derivatives(Core& core, Given q_tree, Given v_tree, Given u_tree) {
+  require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
+  const int n = core.n, m = core.rows.closure.rows;
+  Vector a(n);
+  Matrix by_q, by_v, by_u;
+  core.set(q_tree, true), core.set_velocity(v_tree);
+  if (!core.dae_acceleration(u_tree, Vector::Zero(m), a) || !core.differentiate(u_tree, a)) return nb::none();
+  const Derivatives& by = core.derivatives;
+  if (!core.respond(-by.force_by_q, by.row_by_q, by_q) || !core.respond(-by.force_by_v, by.row_by_v, by_v) ||
+      !core.respond(Matrix::Identity(n, n), Matrix::Zero(m, n), by_u))
+    return nb::none();
+  nb::dict found;
+  found["a"] = a, found["by_q"] = by_q, found["by_v"] = by_v, found["by_u"] = by_u;
+  found["rate_by_q"] = by.rate_by_q, found["J"] = by.J;
+  return found;
+}
+
 }  // namespace
 
 nb::object term_of(Core& core, const std::string& name) {
@@ -198,7 +217,8 @@ void bind_core(nb::module_& m) {
       .def("jacobian", &jacobian, "q_tree"_a)
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)
-      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a);
+      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a)
+      .def("derivatives", &derivatives, "q_tree"_a, "v_tree"_a, "u_tree"_a);
 }
 
 }  // namespace ckc

@@ -6,19 +6,22 @@
 #include <nanobind/stl/unique_ptr.h>
 
 #include "bind_run.hpp"
+#include "written.hpp"
 #include "printed_spf.hpp"
+#include "varied.hpp"
 
 namespace ckc {
 
 using namespace nb::literals;
+
+const char* const reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
+                               "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
 
 namespace {
 
 using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 constexpr const char* changes[] = {"sticks", "slides", "touches", "leaves", "bounces"};
-constexpr const char* reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
-                                   "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
 constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague"};
 constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
@@ -29,13 +32,24 @@ std::unique_ptr<System> system_of(Core& core, Control& control, const nb::dict& 
   if (kind == "dae") {
     const double alpha = get<double>(table, "alpha"), beta = get<double>(table, "beta");
     require(alpha >= 0 && beta >= 0, "alpha and beta must not be negative");
-    return std::make_unique<Dae>(core, control, tolerance, get<bool>(table, "projects"), alpha, beta);
+    const bool projects = get<bool>(table, "projects");
+    if (table.contains("variation")) {
+      require(projects && alpha == 0 && beta == 0, "variation: of a motion that is put back on the closure");
+      return std::make_unique<Varied<Dae>>(variation_of(nb::cast<nb::dict>(table["variation"])), core, control, tolerance,
+                                           projects, alpha, beta);
+    }
+    return std::make_unique<Dae>(core, control, tolerance, projects, alpha, beta);
   }
   const double epsilon = get<double>(table, "epsilon");
   const bool actual = get<bool>(table, "actual");
   require(epsilon > 0, "epsilon must be positive");
-  if (kind == "level_set")
-    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "slack"));
+  if (kind == "level_set") {
+    const double slack = get<double>(table, "slack");
+    if (!table.contains("variation"))
+      return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, slack);
+    return std::make_unique<Varied<LevelSet>>(variation_of(nb::cast<nb::dict>(table["variation"])), core, control, epsilon,
+                                              actual, tolerance, slack);
+  }
   require(kind == "printed" && core.tree.roots.empty(), "eq. 8 as printed has no free root: its place is no number");
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
@@ -64,28 +78,44 @@ Event event_of(const nb::tuple& row, const Core& core, const std::shared_ptr<Vie
   return event;
 }
 
-void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
-          const nb::list& events) {
-  new (self) Run;
-  self->core = core_of(core);
-  auto acting = control_of(control, *self->core, self->view);
-  auto system = system_of(*self->core, *acting, formulation);
+}  // namespace
+
+void prepare(Run& run, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
+             const nb::dict& solver, const nb::list& events) {
+  run.core = core_of(core);
+  auto acting = control_of(control, *run.core, run.view);
+  auto system = system_of(*run.core, *acting, formulation);
   const Options options{get<std::string>(solver, "method"), get<double>(solver, "rtol"),   get<double>(solver, "atol"),
                         get<double>(solver, "max_step"),    get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
                         get<double>(solver, "closed")};
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
   std::vector<Event> functions;
-  for (const auto& row : events) functions.push_back(event_of(nb::cast<nb::tuple>(row), *self->core, self->view));
-  self->core->profile.on = get<bool>(solver, "profile");
-  self->loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(functions));
+  for (const auto& row : events) functions.push_back(event_of(nb::cast<nb::tuple>(row), *run.core, run.view));
+  run.core->profile.on = get<bool>(solver, "profile");
+  run.loop = std::make_unique<Loop>(std::move(acting), std::move(system), options, std::move(functions));
+}
+
+namespace {
+
+void make(Run* self, const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
+          const nb::list& events) {
+  new (self) Run;
+  prepare(*self, core, formulation, control, solver, events);
 }
 
 void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {
   const Core& core = *run.core;
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(w, core.rows.closure.rows, "w");
   require(std::isfinite(t), "t: a number is not finite");
-  run.view->calls = 0;
+  run.view->calls = 0, run.rhs_before = 0;
   run.loop->start(t, q_tree, v_tree, w);
+}
+
+// From here on the core has terms that are written out.
+void write(Run& run, const nb::tuple& library) {
+  if (!run.core->written) run.rhs_before = run.loop->work.rhs;
+  run.core->written = written_of(library);
+  run.loop->settle_core();
 }
 
 void record(Run& run, Given instants, Rows rows) {
@@ -155,16 +185,20 @@ nb::tuple trouble(Run& run) {
 nb::dict stats(const Run& run) {
   const Loop& loop = *run.loop;
   const Counts& counts = loop.system->counts;
-  nb::dict found, by_method;
+  nb::dict found, by_method, by_terms;
   long steps = 0;
   for (int k = 0; k < 3; ++k) {
     steps += loop.steps[k];
     if (loop.steps[k]) by_method[methods[k]] = loop.steps[k];
   }
   found["terms"] = run.core->written ? "generated" : "pinocchio";
+  if (run.core->written) by_terms["generated"] = loop.work.rhs - run.rhs_before;
+  if (run.rhs_before || !run.core->written) by_terms["pinocchio"] = run.core->written ? run.rhs_before : loop.work.rhs;
+  found["rhs_by_terms"] = by_terms;
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;
   found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + loop.work.factorizations;
-  found["jacobians"] = loop.work.jacobians, found["switches"] = counts.switches;
+  found["jacobians"] = loop.work.jacobians, found["differences"] = counts.differences;
+  found["switches"] = counts.switches;
   found["method"] = loop.method() ? loop.method()->name() : "";
   found["steps_by_method"] = by_method, found["python_calls"] = run.view->calls;
   return found;
@@ -236,6 +270,8 @@ void bind_loop(nb::module_& m) {
       .def("step", &step, "u"_a, "of_motors"_a, "until"_a, "pause"_a)
       .def("record", &record, "instants"_a, "rows"_a)
       .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
+      .def("write", &write, "library"_a)
+      .def("pause_at", [](Run& run, long rhs) { run.loop->pause_at = rhs; }, "rhs"_a)
       .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)
       .def("state", &state)
       .def("trouble", &trouble)
@@ -252,6 +288,7 @@ void bind_loop(nb::module_& m) {
       .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->y()); })
       .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });
   bind_parts(m, loop);
+  bind_variation(loop);
 }
 
 }  // namespace ckc

@@ -9,4 +9,5 @@ NB_MODULE(_core, m) {
   ckc::bind_core(m);
   ckc::bind_loop(m);
   ckc::bind_gate(m);
+  ckc::bind_batch(m);
 }

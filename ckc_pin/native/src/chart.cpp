@@ -2,6 +2,10 @@
 
 #include <algorithm>
 
+#include <Eigen/LU>
+
+#include "rotation.hpp"
+
 namespace ckc {
 
 constexpr double far = 1.0;  // rad from the reference: a third of the way to where rotation vectors end
@@ -48,6 +52,27 @@ void Chart::rate(const Core& core, In q_tree, In q_dot, Out rate) const {
     put(turn * three(q_dot, root.k), root.k, rate);
     put(Jlog3(root.reference.transpose() * turn) * three(q_dot, root.k + 3), root.k + 3, rate);
   }
+}
+
+void Chart::jacobian(const Core& core, In q_tree, In q_dot, Matrix& jacobian) const {
+  const int d = core.d;
+  Matrix rates = Matrix::Identity(d, d), changes = Matrix::Zero(d, d);  // of the numbers by q_dot, and how they change
+  for (const Root& root : roots_) {
+    const Matrix3 turn = core.tree.orientation(q_tree, root.at);
+    const LogRate log(log3(root.reference.transpose() * turn));
+    const Vector3 move = three(q_dot, root.k), spin = three(q_dot, root.k + 3);
+    for (int i = 0; i < 3; ++i) {
+      const Vector3 axis = Vector3::Unit(i), along = log.value * axis;
+      rates.col(root.k[i]).setZero(), rates.col(root.k[3 + i]).setZero();
+      put(turn * axis, root.k, rates.col(root.k[i])), put(along, root.k + 3, rates.col(root.k[3 + i]));
+      put(turn * axis.cross(move), root.k, changes.col(root.k[3 + i]));
+      put(log.along(along) * spin, root.k + 3, changes.col(root.k[3 + i]));
+    }
+  }
+  const Matrix steps = rates.inverse();  // by the numbers
+  jacobian.topLeftCorner(d, d) = changes * steps;
+  jacobian.topRightCorner(d, d) = rates;
+  jacobian.bottomLeftCorner(d, d) = Matrix(jacobian.bottomLeftCorner(d, d) * steps);
 }
 
 bool Chart::outgrown(In numbers) const {

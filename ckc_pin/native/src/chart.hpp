@@ -15,6 +15,8 @@ class Chart {
   void step(const Core& core, In q_tree, In numbers, Out step) const;
   // Rate of the numbers at tangent velocity q_dot.
   void rate(const Core& core, In q_tree, In q_dot, Out rate) const;
+  // From d (q_dot, q_ddot) / d (tangent step, q_dot) to d (rate, q_ddot) / d (numbers, q_dot), in place.
+  void jacobian(const Core& core, In q_tree, In q_dot, Matrix& jacobian) const;
   // Whether an orientation has turned so far from its reference that the chart should follow.
   bool outgrown(In numbers) const;
 

@@ -76,11 +76,14 @@ struct Places {
 
 // A mechanism from Python's tables; one of its terms by name.
 std::unique_ptr<Core> core_of(const nb::dict& table);
+std::unique_ptr<Written> written_of(const nb::tuple& library);  // (path, parameters)
 Closure closure_of(const nb::dict& table);
+SpringTable springs_of(const nb::dict& table);
 nb::object term_of(Core& core, const std::string& name);
 
 void bind_core(nb::module_& m);
 void bind_loop(nb::module_& m);
 void bind_gate(nb::module_& m);
+void bind_batch(nb::module_& m);
 
 }  // namespace ckc

@@ -4,6 +4,8 @@
 
 namespace ckc {
 
+constexpr double realised = 1e-9;  // of u: what motors make of it is it
+
 SetPoint::SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d)
     : K_P_(std::move(K_P)),
       K_V_(std::move(K_V)),
@@ -186,20 +188,31 @@ Measured Control::in_own_q(const Measured& at) {
   return {at.t, at.core, q_, q_dot_, at.v_tree, at.rate};
 }
 
-bool SetPoint::slopes(Matrix& by_q, Matrix& by_q_dot) const { return by_q = -K_P_, by_q_dot = -K_V_, true; }
-
-// Where an actuator is at its limit, it does not answer.
-bool Control::slopes(Matrix& by_q, Matrix& by_v) {
-  const auto n = static_cast<int>(u_tree.size());
-  by_q.setZero(n, n), by_v.setZero(n, n);
-  if (!feedback()) return true;
-  if (law->of_motors()) return law->slopes(slope_, slope_dot_);
-  if (!actuation_.direct || !law->slopes(slope_, slope_dot_)) return false;
-  for (size_t i = 0; i < own_.size(); ++i) {
-    if (actuation_.limited(tau, static_cast<Eigen::Index>(i))) continue;
-    for (size_t k = 0; k < own_.size(); ++k)
-      by_q(own_[i], own_[k]) = slope_(i, k), by_v(own_[i], own_[k]) = slope_dot_(i, k);
+bool SetPoint::slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) {
+  for (size_t k = 0; k < own.size(); ++k) {
+    const auto column = static_cast<Eigen::Index>(k);
+    by_q.col(own[k]) = -K_P_.col(column), by_v.col(own[k]) = -K_V_.col(column);
   }
+  return true;
+}
+
+// Where an actuator is at its limit, it does not answer. Motors that are not q's own share u: as long as they amount to
+// it, it does not matter which.
+bool Control::slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force) {
+  const auto n = u_tree.size();
+  by_q.setZero(n, n), by_v.setZero(n, n);
+  force = u_tree;
+  slope_.setZero(u.size(), n), slope_dot_.setZero(u.size(), n);
+  if (!acts() || of_motors()) return !feedback() || law->slopes(core, own_, slope_, slope_dot_);
+  if (!actuation_.direct) {
+    if (!((u - wanted_).norm() <= realised * wanted_.norm())) return false;
+    force.setZero();
+    for (size_t i = 0; i < own_.size(); ++i) force(own_[i]) = u(static_cast<Eigen::Index>(i));
+  }
+  if (!feedback()) return true;
+  if (!law->slopes(core, own_, slope_, slope_dot_)) return false;
+  for (Eigen::Index i = 0; i < u.size(); ++i)
+    if (answers(i)) by_q.row(own_[i]) = slope_.row(i), by_v.row(own_[i]) = slope_dot_.row(i);
   return true;
 }
 
@@ -225,7 +238,7 @@ bool Control::act(const Measured& at) {
   else if (torques)
     actuation_.drive(tau, u_tree);
   else
-    actuation_.apply(at.core, u, tau, u_tree);
+    wanted_ = u, actuation_.apply(at.core, u, tau, u_tree);
   return true;
 }
 

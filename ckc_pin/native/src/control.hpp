@@ -41,8 +41,8 @@ class Controller {
   virtual double lyapunov(const Measured&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it looks at terms of q's own partition, or at q and q_dot alone.
   virtual bool needs_terms() const { return true; }
-  // d u / d q and d u / d q_dot where they are known; false where not.
-  virtual bool slopes(Matrix&, Matrix&) const { return false; }
+  // d u / d q' and d u / d v', tangent, of the last u, at the core's state; zero so far; `own`: q. False where unknown.
+  virtual bool slopes(Core&, const Indices&, Matrix&, Matrix&) { return false; }
 };
 
 // Eq. 14.
@@ -52,7 +52,7 @@ class SetPoint : public Controller {
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
-  bool slopes(Matrix& by_q, Matrix& by_q_dot) const override;
+  bool slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) override;
 
  private:
   Matrix K_P_, K_V_;
@@ -67,6 +67,7 @@ class Tracking : public Controller {
   Tracking(Matrix Lambda, Matrix K_D, std::unique_ptr<Motion> desired, std::unique_ptr<Core> model, bool actual);
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
+  bool slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) override;
 
  private:
   Matrix Lambda_, K_D_;
@@ -84,7 +85,7 @@ class Torques : public Controller {
   bool u(const Measured& at, Out tau, Problem& problem) override;
   bool of_motors() const override { return true; }
   bool needs_terms() const override { return false; }
-  bool slopes(Matrix&, Matrix&) const override { return true; }  // none
+  bool slopes(Core&, const Indices&, Matrix&, Matrix&) override { return true; }  // none
 
  private:
   Vector times_;
@@ -153,8 +154,11 @@ class Control {
   bool needs_terms() const {
     return acts() && ((feedback() && law->needs_terms()) || !(actuation_.direct || of_motors()));
   }
-  // d u' / d q' and d u' / d v', joints of one freedom alone, where u' was found last; false where that is not known.
-  bool slopes(Matrix& by_q, Matrix& by_v);
+  // d u' / d q' and d u' / d v' where u' was found last; false where that is not known.
+  // `force`: what acts, where eq. 6's force is meant as that alone on q.
+  bool slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
+  // Whether a motor that is q's own is not at its limit.
+  bool answers(Eigen::Index k) const { return !(actuation_.direct && actuation_.limited(tau, k)); }
   // Whether u follows the state between samples.
   bool feedback() const { return law && !(sampling && sampling->holds); }
   bool act(const Measured& at);
@@ -170,7 +174,7 @@ class Control {
   Measured in_own_q(const Measured& at);
   Actuation actuation_;
   const Indices own_;  // q, whatever the coordinates of the motion are
-  Vector sampled_, asked_, pushed_, q_, q_dot_;
+  Vector sampled_, asked_, pushed_, q_, q_dot_, wanted_;
   Matrix slope_, slope_dot_, to_own_;
 };
 

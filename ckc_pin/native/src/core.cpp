@@ -1,6 +1,8 @@
 #include "core.hpp"
 #include "written.hpp"
 
+#include <Eigen/LU>
+
 #include <algorithm>
 #include <cmath>
 
@@ -20,6 +22,7 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
       scales(std::move(scales_)),
       d(0),
       written(std::move(written_)),
+      derivatives(tree, rows.closure, springs.table),
       qr_(std::max(rows.closure.rows, 1), n) {
   const int m = rows.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
@@ -44,6 +47,45 @@ void Core::split(Indices q_, Indices z_) {
   basis_q_ = q, basis_z_ = z, basis_at_ = -1;
   D_factor.shape(d);
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
+}
+
+Eigen::Index Core::size_of(Number what) const {
+  const Eigen::Index m = rows.closure.rows;
+  switch (what) {
+    case Number::gravity: return 3;
+    case Number::offset: case Number::centre: return 3 * tree.joints;
+    case Number::mass: return tree.joints;
+    case Number::inertia: return 9 * tree.joints;
+    case Number::point: return 3 * static_cast<Eigen::Index>(rows.closure.point_local.size());
+    case Number::length: case Number::affine_offset: return m;
+    case Number::affine: return m * n;
+    case Number::end: return 6 * springs.count();
+    case Number::stiffness: case Number::rest_length: case Number::damping: return springs.count();
+    case Number::written: return written ? written->parameters() : 0;
+    default: return n;
+  }
+}
+
+void Core::vary(Number what, In numbers) {
+  const int k = static_cast<int>(what);
+  const auto from = [k](Number first) { return k - static_cast<int>(first); };
+  if (what == Number::written)
+    written->vary(numbers);
+  else if (what >= Number::end)
+    springs.vary(static_cast<Springs::Number>(from(Number::end)), numbers);
+  else if (what >= Number::point)
+    rows.vary(static_cast<Rows::Number>(from(Number::point)), numbers);
+  else
+    tree.vary(static_cast<Tree::Number>(k), numbers);
+  here_ = 0, basis_at_ = -1, ++sets;
+}
+
+bool Core::reversed() {
+  if (rows.closure.rows != static_cast<int>(z.size()) || z.empty()) return false;
+  Matrix square(z.size(), z.size());
+  jacobian();
+  for (size_t k = 0; k < z.size(); ++k) square.col(k) = rows.J.col(z[k]);
+  return square.partialPivLu().determinant() < 0.0;
 }
 
 void Core::set(In q_tree_, bool with_inertia) {

@@ -6,6 +6,7 @@
 
 #include <Eigen/QR>
 
+#include "derivatives.hpp"
 #include "joints.hpp"
 #include "linear.hpp"
 #include "rows.hpp"
@@ -34,6 +35,17 @@ class Core {
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
+  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.parameters` has them in, and what the code that
+  // is written out takes; nothing that was computed before is known after it.
+  enum class Number {
+    gravity, offset, mass, centre, inertia, armature, point, length, affine, affine_offset, end, stiffness, rest_length,
+    damping, joint_stiffness, joint_rest, joint_damping, constant, written,
+  };
+  Eigen::Index size_of(Number what) const;
+  void vary(Number what, In numbers);
+  // Whether det phi_z is negative here; false where phi_z is not square.
+  bool reversed();
+
   Tree tree;
   Rows rows;
   Springs springs;
@@ -43,7 +55,7 @@ class Core {
   int d;
   Indices q, z;
   Profile profile;
-  const std::unique_ptr<Written> written;  // the terms of the tree and the rows; null: Pinocchio's
+  std::unique_ptr<Written> written;  // the terms of the tree and the rows; null: Pinocchio's
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
@@ -94,6 +106,13 @@ class Core {
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
   bool responses(const Indices& at, Matrix& columns);
+  // How the terms change at the core's state, where the tree accelerates under u'; false where nothing tells J^T lambda.
+  bool differentiate(In u_tree, In acceleration);
+  Derivatives derivatives;
+  // The least lambda for which J^T lambda is this.
+  void multipliers(In force, Out lambda);
+  // How eq. 1's acceleration changes with forces and with what J a is to lack, a column each; false where J has lost rank.
+  bool respond(const Matrix& force, const Matrix& residual, Matrix& change);
   // The same as `dae_acceleration` at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
   bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 

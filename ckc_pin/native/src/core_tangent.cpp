@@ -169,6 +169,38 @@ bool Core::responses(const Indices& at, Matrix& columns) {
   return true;
 }
 
+void Core::multipliers(In force, Out lambda) {
+  if (!rows.closure.rows) return;
+  jacobian();
+  Eigen::ColPivHouseholderQR<Matrix> transposed;
+  transposed.setThreshold(scales.rank);
+  transposed.compute(scales.columns.asDiagonal() * rows.J.transpose() * scales.rows.asDiagonal());
+  lambda = scales.rows.cwiseProduct(transposed.solve(scales.columns.cwiseProduct(force)));
+}
+
+bool Core::differentiate(In u_tree, In acceleration) {
+  bias(), tree_inertia();
+  Vector force(n), lambda = Vector::Zero(rows.closure.rows);
+  D_times(acceleration, force);
+  force += bias_tree - damping_tree - u_tree;
+  multipliers(force, lambda);
+  derivatives.compute(q_tree, v_tree, acceleration, lambda);
+  return derivatives.force_by_q.allFinite() && derivatives.row_by_q.allFinite();
+}
+
+bool Core::respond(const Matrix& force, const Matrix& residual, Matrix& change) {
+  change.resize(n, force.cols());
+  for (Eigen::Index k = 0; k < force.cols(); ++k) {
+    residual_ = residual.col(k);
+    if (!tangent_basis(residual_, singular)) return false;
+    if (!k) tangent_inertia();
+    D_times(x_, y_);
+    y_ = force.col(k) - y_;
+    with_force(y_, change.col(k));
+  }
+  return true;
+}
+
 bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
   return written && written->acceleration(q_tree, v, u_tree, correction, acceleration);
 }

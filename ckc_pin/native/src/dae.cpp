@@ -83,23 +83,38 @@ bool Dae::rate(double t, In v, Out y_dot) {
   return finite(y_dot) || fails(Trouble::infinite);
 }
 
-// Exact where the terms are written out, no joint is held, and what acts is known to depend on joints of one freedom
-// alone, or not at all.
+// In numbers: a free root's quaternion stands for the rotation that it is normalised to.
 bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const int n = core.n, nq = core.tree.nq;
-  const Joints& joints = core.joints;
-  if (!core.written || !joints.locked.empty() || joints.smooth() || stabilised() || (control.feedback() && nq != n) || !finite(y))
-    return System::jacobian(t, y, jacobian, evaluations);
+  if (!finite(y)) return false;
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
-  if (control.needs_terms()) place(y);
+  if (!core.written || !core.joints.locked.empty() || control.needs_terms() || stabilised()) place(y), core.set_velocity(v);
   if (!forces(t, q_tree_, v)) return false;
-  if (!control.slopes(by_q_, by_v_) || !core.written->jacobian(q_tree_, v, acting(v), jacobian, by_u_))
-    return System::jacobian(t, y, jacobian, evaluations);
-  if (control.feedback()) {  // joints of one freedom alone
-    jacobian.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
-    jacobian.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
+  residual_.setZero();
+  if (stabilised()) {
+    residual_.noalias() = core.rows.J * v;
+    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
+  }
+  if (!slopes(q_tree_, v, residual_, by_q_, by_v_)) return System::jacobian(t, y, jacobian, evaluations);
+  if (stabilised() && core.rows.closure.rows) {
+    const Derivatives& by = core.derivatives;
+    const Matrix none = Matrix::Zero(n, n);
+    if (!core.respond(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, more_)) return false;
+    by_q_ += more_;
+    if (!core.respond(none, 2 * alpha_ * by.J, more_)) return false;
+    by_v_ += more_;
+  }
+  jacobian.setZero(nq + n, nq + n);
+  for (int k = 0; k < n; ++k) core.tree.configuration_rate(q_tree_, Vector::Unit(n, k), jacobian.col(nq + k).head(nq));
+  jacobian.bottomRightCorner(n, n) = by_v_;
+  if (nq == n) {
+    jacobian.bottomLeftCorner(n, n) = by_q_;
+  } else {
+    const Matrix tangents = core.tree.tangents(y.head(nq));
+    jacobian.topLeftCorner(nq, nq) = core.tree.rate_changes(q_tree_, v) * tangents;
+    jacobian.bottomLeftCorner(n, nq) = by_q_ * tangents;
   }
   return jacobian.allFinite();
 }

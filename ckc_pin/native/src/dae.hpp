@@ -41,7 +41,7 @@ class Dae : public System {
   const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
   Vector q_tree_, step_, z_step_, residual_, unforced_;
-  Matrix by_u_, by_q_, by_v_;
+  Matrix by_q_, by_v_, more_;
 };
 
 }  // namespace ckc

@@ -36,6 +36,8 @@ bool JointChanges::take_state(double t, In y) {
 bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
   if (!take_state(t, y)) return false;
   const Vector& reach = joints_.table.reach;
+  const bool known = known_ && !met.empty();
+  if (known && !system_.before_change(t, y, timed(met))) return false;
   joints_.account(coordinates);
   // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
   rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
@@ -57,9 +59,18 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
     slips_ |= event.of == Event::holding;
   }
   for (int k : joints_.locked) rest_(k) = infinity;
-  if (!impact(t, y) || !grip(t, y)) return false;
+  const Indices held = joints_.locked;
+  if (!impact(t, y) || !grip(t, y, held)) return false;
   known_ = true;
-  return true;
+  return !known || system_.after_change(t, y);
+}
+
+// Of what was met, what comes at a time of its own: what holds gives way where nothing changes yet.
+std::vector<System::Met> JointChanges::timed(const std::vector<Event>& met) {
+  std::vector<System::Met> found;
+  for (const Event& event : met)
+    if (event.of != Event::holding) found.push_back({event.coordinate, event.of == Event::q_dot});
+  return found;
 }
 
 bool JointChanges::movable(Indices& at) {
@@ -101,7 +112,7 @@ bool JointChanges::impact(double t, Out y) {
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
   if (!system_.acceleration(t, a_) || !movable(at)) return false;
   const auto m = static_cast<Eigen::Index>(at.size());
-  if (!m) return true;
+  if (!m) return joints_.touch = touched, true;
   scale(at);
   b_.resize(m), low_.setConstant(m, -infinity), high_.setConstant(m, infinity);
   Vector back(m);  // speeds off the stops
@@ -131,6 +142,7 @@ bool JointChanges::impact(double t, Out y) {
     change += x_(i) * (v_(k) + 0.5 * step_(k));
   }
   joints_.impact_loss -= change;
+  if (!system_.at_impact(step_, at, responses_, x_, back)) return false;
   const Vector before = v_;
   system_.push(y, step_);
   if (!take_state(t, y)) return false;
@@ -149,9 +161,10 @@ bool JointChanges::impact(double t, Out y) {
 
 // Gauss' principle: of the accelerations that the loops and the stops allow, the one nearest in the metric of D' to that
 // without what holds, less what friction takes, which is the problem of least forces between their bounds.
-bool JointChanges::grip(double t, Out y) {
+bool JointChanges::grip(double t, Out y, const Indices& before) {
   Indices at, locked;
-  const Indices sign = joints_.sign, touch = joints_.touch, before = std::exchange(joints_.locked, {});
+  const Indices sign = joints_.sign, touch = joints_.touch;
+  joints_.locked.clear();
   for (int k = 0; k < core_.n; ++k) {
     const bool rubs = joints_.rubs_at(k);
     const bool touches = near_[k] && rests(k);

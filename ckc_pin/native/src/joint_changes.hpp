@@ -20,8 +20,9 @@ class JointChanges {
 
  private:
   bool take_state(double t, In y);
+  static std::vector<System::Met> timed(const std::vector<Event>& met);
   bool impact(double t, Out y);
-  bool grip(double t, Out y);
+  bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
   bool movable(Indices& at);
   void scale(const Indices& at);  // A_, free of units: what unit forces make of the coordinates that they are on

@@ -34,6 +34,14 @@ void Joints::add_friction(In v, Out force) const {
       force(k) -= table.friction(k) * sign[k];
 }
 
+void Joints::add_slopes(In v, Out slopes) const {
+  if (!smooth_) return;
+  for (Eigen::Index k = 0; k < v.size(); ++k) {
+    const double part = std::tanh(v(k) / table.smoothing);
+    slopes(k) -= table.friction(k) / table.smoothing * (1.0 - part * part);
+  }
+}
+
 double Joints::passed(In q_tree, const Indices& at) const {
   double most = 0.0;
   if (stops)

@@ -62,6 +62,9 @@ class Joints {
   // --- forces that hold them ---
   // `a`: acceleration without them; `responses`: what one unit of each makes, (n, locked). Add what they make to `a`.
   void hold(const Matrix& responses, Out a);
+  const Vector& forces() const { return force_; }  // by locked coordinate, those that were found last
+  // d force / d v of friction that is no event, (n).
+  void add_slopes(In v, Out slopes) const;
   // How far the forces that `hold` found last are from not being enough: negative where none within their bounds are.
   double margin();
   // What is to be added to a velocity, or a small displacement, so that x of the locked coordinates vanishes.

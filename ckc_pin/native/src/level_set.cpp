@@ -2,8 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-
-#include "written.hpp"
+#include <limits>
 
 namespace ckc {
 
@@ -15,6 +14,7 @@ constexpr double poor = 1e-3;           // and from there on at every step
 constexpr double clearly = 2.0;         // times as far from singular: a better q
 constexpr double gains = 0.1;  // Newton's method to rounding goes on while a step leaves no more
 constexpr double weight = 3.0, patience = 100.0;  // of a refused step, in steps as before it; until none is tried
+constexpr double rounding = 8 * std::numeric_limits<double>::epsilon();
 constexpr double gone = 100.0;  // epsilons after which w is no more
 
 LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double slack)
@@ -32,7 +32,7 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   if (core.q != own_.q) core.split(own_.q, own_.z);
-  refusals_ = 0, balance_ = 0.0;
+  refusals_ = 0, balance_ = 0.0, expected_ = 0;
   t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
   core.set(q_tree);
   core.reduce();
@@ -153,39 +153,43 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
 }
 
 bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  const bool free = core.joints.locked.empty() && !core.joints.smooth();
-  if (core.written && on_manifold_ && free && core.tree.roots.empty() && exact_jacobian(t, y, jacobian)) return true;
+  if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
   to_rounding_ = true;  // what the slack of the loops leaves open is far more than a difference moves
   const bool exists = System::jacobian(t, y, jacobian, evaluations);
   to_rounding_ = false;
   return exists;
 }
 
-// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot, d v' / d q_dot = rho.
+// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot but for a free root, whose axes turn,
+// d v' / d q_dot = rho.
 bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   const int d = core.d, n = core.n;
   if (!finite(y) || !state(t, y, tolerance_)) return false;
   core.set_velocity(v_tree);
-  if (!act(t) || !control.slopes(by_q_, by_v_)) return false;
-  if (!core.written->jacobian(core.q_tree, v_tree, acting(v_tree), by_state_, by_u_)) return false;
-  if (control.feedback()) {
-    by_state_.bottomLeftCorner(n, n).noalias() += by_u_ * by_q_;
-    by_state_.bottomRightCorner(n, n).noalias() += by_u_ * by_v_;
-  }
+  if (!act(t) || !slopes(core.q_tree, v_tree, uncorrected_, by_q_, by_v_)) return false;
   core.jacobian_rate(v_tree);
   rho_dot_.resize(n, d);
   for (int k = 0; k < d; ++k) {
     unit_.setUnit(d, k);
     core.rho_dot_times(unit_, rho_dot_.col(k));
   }
+  if (!core.tree.roots.empty()) {
+    const Matrix turned = core.tree.brackets(v_tree) * core.rho;
+    for (int k = 0; k < d; ++k) {  // J x = J turned, x of z alone
+      residual_.noalias() = core.rows.J * turned.col(k);
+      core.z_step(residual_, step_);
+      rho_dot_.col(k) -= step_;
+    }
+  }
   jacobian.setZero(2 * d, 2 * d);
   jacobian.topRightCorner(d, d).setIdentity();
   for (int k = 0; k < d; ++k) {
-    const auto row = by_state_.row(n + core.q[k]);
-    jacobian.row(d + k).head(d).noalias() = row.head(n) * core.rho;
-    jacobian.row(d + k).head(d).noalias() += row.tail(n) * rho_dot_;
-    jacobian.row(d + k).tail(d).noalias() = row.tail(n) * core.rho;
+    const auto row = by_q_.row(core.q[k]), row_v = by_v_.row(core.q[k]);
+    jacobian.row(d + k).head(d).noalias() = row * core.rho;
+    jacobian.row(d + k).head(d).noalias() += row_v * rho_dot_;
+    jacobian.row(d + k).tail(d).noalias() = row_v * core.rho;
   }
+  if (!chart_.plain()) chart_.jacobian(core, core.q_tree, q_dot, jacobian);
   return jacobian.allFinite();
 }
 
@@ -243,6 +247,16 @@ void LevelSet::whole(In f, Out x, Out x_dot) const {
     x << core.q_tree, q_dot;
     x_dot.tail(core.d) = f.tail(core.d);
   }
+}
+
+// y is rounded as its largest number is, a crank's angle after many turns, and z follows it: an angle that passes zero is
+// not known better. What a nearly singular phi_z makes of that is not rounding.
+void LevelSet::add_rounding(In x, Out scale) const {
+  const Vector& units = core.scales.columns;
+  double largest = 0.0;
+  for (int k : core.tree.single) largest = std::max(largest, std::abs(x(core.tree.place[k])) / units(k));
+  for (int k : core.tree.single) scale(core.tree.place[k]) += rounding * largest * units(k);
+  if (on_manifold_) scale.tail(core.n) += rounding * x.tail(core.n).cwiseQuotient(units).lpNorm<Eigen::Infinity>() * units;
 }
 
 // Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.

@@ -34,6 +34,7 @@ class LevelSet : public System {
   int whole_size() const override { return core.rank ? core.tree.nq + (on_manifold_ ? core.n : core.d) : 0; }
   double whole_within() const override { return on_manifold_ ? System::whole_within() : epsilon_; }
   void whole(In f, Out x, Out x_dot) const override;
+  void add_rounding(In x, Out scale) const override;
 
  private:
   void level(double t);
@@ -65,7 +66,7 @@ class LevelSet : public System {
   Vector w0_, q_tree_, residual_, z_, step_;
   bool written_ = false;  // whether a_tree_ is that of the last right-hand side
   Vector a_tree_, unit_;
-  Matrix by_state_, by_u_, by_q_, by_v_, rho_dot_;
+  Matrix by_q_, by_v_, rho_dot_;
 };
 
 }  // namespace ckc

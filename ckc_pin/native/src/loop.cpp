@@ -109,7 +109,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
       if (beyond_) return within(until);
       const double seconds = spent();
       if (seconds > budget) return {Stop::wall_budget, now.t};
-      if (seconds > pause) return {Stop::pause, now.t};
+      if (seconds > pause || work.rhs >= pause_at) return {Stop::pause, now.t};
     }
   }
 }

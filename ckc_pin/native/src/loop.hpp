@@ -73,6 +73,8 @@ class Loop {
   std::vector<double> crossings;  // when J lost rank
   const Method* method() const { return method_; }
   double& newton_tolerance() { return tolerance_.newton; }
+  // Right-hand sides after which `advance` pauses, whatever the time.
+  long pause_at = std::numeric_limits<long>::max();
 
  private:
   // A step that was made: how it moves, when J lost rank on it (NaN for an ordinary one), and what is known at its end.

@@ -20,6 +20,7 @@ bool Method::evaluate_start() {
 
 double Method::disagreement(In integral) {
   x_scale_ = tolerance_.between(step_.x, step_.x_new);
+  system_.add_rounding(step_.x_new, x_scale_);
   x_error_ = step_.x_new - step_.x - integral;
   return norm(x_error_, x_scale_);
 }

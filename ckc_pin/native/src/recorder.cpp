@@ -7,7 +7,7 @@ namespace ckc {
 
 static int width_of(const System& system) {
   const Core& core = system.core;
-  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows;
+  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows + system.extra();
 }
 
 Recorder::Recorder(const System& system) : width(width_of(system)) { momentum_.setZero(system.core.n); }
@@ -48,6 +48,7 @@ bool Recorder::row(System& system, double t, In y, Out row) {
     opening = std::max(opening, std::abs(core.rows.J.row(i).dot(system.velocity) - system.decay() * system.w(i)));
   }
   row(at++) = open, row(at++) = opening;
+  system.put_extra(y, row.tail(system.extra()));
   return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }
 

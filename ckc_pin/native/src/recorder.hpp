@@ -10,7 +10,7 @@ class Recorder {
   explicit Recorder(const System& system);
 
   // t, q', velocity, u, tau, phi, w, energy, energy that friction and impacts took, Lyapunov
-  // function, largest |phi - w|, largest |phi_dot - w_dot|
+  // function, largest |phi - w|, largest |phi_dot - w_dot|, what the system adds
   const int width;
 
   void begin(Vector instants, double* rows, Eigen::Index most);  // rows: most by width

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <set>
 
+#include "rotation.hpp"
+
 namespace ckc {
 
 namespace {
@@ -25,25 +27,6 @@ Vector6 torque(const Vector3& about) {
   Vector6 w;
   w << Vector3::Zero(), about;
   return w;
-}
-
-Matrix3 skew(const Vector3& a) {
-  Matrix3 m;
-  m << 0, -a(2), a(1), a(2), 0, -a(0), -a(1), a(0), 0;
-  return m;
-}
-
-// c(theta) of Jlog(u) = 1 + [u]/2 + c [u]^2, and c'(theta)/theta; series near zero.
-void log_coefficient(const Vector3& u, double& c, double& c_rate) {
-  const double s = u.squaredNorm();
-  if (s < 0.01) {
-    c = 1.0 / 12 + s / 720 + s * s / 30240 + s * s * s / 1209600 + s * s * s * s / 47900160;
-    c_rate = 1.0 / 360 + s / 7560 + s * s / 201600 + s * s * s / 5987520;
-    return;
-  }
-  const double t = std::sqrt(s), cotangent = 1 / std::tan(t / 2), sine = std::sin(t / 2);
-  c = 1 / s - cotangent / (2 * t);
-  c_rate = (-2 / (s * t) + cotangent / (2 * s) + 1 / (4 * t * sine * sine)) / t;
 }
 
 }  // namespace
@@ -80,6 +63,18 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
     for (int j = 0; j < tree.n; ++j)
       if (J(i, j) != 0.0) columns.insert(j);
     pattern[i].assign(columns.begin(), columns.end());
+  }
+}
+
+void Rows::vary(Number what, In numbers) {
+  if (what == Number::point)
+    for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = numbers.segment<3>(3 * k);
+  if (what == Number::length)
+    for (auto& row : closure.distances) row.length = numbers(row.out);
+  const auto n = J.cols();
+  for (auto& row : closure.affine) {
+    if (what == Number::affine) row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (what == Number::affine_offset) row.offset = numbers(row.out);
   }
 }
 
@@ -123,10 +118,7 @@ void Rows::relative(const Tree& tree) {
     const Matrix3 r_a = tree.rotation(rows.joint_a) * rows.rotation_a;
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
     const Vector3 u = log3(r_a.transpose() * r_b);
-    double c, c_rate;
-    log_coefficient(u, c, c_rate);
-    const Matrix3 s = skew(u);
-    const Matrix3 m = (Matrix3::Identity() + s / 2 + c * s * s) * r_b.transpose();
+    const Matrix3 m = LogRate(u).value * r_b.transpose();
     for (int k = 0; k < 3; ++k) {
       auto& w = wrenches_[rows.out[k]];
       phi(rows.out[k]) = u(k);
@@ -176,14 +168,10 @@ void Rows::relative_rates(const Tree& tree) {
     const Vector3 omega = omega_b - velocity_[rows.joint_a].tail<3>();
     Vector3 u;
     for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
-    double c, c_rate;
-    log_coefficient(u, c, c_rate);
-    const Matrix3 s = skew(u), j_log = Matrix3::Identity() + s / 2 + c * s * s;
-    const Vector3 u_dot = j_log * (r_b.transpose() * omega);
-    const Matrix3 s_dot = skew(u_dot);
-    const Matrix3 j_log_dot = s_dot / 2 + c_rate * u.dot(u_dot) * s * s + c * (s_dot * s + s * s_dot);
+    const LogRate j_log(u);
+    const Vector3 u_dot = j_log.value * (r_b.transpose() * omega);
     // d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
-    const Matrix3 m_dot = j_log_dot * r_b.transpose() - j_log * r_b.transpose() * skew(omega_b);
+    const Matrix3 m_dot = j_log.along(u_dot) * r_b.transpose() - j_log.value * r_b.transpose() * skew(omega_b);
     for (int k = 0; k < 3; ++k) {
       auto& w = wrenches_[rows.out[k]];
       w[1].w_dot = torque(m_dot.row(k));

@@ -35,11 +35,14 @@ class Rows {
  public:
   Rows(const Tree& tree, Closure closure);
 
-  const Closure closure;
+  Closure closure;
   std::vector<Indices> pattern;  // by row: the columns of J that are not zero
   Vector phi;                    // (rows)
   Matrix J, J_dot;               // (rows, n); zero outside the pattern
 
+  // Other numbers: points one after the other; of lengths, coefficients and offsets those of all rows.
+  enum class Number { point, length, affine, affine_offset };
+  void vary(Number what, In numbers);
   std::vector<Indices> pattern_of(const Indices& columns, int n) const;  // of those of n columns, counted among them
   void set(const Tree& tree, In q);  // phi and the wrenches, from the tree's placements
   void jacobian(const Tree& tree);

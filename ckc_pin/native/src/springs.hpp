@@ -16,7 +16,12 @@ class Springs {
  public:
   Springs(const Tree& tree, SpringTable table);
 
+  SpringTable table;  // changed by `vary` alone
   bool any, any_damping;
+  Eigen::Index count() const { return count_; }
+
+  enum class Number { end, stiffness, rest_length, damping, joint_stiffness, joint_rest, joint_damping, constant };
+  void vary(Number what, In numbers);
 
   void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
   void add_elastic(const Tree& tree, In q, Out force) const;
@@ -24,7 +29,8 @@ class Springs {
   double energy(const Tree& tree, In q) const;
 
  private:
-  SpringTable table_;
+  void look();  // which of them there are
+
   int count_;
   std::vector<Indices> pattern_;
   Vector length_;

@@ -11,6 +11,7 @@ constexpr double chart_margin = 1e-5;
 
 struct Counts {
   long newton = 0, factorizations = 0, switches = 0;
+  long differences = 0;  // Jacobians that were not exact
 };
 
 // Why a right-hand side does not exist.
@@ -55,7 +56,7 @@ class System {
   virtual Accepted accept(double t, Out y, double margin) = 0;
   // Make the user's own partition that of q; false where phi_z is singular there.
   virtual bool own_partition(double, Out, bool& changed) { return changed = false, true; }
-  // d rhs / d y by differences, counted in `evaluations`; false where one does not exist.
+  // d rhs / d y, here by differences, counted in `evaluations`; false where one does not exist.
   virtual bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
   // Entries of y whose rate is another entry: (where, which).
   virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
@@ -78,6 +79,8 @@ class System {
   virtual double whole_within() const { return std::numeric_limits<double>::infinity(); }
   // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).
   virtual void whole(In, Out, Out) const {}
+  // Add to what may be wrong in each of its numbers x what rounding alone makes wrong.
+  virtual void add_rounding(In, Out) const {}
 
   // --- dry friction and stops ---
   // What acts on the tree where its motion is v: the controller's forces, and friction of what slides.
@@ -87,6 +90,17 @@ class System {
   // Take back what locked joints have drifted by more than `tolerance`, and their rates, at the core's state, that of y;
   // false where that cannot be.
   bool keep_locked(Out y, double tolerance, bool& changed);
+  // --- parameters (varied.hpp) ---
+  // What was met at y where joints change what they do, the core being there; and what becomes of y: an impact adds
+  // `step` to the velocities, by impulses `x` on the coordinates `at`, whose speeds it turns round by `back`.
+  struct Met { int coordinate; bool of_rate; };
+  virtual bool before_change(double, In, const std::vector<Met>&) { return true; }
+  virtual bool at_impact(In, const Indices&, const Matrix&, In, In) { return true; }
+  virtual bool after_change(double, Out) { return true; }
+  // Numbers that are recorded behind those of the state.
+  virtual int extra() const { return 0; }
+  virtual void put_extra(In, Out) const {}
+
   // Add to the velocities, and to the coordinates, in y.
   virtual void push(Out y, In v) const = 0;
   virtual void shift(Out y, In step) const = 0;
@@ -95,7 +109,7 @@ class System {
 
   Core& core;
   Control& control;
-  const int size;         // of y
+  int size;               // of y
   Counts counts;
   bool crosses = false;     // positions where J loses rank are passed
   bool may_switch = false;  // q may become other coordinates
@@ -115,12 +129,18 @@ class System {
   void new_partition() { phi_z_.reset(); }  // of the core
   // Eq. 1 at the core's state moving with v, what acts there known, with what holds joints; `correction`: of J a.
   bool eq_1(In v, In correction, Out a);
+  // d a / d q' and d v' of eq. 1 with that correction, tangent, where what acts at (q', v') is known; the core is there
+  // unless its terms are written out and no joint is held. False where what acts has no known derivatives.
+  bool slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v);
 
   Vector uncorrected_;  // zero, (rows)
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_, rate_here_, acting_, drift_, back_;
+  Vector moved_, rate_, rate_here_, acting_, drift_, back_, a_, force_;
+  Matrix by_state_, by_u_, u_by_q_, u_by_v_;
+
+ protected:
   Matrix responses_;
 };
 

@@ -3,10 +3,13 @@
 #include <pinocchio/algorithm/crba.hpp>
 #include <pinocchio/algorithm/energy.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/rnea-derivatives.hpp>
 #include <pinocchio/algorithm/rnea.hpp>
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/serialization.hpp>
 #include <pinocchio/spatial.hpp>
+
+#include "rotation.hpp"
 
 namespace ckc {
 
@@ -29,7 +32,7 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
   const pin::Model& model = own->model;
   n = model.nv, nq = model.nq, joints = model.njoints;
   support.resize(joints);
-  ancestors.resize(n);
+  ancestors.resize(n), joint_of.resize(n), parent.assign(model.parents.begin(), model.parents.end());
   for (int joint = 1; joint < joints; ++joint) {
     if (model.nqs[joint] == 7)
       roots.push_back({model.idx_qs[joint], model.idx_vs[joint]});
@@ -38,12 +41,27 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
     support[joint] = support[model.parents[joint]];
     for (int k = model.idx_vs[joint]; k < model.idx_vs[joint] + model.nvs[joint]; ++k) {
       support[joint].push_back(k);
+      joint_of[k] = joint;
       ancestors[k] = support[joint];
     }
   }
 }
 
 Tree::~Tree() = default;
+
+void Tree::vary(Number what, In numbers) {
+  pin::Model& model = own->model;
+  const auto three = [&](int joint) { return Vector3(numbers.segment<3>(3 * joint)); };
+  if (what == Number::gravity) model.gravity.linear() = three(0);
+  if (what == Number::armature) model.armature = numbers;
+  for (int joint = 0; joint < joints; ++joint) {
+    pin::Inertia& body = model.inertias[joint];
+    if (what == Number::offset) model.jointPlacements[joint].translation() = three(joint);
+    if (what == Number::mass) body.mass() = numbers(joint);
+    if (what == Number::centre) body.lever() = three(joint);
+    if (what == Number::inertia) body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
+  }
+}
 
 void Tree::set(In q) { pin::computeJointJacobians(own->model, own->data, q); }
 
@@ -77,6 +95,30 @@ const Matrix6x& Tree::jacobian_rate(In q, In v) {
 }
 
 double Tree::potential_energy(In q) { return pin::computePotentialEnergy(own->model, own->data, q); }
+
+void Tree::derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
+  pin::Model& model = own->model;
+  pin::Data& data = own->data;
+  pin::computeRNEADerivatives(model, data, q, v, a);
+  by_q = data.dtau_dq, by_v = data.dtau_dv;
+  if (!gravity) {
+    Matrix of_gravity = Matrix::Zero(n, n);
+    pin::computeGeneralizedGravityDerivatives(model, data, q, of_gravity);
+    by_q -= of_gravity;
+  }
+  pin::forwardKinematics(model, data, q, v, a);
+  set(q);
+}
+
+Vector6 Tree::motion(int joint) const { return velocity(joint); }
+
+Vector6 Tree::motion_rate(int joint) const { return own->data.oMi[joint].act(own->data.a[joint]).toVector(); }
+
+Matrix6 Tree::spatial_inertia(int joint) const {
+  return joint ? own->data.oMi[joint].act(own->model.inertias[joint]).matrix() : Matrix6(Matrix6::Zero());
+}
+
+Vector6 Tree::field() const { return own->model.gravity.toVector(); }
 
 static Eigen::Quaterniond turned(In q, Tree::Root root) {
   return Eigen::Quaterniond(Eigen::Vector4d(q.segment<4>(root.q + 3))).normalized();
@@ -123,6 +165,47 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
     q_dot.segment<3>(root.q) = turn * Vector3(v.segment<3>(root.v));
     q_dot.segment<4>(root.q + 3) = (turn * spin).coeffs();
   }
+}
+
+Matrix Tree::tangents(In q) const {
+  Matrix found = Matrix::Zero(n, nq);
+  for (int k : single) found(k, place[k]) = 1.0;
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    const double size = q.segment<4>(root.q + 3).norm();
+    found.block<3, 3>(root.v, root.q) = turn.toRotationMatrix().transpose();
+    for (int k = 0; k < 4; ++k) {  // twice the vector part of conj(turn) times the change
+      Eigen::Quaterniond change(0, 0, 0, 0);
+      change.coeffs()(k) = 1.0;
+      found.block<3, 1>(root.v + 3, root.q + 3 + k) = 2.0 / size * (turn.conjugate() * change).vec();
+    }
+  }
+  return found;
+}
+
+Matrix Tree::rate_changes(In q, In v) const {
+  Matrix found = Matrix::Zero(nq, n);
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    Eigen::Quaterniond half, spin;
+    spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
+    for (int k = 0; k < 3; ++k) {
+      half.w() = 0.0, half.vec() = 0.5 * Vector3::Unit(k);
+      found.block<3, 1>(root.q, root.v + 3 + k) = turn * Vector3(Vector3::Unit(k).cross(Vector3(v.segment<3>(root.v))));
+      found.block<4, 1>(root.q + 3, root.v + 3 + k) = (turn * half * spin).coeffs();
+    }
+  }
+  return found;
+}
+
+Matrix Tree::brackets(In v) const {
+  Matrix found = Matrix::Zero(n, n);
+  for (const Root& root : roots) {
+    const Matrix3 turning = skew(v.segment<3>(root.v + 3));
+    found.block<3, 3>(root.v, root.v) = found.block<3, 3>(root.v + 3, root.v + 3) = turning;
+    found.block<3, 3>(root.v, root.v + 3) = skew(v.segment<3>(root.v));
+  }
+  return found;
 }
 
 Matrix3 Tree::orientation(In q, Root root) const { return turned(q, root).toRotationMatrix(); }

@@ -22,6 +22,12 @@ class Tree {
   Indices single;                 // tangent coordinates of joints of one freedom
   std::vector<Indices> support;   // by joint: the tangent coordinates that move it, ascending
   std::vector<Indices> ancestors; // by coordinate: those at or above it on its branch, where D' is not zero
+  Indices joint_of;               // by coordinate: the joint that it is of
+  Indices parent;                 // by joint
+
+  // Other numbers of the model, all joints' one after the other.
+  enum class Number { gravity, offset, mass, centre, inertia, armature };
+  void vary(Number what, In numbers);
 
   // Placements of all joints, and the Jacobian in world axes.
   void set(In q);
@@ -44,12 +50,24 @@ class Tree {
   const Matrix6x& jacobian_rate(In q, In v); // the same without C'
   double potential_energy(In q);
 
+  // The motion with an acceleration, and how D'a + C'v + h' changes along each coordinate and with each velocity; with
+  // `gravity` or without. What follows is that of `set` too, and the motion in the world's axes, at its origin.
+  void derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v);
+  Vector6 motion(int joint) const;        // velocity
+  Vector6 motion_rate(int joint) const;   // its rate, without gravity
+  Matrix6 spatial_inertia(int joint) const;
+  Vector6 field() const;                  // gravity
+
   // On q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
   void normalize(Out q) const;
   void integrate(Out q, In step) const;  // by a tangent step, in place
   void difference(In from, In to, Out step) const;
   void difference_rate(In from, In to, In v, Out rate) const;  // where `to` moves with v
   void configuration_rate(In q, In v, Out q_dot) const;
+  Matrix tangents(In q) const;               // (n, nq): tangent steps by changes of q'
+  Matrix rate_changes(In q, In v) const;     // (nq, n): of `configuration_rate` by tangent steps
+  // What a free root's twist adds to the rate of a tangent step x: x_dot = v_change - brackets(v) x.
+  Matrix brackets(In v) const;               // (n, n)
   void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
   Matrix3 orientation(In q, Root root) const;
   // The twist in a free root's axes that takes it to another place.

@@ -11,9 +11,8 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
   try {
     if (size("numbers_sparsity_in") != parameters.size()) throw std::runtime_error(path + ": of another mechanism");
     numbers_.setZero(size("numbers_sparsity_out"));
-    const double* from[] = {parameters.data()};
-    double* to[] = {numbers_.data()};
-    code("numbers", 1)(from, to, nullptr, nullptr, 0);
+    given_ = code("numbers", 1);
+    vary(parameters);
     place_ = code("place", 3), inertia_ = code("inertia", 3), bias_ = code("bias", 4);
     jacobian_rate_ = code("jacobian_rate", 4), rest_ = code("rest", 3), coriolis_ = perhaps("coriolis", 5);
     potential_energy_ = code("potential_energy", 3), acceleration_ = code("acceleration", 6);
@@ -22,6 +21,12 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     dlclose(library_);
     throw;
   }
+}
+
+void Written::vary(In parameters) {
+  const double* from[] = {parameters.data()};
+  double* to[] = {numbers_.data()};
+  given_(from, to, nullptr, nullptr, 0);
 }
 
 Written::~Written() { dlclose(library_); }

@@ -14,6 +14,9 @@ class Written {
   ~Written();
   Written(const Written&) = delete;
 
+  void vary(In parameters);  // other numbers
+  long long parameters() const { return size("numbers_sparsity_in"); }
+
   void place(In q, Out phi, Matrix& J) const;
   void inertia(In q, Matrix& D_tree) const;
   void bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const;
@@ -43,7 +46,7 @@ class Written {
   void* library_;
   Vector numbers_;  // the parameters, and what follows from them alone
   mutable Trig trig_;
-  Code place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
+  Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
 };
 
 }  // namespace ckc

@@ -20,15 +20,12 @@ __all__ = ["MAIN", "draw", "draw_growth", "draw_main", "front"]
 MAIN = ("swing", "andrews", "n_four_bar_16", "n_four_bar_4")  # the first three of them that were measured
 MARKERS = "osD^vPX<>"
 FLOOR = 1e-17  # a number of zero has no logarithm
-APART = 11.0  # points between the labels of two curves
-REACH = 100.0  # points: labels further apart do not meet
-LETTER = 5.0  # points wide
 LABELS = {
-    "wall_s": "time, s",
+    "wall_s": "time (s)",
     "rhs": "right-hand sides",
-    "error_max": "largest error along the run, rad or m",
-    "error_end": "error at the end, rad or m",
-    "closure": "largest |φ|, m or rad",
+    "error_max": "largest error along the run (rad or m)",
+    "error_end": "error at the end (rad or m)",
+    "closure": "largest |φ| (m or rad)",
     "energy_drift": "largest energy drift / kinetic energy",
 }
 
@@ -44,7 +41,7 @@ class Curve:
 
 def draw(found: Found, work: str, folder: Path) -> str:
     """Draw one work; return the file's name."""
-    figure, axes = chart(columns=3, rows=2, size=(5.6, 4.2))
+    figure, axes = chart(columns=3, rows=2, size=(3.7, 3.1))
     rows = found.rows[found.rows.work == work]
     programs, formulations = list(_programs(rows, found.programs)), list(_formulations(rows))
     _panel(axes[0], programs, "wall_s", "error_max", "programs: error")
@@ -57,14 +54,15 @@ def draw(found: Found, work: str, folder: Path) -> str:
     _panel(axes[4], formulations, "rhs", "error_max", f"{PROGRAM}: error")
     _panel(axes[5], formulations, "wall_s", "error_end", f"{PROGRAM}: at the end")
     figure.suptitle(found.works.says[work])
-    _name(figure, axes)
+    _name(figure, axes[:3], loc="outside lower left", ncols=2, title="programs")
+    _name(figure, axes[3:], loc="outside lower right", ncols=2, title=PROGRAM)
     return save(figure, folder, f"{work}.png")
 
 
 def draw_main(found: Found, folder: Path) -> str:
     """Draw error against time of a few works side by side, by program; return the file's name."""
     chosen = [key for key in MAIN if key in found.works.index][:3] or list(found.works.index[:3])
-    figure, axes = chart(columns=len(chosen), size=(5.6, 4.6))
+    figure, axes = chart(columns=len(chosen), size=(3.7, 3.2))
     for ax, work in zip(axes, chosen, strict=True):
         curves = list(_programs(found.rows[found.rows.work == work], found.programs))
         _panel(ax, curves, "wall_s", "error_max", found.works.says[work])
@@ -74,7 +72,7 @@ def draw_main(found: Found, folder: Path) -> str:
 
 def draw_growth(found: Found, folder: Path) -> str:
     """Draw right-hand sides' times along each family; return the file's name."""
-    figure, axes = chart(columns=len(FAMILIES), size=(5.6, 4.2))
+    figure, axes = chart(columns=len(FAMILIES), size=(3.7, 3.1))
     for ax, family in zip(axes, FAMILIES, strict=True):
         own = found.growth[(found.growth.family == family.key) & found.growth.rhs_s.notna()]
         for k, formulation in enumerate(FORMULATIONS):
@@ -84,10 +82,10 @@ def draw_growth(found: Found, folder: Path) -> str:
                 look = {"color": COLOURS[k], "marker": MARKERS[k + 1], "markersize": 4, "clip_on": False}
                 ax.plot(points.index, 1e6 * points, label=f"{NAMES[formulation]}: ∝ {family.along}^{p:.1f}", **look)
         ax.set(xscale="log", yscale="log", xlabel=family.along, title=family.says)
-        ax.set_ylabel("one right-hand side, µs")
+        ax.set_ylabel("one right-hand side (µs)")
         whole_decades(ax)
         if ax.lines:
-            ax.legend(fontsize=7.5)
+            ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     return save(figure, folder, "growth.png")
 
 
@@ -121,43 +119,11 @@ def _panel(ax: Any, curves: Sequence[Curve], x: str, y: str, title: str) -> None
             look = {"markersize": 4.5, "linewidth": 1.4, "clip_on": False, **curve.look}
             ax.plot(points[x], points[y].clip(lower=FLOOR), label=curve.name, **look)
     whole_decades(ax)
+    for words in (ax.title, ax.xaxis.label, ax.yaxis.label):
+        words.set_fontsize(8)
 
 
-def _name(figure: Any, axes: Sequence[Any]) -> None:
-    """Write each curve's name beside its end, where that does not lie on another name."""
-    figure.draw_without_rendering()  # settles the layout, in which the labels are to be placed
-    figure.set_layout_engine("none")
-    scale = 72.0 / figure.dpi
-    for ax in axes:
-        right, taken = ax.bbox.x1 * scale, list[tuple[float, float, int]]()
-        ends = [
-            (line, ax.transData.transform((line.get_xdata()[-1], line.get_ydata()[-1])) * scale) for line in ax.lines
-        ]
-        for line, (x, low) in sorted(ends, key=lambda end: float(end[1][1])):
-            words = line.get_label().removeprefix("Pinocchio ").replace(", ", ",\n")
-            lines = words.count("\n") + 1
-            y = max(float(low), ax.bbox.y0 * scale + APART * lines / 2)
-            while any(abs(x - a) < REACH and abs(y - b) < APART * (lines + n) / 2 for a, b, n in taken):
-                y += 1.0
-            taken.append((float(x), y, lines))
-            inside = x + LETTER * max(map(len, words.splitlines())) < right
-            ax.annotate(
-                words,
-                (line.get_xdata()[-1], line.get_ydata()[-1]),
-                xytext=(6 if inside else -6, y - float(low)),
-                textcoords="offset points",
-                ha="left" if inside else "right",
-                va="center",
-                fontsize=8,
-                linespacing=1.0,
-                color=_dark(line.get_color()),
-                bbox={"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
-            )
-
-
-def _dark(colour: str) -> str:
-    """Return a colour dark enough to be read as text on white."""
-    from matplotlib.colors import to_hex, to_rgb
-
-    red, green, blue = to_rgb(colour)
-    return str(to_hex((0.62 * red, 0.62 * green, 0.62 * blue)))
+def _name(figure: Any, axes: Sequence[Any], **where: Any) -> None:
+    """Name the curves of some panels in a legend below all of them, which covers none."""
+    named = {line.get_label(): line for ax in axes for line in ax.lines}
+    figure.legend(list(named.values()), list(named), **({"loc": "outside lower center", "ncols": 4} | where))

@@ -26,6 +26,7 @@ from scripts.experiments.benchmark.reference import Reference, reference
 from scripts.experiments.benchmark.row import Row, judged
 from scripts.experiments.benchmark.stamp import machine, stamp, versions, work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
+from scripts.experiments.benchmark.written_out import WrittenOut, written_out
 from scripts.experiments.pages import GZIP, render
 
 __all__ = ["BUDGET", "TABLES", "exact_of", "measure", "report", "rows_of", "save", "write"]
@@ -101,7 +102,7 @@ def measure(quick: bool, memory: Memory) -> tuple[Tables, dict[str, Any]]:
     references = [(work, exact_of(work, memory)()) for work in works]
     described = [
         {"work": work.key, "says": work.says, "epsilon": work.epsilon, "controlled": work.controlled,
-         "accuracy": exact.accuracy, "how": exact.how}
+         "accuracy": exact.accuracy, "how": exact.how, **asdict(_written_out(work, memory))}
         for work, exact in references
     ]  # fmt: skip
     tables: dict[str, Iterable[Any]] = {
@@ -171,6 +172,16 @@ def _run(
 def _reference(own: str, work: Work) -> Reference:
     _tell(f"{work.key}: reference")
     return reference(work)
+
+
+def _written_out(work: Work, memory: Memory) -> WrittenOut:
+    found: WrittenOut = memory.cache(_write_out, ignore=["work"])(work_stamp(work), work)
+    return found
+
+
+def _write_out(own: str, work: Work) -> WrittenOut:
+    _tell(f"{work.key}: terms written out")
+    return written_out(work, BUDGET.own)
 
 
 def _grown(quick: bool, memory: Memory) -> list[Growth]:

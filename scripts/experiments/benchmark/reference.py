@@ -57,7 +57,9 @@ def reference(work: Work) -> Reference:
 
 
 def _tight(work: Work, formulation: str) -> Array:
-    run = simulate(work.load(formulation=formulation, solver__method="DOP853", solver__rtol=TIGHT))
+    run = simulate(
+        work.load(formulation=formulation, solver__method="DOP853", solver__rtol=TIGHT, solver__terms="pinocchio")
+    )
     if run.status != "done":
         raise NumericalError(f"{work.key}: no reference, the {formulation} {run.message}", run=run)
     return work.observed(run.q_tree)

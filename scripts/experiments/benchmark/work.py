@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.errors import InputError
+from ckc_pin.generated.library import compiled
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import scene_mechanism
@@ -69,6 +71,15 @@ class Work:
     def mechanism(self) -> Mechanism:
         """The mechanism, loaded once."""
         return scene_mechanism(self.load())
+
+    @cached_property
+    def terms(self) -> str:
+        """What the mechanism is run with: terms written out, compiled here if need be, or Pinocchio's."""
+        try:
+            compiled(self.mechanism)
+        except InputError:
+            return "pinocchio"
+        return "generated"
 
     @property
     def controlled(self) -> bool:

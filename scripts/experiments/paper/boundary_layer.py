@@ -205,7 +205,7 @@ def _layer_claim(layer: Layer, figures: Path) -> Claim:
         ax.semilogy(layer.taus, np.abs(y).max(axis=1), color=colour, linewidth=3, label=f"SPF, ε = {epsilon:g} s")
     ax.semilogy(layer.taus, layer.size, color=BLACK, linewidth=1, label="eq. 12")
     ax.semilogy(layer.taus, layer.size[0] * np.exp(-layer.taus), ":", color=BLACK, label="|y(0)| exp(-τ)")
-    ax.set(xlabel="fast time τ = t/ε", ylabel="largest component of y = z - h(t, x̄) [rad]")
+    ax.set(xlabel="fast time τ = t/ε", ylabel="largest component of y = z - h(t, x̄) (rad)")
     ax.set_title(f"The boundary layer, w(0) = {vector(W0)} m")
     ax.legend(fontsize=8)
     name = save(figure, figures, "boundary_layer.png")
@@ -259,7 +259,7 @@ def _draw_eigenvalues(inside: Array, times: Array, on: Array, off: Array, radius
     low, high = np.nanmin(off, axis=1), np.nanmax(off, axis=1)
     right.fill_between(times, low, high, color=COLOURS[5], alpha=0.5, label=f"off it, |w| = {radius:.4g} m")
     right.plot(times, on, color=BLACK, label=["on φ = 0", *[None] * (on.shape[1] - 1)])
-    right.set(xlabel="t [s]", ylabel="Re λ")
+    right.set(xlabel="t (s)", ylabel="Re λ")
     right.set_title(f"Along {SCENE}")
     for ax in (left, right):
         ax.legend(fontsize=8)

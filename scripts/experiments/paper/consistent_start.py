@@ -118,7 +118,7 @@ def _draw(found: Sequence[Irrelevance], figures: Path) -> str:
         ax.loglog(PRINTED, each.printed, "o-", color=colour, label=f"eq. 8, Radau, rtol {each.rtol:.0e}")
         ax.loglog(EQ_17, each.eq_17, "s--", color=colour, label=f"eq. 17, DOP853, rtol {each.rtol:.0e}", markersize=4)
     ax.loglog(EQ_17, EQ_17, ":", color=BLACK, label="ε, the bound off the manifold")
-    ax.set(xlabel="ε [s]", ylabel=f"largest difference in (q, q̇) from the DAE at t = {T_END:g} s")
+    ax.set(xlabel="ε (s)", ylabel=f"largest difference in (q, q̇) from the DAE at t = {T_END:g} s")
     ax.set_ylim(1e-12, 1.0)
     ax.set_title("From w(0) = 0: the tolerance counts, ε does not")
     ax.legend(fontsize=7, ncols=2)

@@ -105,7 +105,7 @@ def _row(cost: Cost) -> tuple[str, ...]:
 def _draw(found: Found, figures: Path) -> str:
     figure, axes = chart(len(found))
     for ax, (name, costs) in zip(axes, found.items(), strict=True):
-        ax.set(xscale="log", xlim=(min(EPSILONS) / 2, max(EPSILONS) * 2), xlabel="ε [s]")
+        ax.set(xscale="log", xlim=(min(EPSILONS) / 2, max(EPSILONS) * 2), xlabel="ε (s)")
         ax.set(yscale="log", ylim=(200, 4e5), ylabel="right-hand sides")
         for method, colour in zip(METHODS, COLOURS, strict=False):
             _draw_method(ax, method, [cost for cost in costs if cost.method == method], colour)

@@ -30,8 +30,8 @@ def draw_lyapunov(records: Mapping[str, Record], folder: Path) -> str:
     last = list(records.values())[-1]
     right.semilogy(last.t, -last.predicted, color=BLACK, linewidth=0.8, label="q_dot^T K_V q_dot")
     left.axhline(last.round_off, color=BLACK, linewidth=0.8, linestyle=":", label="rounding and closure")
-    left.set(xlabel="t / s", ylabel="V_L / J", title="Lyapunov function of eq. 14", ylim=(1e-17, None))
-    right.set(xlabel="t / s", ylabel="power / W", title="its rate, and what the paper says it is", ylim=(1e-12, None))
+    left.set(xlabel="t (s)", ylabel="V_L (J)", title="Lyapunov function of eq. 14", ylim=(1e-17, None))
+    right.set(xlabel="t (s)", ylabel="power (W)", title="its rate, and what the paper says it is", ylim=(1e-12, None))
     for ax in (left, right):
         ax.legend()
     return save(figure, folder, "set_point_lyapunov.png")
@@ -52,7 +52,7 @@ def draw_bounds(branches: list[list[Bound]], K_P: Array, folder: Path) -> str:
     ax.axhline(float(np.linalg.eigvalsh(K_P)[0]), color=BLACK, linestyle=":", label="K_P of eq. 20")
     ax.set_xticks(margins, [f"{s:g}" for s in margins])
     ax.set_xticks([], minor=True)
-    ax.set(xlabel="s_min, |s| = |det phi_z| / (l2 l4)", ylabel="N m / rad", title="dh/dq where |s| >= s_min")
+    ax.set(xlabel="s_min, |s| = |det phi_z| / (l2 l4)", ylabel="dh/dq (N m/rad)", title="dh/dq where |s| >= s_min")
     ax.legend(fontsize=8)
     return save(figure, folder, "set_point_gradient.png")
 
@@ -77,7 +77,7 @@ def draw_set(case: Case, certificate: Certificate, run: Run, divisions: int, fol
     ax.plot(*path[0], "o", color=COLOURS[0])
     ax.plot(*case.controller.q_d, "*", color=BLACK, markersize=12, label="q_d")
     names = case.mechanism.independent
-    ax.set(xlabel=f"{names[0]} / rad", ylabel=f"{names[1]} / rad", aspect="equal")
+    ax.set(xlabel=f"{names[0]} (rad)", ylabel=f"{names[1]} (rad)", aspect="equal")
     figure.set_size_inches(7.5, 8.8)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return save(figure, folder, "set_point_set.png")

@@ -191,7 +191,7 @@ def _cells(c: Convergence, k: int) -> tuple[str, str, str, str]:
 def _draw(rho: Sequence[Convergence], actual: Sequence[Convergence], figures: Path) -> str:
     figure, axes = chart(2)
     for ax, title in zip(axes, ("C at ρ q̇ (eq. 8)", "C at the actual ż (eq. 16)"), strict=True):
-        ax.set(xscale="log", yscale="log", xlabel="ε [s]", ylabel=f"largest difference from the DAE at t = {T_END:g} s")
+        ax.set(xscale="log", yscale="log", xlabel="ε (s)", ylabel=f"largest difference from the DAE at t = {T_END:g} s")
         ax.set_title(title)
     for c, name, colour in zip(rho, ("from rest", "moving"), COLOURS, strict=False):
         axes[0].plot(c.epsilons, c.x, "o-", color=colour, label=f"{name}: (q, q̇) [rad, rad/s]")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from joblib import Memory
 from scipy.integrate import solve_ivp
@@ -23,6 +24,7 @@ from scripts.experiments.benchmark.reference import Reference, reference
 from scripts.experiments.benchmark.row import judged
 from scripts.experiments.benchmark.stamp import work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
+from scripts.experiments.benchmark.written_out import written_out
 from tests.analytic.five_bar import FIVE_BAR, Q
 
 SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
@@ -262,3 +264,29 @@ def test_a_page_is_made_from_the_tables_alone(tmp_path: Path) -> None:
 def test_a_folder_without_tables_has_no_page(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         make.report(tmp_path, anew=False)
+
+
+def test_terms_written_out_are_paid_for_by_motion() -> None:
+    """What they save, per second of motion, has to make up for compiling; too large a tree says why it has none."""
+    found = written_out(SHORT, 1.5)
+    assert None not in (found.compile_s, found.written_s, found.general_s, found.pays_s)
+    assert found.written_s < found.general_s
+    assert found.pays_s * (found.general_s - found.written_s) == pytest.approx(found.compile_s * SHORT.t_end)
+    large = written_out(EVERY["n_four_bar_40"], 1.5)
+    assert "terms are written out for trees of up to 40" in large.refused
+    assert large.compile_s is None
+
+
+def test_a_page_says_what_compiling_costs(tmp_path: Path) -> None:
+    for name in [*(f"{name}.csv.gz" for name in make.TABLES), "about.json"]:
+        shutil.copy(DOCS / name, tmp_path)
+    works = pd.read_csv(tmp_path / "works.csv.gz")
+    costs = pd.DataFrame([{"compile_s": 0.8, "written_s": 1e-3, "general_s": 5e-3, "pays_s": 400.0}] * len(works))
+    costs.loc[1] = None
+    works = works.drop(columns=costs.columns, errors="ignore").join(costs).assign(refused="")
+    works.loc[1, "refused"] = "81 coordinates"
+    works.to_csv(tmp_path / "works.csv.gz", index=False)
+    make.write(tmp_path)
+    page = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert f"| {works.says[0]} | 0.8 | 1 | 5 | 5 | 400 |" in page
+    assert f"| {works.says[1]} | 81 coordinates |" in page

@@ -1,0 +1,85 @@
+"""What a mechanism does near one state: linearize."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+
+import ckc_pin
+from ckc_pin.cli import options
+from ckc_pin.cli.exits import interrupts
+from ckc_pin.cli.output import errors, make_folder, print_json, print_table
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import alone_in
+from ckc_pin.simulation.arguments import read_changes, read_table
+from ckc_pin.simulation.linear_report import linear_plain, linear_text, save_linear
+from ckc_pin.simulation.linearize import At
+
+__all__ = ["linearize"]
+
+
+@click.command(
+    epilog=options.examples(
+        "ckc linearize five_bar --at equilibrium --json",
+        'ckc linearize five_bar --at \'{"theta_1": -1.2, "theta_3": -1.9}\'',
+        "ckc linearize five_bar/tracking --at 2.5",
+        "ckc linearize stewart --out modes; ckc play modes/mode_1.npz",
+    )
+)
+@click.argument("what", metavar="MECHANISM|SCENE", help="A mechanism or a scene.")
+@click.option(
+    "--at",
+    metavar="equilibrium|assembled|T|JSON",
+    default="equilibrium",
+    help="About the stable equilibrium, an instant of the scene's run in s, or as assembled or at coordinates, held by "
+    "its motors.",
+)
+@options.changes
+@click.option("--out", metavar="DIR", type=Path, help="Folder for linear.npz, figures, and the modes as runs to play.")
+@options.as_json
+def linearize(what: str, at: str, changes: tuple[str, ...], out: Path | None, as_json: bool) -> None:
+    """Linear model in minimal coordinates: A, B, C, D, modes. Exact, about a state of rest or of a run."""
+    if out is not None:
+        make_folder(out)
+    model = ckc_pin.linearize(what, _at(at), read_changes("--set", changes))
+    if out is not None:
+        _write(model, what, changes, out)
+    if as_json:
+        print_json(linear_plain(model))
+    else:
+        print_table(linear_text(model))
+        if out is not None:
+            print(f"written to {out}")
+
+
+def _at(given: str) -> At:
+    if given in ("equilibrium", "assembled"):
+        return given
+    if given.lstrip().startswith("{"):
+        return read_table("--at", given)
+    try:
+        return float(given)
+    except ValueError:
+        raise InputError(
+            f"--at {given!r:.80}: give equilibrium, assembled, a time in seconds, or a table of coordinates as JSON"
+        ) from None
+
+
+def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> None:
+    """Save the model and its modes, whatever signals come, then draw them."""
+    from ckc_pin.simulation.locus import gain_locus
+    from ckc_pin.simulation.sway import sways
+
+    with interrupts.deferred(), ExitStack() as stack:
+        stack.enter_context(alone_in(out))
+        save_linear(model, out / "linear.npz")
+        for number, run in sways(model).items():
+            run.save(out / f"mode_{number}.npz")
+        try:
+            from ckc_pin.view.linear_figure import save_linear_figures
+
+            save_linear_figures(model, gain_locus(what, read_changes("--set", changes)), out)
+        except InputError as error:  # matplotlib is an extra; the model is saved
+            errors().print(f"no figures: {error}")

@@ -1,0 +1,42 @@
+"""A working folder to begin with: new."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+
+from ckc_pin.cli import options
+from ckc_pin.cli.output import make_folder, print_json
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import write_whole
+
+__all__ = ["new"]
+
+FILES = Path(__file__).parent / "new_files"  # NAME stands for the name, in their texts and their names
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+@click.command(epilog=options.examples("ckc new mine", "cd mine", "ckc run . --out first", "ckc play first"))
+@click.argument("folder", metavar="NAME", type=options.PATH, help="Of the mechanism: a new folder.")
+@options.as_json
+def new(folder: Path, as_json: bool) -> None:
+    """Make a folder with a mechanism of one loop that runs. Its three files are commented: change them into yours."""
+    name = folder.resolve().name if folder.name in ("", ".", "..") else folder.name
+    if not NAME.fullmatch(name):
+        raise InputError(f"{name!r}: a name is of letters, digits, - and _, and begins with a letter or a digit")
+    templates = sorted(FILES.iterdir())
+    paths = [folder / path.name.replace("NAME", name) for path in templates]
+    there = next((path for path in (folder, *paths) if path.exists() and (path != folder or not folder.is_dir())), None)
+    if there is not None:
+        raise InputError(f"{there}: is there already; give another name")
+    make_folder(folder)
+    for path, template in zip(paths, templates, strict=True):
+        write_whole(path, template.read_text(encoding="utf-8").replace("NAME", name))
+    if as_json:
+        print_json({"status": "done", "written": [str(path) for path in paths]})
+        return
+    for path in paths:
+        print(f"written: {path}")
+    print(f"next: cd {folder} && ckc run .")

@@ -1,0 +1,132 @@
+"""Many runs of one scene: the command `ckc sweep`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ckc_pin.cli import options
+from ckc_pin.cli.exits import STOPPED, interrupted
+from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.errors import InputError
+from ckc_pin.simulation.ensembles.ensemble import Summary, run_sweep, sweep_task
+from ckc_pin.simulation.ensembles.task import SweepTask
+
+__all__ = ["sweep"]
+
+EPILOG = options.examples(
+    "ckc sweep swing.sweep.toml --out sweeps/swing",
+    "ckc sweep swing.sweep.toml --out sweeps/swing --workers 4",
+    "ckc sweep swing.sweep.toml --out sweeps/swing --scheduler tcp://10.0.0.1:8786",
+    "ckc sweep swing.sweep.toml --out sweeps/swing --worst drift    # runs for ckc play",
+)
+
+
+@click.command("sweep", epilog=EPILOG)
+@click.argument("file", metavar="FILE", type=Path, help="A *.sweep.toml: a scene, its variables, what is kept.")
+@click.option(
+    "--out", type=Path, required=True, metavar="DIR", help="Gets results.zarr; what is there is gone on with."
+)
+@click.option("--threads", type=click.IntRange(min=1), help="Threads of this process; absent: one a core.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine, by Dask, in place of threads.")
+@click.option("--scheduler", metavar="ADDRESS", help="A cluster of Dask's that is there.")
+@click.option(
+    "--chunk", type=click.IntRange(min=1), help="Members that are written together; absent: about a second's."
+)
+@click.option(
+    "--worst", metavar="OUTPUT", multiple=True, help="Run the members where it is largest again, for ckc play."
+)
+@click.option(
+    "--indices", type=click.IntRange(min=2), metavar="N", help="Sobol indices, from (variables + 2) N members."
+)
+@click.option("--figures/--no-figures", default=True, help="Draw fans, maps and which variable matters.")
+@options.as_json
+def sweep(
+    file: Path,
+    out: Path,
+    threads: int | None,
+    workers: int | None,
+    scheduler: str | None,
+    chunk: int | None,
+    worst: tuple[str, ...],
+    indices: int | None,
+    figures: bool,
+    as_json: bool,
+) -> None:
+    """Run a scene many times with other numbers.
+
+    Killed at any time, the same command goes on where it was; the results do not depend on threads, chunks or workers.
+    """
+    if scheduler and workers:
+        raise InputError("--workers and --scheduler: give one of them")
+    task = sweep_task(file)
+    unknown = [name for name in worst if name not in task.spec.outputs]
+    if unknown:
+        raise InputError(f"--worst {unknown[0]}: no such output; there are {', '.join(task.spec.outputs)}")
+    found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
+    if found.status == "done":
+        _afterwards(found, out, worst, figures)
+        if indices is not None:
+            _weigh(task, indices, threads, out, figures)
+    _print(found, out, as_json)
+    if found.status != "done":
+        errors().print(found.message)
+        raise click.exceptions.Exit(STOPPED if found.status == "stopped" else interrupted(found.message))
+
+
+def _print(found: Summary, out: Path, as_json: bool) -> None:
+    keys = ("members", "done", "stopped", "failed", "wall_s", "rate")
+    summary = {key: getattr(found, key) for key in keys}
+    if as_json:
+        print_json({"status": found.status, "message": found.message, **summary})
+        return
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None)
+    for key in keys:
+        value = summary[key]
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    print_table(table)
+    print(f"written to {out}")
+
+
+def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures: bool) -> None:
+    """Write which variable matters, a row an output and variable, and draw it."""
+    from ckc_pin.mechanism.whole_file import write_whole
+    from ckc_pin.simulation.ensembles.importance import importance
+
+    found = importance(task, count, threads)
+    rows = ["output,variable,first_order,total_order"]
+    for name in found["output"].to_numpy():
+        of = found.sel(output=name)
+        for variable in found["variable"].to_numpy():
+            one = of.sel(variable=variable)
+            rows.append(f"{name},{variable},{float(one['first_order'])!r},{float(one['total_order'])!r}")
+        if figures:
+            try:
+                from ckc_pin.view.ensemble_figures import draw_importance
+
+                draw_importance(of, out / f"indices_{name}.png")
+            except InputError as error:
+                errors().print(f"no figures: {error}")
+    write_whole(out / "indices.csv", "\n".join(rows) + "\n")
+
+
+def _afterwards(found: Summary, out: Path, worst: tuple[str, ...], figures: bool) -> None:
+    """Draw figures, and run the worst members again."""
+    import xarray as xr
+
+    results = xr.open_zarr(found.place, consolidated=False, decode_timedelta=False)
+    if figures:
+        try:
+            from ckc_pin.view.ensemble_figures import draw
+
+            draw(results, out)
+        except InputError as error:  # matplotlib is an extra; the results are there
+            errors().print(f"no figures: {error}")
+    for name in worst:
+        from ckc_pin.simulation.ensembles.worst import save_worst
+
+        for folder in save_worst(found.prepared, results, name, out):
+            errors().print(f"ckc play {folder}")

@@ -1,0 +1,310 @@
+"""The linear model of a mechanism about one state: eq. 1 in minimal coordinates, differentiated exactly.
+
+The state is x = (q, q_dot) in d coordinates. With the tangent basis T, v' = T q_dot, and V what a change of q asks of
+v' so that the loops stay closed, the change of the acceleration a of eq. 1 along those coordinates is
+
+    (a_q T + a_v V) dq + a_v T dq_dot + a_u turns^T dtau.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ckc_pin.dynamics.derivatives import NONE, AccelerationDerivatives, acceleration_derivatives
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array, IntArray
+
+__all__ = ["LinearModel", "MinimalCoordinates", "Mode", "eigenvalues_of", "linear_model", "reduced"]
+
+ComplexArray = NDArray[np.complex128]
+
+MOST_NAMES, MOST_ROWS = 14, 12  # names in a list, and modes, in what is printed
+ROUNDING = 1e-12  # a damping ratio as small as that is printed as none
+LARGEST = 1e6  # condition of the coordinates' part of a tangent basis: beyond that they are no chart
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """One real eigenvalue, or a pair of conjugate ones.
+
+    Attributes
+    ----------
+    eigenvalue : complex
+        1/s; of a pair the one above the real axis.
+    frequency : float
+        Of a pair without its damping, |eigenvalue| / (2 pi), Hz; 0 of a real one.
+    damping_ratio : float
+        -Re / |eigenvalue|; NaN at zero.
+    shape : (n,) complex array
+        How the tree's coordinates move, the largest part one (in radians, or in the mechanism's size).
+    """
+
+    eigenvalue: complex
+    frequency: float
+    damping_ratio: float
+    shape: ComplexArray
+
+    @property
+    def says(self) -> str:
+        """Frequency and damping ratio of a pair, or the eigenvalue, in words."""
+        if not self.frequency:
+            return f"{self.eigenvalue.real + 0.0:.6g} 1/s"
+        ratio = 0.0 if abs(self.damping_ratio) < ROUNDING else self.damping_ratio
+        return f"{self.frequency:.4g} Hz, damping ratio {ratio:.3g}"
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """dx/dt = A x + B tau, y = C x + D tau, of deviations from one state of a mechanism.
+
+    Attributes
+    ----------
+    name : str
+    mechanism : Mechanism
+    at : str
+        What that state is, in words.
+    t : float or None
+        Of an instant of a run, s.
+    states, inputs, outputs : tuple of str
+        d coordinates and then their rates, ``NAME_dot``; motors; coordinates of the tree, ``point:NAME.x`` and
+        ``loop:LOOP.ROW``, the multipliers of eq. 1. Those of a free root are tangent coordinates, in its own axes.
+    A, B, C, D : arrays
+        D is the feedthrough. SI units.
+    q_tree, v_tree : (n,) arrays
+        The state itself, by coordinate.
+    tau : (motors,) array
+        What the motors do there.
+    motions : (n, d) array
+        What each coordinate moves of the tree.
+    locked : tuple of str
+        Joints that stick or touch, and do not move.
+    closed_loop : (2 d, 2 d) array or None
+        A with the scene's controller, which then has no inputs.
+    notes : tuple of str
+        What to know before one takes it for the whole truth.
+    """
+
+    name: str
+    mechanism: Mechanism
+    at: str
+    t: float | None
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    q_tree: Array
+    v_tree: Array
+    tau: Array
+    motions: Array
+    locked: tuple[str, ...] = ()
+    closed_loop: Array | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Labels of `q_tree`, `v_tree` and of the shapes of modes."""
+        return self.mechanism.coordinates
+
+    @cached_property
+    def eigenvalues(self) -> ComplexArray:
+        """Of A, 1/s, in falling order of their real parts."""
+        return eigenvalues_of(self.A)
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """Of A, in rising order of |eigenvalue|: of a motion, those of the instant."""
+        values, vectors = np.linalg.eig(self.A)
+        reach = self.mechanism.tree.reach
+        found = []
+        for k in np.argsort(np.abs(values), kind="stable"):
+            if values[k].imag < 0:
+                continue
+            shape = self.motions @ vectors[: len(self.A) // 2, k]
+            largest = shape[np.argmax(np.abs(shape / reach))]
+            size, pair = float(abs(values[k])), values[k].imag > 0
+            found.append(
+                Mode(
+                    complex(values[k]),
+                    size / (2 * np.pi) if pair else 0.0,
+                    float(-values[k].real / size) if size else float("nan"),
+                    shape / largest * reach[np.argmax(np.abs(shape / reach))] if largest else shape,
+                )
+            )
+        return tuple(found)
+
+    def to_statespace(self) -> Any:
+        """Return the model for python-control, a `control.StateSpace` with the same names, dots as underscores.
+
+        Raises
+        ------
+        InputError
+            python-control is not installed.
+        """
+        try:
+            import control
+        except ModuleNotFoundError as error:
+            raise InputError(
+                "to_statespace needs python-control, which is not installed: pip install ckc_pin[control]"
+            ) from error
+        names = ([name.replace(".", "_") for name in x] for x in (self.states, self.inputs, self.outputs))
+        states, inputs, outputs = names
+        return control.ss(self.A, self.B, self.C, self.D, states=states, inputs=inputs, outputs=outputs, name=self.name)
+
+    def __repr__(self) -> str:
+        head = f"LinearModel of {self.name} {self.at}: {len(self.states)} states, {len(self.inputs)} inputs"
+        shown = [f"  {says}" for says in (*_rows(self), *(f"note: {note}" for note in self.notes))]
+        return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {_some(self.states)}", *shown])
+
+
+def _some(names: tuple[str, ...]) -> str:
+    """Names as far as people read them."""
+    return ", ".join(
+        names if len(names) <= MOST_NAMES else (*names[: MOST_NAMES - 1], f"{len(names) - MOST_NAMES + 1} more")
+    )
+
+
+def _rows(model: LinearModel) -> list[str]:
+    rows = [f"inputs  {_some(model.inputs) or 'none'}"]
+    for mode in model.modes[:MOST_ROWS]:
+        value = mode.eigenvalue
+        still = bool(mode.frequency) and abs(mode.damping_ratio) < ROUNDING
+        pair = f"{0.0 if still else value.real:.6g} +- {value.imag:.6g}i 1/s: " if mode.frequency else ""
+        rows.append(f"eigenvalue {pair}{mode.says}")
+    return rows + ([f"and {len(model.modes) - MOST_ROWS} more"] if len(model.modes) > MOST_ROWS else [])
+
+
+def eigenvalues_of(A: Array) -> ComplexArray:
+    """Return a matrix's eigenvalues by falling real parts, conjugate ones side by side."""
+    values = np.linalg.eigvals(A).astype(complex)
+    return values[np.lexsort((-values.imag, np.round(np.abs(values.imag), 9), -np.round(values.real, 9)))]
+
+
+@dataclass(frozen=True)
+class MinimalCoordinates:
+    """Eq. 1's derivatives in minimal coordinates.
+
+    Attributes
+    ----------
+    at : (d,) int array
+        Which tangent coordinates the states are.
+    T, V : (n, d) arrays
+        v' by the coordinates' rates, and by the coordinates.
+    A : (2 d, 2 d) array
+    by_u : (2 d, n) array
+        The states' rates by u'.
+    """
+
+    at: IntArray
+    T: Array
+    V: Array
+    A: Array
+    by_u: Array
+
+
+def reduced(terms: Terms, found: AccelerationDerivatives) -> MinimalCoordinates:
+    """Bring derivatives of eq. 1 to minimal coordinates: `independent`, or others where those are no chart."""
+    at, d = found.chart, len(found.chart)
+    own = np.array([k for k in terms.mechanism.partition.q if found.tangent[k].any()], dtype=np.intp)  # not locked
+    if len(own) == d and np.linalg.cond(found.tangent[own]) < LARGEST:
+        at = own
+    T = found.tangent @ np.linalg.inv(found.tangent[at])
+    V = found.v_q @ T
+    V -= T @ V[at]
+    A = np.zeros((2 * d, 2 * d))
+    A[:d, :d] = -(terms.mechanism.tree.bracket(terms.v_tree) @ T)[at]
+    A[:d, d:] = np.eye(d)
+    A[d:, :d] = (found.a_q @ T + found.a_v @ V)[at]
+    A[d:, d:] = (found.a_v @ T)[at]
+    return MinimalCoordinates(at, T, V, A, np.vstack([np.zeros((d, terms.mechanism.n)), found.a_u[at]]))
+
+
+def linear_model(
+    terms: Terms,
+    tau: Array,
+    *,
+    at: str,
+    t: float | None = None,
+    u_tree: Array | float = 0.0,
+    locked: IntArray = NONE,
+    smoothing: float | None = None,
+    notes: tuple[str, ...] = (),
+) -> LinearModel:
+    """Linearize eq. 1 about a state.
+
+    Parameters
+    ----------
+    terms : Terms
+        On the closure.
+    tau : (motors,) array
+        What the motors do there.
+    at : str
+        What the state is, in words.
+    t : float, optional
+        Of an instant of a run, s.
+    u_tree : (n,) array, optional
+        Other forces that do not change with the state, as of joints that slide.
+    locked : int array, optional
+        Coordinates of joints that stick or touch.
+    smoothing : float, optional
+        Rate over which dry friction grows, as a scene's friction_smoothing.
+
+    Raises
+    ------
+    NumericalError
+        J has lost rank.
+    InputError
+        Nothing is free to move.
+    """
+    mechanism = terms.mechanism
+    names = tuple(mechanism.coordinates[k] for k in locked)
+    found = acceleration_derivatives(terms, mechanism.motors.force(tau) + u_tree, locked, smoothing)
+    if not found.tangent.shape[1]:
+        why = (
+            f"its joints stick or touch ({', '.join(names)}); friction_smoothing lets them slide" if names else "d = 0"
+        )
+        raise InputError(f"{mechanism.name}: no freedom is left to linearize in: {why}")
+    small = reduced(terms, found)
+    if not np.all(np.isfinite(small.A)):
+        raise NumericalError(f"{mechanism.name}: no linear model there, its derivatives are not finite")
+    chart = tuple(mechanism.coordinates[k] for k in small.at)
+    if chart != mechanism.independent and not names:
+        notes = (*notes, f"{', '.join(mechanism.independent)} are no coordinates there; {', '.join(chart)} are")
+    if names:
+        notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
+    points = mechanism.point_jacobians(terms.q_tree)
+    turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(small.at)))
+    places = np.vstack([small.T, *(x @ small.T for x in points.values())])
+    forces_q = found.multipliers_q @ small.T + found.multipliers_v @ small.V
+    return LinearModel(
+        name=mechanism.name,
+        mechanism=mechanism,
+        at=at,
+        t=t,
+        states=(*chart, *(f"{name}_dot" for name in chart)),
+        inputs=mechanism.actuated,
+        outputs=(
+            *mechanism.coordinates,
+            *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
+            *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
+        ),
+        A=small.A,
+        B=small.by_u @ turns,
+        C=np.block([[places, zero], [forces_q, found.multipliers_v @ small.T]]),
+        D=np.vstack([np.zeros((len(zero), len(mechanism.actuated))), found.multipliers_u @ turns]),
+        q_tree=mechanism.tree.to_coordinates(terms.q_tree),
+        v_tree=terms.v_tree,
+        tau=tau,
+        motions=small.T,
+        locked=names,
+        notes=notes,
+    )

@@ -1,0 +1,82 @@
+"""What public functions say of an argument of the wrong kind: once, at their door, with what they take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.errors import InputError
+
+__all__ = ["a_kind", "is_number", "require_callable", "require_flag", "require_kind", "require_path", "require_table"]
+
+PLAIN = (int, float, complex, str, bytes, type(None), np.generic)  # shown as they are; of the rest their kind
+MOST = 80  # characters of a value that is shown
+
+
+def a_kind(given: Any) -> str:
+    """Say what was given: a plain value as it is written, of anything else what it is."""
+    if isinstance(given, type):
+        return f"the class {given.__name__}"
+    if isinstance(given, PLAIN):
+        return f"{given!r:.{MOST}}"
+    kind = type(given).__name__
+    return f"{'an' if kind[0] in 'AEIOUaeiou' else 'a'} {kind}"
+
+
+def require_kind(given: Any, kinds: type | tuple[type, ...], what: str, takes: str) -> None:
+    """Refuse an argument that is of none of some kinds.
+
+    Parameters
+    ----------
+    given
+        The argument.
+    kinds : type or tuple of types
+    what : str
+        The function and its argument, as ``"simulate: scene"``.
+    takes : str
+        What would be right.
+
+    Raises
+    ------
+    InputError
+        ``what``, what was given, what it takes.
+    """
+    if not isinstance(given, kinds):
+        raise InputError(f"{what}: {a_kind(given)} was given; it takes {takes}")
+
+
+def require_path(given: Any, what: str, takes: str = "a path, as a string or a Path") -> None:
+    """Refuse what is no path; errors are those of `require_kind`."""
+    require_kind(given, (str, PathLike), what, takes)
+
+
+def require_table(given: Any, what: str, takes: str) -> None:
+    """Refuse what is no table, and one with keys that are no names; errors are those of `require_kind`."""
+    require_kind(given, Mapping, what, takes)
+    for key in given:
+        require_kind(key, str, f"{what}, a key", takes)
+
+
+def require_callable(given: Any, what: str, takes: str) -> None:
+    """Refuse what cannot be called and is not absent.
+
+    Raises
+    ------
+    InputError
+        What it takes.
+    """
+    if given is not None and not callable(given):
+        raise InputError(f"{what}: {a_kind(given)} was given; it takes {takes}")
+
+
+def require_flag(given: Any, what: str) -> None:
+    """Refuse what is neither True nor False; errors are those of `require_kind`."""
+    require_kind(given, (bool, np.bool_), what, "True or False")
+
+
+def is_number(given: Any) -> bool:
+    """Whether something is a real number, Python's or NumPy's; True and False are none."""
+    return isinstance(given, int | float | np.integer | np.floating) and not isinstance(given, bool)

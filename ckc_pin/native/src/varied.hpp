@@ -1,0 +1,129 @@
+// A formulation together with how its motion changes with parameters, y = (its y, and by parameter the change of q', v').
+#pragma once
+
+#include <algorithm>
+#include <type_traits>
+
+#include "dae.hpp"
+#include "level_set.hpp"
+#include "variation.hpp"
+
+namespace ckc {
+
+class WithVariation {
+ public:
+  virtual ~WithVariation() = default;
+  virtual Variation& variation() = 0;
+  virtual Matrix changes(In y) const = 0;  // (2 n, parameters)
+  bool together = true;  // false: what was met at once has different delays
+};
+
+template <class Base>
+class Varied : public Base, public WithVariation {
+ public:
+  template <class... Given>
+  Varied(VariationTable table, Given&&... given)
+      : Base(std::forward<Given>(given)...),
+        size_(Base::size),
+        of_start_(std::all_of(table.parameters.begin(), table.parameters.end(),
+                              [](const Parameter& of) { return of.kind == Parameter::start; })),
+        variation_(*this, std::move(table)) {
+    this->size = size_ + 2 * variation_.n * variation_.count;
+    this->crosses = false;
+  }
+
+  Variation& variation() override { return variation_; }
+  Matrix changes(In y) const override { return Eigen::Map<const Matrix>(y.data() + size_, rows(), variation_.count); }
+
+  void start(double t, In q_tree, In v, In w, Out y) override {
+    Base::start(t, q_tree, v, w, y.head(size_));
+    together = true;
+    this->core.set(q_tree);
+    if (!variation_.start(v, s_)) s_.setConstant(2 * variation_.n, variation_.count, std::nan(""));
+    put(y);
+  }
+
+  bool rhs(double t, In y, Out y_dot) override {
+    if (!Base::rhs(t, y.head(size_), y_dot.head(size_))) return false;
+    if (std::is_same_v<Base, Dae>) Base::at_last(t, y.head(size_));
+    v_ = std::is_same_v<Base, Dae> ? this->velocity : this->v_tree;
+    a_.resize(variation_.n);
+    if (!Base::tree_acceleration(y_dot.head(size_), a_)) return this->fails(Trouble::open);
+    take(y);
+    if (of_start_ && this->core.written) {
+      this->core.set_velocity(v_);
+      if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return this->fails(Trouble::infinite);
+      variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
+    } else if (!variation_.rates(v_, a_, s_, s_dot_)) {
+      return this->fails(Trouble::infinite);
+    }
+    Eigen::Map<Matrix>(y_dot.data() + size_, rows(), variation_.count) = s_dot_;
+    return true;
+  }
+
+  bool exact(double t, In y) override { return Base::exact(t, y.head(size_)); }
+  bool at_start(double t, In y) override { return Base::at_start(t, y.head(size_)); }
+  bool at_last(double t, In y) override { return Base::at_last(t, y.head(size_)); }
+  bool place(In y) override { return Base::place(y.head(size_)); }
+  Accepted accept(double t, Out y, double margin) override { return Base::accept(t, y.head(size_), margin); }
+  bool own_partition(double t, Out y, bool& changed) override { return Base::own_partition(t, y.head(size_), changed); }
+  bool modes(In y, Matrix& jacobian) override {
+    jacobian = Matrix(jacobian.topLeftCorner(size_, size_));
+    return Base::modes(y.head(size_), jacobian);
+  }
+  bool tree_acceleration(In f, Out a) const override { return Base::tree_acceleration(f.head(size_), a); }
+  void whole(In f, Out x, Out x_dot) const override { Base::whole(f.head(size_), x, x_dot); }
+  void push(Out y, In v) const override { Base::push(y.head(size_), v); }
+  void shift(Out y, In step) const override { Base::shift(y.head(size_), step); }
+  void go_on(double t, Out y) override { Base::go_on(t, y.head(size_)); }
+
+  // Without how the changes' own rates change along the motion, which an iteration can do without.
+  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override {
+    const int n = variation_.n;
+    Matrix of_motion, by_q, by_v;
+    if (!Base::jacobian(t, y.head(size_), of_motion, evaluations)) return false;
+    Vector v = this->v_tree;
+    if (std::is_same_v<Base, Dae>) Base::at_last(t, y.head(size_)), v = this->velocity;
+    if (!this->slopes(Vector(this->core.q_tree), v, this->uncorrected_, by_q, by_v)) return false;
+    jacobian.setZero(this->size, this->size);
+    jacobian.topLeftCorner(size_, size_) = of_motion;
+    for (int p = 0; p < variation_.count; ++p) {
+      auto block = jacobian.block(size_ + 2 * n * p, size_ + 2 * n * p, 2 * n, 2 * n);
+      block.topLeftCorner(n, n) = -this->core.tree.brackets(v);
+      block.topRightCorner(n, n).setIdentity();
+      block.bottomLeftCorner(n, n) = by_q, block.bottomRightCorner(n, n) = by_v;
+    }
+    return jacobian.allFinite();
+  }
+
+  bool before_change(double t, In y, const std::vector<System::Met>& met) override {
+    take(y), a_.resize(variation_.n), v_ = this->velocity;
+    if (!this->acceleration(t, a_)) return false;
+    together = variation_.before_change(v_, a_, met, s_);
+    return together;
+  }
+  bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back) override {
+    return variation_.at_impact(step, at, responses, x, back, s_);
+  }
+  bool after_change(double t, Out y) override {
+    if (!this->acceleration(t, a_)) return false;
+    variation_.after_change(this->velocity, a_, s_);
+    put(y);
+    return true;
+  }
+  int extra() const override { return 2 * variation_.n * variation_.count; }
+  void put_extra(In y, Out row) const override { row = y.tail(extra()); }
+
+ private:
+  int rows() const { return 2 * variation_.n; }
+  void take(In y) { s_ = changes(y); }
+  void put(Out y) const { Eigen::Map<Matrix>(y.data() + size_, rows(), variation_.count) = s_; }
+
+  const int size_;  // of the base's y
+  const bool of_start_;  // nothing varies but where it starts
+  Variation variation_;
+  Matrix s_, s_dot_, by_q_, by_v_;
+  Vector v_, a_;
+};
+
+}  // namespace ckc

@@ -1,0 +1,92 @@
+"""Chunks of members in processes and on machines: all of it Dask's, but for what one worker does with one chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any
+
+from ckc_pin.errors import InputError
+from ckc_pin.simulation.ensembles.members import Chunk, Members
+from ckc_pin.simulation.ensembles.task import SweepTask
+
+__all__ = ["chunks_by", "client_of"]
+
+PATIENCE = 10.0  # s, for a scheduler to answer
+AHEAD = 3  # chunks a worker that are waiting or under way: none of them idles, and memory is bounded
+
+_members: dict[str, Members] = {}  # of this process: what was prepared last
+
+
+def work(task: SweepTask, first: int, end: int) -> Chunk:
+    """Run one chunk on a worker; what is prepared for a sweep is kept for its next chunk."""
+    if task.identity not in _members:
+        _members.clear()
+        _members[task.identity] = task.members(1)
+    return _members[task.identity].run(first, task.variables().values(first, end))
+
+
+@contextmanager
+def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    """Connect to a scheduler, or start a cluster of processes on this machine, which nobody else can reach.
+
+    Raises
+    ------
+    InputError
+        Dask is not installed; the scheduler does not answer.
+    """
+    try:
+        from dask.distributed import Client, LocalCluster
+    except ModuleNotFoundError:
+        says = (
+            "processes and machines are run by dask.distributed, which is not installed: pip install ckc_pin[cluster]"
+        )
+        raise InputError(says) from None
+    if scheduler is None:
+        with (
+            LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+            ) as cluster,
+            Client(cluster) as client,  # type: ignore[no-untyped-call]
+        ):
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=PATIENCE)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
+            "`dask scheduler` and `dask worker ADDRESS`, or leave it out for processes on this machine"
+        ) from None
+    with client:
+        yield client
+
+
+def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
+    """Yield chunks as workers finish them, in whatever order.
+
+    Raises
+    ------
+    InputError
+        A chunk that its workers cannot finish: those that died, or what it raised. Others that are under way are lost.
+    """
+    from dask.distributed import as_completed
+
+    todo = iter(pending)
+
+    def submit(count: int) -> list[Any]:
+        return [
+            client.submit(work, task, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
+            for first, end in islice(todo, count)
+        ]
+
+    running = as_completed(submit(AHEAD * workers))  # type: ignore[no-untyped-call]
+    for future in running:
+        try:
+            chunk = future.result()
+        except Exception as error:  # what a worker raised, or that workers died over it
+            raise InputError(f"a worker failed: {type(error).__name__}: {error}") from None
+        for more in submit(1):
+            running.add(more)  # type: ignore[no-untyped-call]
+        yield chunk

@@ -1,0 +1,197 @@
+"""Results on disk: a Zarr group that xarray opens, written chunk by chunk, each of them whole or not there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ckc_pin.errors import InputError
+from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
+
+__all__ = ["RESULTS", "Store", "require_libraries"]
+
+RESULTS = "results.zarr"
+FORMAT = 1
+BLOCK = 2**20  # members whose status is read at once
+STATUS_NAME, MESSAGE_NAME = "status", "message"
+UNITS = "SI units: s, m, rad, kg, N, N m, J"
+
+
+def require_libraries() -> None:
+    """Refuse to begin without xarray and Zarr (InputError)."""
+    try:
+        import xarray  # noqa: F401
+        import zarr  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"ensembles are kept by {error.name}, which is not installed: pip install ckc_pin[ensembles]"
+        ) from None
+
+
+class Store:
+    """The results of one sweep.
+
+    Parameters
+    ----------
+    path : Path or None
+        The group; None: in memory.
+    sweep : mapping
+        All that the results follow from, as plain data: who goes on with a store must have the same.
+    members : Members
+    count : int
+    chunk : int
+        Members that are written together; of a store that is there its own is kept.
+
+    Raises
+    ------
+    InputError
+        The store is of another sweep, is no store, or cannot be written.
+
+    Attributes
+    ----------
+    chunk : int
+    """
+
+    def __init__(self, path: Path | None, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
+        import zarr
+        from zarr.storage import MemoryStore
+
+        self.path, self.count = path, count
+        _require_free_names(members)
+        sweep = json.loads(json.dumps(sweep))
+        self._identity = sha256(msgspec.json.encode(sweep, order="deterministic")).hexdigest()
+        if path is not None and path.exists():
+            self._group = self._open(path, sweep)
+        else:
+            where: Any = MemoryStore() if path is None else path
+            try:
+                self._group = zarr.open_group(where, mode="w", zarr_format=3)
+                self._make(sweep, members, min(chunk, count))
+            except OSError as error:
+                raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        self.chunk: int = self._group[STATUS_NAME].chunks[0]
+
+    @property
+    def place(self) -> Any:
+        """What xarray opens."""
+        return self._group.store if self.path is None else self.path
+
+    def pending(self) -> Iterator[tuple[int, int]]:
+        """Yield the chunks that are not there yet, as first and end of their members."""
+        for block, status in self._statuses():
+            for first in range(0, len(status), self.chunk):
+                end = min(first + self.chunk, len(status))
+                if (status[first:end] == PENDING).any():
+                    yield block + first, block + end
+
+    def counts(self) -> dict[str, int]:
+        """Count members by how they ended."""
+        counts = np.zeros(len(STATUS), dtype=np.int64)
+        for _, status in self._statuses():
+            counts += np.bincount(status, minlength=len(STATUS))
+        return {name: int(counts[k]) for k, name in enumerate(STATUS)}
+
+    def _statuses(self) -> Iterator[tuple[int, Any]]:
+        """Read how members ended, many chunks at a time."""
+        status: Any = self._group[STATUS_NAME]
+        step = self.chunk * max(1, BLOCK // self.chunk)
+        for first in range(0, self.count, step):
+            yield first, status[first : first + step]
+
+    def write(self, chunk: Chunk, names: tuple[str, ...]) -> None:
+        """Write a chunk; how its members ended comes last, and says that it is whole.
+
+        Raises
+        ------
+        InputError
+            It cannot be written: a full disk. What was written before is whole.
+        """
+        at = slice(chunk.first, chunk.first + len(chunk.status))
+        group: Any = self._group
+        try:
+            for k, name in enumerate(names):
+                group[_key(name)][at] = chunk.values[:, k]
+            for name, values in chunk.outputs.items():
+                group[_key(name)][at] = values
+            if any(chunk.message):
+                group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
+            group[STATUS_NAME][at] = chunk.status
+        except OSError as error:
+            says = f"{self.path}: cannot be written: {error.strerror or error}"
+            raise InputError(f"{says}; what is there stays, and the same command goes on from it") from None
+
+    def _open(self, path: Path, sweep: Mapping[str, Any]) -> Any:
+        import zarr
+
+        try:
+            group = zarr.open_group(path, mode="r+", zarr_format=3)
+            attributes = dict(group.attrs)
+        except Exception as error:  # whatever a damaged store makes Zarr raise
+            raise InputError(
+                f"{path}: no results of a sweep ({type(error).__name__}); remove it, or choose another DIR"
+            ) from None
+        if attributes.get("format") != FORMAT or "identity" not in attributes:
+            raise InputError(
+                f"{path}: not begun as results of a sweep, or not to its end; remove it, or choose another DIR"
+            )
+        if attributes["identity"] != self._identity:
+            other = json.loads(str(attributes["sweep"]))
+            differs = [key for key in sweep if other.get(key) != sweep[key]]
+            raise InputError(
+                f"{path}: results of another sweep: {', '.join(differs) or 'its content'} differ; choose another "
+                "DIR, or remove it"
+            )
+        return group
+
+    def _make(self, sweep: Mapping[str, Any], members: Members, chunk: int) -> None:
+        group: Any = self._group
+        labels = {name: found for name, found in members.outputs.labels.items() if _is_used(name, members)}
+        for name, found in labels.items():
+            place = group.create_array(name, shape=(len(found),), dtype=str, dimension_names=(name,))
+            place[:] = np.array(found, dtype=np.dtypes.StringDType())
+        if _is_used("time", members):
+            place = group.create_array(
+                "time", shape=(len(members.instants),), dtype="f8", dimension_names=("time",), attributes={"units": "s"}
+            )
+            place[:] = members.instants
+        every = dict.fromkeys(members.names, ((), ())) | members.shapes
+        for name, (dims, shape) in every.items():
+            group.create_array(
+                _key(name), shape=(self.count, *shape), chunks=(chunk, *shape), dtype="f8", fill_value=np.nan,
+                dimension_names=("member", *dims), attributes={"is": "variable" if name in members.names else "output"},
+            )  # fmt: skip
+        group.create_array(
+            MESSAGE_NAME, shape=(self.count,), chunks=(chunk,), dtype=str, dimension_names=("member",), fill_value=""
+        )
+        flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
+        group.create_array(
+            STATUS_NAME, shape=(self.count,), chunks=(chunk,), dtype="u1", dimension_names=("member",),
+            fill_value=PENDING, attributes=flags,
+        )  # fmt: skip
+        group.attrs.update(
+            {"format": FORMAT, "units": UNITS, "sweep": json.dumps(sweep), "identity": self._identity}
+        )  # last: a store without them was not begun to its end
+
+
+def _require_free_names(members: Members) -> None:
+    """Refuse outputs that are called like something else in the store."""
+    for name in (*members.names, *members.shapes):
+        if name in (STATUS_NAME, MESSAGE_NAME, *members.outputs.labels, "time") or (
+            name in members.names and name in members.shapes
+        ):
+            raise InputError(f"outputs: {name!r} is taken; choose another name")
+
+
+def _is_used(dimension: str, members: Members) -> bool:
+    return any(dimension in dims for dims, _ in members.shapes.values())
+
+
+def _key(name: str) -> str:
+    """An array's name in the group: a slash would make groups of it."""
+    return name.replace("/", "_")

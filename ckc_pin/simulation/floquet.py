@@ -1,0 +1,120 @@
+"""How a periodic motion answers to a push: its monodromy matrix and Floquet multipliers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.sensitivities import sensitivities
+
+__all__ = ["Floquet", "floquet"]
+
+RETURNS = 1e-5  # rad, m and their rates, of the motion's own size: a motion that comes back
+LEAST_RTOL = 1e-8
+
+
+@dataclass(frozen=True)
+class Floquet:
+    """A periodic motion to first order.
+
+    Attributes
+    ----------
+    states : tuple of str
+        Rows and columns: the independent coordinates, then their rates.
+    monodromy : (2 d, 2 d) array
+        What a small change of the start has become after a period.
+    multipliers : (2 d,) complex array
+        Its eigenvalues, the largest first: beyond 1 in size the motion is unstable.
+    period : float
+        s.
+    run : Run
+    """
+
+    states: tuple[str, ...]
+    monodromy: Array
+    multipliers: np.ndarray[Any, np.dtype[np.complex128]]
+    period: float
+    run: Run
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as JSON has it, complex numbers as [re, im]."""
+        return {
+            "states": list(self.states),
+            "period": self.period,
+            "monodromy": self.monodromy.tolist(),
+            "multipliers": [[float(x.real), float(x.imag)] for x in self.multipliers],
+        }
+
+
+def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any] | None = None) -> Floquet:
+    """Return the monodromy matrix and the Floquet multipliers of a scene's motion, which is periodic from its start.
+
+    Parameters
+    ----------
+    scene : str, Path or Scene
+    period : float
+        s.
+    changes : mapping, optional
+        As of `simulate`.
+
+    Returns
+    -------
+    Floquet
+
+    Raises
+    ------
+    InputError
+        The motion does not come back after the period: the message says by how much it misses.
+    NumericalError
+        It does not get to its end.
+    """
+    if not np.isfinite(period) or period <= 0:
+        raise InputError(f"period = {period:g}: a positive number of seconds is needed")
+    if isinstance(scene, Scene):
+        raise InputError("floquet: name the scene, or give its path; a Scene is complete, t_end included")
+    loaded = load_scene(scene, {**(changes or {}), "t_end": period})
+    if loaded.spec.initial.at is not None:
+        raise InputError(
+            f'{loaded.name}: initial.at = "{loaded.spec.initial.at}" has no motion; give initial.q and q_dot'
+        )
+    from ckc_pin.simulation.prepare import scene_mechanism
+
+    mechanism = scene_mechanism(loaded)
+    if mechanism.rooted:
+        raise InputError(f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates")
+    names = mechanism.independent
+    found = sensitivities(loaded, [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names])
+    run = found.run
+    if run.status != "done" or run.t[-1] < period * (1 - 1e-12):
+        raise NumericalError(f"floquet: the motion does not reach the end of its period: {run.message}")
+    _require_back(run)
+    q = mechanism.partition.q
+    monodromy = np.concatenate([found.q_tree[-1][q], found.v_tree[-1][q]])
+    multipliers = np.linalg.eigvals(monodromy).astype(np.complex128)
+    order = np.argsort(-np.abs(multipliers), kind="stable")
+    states = (*names, *(f"{name}_dot" for name in names))
+    return Floquet(states, monodromy, multipliers[order], float(period), run)
+
+
+def _require_back(run: Run) -> None:
+    """A motion is periodic where it ends as it began; turns of a joint are one place."""
+    tree = run.mechanism.tree
+    for what, values in (("", run.q_tree), (" (rate)", run.v_tree)):
+        miss = values[-1] - values[0]
+        if not what:
+            miss = np.where(tree.in_metres, miss, np.mod(miss + np.pi, 2 * np.pi) - np.pi)
+        scale = max(1.0, float(np.abs(values).max()))
+        worst = int(np.argmax(np.abs(miss)))
+        if not np.abs(miss[worst]) <= RETURNS * scale:
+            raise InputError(
+                f"period = {run.t[-1]:.9g} s is none: after it {run.coordinates[worst]}{what} is off by "
+                f"{miss[worst]:.6g} from its {values[0, worst]:.6g} at the start"
+            )

@@ -1,0 +1,169 @@
+"""Linear models and the stability of controllers, as plain data and in words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ckc_pin.dynamics.linearization import LinearModel, eigenvalues_of
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.simulation.stability import Stability
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+__all__ = [
+    "linear_plain",
+    "linear_text",
+    "pairs",
+    "save_linear",
+    "stability_plain",
+    "stability_text",
+    "stability_warning",
+]
+
+SHOWN = 6  # eigenvalues, in what people read
+
+
+def pairs(values: Any) -> list[list[float]]:
+    """Return complex numbers as [re, im]."""
+    return [[float(x.real), float(x.imag)] for x in np.asarray(values, dtype=complex)]
+
+
+def linear_plain(model: LinearModel) -> dict[str, Any]:
+    """Return a linear model as JSON-ready data (docs/reference/json.md)."""
+    closed = model.closed_loop
+    return {
+        "name": model.name,
+        "states": model.states,
+        "inputs": model.inputs,
+        "outputs": model.outputs,
+        **{name: getattr(model, name).tolist() for name in "ABCD"},
+        "eigenvalues": pairs(model.eigenvalues),
+        "modes": [
+            {
+                "eigenvalue": pairs([mode.eigenvalue])[0],
+                "frequency": mode.frequency,
+                "damping_ratio": mode.damping_ratio,
+                "shape": dict(zip(model.coordinates, pairs(mode.shape), strict=True)),
+            }
+            for mode in model.modes
+        ],
+        "at": {
+            "state": model.at,
+            "t": model.t,
+            "coordinates": model.coordinates,
+            "q_tree": model.q_tree.tolist(),
+            "v_tree": model.v_tree.tolist(),
+            "tau": model.tau.tolist(),
+        },
+        "locked": model.locked,
+        "closed_loop": None if closed is None else {"A": closed.tolist(), "eigenvalues": pairs(eigenvalues_of(closed))},
+        "notes": model.notes,
+    }
+
+
+def linear_text(model: LinearModel) -> Text:
+    """Return a linear model for people."""
+    from rich.text import Text
+
+    lines = [repr(model)]
+    if model.closed_loop is not None:
+        lines.append(f"  closed loop: {eigenvalues_text(eigenvalues_of(model.closed_loop))} 1/s")
+    return Text("\n".join(lines))
+
+
+def save_linear(model: LinearModel, path: Path) -> Path:
+    """Write a linear model to a file, NumPy's npz without pickle (docs/reference/run_file.md): whole or not at all.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    numbers = (*"ABCD", "q_tree", "v_tree", "tau", "motions", "eigenvalues")
+    arrays: dict[str, Any] = {name: getattr(model, name) for name in numbers}
+    arrays |= {
+        name: np.array(getattr(model, name), dtype=str) for name in ("states", "inputs", "outputs", "coordinates")
+    }
+    about = {"name": model.name, "at": model.at, "t": model.t, "locked": model.locked, "notes": model.notes}
+    if model.closed_loop is not None:
+        arrays["closed_loop"] = model.closed_loop
+    with written_whole(path) as file:
+        np.savez_compressed(file, **arrays, meta=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8))
+    return path
+
+
+# --- stability -----------------------------------------------------------------------------------
+
+
+def stability_plain(found: Stability | None) -> dict[str, Any] | None:
+    """Return what a check says of a closed loop as JSON-ready data."""
+    if found is None:
+        return None
+    return {
+        **vars(found),
+        "eigenvalues": pairs(found.eigenvalues),
+        "least_K_P": None if found.least_K_P is None else found.least_K_P.tolist(),
+    }
+
+
+def stability_text(found: Stability) -> str:
+    """Say in a line whether a closed loop is stable, and how much."""
+    says = "stable" if found.stable else "UNSTABLE"
+    if found.leaves_out:
+        says += f", {' and '.join(found.leaves_out)} left out,"
+    if found.growth is not None and found.largest_growth is not None:
+        return (
+            f"{says} along the motion: errors grow to {found.largest_growth:.3g} times at most, to {found.growth:.2e} "
+            f"at its end; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
+        )
+    if found.multiplier is not None:
+        says += f" as sampled, factor {found.multiplier:.6g} a sample,"
+    slowest = f", slowest decay {found.slowest:.3g} s" if np.isfinite(found.slowest) else ""
+    return f"{says} at its target{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
+
+
+def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> list[str]:
+    """Say of an unstable loop what would make it stable."""
+    if found is None or found.stable:
+        return []
+    if found.least_K_P is None:
+        return [
+            f"the closed loop is unstable along the desired motion: an error may be {found.growth:.3g} times as large "
+            "at its end; larger Lambda and K_D would help"
+        ]
+    worst = float(found.eigenvalues[0].real)
+    if found.multiplier is not None and worst < 0:
+        return [
+            f"the closed loop is unstable as sampled: errors grow {found.multiplier:.4g} times a sample, while without "
+            "sampling and delay they would decay; sample more often, delay less, or take smaller gains"
+        ]
+    if not found.least_K_P.any():
+        return [f"the closed loop does not come to rest at its target (eigenvalue {worst:.3g} 1/s): K_V is too small"]
+    return [
+        f"the closed loop is unstable at its target: eigenvalue {worst:.3g} 1/s, and K_P + dh/dq has the eigenvalue "
+        f"{found.least_eigenvalue:.4g}; the least K_P in its proportions is {_gain(found.least_K_P, independent)}"
+    ]
+
+
+def _gain(K_P: Array, names: tuple[str, ...]) -> str:
+    diagonal = np.diagonal(K_P)
+    if np.array_equal(K_P, diagonal[0] * np.eye(len(K_P))):
+        return f"{diagonal[0]:.6g}"
+    if np.array_equal(K_P, np.diag(diagonal)):
+        return ", ".join(f"{name} = {x:.6g}" for name, x in zip(names, diagonal, strict=True))
+    return str(np.round(K_P, 4).tolist())
+
+
+def eigenvalues_text(values: Any) -> str:
+    """Return the rightmost eigenvalues in words, a pair of conjugates as one."""
+    some = [x for x in values if x.imag >= -1e-9 * abs(x)]
+    shown = [
+        f"{x.real:.4g}" if abs(x.imag) <= 1e-9 * abs(x) else f"{x.real:.4g} +- {x.imag:.4g}i" for x in some[:SHOWN]
+    ]
+    return ", ".join(shown) + (f" and {len(some) - SHOWN} more" if len(some) > SHOWN else "")

@@ -1,0 +1,112 @@
+"""What figures and playback are in a notebook: values that show themselves in the page, and do nothing else."""
+
+from __future__ import annotations
+
+import sys
+from base64 import b64encode
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ckc_pin.simulation.run import Run
+from ckc_pin.view.figures import draw, write_figures
+from ckc_pin.view.player import html, write_page
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Figures", "Playback", "in_notebook"]
+
+HEIGHT = 480  # of a playback in a page, in its pixels
+RESOLUTION = 100  # of a figure in a page
+
+
+def in_notebook() -> bool:
+    """Whether what a cell returns is shown in a page: a kernel runs us, and not a terminal."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return shell is not None and hasattr(shell, "kernel")
+
+
+class Figures(Mapping[str, "Figure"]):
+    """Figures of runs by name, as `view.figures.draw` draws them; shown inline by a notebook.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self._figures = draw(runs)
+
+    def __getitem__(self, name: str) -> Figure:
+        """Return matplotlib's figure, to be changed as any."""
+        return self._figures[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._figures)
+
+    def __len__(self) -> int:
+        return len(self._figures)
+
+    def __repr__(self) -> str:
+        return f"Figures({', '.join(self)})"
+
+    def _repr_html_(self) -> str:
+        return "\n".join(_image(name, figure) for name, figure in self._figures.items())
+
+    def save(self, out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+        """Write the figures to a folder, which is made when missing; formats are "png", "svg" and "pdf".
+
+        Raises
+        ------
+        InputError
+            An unknown format, a folder that cannot be written.
+        """
+        return write_figures(self._figures, out_dir, formats)
+
+
+class Playback:
+    """Playback of runs as a page of its own; shown inline by a notebook, and kept with it.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    speed, gap, meshes, forces
+        As for `play`.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        *,
+        speed: float = 1.0,
+        gap: float = 0.0,
+        meshes: str | Path | None = None,
+        forces: bool = False,
+    ) -> None:
+        self._runs = tuple(runs)
+        self.html = html(self._runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
+
+    def __repr__(self) -> str:
+        return f"Playback({', '.join(run.scene_name for run in self._runs)}); save(FILE) writes a page that plays"
+
+    def _repr_html_(self) -> str:
+        page = escape(self.html, quote=True)  # a page within the page; its scripts can reach nothing of ours
+        return (
+            f'<iframe srcdoc="{page}" sandbox="allow-scripts" width="100%" height="{HEIGHT}" '
+            'style="border: 1px solid #ddd"></iframe>'
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write one HTML file that plays from disk, without a network; errors are those of `save_html`."""
+        return write_page(self.html, path)
+
+
+def _image(name: str, figure: Figure) -> str:
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=RESOLUTION)
+    data = b64encode(file.getvalue()).decode()
+    return f'<img src="data:image/png;base64,{data}" alt="{escape(name, quote=True)}" style="max-width: 100%">'

@@ -1,0 +1,42 @@
+"""A sweep with its basin.
+
+Set-point control from rest at a grid of starts: from which does the five-bar settle at its target within 5 s? One call
+runs them all; starts that the loops cannot close stay in the result as failed, with their reason.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import ckc_pin
+
+GRID = {"start": -1.9, "stop": 1.9, "count": 15}  # rad, of both starts
+
+
+def main():
+    found = ckc_pin.ensemble(
+        "five_bar/set_point",
+        {"initial.q.theta_1": {"grid": GRID}, "initial.q.theta_3": {"grid": GRID}},
+        {"settled": {"of": "settled", "tolerance": 1e-2}, "end": "q_tree"},
+        changes={"formulation": "reduced", "t_end": 5.0, "solver.rtol": 1e-6},
+    )
+    done, settled = found["status"].to_numpy() == 1, found["settled"].to_numpy() == 1
+    theta_1, theta_3 = found["initial.q.theta_1"].to_numpy(), found["initial.q.theta_3"].to_numpy()
+    print(f"{done.sum()} of {done.size} starts can be assembled and run to the end; {settled.sum()} settle")
+    figure, ax = plt.subplots(figsize=(4.6, 4.2), layout="constrained")
+    for which, label, marker in (
+        (settled, "settles", "o"),
+        (done & ~settled, "does not", "x"),
+        (~done, "does not run", "."),
+    ):
+        ax.plot(theta_1[which], theta_3[which], marker, label=label, markersize=4)
+    ax.set(xlabel="θ₁ at the start / rad", ylabel="θ₃ at the start / rad", aspect="equal")
+    figure.legend(loc="outside lower center", ncols=3)
+    target = ckc_pin.load_scene("five_bar/set_point").plain()["controller"]["q_d"]["theta_1"]
+    ends = found["end"].sel(coordinate="theta_1").to_numpy()[settled]
+    assert settled.sum() > 20
+    assert np.abs(ends - target).max() < 1e-2
+    return figure
+
+
+if __name__ == "__main__":
+    main().savefig("basin.png")

@@ -1,0 +1,121 @@
+"""Prints how long 10^9 members take on many cores: scheduler, workers and who writes, simulated event by event.
+
+What goes in is measured here: members a second of a core, what a task costs Dask's scheduler, what writing a chunk
+takes. Workers ask for the next chunk when they have finished one; the scheduler serves one at a time, and so does the
+client, which fetches and writes results. AHEAD chunks a worker are on their way, as in `ensembles.cluster`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ckc_pin.simulation.ensembles.cluster import AHEAD
+from ckc_pin.simulation.ensembles.members import Chunk, Members
+from ckc_pin.simulation.ensembles.store import Store
+
+NETWORK = 1.0e9  # bytes a second to the client: a 10 Gbit/s link
+MEMBERS = 10**9
+NUMBERS = 7  # a member: two variables, four coordinates at the end, status and message
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds."""
+
+    member: float  # of a core
+    task: float  # of the scheduler
+    files: float  # of the client, a chunk, whatever its size
+    byte: float  # of the client
+
+
+def simulated(costs: Costs, cores: int, chunk: int, members: int = MEMBERS) -> tuple[float, float, float]:
+    """Return seconds in all, and how busy workers and client are."""
+    size = 8.0 * NUMBERS * chunk
+    work, write = chunk * costs.member, costs.files + size * (costs.byte + 1 / NETWORK)
+    left = -(-members // chunk)
+    chunks, scheduler, client = left, 0.0, 0.0
+    idle = [(0.0, k) for k in range(cores)]  # when each worker is free
+    heapq.heapify(idle)
+    written: list[float] = []  # when each chunk is written: a further one is sent then
+    sent = 0
+    end = 0.0
+    while left:
+        free, k = heapq.heappop(idle)
+        asked = free if sent < AHEAD * cores else max(free, written[sent - AHEAD * cores])
+        scheduler = max(scheduler, asked) + costs.task
+        done = scheduler + work
+        client = max(client, done) + write
+        written.append(client)
+        heapq.heappush(idle, (done, k))
+        end = client
+        sent += 1
+        left -= 1
+    return end, chunks * work / (cores * end), chunks * write / end
+
+
+def measured(scratch: Path) -> Costs:
+    """Measure what goes into it."""
+    names = ("initial.q.theta_1", "initial.q.theta_3")
+    members = Members(
+        "five_bar/swing", {"solver.rtol": 1e-6, "solver.terms": "generated"}, names, {"end": "q_tree"}, 1, 1
+    )
+    values = np.random.default_rng(1).uniform([-1.2, -1.4], [-0.9, -1.2], (2000, 2))
+    members.run(0, values[:2])
+    started = time.process_time()
+    members.run(0, values)
+    member = (time.process_time() - started) / len(values)
+    seconds = {size: writing(members, scratch / f"{size}.zarr", size) for size in (100, 100_000)}
+    byte = max(0.0, seconds[100_000] - seconds[100]) / (8 * NUMBERS * 99_900)
+    return Costs(member, dask_task(), seconds[100], byte)
+
+
+def writing(members: Members, path: Path, size: int) -> float:
+    """Processor seconds for a chunk of a size."""
+    chunks = 5
+    store = Store(path, {}, members, chunks * size, size)
+    random = np.random.default_rng(0)
+    spent = time.process_time()
+    for k in range(chunks):
+        found = Chunk(k * size, random.normal(size=(size, 2)), np.ones(size, np.uint8), [""] * size,
+                      {"end": random.normal(size=(size, 4))}, 0)  # fmt: skip
+        store.write(found, members.names)
+    return (time.process_time() - spent) / chunks
+
+
+def dask_task() -> float:
+    """Processor seconds of scheduler and client in one process, a task that does nothing."""
+    from dask.distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,  # type: ignore[no-untyped-call]
+        Client(cluster) as client,  # type: ignore[no-untyped-call]
+    ):
+        client.gather(client.map(int, range(10)))
+        spent = time.process_time()
+        client.gather(client.map(int, range(100, 1100)))
+        return (time.process_time() - spent) / 1000
+
+
+def main() -> None:
+    """Print a Markdown table."""
+    with tempfile.TemporaryDirectory() as scratch:
+        costs = measured(Path(scratch))
+    print(
+        f"a member {costs.member * 1e6:.0f} us of a core; a task {costs.task * 1e3:.2f} ms of scheduler and client; "
+        f"a chunk {costs.files * 1e3:.1f} ms to write, and {1e-6 / costs.byte:.0f} MB a second\n"
+    )
+    columns = ("cores", "members a chunk", "s of a chunk", "hours for 10^9", "cores busy", "client busy")
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+    for cores in (2, 100, 1000):
+        for seconds in (1.0, 10.0, 60.0):
+            chunk = round(seconds / costs.member)
+            end, busy, writes = simulated(costs, cores, chunk)
+            print(
+                f"| {cores} | {chunk:,} | {seconds:g} | {end / 3600:.2f} | {100 * busy:.0f} % | {100 * writes:.0f} % |"
+            )

@@ -1,0 +1,220 @@
+"""Eq. 1 in many digits and from positions alone: a model of the tests' own, slow, and sharing no formula.
+
+Frames are placed joint by joint with mpmath; every velocity, acceleration and Jacobian is a difference of placements,
+every force d'Alembert's. With 80 digits and steps of 1e-20 that leaves about 40 digits; differences of whole solutions
+keep 20. Read from the program are numbers only: the tree's placements, axes and inertias, and what rows and springs
+hold on to.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mpmath as mp
+import numpy as np
+
+from ckc_pin.mechanism import Mechanism
+from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+
+mp.mp.dps = 80
+SMALL = mp.mpf(10) ** -20  # of differences within a solution
+STEP = mp.mpf(10) ** -10  # of differences of solutions
+
+Vector = Any  # arrays of mpf
+
+
+def exact(x: Any) -> Vector:
+    """The same numbers as mpf."""
+    return np.vectorize(mp.mpf, otypes=[object])(np.asarray(x, dtype=float))
+
+
+def hat(a: Vector) -> Vector:
+    zero = mp.mpf(0)
+    return np.array([[zero, -a[2], a[1]], [a[2], zero, -a[0]], [-a[1], a[0], zero]], dtype=object)
+
+
+def axial(m: Vector) -> Vector:
+    """The vector of a matrix's skew part."""
+    return np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], dtype=object) / 2
+
+
+def turn(a: Vector) -> Vector:
+    """exp of a rotation vector."""
+    angle = mp.sqrt(a @ a)
+    s = hat(a)
+    if angle < SMALL**3:
+        return exact(np.eye(3)) + s
+    half = mp.sin(angle / 2)
+    return exact(np.eye(3)) + s * (mp.sin(angle) / angle) + (s @ s) * (2 * half**2 / angle**2)
+
+
+def log(R: Vector) -> Vector:
+    """The rotation vector of a rotation by less than half a turn."""
+    sine = axial(R)
+    size = mp.sqrt(sine @ sine)
+    if size < SMALL**3:
+        return sine
+    return sine * (mp.atan2(size, (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2) / size)
+
+
+class ManyDigits:
+    """A mechanism's eq. 1."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        tree, model, springs = mechanism.tree, mechanism.tree.model, mechanism.springs
+        self.tree, self.closure, self.n = tree, mechanism.closure, mechanism.n
+        self.joints = [
+            (model.parents[k], model.joints[k].idx_v, model.joints[k].nq == 7) for k in range(1, model.njoints)
+        ]
+        self.stands = [(exact(x.rotation), exact(x.translation)) for x in list(model.jointPlacements)[1:]]
+        self.axes = [
+            None if free else (exact(tree.axis(k)[0]), tree.axis(k)[1]) for k, (*_, free) in enumerate(self.joints, 1)
+        ]
+        self.bodies = [(mp.mpf(x.mass), exact(x.lever), exact(x.inertia)) for x in list(model.inertias)[1:]]
+        self.gravity, self.armature = exact(model.gravity.linear), exact(model.armature)
+        self.springs = springs
+        self.stiffness, self.damping, self.rest = (
+            exact(x) for x in (springs.stiffness, springs.damping, springs.rest_length)
+        )
+
+    def configuration(self, q_tree: Any) -> list[Any]:
+        """By joint: a number, or a rotation and a position."""
+        found: list[Any] = []
+        for k, (*_, free) in enumerate(self.joints, 1):
+            at = self.tree.model.joints[k].idx_q
+            if not free:
+                found.append(mp.mpf(float(q_tree[at])))
+                continue
+            x = exact(q_tree[at + 3 : at + 7])
+            x = x / mp.sqrt(x @ x)
+            s = hat(x[:3])
+            found.append((exact(np.eye(3)) + 2 * x[3] * s + 2 * (s @ s), exact(q_tree[at : at + 3])))
+        return found
+
+    def moved(self, q: list[Any], v: Vector, a: Vector, t: Any) -> list[Any]:
+        """After a time t along the velocity v and its rate a, to second order."""
+        found: list[Any] = []
+        for x, (_, at, free) in zip(q, self.joints, strict=True):
+            if not free:
+                found.append(x + v[at] * t + a[at] * t * t / 2)
+                continue
+            R, p = x
+            (slide, spin), (slides, spins) = (v[at : at + 3], v[at + 3 : at + 6]), (a[at : at + 3], a[at + 3 : at + 6])
+            slides = slides + hat(spin) @ slide
+            found.append((R @ turn(spin * t + spins * (t * t / 2)), p + R @ (slide * t + slides * (t * t / 2))))
+        return found
+
+    def frames(self, q: list[Any]) -> list[tuple[Vector, Vector]]:
+        """Rotation and origin of every body, the world first."""
+        found = [(exact(np.eye(3)), exact(np.zeros(3)))]
+        for k, (x, (parent, _, free)) in enumerate(zip(q, self.joints, strict=True)):
+            R, p = found[parent]
+            R, p = R @ self.stands[k][0], p + R @ self.stands[k][1]
+            if free:
+                R, p = R @ x[0], p + R @ x[1]
+            elif self.axes[k][1]:
+                R = R @ turn(self.axes[k][0] * x)
+            else:
+                p = p + R @ self.axes[k][0] * x
+            found.append((R, p))
+        return found
+
+    def numbers(self, q: list[Any]) -> tuple[Vector, Vector]:
+        """What forces and loops see: centres of mass, springs' lengths and phi, stacked; and bodies' rotations."""
+        frames = self.frames(q)
+        centres = [p + R @ c for (R, p), (_, c, _) in zip(frames[1:], self.bodies, strict=True)]
+        ends = self._points(frames, self.springs.anchors)
+        half = len(ends) // 2
+        lengths = [mp.sqrt((a - b) @ (a - b)) for a, b in zip(ends[:half], ends[half:], strict=True)]
+        return np.concatenate([*centres, np.array(lengths, dtype=object), self.phi(frames, q)]), np.array(
+            [R for R, _ in frames[1:]]
+        )
+
+    @staticmethod
+    def _points(frames: list[tuple[Vector, Vector]], anchors: Any) -> list[Vector]:
+        return [
+            frames[j][1] + frames[j][0] @ exact(x)
+            for j, x in zip(anchors.point_joint, anchors.point_local, strict=True)
+        ]
+
+    def phi(self, frames: list[tuple[Vector, Vector]], q: list[Any]) -> Vector:
+        anchors = self.closure.anchors
+        p = self._points(frames, anchors)
+        e = [frames[j][0] @ exact(x) for j, x in zip(anchors.direction_joint, anchors.direction_local, strict=True)]
+        r = [a - b for a, b in zip(p[: len(p) // 2], p[len(p) // 2 :], strict=True)]
+        found = np.full(self.closure.rows, mp.mpf(0), dtype=object)
+        for group in self.closure.groups:
+            if isinstance(group, Component):
+                found[group.out] = [e[d] @ r[k] for k, d in zip(group.pair, group.direction, strict=True)]
+            elif isinstance(group, Dot):
+                found[group.out] = [e[a] @ e[b] for a, b in zip(group.a, group.b, strict=True)]
+            elif isinstance(group, Distance):
+                length = exact(group.length)
+                found[group.out] = [(r[k] @ r[k] - x * x) / (2 * x) for k, x in zip(group.pair, length, strict=True)]
+            elif isinstance(group, Affine):
+                x = np.full(self.n, mp.mpf(0), dtype=object)
+                for value, (_, at, free) in zip(q, self.joints, strict=True):
+                    if not free:
+                        x[at] = value
+                found[group.out] = exact(group.matrix) @ x - exact(group.offset)
+            elif isinstance(group, RelativeLog):
+                ends = zip(group.joint_a, group.rotation_a, group.joint_b, group.rotation_b, strict=True)
+                found[group.out] = np.concatenate(
+                    [log((frames[a][0] @ exact(A)).T @ (frames[b][0] @ exact(B))) for a, A, b, B in ends]
+                )
+        return found
+
+    def acceleration(self, q: list[Any], v: Vector, u: Vector) -> tuple[Vector, Vector]:
+        """Eq. 1's acceleration and multipliers."""
+        n, rows, count, h = self.n, self.closure.rows, len(self.bodies), SMALL
+        none, unit = exact(np.zeros(n)), exact(np.eye(n))
+        here, R = self.numbers(q)
+        by_q = np.empty((len(here), n), dtype=object)
+        spins_by_q = np.empty((3 * count, n), dtype=object)
+        for k in range(n):
+            (x1, R1), (x0, R0) = (self.numbers(self.moved(q, unit[k], none, s * h)) for s in (1, -1))
+            by_q[:, k] = (x1 - x0) / (2 * h)
+            spins_by_q[:, k] = np.concatenate(
+                [axial((a - b) @ c.T) / (2 * h) for a, b, c in zip(R1, R0, R, strict=True)]
+            )
+        (x1, R1), (x0, R0) = (self.numbers(self.moved(q, v, none, s * h)) for s in (1, -1))
+        rate, rates = (x1 - x0) / (2 * h), (x1 - 2 * here + x0) / (h * h)
+        D, force = np.diag(self.armature), np.array(u)
+        for k, (mass, _, inertia) in enumerate(self.bodies):
+            J, W = by_q[3 * k : 3 * k + 3], spins_by_q[3 * k : 3 * k + 3]
+            I = R[k] @ inertia @ R[k].T
+            omega = axial((R1[k] - R0[k]) @ R[k].T) / (2 * h)
+            alpha = axial((R1[k] - 2 * R[k] + R0[k]) @ R[k].T) / (h * h)
+            D = D + mass * (J.T @ J) + W.T @ I @ W
+            force = force - mass * (J.T @ (rates[3 * k : 3 * k + 3] - self.gravity))
+            force = force - W.T @ (I @ alpha + hat(omega) @ (I @ omega))
+        at = slice(3 * count, 3 * count + len(self.stiffness))
+        pull = self.stiffness * (here[at] - self.rest) + self.damping * rate[at]
+        force = force - by_q[at].T @ pull if len(pull) else force
+        force = force + exact(self.springs.constant) - exact(self.springs.joint_damping) * v
+        for x, (_, k, free) in zip(q, self.joints, strict=True):
+            if not free:
+                force[k] -= mp.mpf(self.springs.joint_stiffness[k]) * (x - mp.mpf(self.springs.joint_rest[k]))
+        J = by_q[at.stop :]
+        matrix, right = mp.zeros(n + rows), mp.zeros(n + rows, 1)
+        for i in range(n):
+            right[i] = force[i]
+            for j in range(n):
+                matrix[i, j] = D[i, j]
+        for i in range(rows):
+            right[n + i] = -rates[at.stop + i]
+            for j in range(n):
+                matrix[n + i, j], matrix[j, n + i] = J[i, j], -J[i, j]
+        found = np.array(list(mp.lu_solve(matrix, right)), dtype=object)
+        return found[:n], found[n:]
+
+    def along(self, q_tree: Any, v: Any, u: Any, by: tuple[Any, Any, Any]) -> tuple[Any, Any]:
+        """Derivatives of acceleration and multipliers along steps of q', v' and u', as floats."""
+        q, v, u = self.configuration(q_tree), exact(v), exact(u)
+        step, dv, du = (exact(x) for x in by)
+        none = exact(np.zeros(self.n))
+        (a1, l1), (a0, l0) = (
+            self.acceleration(self.moved(q, step, none, s * STEP), v + s * STEP * dv, u + s * STEP * du)
+            for s in (1, -1)
+        )
+        return tuple(np.array((one - other) / (2 * STEP), dtype=float) for one, other in ((a1, a0), (l1, l0)))  # type: ignore[return-value]

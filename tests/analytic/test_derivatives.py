@@ -1,0 +1,88 @@
+"""Exact derivatives of eq. 1 against differences in forty digits of the tests' own model of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from ckc_pin import Mechanism, load
+from ckc_pin.dynamics import Terms
+from ckc_pin.dynamics.derivatives import acceleration_derivatives
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_change, log_jacobian_dot
+from ckc_pin.mechanism.spec import LoopType
+from tests.analytic.many_digits import ManyDigits, exact, log, turn
+from tests.analytic.small_models import coupled_four_bar, plate_on_springs
+from tests.property.mechanisms import closed_mechanism
+
+EQUAL = 1e-10  # relative
+
+
+def compare(terms: Terms, random: np.random.Generator) -> None:
+    """Along a random step of configuration, velocity and force, off the closure too."""
+    mechanism = terms.mechanism
+    u_tree, steps = random.uniform(-5, 5, mechanism.n), random.uniform(-1, 1, (3, mechanism.n))
+    found = acceleration_derivatives(terms, u_tree)
+    theirs = ManyDigits(mechanism).along(terms.q_tree, terms.v_tree, u_tree, (steps[0], steps[1], steps[2]))
+    a = found.a_q @ steps[0] + found.a_v @ steps[1] + found.a_u @ steps[2]
+    forces = found.multipliers_q @ steps[0] + found.multipliers_v @ steps[1] + found.multipliers_u @ steps[2]
+    for ours, wanted in zip((a, forces), theirs, strict=True):
+        assert np.abs(ours - wanted).max() <= EQUAL * np.abs(wanted).max()
+
+
+def somewhere(mechanism: Mechanism, random: np.random.Generator, spread: float) -> Terms:
+    """A random state off the closure."""
+    q_tree = mechanism.tree.integrate(mechanism.q_tree, random.uniform(-spread, spread, mechanism.n))
+    return Terms(mechanism, mechanism.kinematics(q_tree), random.uniform(-2, 2, mechanism.n))
+
+
+@pytest.mark.parametrize("kind", get_args(LoopType))
+def test_every_kind_of_loop(kind: LoopType) -> None:
+    """A free root, prismatic and revolute joints, a coupling, springs, dampers and rotors with it."""
+    world = next(x for seed in range(20) if (x := closed_mechanism(kind, seed)).regular)
+    compare(world.near(), np.random.default_rng(1))
+    compare(somewhere(world.mechanism, np.random.default_rng(2), 0.05), np.random.default_rng(3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_five_bar(seed: int) -> None:
+    mechanism, random = load("five_bar"), np.random.default_rng(seed)
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.3, 0.3, 2)).at
+    compare(Terms(mechanism, at, at.rho @ random.uniform(-3, 3, 2)), random)
+
+
+@pytest.mark.parametrize("make", [coupled_four_bar, plate_on_springs])
+def test_loops_with_springs(make: type, tmp_path: Path) -> None:
+    mechanism = make(tmp_path)
+    for seed in range(3):
+        compare(somewhere(mechanism, np.random.default_rng(seed), 0.1), np.random.default_rng(seed + 9))
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1e-3, 0.4, 0.999, 1.001, 2.0, 3.0])
+def test_the_logarithm_of_a_rotation_differentiated_three_times(angle: float) -> None:
+    """By differences in many digits of the logarithm alone."""
+    random = np.random.default_rng(0)
+    u, x, y, z = random.uniform(-1, 1, (4, 3))
+    u *= angle / np.linalg.norm(u)
+    U, X, Y, Z = (exact(a) for a in (u, x, y, z))
+    h = exact(1e-12)[()]
+
+    def jlog(v: object) -> object:
+        R = turn(v)
+        return (log(R @ turn(h * h * X)) - log(R @ turn(-h * h * X))) / (2 * h * h)
+
+    def change(v: object) -> object:
+        return (jlog(v + h * Y) - jlog(v - h * Y)) / (2 * h)  # type: ignore[operator]
+
+    twice = (change(U + h * Z) - change(U - h * Z)) / (2 * h)
+    for ours, theirs in (
+        (log_jacobian(u[None])[0] @ x, jlog(U)),
+        (log_jacobian_dot(u[None], y[None])[0] @ x, change(U)),
+        (log_jacobian_change(u[None], y[None, :, None], x[None])[0, :, 0], change(U)),
+        (log_jacobian_change(u[None], z[None, :, None], x[None], along=y[None])[0, :, 0], twice),
+    ):
+        wanted = np.array(theirs, dtype=float)
+        assert np.abs(ours - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max())

@@ -1,0 +1,331 @@
+"""Linear models: the appendix's five-bar by hand, differences of eq. 6, and small motions of the nonlinear run."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from ckc_pin import InputError, LinearModel, Mechanism, NumericalError, linearize, load, simulate, terms
+from ckc_pin.dynamics import Terms, dae_acceleration, linear_model, multipliers, reduced_acceleration
+from ckc_pin.dynamics.derivatives import acceleration_derivatives
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.library import shipped
+from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
+from tests.analytic.small_models import coupled_four_bar, plate_on_springs
+
+ANGLES = ("theta_1", "theta_3")
+
+
+def by_hand(q_tree: Array, q_dot: Array, tau: Array) -> tuple[Array, Array, Array, Array]:
+    """A, B and what the multipliers depend on, from the appendix by complex steps along sigma."""
+
+    def solution(x: Array) -> Array:
+        """q_ddot and lambda at (dq, q_dot, tau); the closure to first order, which is all there is."""
+        moved = q_tree + FIVE_BAR.rho(q_tree) @ x[:2]
+        v_tree = FIVE_BAR.rho(moved) @ x[2:4]
+        a, forces = FIVE_BAR.acceleration_and_multipliers(moved, v_tree, x[4:])
+        return np.concatenate([a[[0, 2]], forces])
+
+    slopes = complex_step(solution, np.concatenate([np.zeros(2), q_dot, tau]))
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [slopes[:2, :4]]])
+    return A, np.vstack([np.zeros((2, 2)), slopes[:2, 4:]]), slopes[2:, :4], slopes[2:, 4:]
+
+
+def agree(ours: Array, theirs: Array, tolerance: float = 1e-11) -> None:
+    assert np.abs(ours - theirs).max() <= tolerance * np.abs(theirs).max()
+
+
+# --- the five-bar --------------------------------------------------------------------------------
+
+
+def test_the_equilibrium_is_that_of_the_appendix() -> None:
+    model = linearize("five_bar")
+    A, B, C, D = by_hand(FIVE_BAR.equilibrium(), np.zeros(2), np.zeros(2))
+    agree(model.A, A)
+    agree(model.B, B)
+    agree(model.C[-2:], C, 1e-9)
+    agree(model.D[-2:], D)
+    values = np.linalg.eigvals(A)
+    agree(np.sort(np.abs(model.eigenvalues)), np.sort(np.abs(values)))
+    assert [round(mode.frequency, 3) for mode in model.modes] == [1.133, 1.521]
+    assert all(abs(mode.damping_ratio) < 1e-12 for mode in model.modes)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_state_is_that_of_the_appendix(seed: int) -> None:
+    mechanism, random = load("five_bar"), np.random.default_rng(seed)
+    q_dot, tau = random.uniform(-3, 3, 2), random.uniform(-1, 1, 2)
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.3, 0.3, 2)).at
+    model = linear_model(Terms(mechanism, at, at.rho @ q_dot), tau, at="somewhere")
+    A, B, C, D = by_hand(at.q_tree, q_dot, tau)
+    for ours, theirs in zip((model.A, model.B, model.C[-2:], model.D[-2:]), (A, B, C, D), strict=True):
+        agree(ours, theirs, 1e-10)
+    agree(model.C[:4, :2], FIVE_BAR.rho(at.q_tree))
+    names = model.outputs.index("point:tip.x"), model.outputs.index("loop:elbow.x")
+    assert names == (4, 7)
+
+
+def test_labels_say_what_is_what() -> None:
+    model = linearize("five_bar")
+    assert model.states == ("theta_1", "theta_3", "theta_1_dot", "theta_3_dot")
+    assert model.inputs == ANGLES
+    assert model.outputs[:4] == ("theta_1", "theta_2", "theta_3", "theta_4")
+    assert model.outputs[4:] == ("point:tip.x", "point:tip.y", "point:tip.z", "loop:elbow.x", "loop:elbow.y")
+    assert len(repr(model).splitlines()) == 5
+    plant = model.to_statespace()
+    assert plant.state_labels == list(model.states)
+    assert plant.input_labels == list(model.inputs)
+    assert plant.output_labels[-1] == "loop:elbow_y"
+    agree(plant.A, model.A)
+    agree(np.sort(plant.poles().imag), np.sort(model.eigenvalues.imag))
+
+
+# --- other mechanisms ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_it_is_the_slope_of_the_reduced_model(name: str) -> None:
+    """Eq. 6 differenced along sigma, while what is linearized is eq. 1; the multipliers of least norm with it."""
+    mechanism, random = load(name), np.random.default_rng(1)
+    d, forces = mechanism.d, random.uniform(-1, 1, len(mechanism.actuated))
+    start = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.03, 0.03, d)).at
+    x = np.concatenate([mechanism.independent_part(start.q_tree), 0.3 * random.uniform(-1, 1, d), forces])
+
+    def rate(x: Array) -> Array:
+        at = sigma(mechanism, x[:d], start).at
+        state, u_tree = Terms(mechanism, at, at.rho @ x[d : 2 * d]), mechanism.motors.force(x[2 * d :])
+        loops = multipliers(state, u_tree, dae_acceleration(state, u_tree))
+        return np.concatenate([reduced_acceleration(state, u_tree), loops])
+
+    model = linear_model(Terms(mechanism, start, start.rho @ x[d : 2 * d]), forces, at="somewhere")
+    step = random.uniform(-1, 1, len(x))
+    slopes = [(rate(x + h * step) - rate(x - h * step)) / (2 * h) for h in (4e-4, 2e-4, 1e-4)]
+    first, second = ((4 * fine - coarse) / 3 for coarse, fine in pairwise(slopes))
+    assert model.states[:d] == mechanism.independent
+    wanted, rows = (16 * second - first) / 15, mechanism.closure.rows
+    agree(np.hstack([model.A, model.B])[d:] @ step, wanted[:d], 1e-6)
+    if rows:
+        agree(np.hstack([model.C, model.D])[-rows:] @ step, wanted[d:], 1e-6)
+
+
+@pytest.mark.parametrize("case", ["five_bar", "stewart", "springs"])
+def test_small_motions_converge_to_it_at_order_two(case: str, tmp_path: Path) -> None:
+    scene, q = {
+        "five_bar": ("five_bar/swing", None),
+        "stewart": ("stewart/default", None),
+        "springs": (str(_scene(coupled_four_bar(tmp_path), tmp_path)), None),
+    }[case]
+    model = linearize(scene)
+    d = len(model.states) // 2
+    rest = [model.q_tree[model.coordinates.index(name)] for name in model.states[:d]]
+    start = np.random.default_rng(3).uniform(-1, 1, d) * (0.05 if case == "stewart" else 1.0)
+    misses = []
+    for size in (4e-3, 2e-3, 1e-3):
+        q = {name: float(x + size * dx) for name, x, dx in zip(model.states[:d], rest, start, strict=True)}
+        changes = {"t_end": 0.4, "initial": {"q": q}, "formulation": "reduced", "solver.rtol": 1e-12}
+        run = simulate(scene, changes)
+        wanted = expm(0.4 * model.A) @ np.concatenate([size * start, np.zeros(d)])
+        moved = run.q_tree[-1][[model.coordinates.index(name) for name in model.states[:d]]] - rest
+        misses.append(float(np.abs(moved - wanted[:d]).max()))
+    orders = [np.log2(one / two) for one, two in pairwise(misses)]
+    assert min(orders) > 1.9
+    assert misses[-1] < 1e-5
+
+
+def _scene(mechanism: Mechanism, folder: Path) -> Path:
+    path = folder / "small.scene.toml"
+    path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\ninitial.at = "equilibrium"\n')
+    assert mechanism.d == 1
+    return path
+
+
+def test_a_free_root_constrained_in_part_has_a_tangent_basis(tmp_path: Path) -> None:
+    """Its motion has no chart of joint coordinates; about a motion the frame that deviations are in turns along."""
+    mechanism = plate_on_springs(tmp_path)
+    assert mechanism.splits_root
+    tree, n, random = mechanism.tree, mechanism.n, np.random.default_rng(0)
+    at = mechanism.assembled
+    J = at.J
+    v = random.uniform(-1, 1, n)
+    v -= np.linalg.pinv(J) @ (J @ v)
+    state = Terms(mechanism, at, v)
+    model = linear_model(state, np.zeros(0), at="somewhere")
+    assert len(model.states) == 8
+    chart = [mechanism.coordinates.index(name) for name in model.states[:4]]
+    # the flow of eq. 1 by SciPy, about the motion and beside it
+    found = acceleration_derivatives(state, np.zeros(n))
+    x = random.uniform(-1, 1, 8)
+    step = model.motions @ x[:4]
+    dv = found.v_q @ step
+    dv += model.motions @ (x[4:] - dv[chart])
+
+    def flow(h: float, t: float) -> Array:
+        def rate(_: float, y: Array) -> Array:
+            here = Terms(mechanism, mechanism.kinematics(y[: tree.nq]), y[tree.nq :])
+            a = dae_acceleration(here, np.zeros(n))
+            return np.concatenate([tree.configuration_rate(y[: tree.nq], y[tree.nq :]), a])
+
+        y = np.concatenate([tree.integrate(at.q_tree, h * step), v + h * dv])
+        return solve_ivp(rate, (0, t), y, rtol=1e-11, atol=1e-13, method="DOP853").y[:, -1]
+
+    def deviation(t: float, h: float) -> Array:
+        here, there, other = flow(0.0, t), flow(h, t), flow(-h, t)
+        q = (
+            tree.difference(here[: tree.nq], there[: tree.nq]) - tree.difference(here[: tree.nq], other[: tree.nq])
+        ) / 2
+        return np.concatenate([q[chart], (there - other)[tree.nq :][chart] / 2]) / h
+
+    h, t = 1e-4, 2e-3
+    rates = (8 * (deviation(t, h) - deviation(-t, h)) - (deviation(2 * t, h) - deviation(-2 * t, h))) / (12 * t)
+    agree(model.A @ x, rates, 1e-5)
+    assert np.abs(model.A[:4, :4]).max() > 0.1
+
+
+# --- friction, operating points ------------------------------------------------------------------
+
+RUBS = '\n[[joint]]\nname = "crank"\nfriction = 0.3\n'
+
+
+def _with_friction(folder: Path) -> str:
+    coupled_four_bar(folder)
+    path = folder / "mechanism.toml"
+    path.write_text(path.read_text() + RUBS)
+    return str(_scene(load(str(path)), folder))
+
+
+def test_friction_is_smoothed_or_locks(tmp_path: Path) -> None:
+    scene, smoothing = _with_friction(tmp_path), 0.05
+    with pytest.raises(InputError, match=r"no freedom is left.*crank.*friction_smoothing"):
+        linearize(scene)
+    free = linearize(str(_scene(coupled_four_bar(tmp_path / "smooth"), tmp_path / "smooth")))
+    smooth = linearize(scene, changes={"friction_smoothing": smoothing})
+    extra = -free.B[1, 0] * 0.3 / smoothing  # -F / s on the crank, which the motor turns too
+    assert smooth.inputs == ("crank",)
+    agree(smooth.A - free.A, np.array([[0, 0], [0, extra]]), 1e-9)
+    assert smooth.modes[0].frequency == 0.0, "overdamped"
+
+
+def test_a_locked_joint_leaves_the_others() -> None:
+    """The five-bar with theta_1 locked, by the appendix: the row of eq. 6 that is left."""
+    mechanism, q_dot = load("five_bar"), 0.7
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + np.array([0.2, -0.1])).at
+    state = Terms(mechanism, at, at.rho @ [0.0, q_dot])
+    model = linear_model(state, np.array([0.3, 0.2]), at="somewhere", locked=np.array([0]))
+    assert model.locked == ("theta_1",)
+    assert model.states == ("theta_3", "theta_3_dot")
+
+    def acceleration(x: Array) -> Array:
+        """Of theta_3, at steps of theta_3, its rate and tau."""
+        moved = at.q_tree + FIVE_BAR.rho(at.q_tree)[:, 1] * x[0]
+        rate = np.array([0.0, q_dot + x[1]])
+        C = FIVE_BAR.C(moved, FIVE_BAR.rho(moved) @ rate)
+        force = 0.2 + x[2] - (C @ rate)[1] - FIVE_BAR.h(moved)[1]
+        return np.array([force / FIVE_BAR.D(moved)[1, 1]])
+
+    slopes = complex_step(acceleration, np.zeros(3))[0]
+    agree(model.A, np.array([[0.0, 1.0], slopes[:2]]))
+    agree(model.B, np.array([[0.0, 0.0], [0.0, slopes[2]]]))
+
+
+def test_motors_hold_an_operating_point() -> None:
+    q = {"theta_1": -1.1, "theta_3": -1.8}
+    model = linearize("five_bar", q)
+    found = terms(load("five_bar"), q)
+    agree(model.tau, FIVE_BAR.h(found.q_tree))
+    agree(model.A, by_hand(found.q_tree, np.zeros(2), model.tau)[0])
+    a = dae_acceleration(found, found.mechanism.motors.force(model.tau))
+    assert np.abs(a).max() < 1e-12
+    assert multipliers(found, found.mechanism.motors.force(model.tau), a).shape == (2,)
+
+
+def test_assembled_is_one_with_redundant_motors() -> None:
+    model = linearize("two_ur5", "assembled")
+    assert len(model.states) == 12
+    assert len(model.inputs) == 12
+    assert np.abs(np.linalg.eigvals(model.A)).max() < 1e3
+
+
+def test_motors_that_cannot_hold_it_are_named(tmp_path: Path) -> None:
+    coupled_four_bar(tmp_path, actuated="actuated = []")
+    mechanism = load(str(tmp_path / "mechanism.toml"))
+    with pytest.raises(InputError, match=r"no motor\) cannot hold.*along crank"):
+        linearize(mechanism, {"crank": 0.9})
+    changes = {"controller": {"type": "set_point", "K_P": 1.0, "K_V": 1.0, "q_d": {"theta_1": -1.2, "theta_3": -1.6},
+                              "torque_limit": 1e-3}}  # fmt: skip
+    with pytest.raises(InputError, match=r"theta_1 would need .* its limit is 0\.001"):
+        linearize("five_bar/swing", {"theta_1": -1.0, "theta_3": -1.9}, changes)
+
+
+@pytest.mark.parametrize("t", [-1.0, 2.5])
+def test_an_instant_outside_the_run(t: float) -> None:
+    with pytest.raises(InputError, match=r"outside the run of five_bar/swing, which lasts from 0 to 2 s"):
+        linearize("five_bar/swing", t)
+
+
+def test_other_refusals() -> None:
+    with pytest.raises(InputError, match=r"a mechanism has no time"):
+        linearize(load("five_bar"), 1.0)
+    with pytest.raises(InputError, match=r"give \"equilibrium\""):
+        linearize("five_bar", "there")
+    with pytest.raises(NumericalError, match=r"no stable equilibrium is reached from q_guess"):
+        linearize("flyball")
+    event = {"coordinate": "theta_1", "of": "q_dot", "value": -0.5, "stop": True}
+    with pytest.raises(InputError, match=r"ends at t = 0\..* s: stopped by the event"):
+        linearize("five_bar/swing", 1.9, {"event": [event]})
+
+
+def test_where_q_is_no_chart_others_are() -> None:
+    """At the type 1 point of the five-bar, elbows coincident, det phi_z = 0 while J keeps its rank."""
+    mechanism, q_1 = load("five_bar"), float(np.arccos(0.1524 / 0.2794))
+    numbers = np.array([q_1, 1.0 - q_1, np.pi - q_1, 1.0 - (np.pi - q_1)])  # the tip any way up
+    at = mechanism.kinematics(numbers)
+    assert np.abs(at.phi).max() < 1e-12
+    assert at.margin() < 1e-9
+    model = linear_model(Terms(mechanism, at, np.zeros(4)), np.zeros(2), at="at a singular q")
+    assert model.states[:2] != mechanism.independent
+    assert np.all(np.isfinite(model.A))
+    assert "theta_1, theta_3 are no coordinates there" in model.notes[0]
+    # of eq. 1 by complex steps along the other coordinates
+    chart = [mechanism.coordinates.index(name) for name in model.states[:2]]
+    others = [k for k in range(4) if k not in chart]
+    J = FIVE_BAR.J(numbers)
+    T = np.zeros((4, 2))
+    T[chart] = np.eye(2)
+    T[others] = -np.linalg.solve(J[:, others], J[:, chart])
+
+    def acceleration(x: Array) -> Array:
+        return FIVE_BAR.acceleration_and_multipliers(numbers + T @ x[:2], np.zeros(4), x[2:])[0][chart]
+
+    slopes = complex_step(acceleration, np.zeros(4))
+    agree(model.A[2:, :2], slopes[:, :2], 1e-9)
+    agree(model.B[2:], slopes[:, 2:], 1e-9)
+    # where the elbows meet the tip may turn about them, and no motor holds it
+    with pytest.raises(InputError, match=r"cannot hold .* along theta_[24],"):
+        linearize(mechanism, dict(zip(mechanism.coordinates, numbers.tolist(), strict=True)))
+
+
+def test_a_singular_configuration_is_refused() -> None:
+    """Where J loses rank no linear model is that of the whole motion; of independent ones alone phi_z tells."""
+    mechanism = load("n_four_bar")
+    with pytest.raises(NumericalError, match="theta_0 = 0 is singular"):
+        linearize(mechanism, {"theta_0": 0.0})
+    with pytest.raises(NumericalError, match="J has lost rank"):
+        linearize(mechanism, dict.fromkeys(mechanism.coordinates, 0.0))
+    state = Terms(mechanism, mechanism.kinematics(np.zeros(mechanism.n)), np.zeros(mechanism.n))
+    with pytest.raises(NumericalError, match="J has lost rank"):
+        linear_model(state, np.zeros(1), at="there")
+
+
+def test_an_instant_of_a_run_is_its_state() -> None:
+    model = linearize("five_bar/tracking", 1.25)
+    run = simulate("five_bar/tracking", {"t_end": 1.25})
+    agree(model.q_tree, run.q_tree[-1])
+    agree(model.A, by_hand(run.q_tree[-1], run.v_tree[-1][[0, 2]], run.tau[-1])[0], 1e-9)
+    assert isinstance(model, LinearModel)
+    assert model.closed_loop is not None
+    assert np.linalg.eigvals(model.closed_loop).real.max() < 0

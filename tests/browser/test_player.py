@@ -1,0 +1,166 @@
+"""The player's buttons and keys, as a person uses them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin.view.player import save_html
+from tests.browser.pages import browser, look_at
+
+__all__ = ["browser", "look_at"]
+
+END = 9.5  # s, of five_bar/tracking
+FIRST, SECOND = "/world/1: reduced", "/world/2: SPF, ε = 10⁻⁴"
+
+
+@pytest.fixture(scope="module")
+def runs(run) -> list[ckc_pin.Run]:
+    return [run("five_bar/tracking", formulation=name) for name in ("reduced", "spf")]
+
+
+@pytest.fixture
+def visit(look_at, runs, tmp_path):
+    """A file of two runs, the second one stopped early, with forces; it stands at its start."""
+    rows = slice(0, int(np.searchsorted(runs[1].t, 4.0)) + 1)
+    names = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy", "lyapunov")
+    short = replace(
+        runs[1], status="stopped", message="phi_z is <singular>", **{n: getattr(runs[1], n)[rows] for n in names}
+    )
+    found = look_at(save_html([runs[0], short], tmp_path / "two.html", forces=True).as_uri(), offline=True)
+    found.page.evaluate("player.pause(); player.go(0)")
+    return found
+
+
+def time(visit) -> float:
+    return float(visit.page.evaluate("viewer.animator.time"))
+
+
+def playing(visit) -> bool:
+    return bool(visit.page.evaluate("viewer.animator.playing"))
+
+
+def test_space_plays_and_pauses(visit):
+    visit.page.keyboard.press("Space")
+    visit.until("viewer.animator.time > 0.05")
+    assert playing(visit)
+    visit.page.keyboard.press("Space")
+    assert not playing(visit)
+    where = time(visit)
+    visit.page.click("#play")
+    visit.until(f"viewer.animator.time > {where}")
+    visit.page.keyboard.press(" ")  # the button that was clicked does not take it
+    assert not playing(visit)
+
+
+def test_arrows_step_and_change_the_speed(visit, runs):
+    camera = visit.page.evaluate("viewer.camera.position.toArray()")
+    visit.page.keyboard.press("ArrowRight")
+    assert time(visit) == pytest.approx(END / 100)
+    visit.page.keyboard.press("ArrowLeft")
+    visit.page.keyboard.press("ArrowLeft")
+    assert time(visit) == 0
+    visit.page.keyboard.press("Shift+ArrowRight")
+    visit.page.keyboard.press("Shift+ArrowRight")
+    assert time(visit) == pytest.approx(runs[0].t[2], abs=1e-6)
+    visit.page.keyboard.press("Shift+ArrowLeft")
+    assert time(visit) == pytest.approx(runs[0].t[1], abs=1e-6)
+    visit.page.keyboard.press("End")
+    assert time(visit) == pytest.approx(END)
+    visit.page.keyboard.press("Home")
+    assert time(visit) == 0
+    visit.page.keyboard.press("ArrowUp")
+    assert visit.page.evaluate("viewer.animator.mixer.timeScale") == 2
+    assert visit.page.input_value("#speed") == "2"
+    visit.page.keyboard.press("ArrowDown")
+    visit.page.keyboard.press("ArrowDown")
+    assert visit.page.evaluate("viewer.animator.mixer.timeScale") == 0.5
+    assert visit.page.evaluate("viewer.camera.position.toArray()") == camera  # the viewer would pan by arrows
+
+
+def test_it_ends_or_begins_again(visit):
+    visit.page.evaluate(f"player.go({END} - 0.1); player.play()")
+    visit.until("!viewer.animator.playing")
+    assert time(visit) == pytest.approx(END)
+    visit.page.keyboard.press("Space")  # from the start
+    visit.until("viewer.animator.time > 0 && viewer.animator.time < 5")
+    visit.page.keyboard.press("l")
+    assert visit.page.get_attribute("#loop", "aria-pressed") == "true"
+    visit.page.evaluate(f"player.go({END} - 0.1)")
+    visit.until("viewer.animator.playing && viewer.animator.time > 0.05 && viewer.animator.time < 5")
+
+
+def test_runs_are_shown_and_hidden_by_name(visit):
+    assert visit.tree()[SECOND]["visible"]
+    visit.page.get_by_label("translucent: SPF").uncheck()
+    assert [visit.tree()[path]["visible"] for path in (FIRST, SECOND)] == [True, False]
+    visit.page.keyboard.press("1")
+    visit.page.keyboard.press("2")
+    assert [visit.tree()[path]["visible"] for path in (FIRST, SECOND)] == [False, True]
+    assert visit.page.get_by_label("translucent: SPF").is_checked()
+
+
+def test_a_stopped_run_says_why_from_its_end_on(visit):
+    line = "translucent: SPF, ε = 10⁻⁴"
+    assert line in visit.caption()
+    visit.page.evaluate("player.go(3.9)")
+    assert line in visit.caption()
+    visit.page.evaluate("player.go(4.1)")
+    assert f"{line} – stopped at 4 s: phi_z is <singular>" in visit.caption()
+    assert "reduced" in visit.caption()
+
+
+def test_arrows_are_the_forces(visit, runs):
+    names = [path for path in visit.tree() if path.startswith(f"{FIRST}/forces/") and path.count("/") == 4]
+    assert sorted(path.split("/")[-1] for path in names) == ["loop:elbow", "motor:theta_1", "motor:theta_3"]
+    times = np.array([1.0, 2.0, 5.0])
+    placed = visit.placements(times, [f"{FIRST}/forces/loop:elbow", f"{FIRST}/forces/motor:theta_1"])
+    rows = [runs[0].at(t) for t in times]
+    forces = runs[0].loop_forces()["elbow"][rows]
+    np.testing.assert_allclose(placed[:, 0, :3, 3], runs[0].points["tip"][rows], atol=1e-5)
+    along = placed[:, 0, :3, 2]
+    sizes = np.linalg.norm(along, axis=1)
+    np.testing.assert_allclose(
+        along[:, :2] / sizes[:, None], forces / np.linalg.norm(forces, axis=1)[:, None], atol=1e-5
+    )
+    np.testing.assert_allclose(sizes / sizes[0], np.linalg.norm(forces, axis=1) / np.linalg.norm(forces[0]), rtol=1e-4)
+    torques = runs[0].tau[rows, 0]
+    np.testing.assert_allclose(np.sign(placed[:, 1, 2, 2]), np.sign(torques))
+    lengths = np.linalg.norm(placed[:, 1, :3, 2], axis=1)
+    np.testing.assert_allclose(lengths / lengths[0], np.abs(torques / torques[0]), rtol=1e-4)
+    visit.page.keyboard.press("f")
+    assert not visit.tree()[f"{FIRST}/forces"]["visible"]
+    visit.page.click("#forces")
+    assert visit.tree()[f"{FIRST}/forces"]["visible"]
+
+
+def test_everything_is_on_a_small_screen(visit):
+    visit.page.set_viewport_size({"width": 360, "height": 640})
+    for name in ("play", "at", "time", "speed", "loop", "forces", "record"):
+        box = visit.page.locator(f"#{name}").bounding_box()
+        assert 0 <= box["x"] < box["x"] + box["width"] <= 360
+        assert box["y"] + box["height"] <= 640
+    assert not visit.page.locator(".dg.main").is_visible()
+    visit.until("Math.abs(viewer.camera.zoom - 360 / 640) < 1e-9")
+    assert visit.page.evaluate("document.documentElement.scrollWidth") == 360
+
+
+def test_a_video_of_it(visit, tmp_path):
+    visit.page.evaluate("viewer.animator.mixer.timeScale = 4")
+    with visit.page.expect_download(timeout=60_000) as waiting:
+        visit.page.keyboard.press("r")
+    assert waiting.value.suggested_filename == "five_bar_tracking.webm"
+    waiting.value.save_as(tmp_path / "video.webm")
+    assert (tmp_path / "video.webm").read_bytes().startswith(bytes.fromhex("1a45dfa3"))  # WebM
+    assert (tmp_path / "video.webm").stat().st_size > 10_000
+
+
+def test_the_ends_of_a_loop_lie_on_each_other_in_one_order(visit):
+    orders = visit.page.evaluate(
+        """() => ["joint:theta_2/loop:elbow:A", "joint:theta_4/loop:elbow:B"].map(path =>
+             viewer.scene_tree.find(["world", "1: reduced", ...path.split("/"), "<object>"]).object.renderOrder)"""
+    )
+    assert orders[0] > orders[1]

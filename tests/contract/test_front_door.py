@@ -1,0 +1,253 @@
+"""The commands as somebody meets them first: a folder of one's own, completion, where results went, what help says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import Run, check, load, simulate
+from ckc_pin.cli import output
+from ckc_pin.cli.app import COMMANDS
+from ckc_pin.cli.output import ProgressBar, Working
+from tests.contract.helpers.command import Outcome, ckc
+
+SHORT = ("--set", "t_end=0.01")
+
+
+def program(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
+    whole = [sys.executable, "-m", "ckc_pin", *words]
+    return subprocess.run(whole, capture_output=True, text=True, check=False, env={**os.environ, **more})
+
+
+# --- how it is called --------------------------------------------------------------------------------
+
+
+def test_version_and_the_package_as_a_program() -> None:
+    assert ckc("--version").out == f"ckc {ckc_pin.__version__}\n"
+    found = program("--version")
+    assert (found.returncode, found.stdout) == (0, f"ckc {ckc_pin.__version__}\n")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_its_completion(shell: str) -> None:
+    found = program(_CKC_COMPLETE=f"{shell}_source")
+    assert found.returncode == 0
+    assert f"_CKC_COMPLETE={shell}_complete" in found.stdout
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("ckc in", {"plain,inverse"}),
+        ("ckc run five_bar/t", {"plain,five_bar/tracking", "file,five_bar/t"}),
+        ("ckc check delt", {"plain,delta", "plain,delta/default", "plain,delta/circle"}),
+        ("ckc terms ste", {"plain,stewart"}),
+        ("ckc map five_bar --sp", {"plain,--space"}),
+        ("ckc map five_bar --space c", {"plain,cartesian"}),
+        ("ckc play ru", {"file,ru"}),
+    ],
+)
+def test_names_are_completed(line: str, wanted: set[str]) -> None:
+    words = line.split()
+    found = program(_CKC_COMPLETE="bash_complete", COMP_WORDS=line, COMP_CWORD=str(len(words) - 1))
+    assert found.returncode == 0
+    assert set(found.stdout.splitlines()) >= wanted
+
+
+# --- a folder of one's own ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    answer = ckc("new", "mine")
+    assert (answer.code, answer.err) == (0, "")
+    *written, last = answer.out.splitlines()
+    assert written == [f"written: mine/{name}" for name in ("mine.urdf", "default.scene.toml", "mechanism.toml")]
+    assert last == "next: cd mine && ckc run ."
+    return tmp_path / "mine"
+
+
+def test_a_new_folder_runs_where_it_is(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mine)
+    answer = ckc("run", ".", "--out", "first")
+    assert (answer.code, answer.err) == (0, "")
+    assert answer.out.startswith("Run of mine, done: reached t_end\n")
+    assert answer.out.endswith("written to first\n")
+    run = Run.load("first")
+    assert run.mechanism.name == "mine"
+    assert np.ptp(run["shoulder"]) > 1.0, "it moves"
+    assert np.abs(run.energy - run.energy[0]).max() < 1e-6
+    found = check(mine)
+    assert (found.n, found.d, found.warnings) == (3, 1, ())
+    assert ckc("check", ".").code == 0
+
+
+def test_a_new_folders_loop_is_closed_as_by_hand(mine: Path) -> None:
+    """Rod and rocker meet: two circles, of 0.6 m about the crank's end and of 0.4 m about the hip."""
+    run = simulate(mine)
+    crank = 0.2 * np.stack([np.cos(run["shoulder"]), np.sin(run["shoulder"])], axis=1)
+    hip = np.array([0.5, 0.0])
+    knee = run.points["knee"][:, :2]
+    assert np.abs(np.linalg.norm(knee - crank, axis=1) - 0.6).max() < 1e-9
+    assert np.abs(np.linalg.norm(knee - hip, axis=1) - 0.4).max() < 1e-9
+    rocker = hip + 0.4 * np.stack([np.cos(run["hip"]), np.sin(run["hip"])], axis=1)
+    assert np.abs(knee - rocker).max() < 1e-9
+
+
+def test_what_a_new_folder_leaves_out_by_comments_works(mine: Path) -> None:
+    path = mine / "default.scene.toml"
+    text = path.read_text(encoding="utf-8")
+    head, mark, rest = text.partition("# [controller]")
+    assert mark
+    path.write_text(head + re.sub(r"^# ", "", mark + rest, flags=re.MULTILINE), encoding="utf-8")
+    run = simulate(mine, {"t_end": 10.0})
+    assert run["shoulder"][-1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
+    answer = ckc("new", "mine", "--json")
+    assert answer.code == 2
+    assert "is there already; give another name" in answer.json["message"]
+    for name in ("a b", "x/../*", "-", "ü"):
+        answer = ckc("new", "--", name)
+        assert answer.code == 2
+        assert "a name is of letters, digits, - and _" in answer.err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    inside = ckc("new", str(tmp_path / "robots" / "arm-2"), "--json")
+    assert len(inside.json["written"]) == 3
+    assert load(tmp_path / "robots" / "arm-2").name == "arm-2"
+
+
+def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mine)
+    Path("default.scene.toml").rename("drop.scene.toml")
+    assert ckc("run", ".", *SHORT).out.startswith("Run of mine/drop, done")
+    for word in ("drop", "drop.scene.toml"):
+        assert ckc("run", word, *SHORT).out.startswith(f"Run of {word}, done")
+        assert ckc("check", word).code == 0
+    monkeypatch.chdir(mine.parent)
+    assert ckc("run", "mine/drop", *SHORT).code == 0
+    other = mine / "other.scene.toml"
+    other.write_text((mine / "drop.scene.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    both = ckc("run", "mine")
+    assert both.code == 2
+    assert "name one of its scenes: drop.scene.toml, other.scene.toml" in both.err
+    other.unlink()
+    (mine / "drop.scene.toml").unlink()
+    none = ckc("run", "mine")
+    assert none.code == 2
+    assert "mine: no scene, *.scene.toml, says what to run; ckc new NAME makes a folder with one" in none.err
+    simulate("five_bar/swing", {"t_end": 0.01}).save(mine / "run.npz")
+    assert "mine: the folder of a run, which is over; ckc play, plot and inverse take it" in ckc("run", "mine").err
+
+
+# --- what is drawn, what is kept ---------------------------------------------------------------------
+
+
+def test_figures_are_drawn_when_they_are_asked_for(tmp_path: Path) -> None:
+    plain, drawn = tmp_path / "plain", tmp_path / "drawn"
+    assert ckc("run", "five_bar/swing", *SHORT, "--out", str(plain)).code == 0
+    assert sorted(path.name for path in plain.iterdir()) == ["run.npz", "scene.json"]
+    assert ckc("run", "five_bar/swing", *SHORT, "--out", str(drawn), "--figures").code == 0
+    names = {path.name for path in drawn.iterdir()}
+    assert names == {"run.npz", "scene.json", "motion.png", "motion_snapshots.png"}
+    forces = tmp_path / "forces"
+    assert ckc("inverse", str(plain), "--out", str(forces)).code == 0
+    assert [path.name for path in forces.iterdir()] == ["inverse.npz"]
+    for command in (("run", "five_bar/swing"), ("inverse", "five_bar/tracking")):
+        assert "--figures goes with --out DIR; give both" in ckc(*command, "--figures").err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("run", "five_bar/swing", *SHORT), "not saved: --out DIR keeps the run, for ckc play, plot and inverse"),
+        (("inverse", "five_bar/set_point", *SHORT), "not saved: --out DIR keeps inverse.npz, for other programs"),
+        (("map", "four_bar", "--cells", "16"), "not drawn: --out DIR draws the map there"),
+    ],
+)
+def test_without_a_folder_it_says_where_results_would_go(words: tuple[str, ...], says: str) -> None:
+    answer = ckc(*words)
+    assert answer.code == 0
+    assert answer.out.splitlines()[-1] == says
+    quiet = ckc(*words, "--json")
+    assert quiet.json
+    assert "--out" not in quiet.out + quiet.err
+
+
+# --- warnings ----------------------------------------------------------------------------------------
+
+
+def _warned(answer: Outcome) -> list[str]:
+    return [line for line in (answer.out + answer.err).splitlines() if "warning" in line and "0 warnings" not in line]
+
+
+def test_a_warning_is_said_once_and_where_it_matters() -> None:
+    about_limits = "joint limits are no walls"
+    assert any(about_limits in warning for warning in check("talos").warnings)
+    assert _warned(ckc("run", "talos", *SHORT)) == []
+    assert _warned(ckc("run", "five_bar_as_printed/tracking", *SHORT)) == [], "so short it stays inside"
+    spoilt = ckc("run", "five_bar_as_printed/tracking", "--set", "formulation=reduced")
+    assert len(_warned(spoilt)) == 1
+    assert "leaves the workspace at t = 4.393" in spoilt.err
+    assert "warning" not in ckc("check", "five_bar_as_printed/tracking", "--json").err
+
+
+# --- help --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_values_are_named_in_one_style(name: str) -> None:
+    said = ckc(name, "--help").out
+    shown = re.findall(r"^  (?:-h, )?(--\S+)(?: (\S+))?  ", said, re.MULTILINE)
+    assert ("--help", "") in shown
+    for option, value in shown:
+        assert value not in {"TEXT", "INTEGER", "FLOAT", "PATH", "FOLDER", "DIRECTORY", "FILENAME"}, option
+        assert re.fullmatch(r"|[A-Z]+(=[A-Z]+|,[A-Z])?|\[[a-z|]+\]", value), (option, value)
+        if option in ("--out", "--meshes"):
+            assert value == "DIR"
+
+
+def test_values_that_cannot_be_are_refused_with_the_choices() -> None:
+    assert "'joint', 'cartesian'" in ckc("map", "five_bar", "--space", "outer").err
+    assert "'mjcf'" in ckc("export", "five_bar", "--to", "sdf").err
+
+
+def test_a_sign_of_work_is_for_terminals_and_only_for_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Working("nothing") as sign:
+        assert sign is None
+    monkeypatch.setattr(output, "on_terminal", lambda: True)
+    quick = Working("quick")
+    with quick:
+        assert not quick.sign.live.is_started
+    assert not quick.sign.live.is_started
+    monkeypatch.setattr(output, "SOON", 0.0)
+    slow = Working("slow")
+    with slow:
+        slow.timer.join()
+        assert slow.sign.live.is_started
+    assert not slow.sign.live.is_started
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.1, ["the run: about 27 s more"]), (0.5, [])])
+def test_in_a_pipe_what_takes_long_is_estimated_once(
+    share: float, says: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three seconds for a tenth are thirty in all; for half they are six, which need no words. Preparing is no part."""
+    clock = [100.0]
+    monkeypatch.setattr(output, "perf_counter", lambda: clock[0])
+    output.errors.cache_clear()
+    with ProgressBar("the run") as progress:
+        for second, part in ((60.0, 0.0), (61.0, 0.01), (63.0, share), (64.0, share + 0.01), (65.0, share + 0.02)):
+            clock[0] = 100.0 + second
+            progress(2.0 * part, 2.0)
+    assert capsys.readouterr().err.splitlines() == says
+    output.errors.cache_clear()

@@ -1,0 +1,174 @@
+"""ckc linearize: JSON, files, modes that play, errors; the LQR example."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin import Run, check, linearize
+from ckc_pin.simulation.locus import gain_locus
+from ckc_pin.simulation.sway import sways
+from ckc_pin.view.linear_figure import draw_locus, draw_modes, draw_poles
+from tests.contract.helpers.command import ckc
+
+ROOT = Path(__file__).resolve().parents[2]
+KEYS = ["name", "states", "inputs", "outputs", "A", "B", "C", "D", "eigenvalues", "modes", "at", "locked",
+        "closed_loop", "notes"]  # fmt: skip
+
+
+def test_json_has_labels_and_matrices() -> None:
+    found = ckc("linearize", "five_bar", "--at", "equilibrium", "--json").json
+    assert list(found) == KEYS
+    model = linearize("five_bar")
+    for name in "ABCD":
+        assert np.array_equal(found[name], getattr(model, name))
+    assert found["states"] == ["theta_1", "theta_3", "theta_1_dot", "theta_3_dot"]
+    assert found["inputs"] == ["theta_1", "theta_3"]
+    assert [complex(*x) for x in found["eigenvalues"]] == model.eigenvalues.tolist()
+    assert found["at"]["q_tree"] == model.q_tree.tolist()
+    assert found["at"]["t"] is None
+    shape = found["modes"][0]["shape"]
+    assert max(abs(complex(*x)) for x in shape.values()) == pytest.approx(1.0)
+    assert found["closed_loop"] is None
+
+
+def test_an_instant_has_the_closed_loop_beside_the_plant() -> None:
+    found = ckc("linearize", "five_bar/set_point", "--at", "0.5", "--json").json
+    assert found["at"]["t"] == 0.5
+    assert len(found["closed_loop"]["A"]) == 4
+    assert max(re for re, _ in found["closed_loop"]["eigenvalues"]) < 0
+    assert any("plant" in note for note in found["notes"])
+
+
+def test_people_read_one_screen() -> None:
+    answer = ckc("linearize", "stewart")
+    assert answer.code == 0
+    assert "1.503 Hz, damping ratio 0" in answer.out
+    assert len(answer.out.splitlines()) < 25
+
+
+def test_out_writes_model_figures_and_modes_to_play(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    assert (
+        ckc("linearize", "five_bar/set_point", "--at", '{"theta_1": -1.3, "theta_3": -1.7}', "--out", str(folder)).code
+        == 0
+    )
+    assert {path.name for path in folder.iterdir()} >= {
+        "linear.npz",
+        "poles.png",
+        "modes.png",
+        "locus.png",
+        "mode_1.npz",
+    }
+    with np.load(folder / "linear.npz") as file:
+        model = linearize("five_bar", {"theta_1": -1.3, "theta_3": -1.7})
+        assert np.array_equal(file["A"], model.A)
+        assert file["outputs"].tolist() == list(model.outputs)
+    run = Run.load(folder / "mode_1.npz")
+    period = 1 / model.modes[0].frequency
+    assert run.t[-1] == pytest.approx(2 * period)
+    assert run.max_phi < 1e-8
+    assert np.abs(run.q_tree[0] - run.q_tree[-1]).max() < 1e-12
+    # for small swings it is the shape
+    shape = model.modes[0].shape
+    swing = run.q_tree - model.q_tree
+    k = int(np.argmax(np.abs(shape)))
+    assert np.ptp(swing[:, k]) == pytest.approx(2 * np.abs(swing[:, k]).max(), rel=0.2)
+    assert ckc("play", str(folder / "mode_1.npz"), "--html", str(tmp_path / "sway.html")).code == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (("five_bar", "--at", "sometimes"), "give equilibrium, assembled, a time in seconds"),
+        (("five_bar/swing", "--at", "3"), "outside the run of five_bar/swing, which lasts from 0 to 2 s"),
+        (("five_bar", "--at", '{"theta_1": 0.3}'), "theta_3 missing"),
+        (("five_bar", "--at", '{"theta_1": 3.0, "theta_3": 0.1}'), "is out of reach"),
+        (("five_bar", "--at", "{"), "not JSON"),
+        (("no_such",), "no mechanism 'no_such'"),
+    ],
+)
+def test_what_was_wrong_is_said(line: tuple[str, ...], says: str) -> None:
+    answer = ckc("linearize", *line)
+    assert answer.code == 2
+    assert says in answer.err
+
+
+def test_no_equilibrium_is_for_the_numerics() -> None:
+    answer = ckc("linearize", "flyball", "--json")
+    assert answer.code == 3
+    assert "no stable equilibrium" in answer.json["message"]
+
+
+def test_check_tells_of_the_closed_loop() -> None:
+    found = ckc("check", "talos/squat", "--json").json["stability"]
+    assert found["stable"] is True
+    assert len(found["eigenvalues"]) == 52
+    assert found["leaves_out"] == ["dry friction"]
+    assert "stable at its target" in ckc("check", "five_bar/set_point").out
+    assert ckc("check", "five_bar", "--json").json["stability"] is None
+
+
+def test_the_regulator_of_the_example_holds() -> None:
+    example = runpy.run_path(str(ROOT / "examples" / "lqr.py"))
+    model, regulator = example["design"]()
+    assert model.eigenvalues.real.max() > 5, "it would fall"
+    values = np.linalg.eigvals(model.A - model.B @ regulator.K)
+    assert values.real.max() < -10
+    run = example["hold"](regulator)
+    error = np.abs(run.q_tree[:, [0, 2]] - regulator.x_0[:2]).max(axis=1)
+    assert run.status == "done"
+    assert error[0] > 0.07
+    assert error[run.at(1.0)] < 1e-5
+    assert error[-1] < 1e-10
+
+
+def test_the_root_locus_crosses_at_the_least_gain() -> None:
+    locus, found = gain_locus("five_bar/set_point"), check("five_bar/set_point").stability
+    assert locus is not None
+    assert locus.gain == "K_P"
+    assert found is not None
+    assert found.least_K_P is not None
+    least = found.least_K_P[0, 0] / 10.0  # of the scene's K_P
+    rightmost = locus.eigenvalues.real.max(axis=1)
+    assert np.array_equal(rightmost < 0, locus.factors > least)
+    own = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
+    assert np.abs(np.sort_complex(own) - np.sort_complex(found.eigenvalues)).max() < 1e-6
+    assert gain_locus("five_bar") is None
+    assert gain_locus("five_bar/swing") is None
+
+
+def test_figures_show_poles_modes_and_the_locus() -> None:
+    model = linearize("five_bar/set_point", 0.5)
+    ax = draw_poles(model).axes[0]
+    plant, closed = (np.sort_complex(line.get_xdata() + 1j * line.get_ydata()) for line in ax.lines[-2:])
+    assert model.closed_loop is not None
+    assert np.array_equal(plant, np.sort_complex(model.eigenvalues))
+    assert np.abs(closed - np.sort_complex(np.linalg.eigvals(model.closed_loop))).max() < 1e-9
+    low, high = ax.get_xlim()
+    assert low < closed.real.min() < plant.real.max() < high
+    panels = draw_modes(linearize("stewart")).axes
+    assert len(panels) == 6
+    assert panels[0].get_title(loc="left").startswith("1: 1.503 Hz")
+    locus = gain_locus("three_rrr/circle")
+    assert locus is not None
+    assert locus.gain == "K_D"
+    assert len(draw_locus(locus).axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
+
+
+def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
+    model = linearize("stewart")
+    runs = sways(model)
+    assert list(runs) == [1, 2, 3, 4, 5, 6]
+    for number, run in runs.items():
+        mode = model.modes[number - 1]
+        assert run.max_phi < 1e-9
+        assert run.max_phi_dot < 1e-9
+        assert run.t[-1] == pytest.approx(2 / mode.frequency)
+        # the rates are those of the motion, by differences around the ring of frames, to the size of a swing squared
+        swing, rates = run.q_tree[:49, 2], run.v_tree[:48, 2]
+        slope = (np.roll(swing[:48], -1) - np.roll(swing[:48], 1)) / (2 * run.t[1])
+        assert np.abs(slope - rates).max() <= 0.2 * np.abs(rates).max()

@@ -1,0 +1,143 @@
+"""Arguments of the wrong kind: every public function says, in one sentence, what it was given and what it takes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import Event, InputError, Run, Sampled, SetPoint, Simulator, Terms, Tracking, load, load_scene, simulate
+
+SWING, SHORT = "five_bar/swing", {"t_end": 0.01}
+Q = {"theta_1": -1.2, "theta_3": -1.9}
+
+
+class Own:
+    def u(self, t: float, terms: Terms) -> Any:
+        return -terms.q_dot
+
+
+class OfOne:
+    def u(self, t: float) -> Any:
+        return t
+
+
+def law(t: float, terms: Terms) -> Any:
+    return -terms.q_dot
+
+
+def trajectory(t: float) -> tuple[Any, Any, Any]:
+    return np.zeros(2), np.zeros(2), np.zeros(2)
+
+
+def run() -> Run:
+    return simulate(SWING, SHORT)
+
+
+def of(controller: Any) -> Callable[[], Any]:
+    return lambda: simulate(SWING, SHORT, controller=controller)
+
+
+def five_bar() -> ckc_pin.Mechanism:
+    return load("five_bar")
+
+
+CALLS: dict[str, tuple[Callable[[], Any], str]] = {
+    "simulate a mechanism": (lambda: simulate(five_bar()), "a Mechanism was given, .*five_bar/default, five_bar/set"),
+    "simulate a number": (lambda: simulate(3), "simulate: scene: 3 was given; it takes a scene"),
+    "simulate a run": (lambda: simulate(run()), "simulate: scene: a Run was given"),
+    "changes as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: changes: 't_end=1' was given"),
+    "changes by number": (lambda: simulate(SWING, {3: 4}), "changes, a key: 3 was given; it takes a table"),
+    "a class as a controller": (of(Own), r"the class Own was given; give an object of it, as Own\(\) makes one"),
+    "a function of one": (of(lambda t: t), r"controller: <lambda>\(t\) was given; it must take \(t, terms\)"),
+    "a method of one": (of(OfOne()), r"controller: u\(t\) was given; it must take \(t, terms\)"),
+    "a string as a controller": (of("pd"), r"controller: 'pd' was given; it takes an object with one of the methods"),
+    "an object as a controller": (of(object()), r"controller: an object was given; .*or a function u\(t, terms\)"),
+    "a class that is sampled": (lambda: Sampled(Own, 0.1), "the class Own was given"),
+    "a sensor": (lambda: Sampled(Own(), 0.1, sensor=3), r"Sampled: sensor: 3 was given; .*\[controller.sensor\]"),
+    "one event": (lambda: simulate(SWING, SHORT, events=Event(law)), "events: an Event was given; it takes a list of"),
+    "progress": (lambda: simulate(SWING, SHORT, progress=True), r"progress: True was given; .* \(t, t_end\)"),
+    "on_output": (lambda: simulate(SWING, SHORT, on_output=3), r"on_output: 3 was given; .* \(t, q_tree\)"),
+    "profile": (lambda: simulate(SWING, SHORT, profile="no"), "profile: 'no' was given; it takes True or False"),
+    "load": (lambda: load(None), "load: name: None was given; it takes a mechanism's shipped name or its path"),
+    "load a scene by name": (lambda: load(SWING), "'five_bar/swing' is a scene; its mechanism is 'five_bar'"),
+    "load_scene": (lambda: load_scene(five_bar()), "load_scene: name: a Mechanism was given"),
+    "check": (lambda: ckc_pin.check(run()), "check: what: a Run was given; it takes a mechanism or a scene"),
+    "terms of a scene": (lambda: ckc_pin.terms(load_scene(SWING), Q), "terms: mechanism: a Scene was given"),
+    "terms at an array": (lambda: ckc_pin.terms("five_bar", np.zeros(2)), "q: a ndarray was given; it takes a table"),
+    "terms at a word": (lambda: ckc_pin.terms("five_bar", {**Q, "theta_1": "a"}), "theta_1 = 'a': a number is needed"),
+    "play nothing": (ckc_pin.play, "play: no run given"),
+    "play a path": (lambda: ckc_pin.play("runs/a"), "play: runs: 'runs/a' was given; it takes runs"),
+    "play fast": (lambda: ckc_pin.play(run(), speed="fast"), "play: speed = 'fast'; it must be a number above zero"),
+    "play at a port": (lambda: ckc_pin.play(run(), port="http"), "play: port: 'http' was given; it takes a port"),
+    "plot a path": (lambda: ckc_pin.plot("runs/a"), "plot: runs: 'runs/a' was given; it takes runs"),
+    "map": (lambda: ckc_pin.singularity_map(3), "singularity_map: mechanism: 3 was given"),
+    "cells": (lambda: ckc_pin.singularity_map("five_bar", cells="many"), "cells: 'many' was given; it takes a number"),
+    "over": (lambda: ckc_pin.singularity_map("five_bar", over="theta_1"), r"'theta_1' was given; .*\['theta_1'\]"),
+    "a map's scene": (lambda: ckc_pin.singularity_map("five_bar", scene=3), "singularity_map: scene: 3 was given"),
+    "symbolic": (lambda: ckc_pin.symbolic(3), "symbolic: mechanism: 3 was given"),
+    "as_ivp": (lambda: ckc_pin.as_ivp(five_bar()), "as_ivp: a Mechanism was given"),
+    "inverse dynamics": (lambda: ckc_pin.inverse_dynamics(3), "inverse_dynamics: scene: 3 was given"),
+    "Simulator": (lambda: Simulator(SWING, 3), "Simulator: changes: 3 was given"),
+    "Point": (lambda: ckc_pin.Point("five_bar", "tip"), "Point: mechanism: 'five_bar' was given; it takes a Mechanism"),
+    "Run.load": (lambda: Run.load(3), "Run.load: path: 3 was given"),
+    "Run.save": (lambda: run().save(3), "Run.save: path: 3 was given"),
+    "Run.at": (lambda: run().at("x"), "Run.at: 'x' was given; it takes a time, s"),
+    "a target too short": (lambda: SetPoint(five_bar(), 1.0, 1.0, [0.1]), "q_d has 1 numbers; 2 are needed: theta_1"),
+    "a target of words": (lambda: SetPoint(five_bar(), 1.0, 1.0, ["a", "b"]), "q_d: theta_1 = 'a': a number is needed"),
+    "a gain of words": (lambda: SetPoint(five_bar(), "ten", 1.0, Q), "K_P: 'ten' was given; it takes a number"),
+    "a gain of another size": (lambda: Tracking(np.eye(3), 1.0, trajectory), "Lambda: a matrix must be 2 x 2"),
+    "no trajectory": (lambda: Tracking(1.0, 1.0, Q), "desired: a dict was given; it takes a function of t"),
+    "a trajectory of one": (lambda: Tracking(1.0, 1.0, lambda t: np.zeros(2)), r"desired\(0\) is array.*its rate and"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_it_says_what_it_takes(name: str) -> None:
+    call, says = CALLS[name]
+    with pytest.raises(InputError) as error:
+        call()
+    message = str(error.value)
+    assert re.search(says, message), message
+    assert "\n" not in message
+    assert len(message) < 400
+
+
+def test_a_plain_function_is_a_controller_as_good_as_an_object() -> None:
+    """Of itself, sampled, as a lambda, as an object that can be called: bit for bit the same motion."""
+
+    class Called:
+        def __call__(self, t: float, terms: Terms) -> Any:
+            return law(t, terms)
+
+    changes = {"t_end": 0.3, "formulation": "reduced"}
+    wanted = simulate(SWING, changes, controller=Own())
+    for own in (law, lambda t, terms: -terms.q_dot, Called()):
+        found = simulate(SWING, changes, controller=own)
+        assert np.array_equal(found.q_tree, wanted.q_tree)
+        assert np.array_equal(found.u, wanted.u)
+    sampled = [simulate(SWING, changes, controller=Sampled(own, 0.01)) for own in (Own(), law)]
+    assert np.array_equal(sampled[0].q_tree, sampled[1].q_tree)
+    assert np.abs(sampled[0].u[-1]).max() > 1e-3
+
+
+def test_gains_of_controllers_are_taken_as_a_scene_takes_them() -> None:
+    mechanism = five_bar()
+    by_number = SetPoint(mechanism, 10.0, 1, Q)
+    by_name = SetPoint(mechanism, {"theta_1": 10.0, "theta_3": 10.0}, [[1, 0], [0, 1]], [-1.2, -1.9])
+    terms = ckc_pin.terms("five_bar", {"theta_1": -1.0, "theta_3": -1.7}, {"theta_1": 0.4})
+    assert np.array_equal(by_number.u(0.0, terms), by_name.u(0.0, terms))
+    assert np.array_equal(
+        Tracking(1.0, 10.0, trajectory).u(0.0, terms), Tracking(np.eye(2), 10 * np.eye(2), trajectory).u(0.0, terms)
+    )
+
+
+def test_runs_of_two_mechanisms_do_not_lie_on_each_other() -> None:
+    runs = [simulate(name, SHORT) for name in (SWING, "four_bar")]
+    for pair in (runs, runs[::-1]):
+        with pytest.raises(InputError, match="other coordinates; only runs of one mechanism lie on each other"):
+            ckc_pin.play(*pair)

@@ -1,0 +1,62 @@
+"""Sobol indices against a mechanism whose answer is known: what gravity, mass and inertia do to a pendulum's energy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin.errors import InputError
+from ckc_pin.simulation.ensembles.ensemble import sweep_task
+from ckc_pin.simulation.ensembles.importance import importance
+from tests.contract.helpers.command import ckc
+from tests.contract.test_parameters import folder
+
+FILE = """
+scene = "own/default.scene.toml"
+[changes]
+initial.at = "assembled"
+t_end = 0.001
+[variables]
+"gravity.x" = {{normal = [0, 1]}}
+"gravity.y" = {{normal = [0, 2]}}
+"epsilon" = {{{epsilon}}}
+[outputs]
+energy = "energy"
+"""
+
+
+def written(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
+    folder(at / "own")
+    path = at / "own.sweep.toml"
+    path.write_text(FILE.format(epsilon=epsilon).replace("[changes]", "members = 2\n[changes]"))
+    return path
+
+
+def test_energy_at_rest_is_linear_in_gravity(tmp_path: Path) -> None:
+    task = sweep_task(written(tmp_path))
+    found = importance(task, 64, 2)
+    # E = c - sum of m g . p, so that the shares are as (p_x 1)^2 to (p_y 2)^2
+    members = task.members(1)
+    energy = members.run(0, np.array([[0, 0, 0.1], [1, 0, 0.1], [0, 1, 0.1]])).outputs["energy"]
+    parts = np.array([energy[1] - energy[0], 2 * (energy[2] - energy[0]), 0.0]) ** 2
+    for order in ("first_order", "total_order"):
+        assert np.allclose(found[order].sel(output="energy"), parts / parts.sum(), atol=0.15)
+    assert float(found["total_order"].sel(output="energy", variable="epsilon")) == pytest.approx(0, abs=1e-9)
+
+
+def test_the_command_writes_them(tmp_path: Path) -> None:
+    done = ckc("sweep", str(written(tmp_path)), "--out", str(tmp_path / "o"), "--indices", "4", "--json")
+    assert done.code == 0, done.err
+    assert len((tmp_path / "o" / "indices.csv").read_text().splitlines()) == 4
+    assert (tmp_path / "o" / "indices_energy.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "count", "says"),
+    [("uniform = [0.1, 0.2]", 6, "no power of 2"), ("list = [0.1]", 4, "no random variable")],
+)
+def test_what_has_no_variance_is_refused(tmp_path: Path, epsilon: str, count: int, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        importance(sweep_task(written(tmp_path, epsilon)), count, 1)

@@ -1,0 +1,188 @@
+"""Each member does what a single run of the same changes does, whoever else is there and however it is run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin.errors import CkcError
+from ckc_pin.simulation.ensembles.members import DONE, FAILED, STOPPED, Members
+from ckc_pin.simulation.ensembles.outputs import SHORT
+from tests.contract.test_parameters import folder
+
+CLOSE = 1e-7  # rtol is 1e-9; a start that is closed to rounding in another way moves the steps
+OUTPUTS = {"end": "q_tree", "rate": "v_tree", "drift": "energy_drift"}
+HANGING = {"initial.q.theta_1": -1.434, "initial.q.theta_3": -1.707}
+SWING = {"t_end": 0.5, "solver.rtol": 1e-9, "solver.terms": "pinocchio"}
+
+# scene, changes, variables with their ranges, whether they are put into a loop that is there
+CASES: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]], bool]] = {
+    "starts": ("five_bar/swing", {}, {"initial.q.theta_1": (-1.9, -0.9), "initial.q_dot.theta_3": (-1, 1)}, True),
+    "masses": ("five_bar/swing", {}, {"link.link_2.mass": (0.1, 0.5), "link.link_3.com.y": (-0.05, 0.05)}, True),
+    "lengths": ("five_bar/swing", {"formulation": "reduced"},
+                {"joint.theta_2.xyz.x": (0.24, 0.28), "loop.elbow.frame_b.xyz.y": (-0.01, 0.01),
+                 "gravity.y": (-10, -5)}, True),
+    "inertia": ("five_bar/swing", {"formulation": "spf"},
+                {"link.link_1.inertia.izz": (0.002, 0.02), "joint.theta_1.damping": (0, 0.1)}, True),
+    "generated": ("five_bar/swing", {"solver.terms": "generated"},
+                  {"link.link_2.mass": (0.1, 0.5), "link.link_2.com.y": (-0.05, 0.05),
+                   "joint.theta_4.xyz.x": (0.24, 0.28)}, True),
+    "another model": ("five_bar/tracking", {"controller.model": "mechanism.toml", "initial.at": None, **HANGING},
+                      {"joint.theta_2.xyz.x": (0.24, 0.26)}, True),
+    "set point": ("five_bar/set_point", {}, {"initial.q.theta_1": (-1.5, -1.3)}, True),
+    "compensated": ("five_bar/set_point", {}, {"link.link_2.mass": (0.1, 0.5)}, False),
+    "gains": ("five_bar/tracking", {}, {"controller.K_D": (5, 20)}, False),
+    "rotations": ("five_bar/swing", {}, {"joint.theta_2.rpy.z": (-0.1, 0.1)}, False),
+}  # fmt: skip
+
+
+def prepared(case: str, threads: int = 2, **outputs: Any) -> tuple[Members, np.ndarray[Any, Any]]:
+    scene, changes, ranges, _ = CASES[case]
+    members = Members(scene, {**SWING, **changes}, tuple(ranges), {**OUTPUTS, **outputs}, 6, threads)
+    low, high = np.array(list(ranges.values())).T
+    return members, np.random.default_rng(5).uniform(low, high, (6, len(ranges)))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_member_is_a_run_of_its_changes(case: str) -> None:
+    members, values = prepared(case)
+    assert members.batched == CASES[case][3]
+    found = members.run(0, values)
+    assert found.status.tolist() == [DONE] * 6, found.message
+    assert np.ptp(found.outputs["end"], axis=0).max() > 1e-4  # the variables matter
+    for k, value in enumerate(values):
+        run = ckc_pin.simulate(members.scene_name, members.changes_of(value))
+        assert np.abs(found.outputs["end"][k] - run.q_tree[-1]).max() < CLOSE
+        assert np.abs(found.outputs["rate"][k] - run.v_tree[-1]).max() < 10 * CLOSE
+
+
+@pytest.mark.parametrize("case", ["starts", "lengths", "inertia", "generated", "set point", "gains"])
+def test_numbers_are_the_same_to_the_bit_in_any_order_chunk_and_thread(case: str) -> None:
+    members, values = prepared(case, threads=1)
+    alone, _ = prepared(case, threads=3)
+    whole = members.run(0, values)
+    order = np.array([4, 1, 5, 0, 3, 2])
+    mixed = alone.run(0, values[order])
+    for name, x in whole.outputs.items():
+        assert np.array_equal(x[order], mixed.outputs[name]), name
+        assert np.array_equal(x[2:3], members.run(2, values[2:3]).outputs[name]), name
+
+
+def test_springs_forces_and_lengths_are_varied_too(tmp_path: Path) -> None:
+    at = folder(tmp_path / "sprung")
+    ranges = {"spring.0.stiffness": (30, 60), "spring.0.frame_a.xyz.x": (0, 0.1), "spring.1.rest": (0, 0.4),
+              "spring.1.damping": (0.05, 0.2), "force.0.value": (-0.3, 0.3), "loop.knee.length": (0.48, 0.52),
+              "loop.knee.frame_a.xyz.y": (-0.02, 0.02), "joint.elbow.xyz.x": (0.38, 0.42), "link.arm.mass": (1, 2),
+              "link.rod.com.y": (-0.02, 0.02), "spring.0.rest_length": (0, 0.2)}  # fmt: skip
+    changes = {"t_end": 0.5, "solver.rtol": 1e-9, "initial.at": None, "initial.q.elbow": 0.35}
+    members = Members(at, changes, tuple(ranges), {"end": "q_tree"}, 6, 2)
+    low, high = np.array(list(ranges.values())).T
+    values = np.random.default_rng(5).uniform(low, high, (6, len(ranges)))
+    assert members.batched
+    found = members.run(0, values)
+    for k, value in enumerate(values):
+        run = ckc_pin.simulate(at, members.changes_of(value))
+        assert np.abs(found.outputs["end"][k] - run.q_tree[-1]).max() < CLOSE
+
+
+def test_reductions_are_those_of_the_run() -> None:
+    kept: dict[str, Any] = {
+        name: {"of": of, "reduce": how}
+        for name, of, how in [("low", "theta_2", "min"), ("mean", "v_tree", "mean"), ("area", "error", "integral"),
+                              ("rms", "error", "rms"), ("path", "u", "trajectory"), ("late", "error", "end")]
+    }  # fmt: skip
+    from ckc_pin.simulation.ensembles.spec import OutputSpec
+
+    specs = {name: OutputSpec(**spec) for name, spec in kept.items()}
+    scene = "five_bar/tracking"
+    members = Members(scene, {"t_end": 0.3, "solver.output_dt": 0.01}, ("initial.q_dot.theta_1",),
+                      {**specs, **{name: name for name in SHORT}, "settled": "settled", "drift": "energy_drift"},
+                      1, 1)  # fmt: skip
+    found = members.run(0, np.array([[0.2]])).outputs
+    run = ckc_pin.simulate(scene, {"t_end": 0.3, "solver.output_dt": 0.01, "initial.q_dot.theta_1": 0.2})
+    error = run.q_tree[:, members.mechanism.partition.q] - np.array([desired(run, t) for t in run.t])
+    assert np.allclose(found["low"], run.q_tree[:, run.column("theta_2")].min(), atol=1e-9)
+    assert np.allclose(found["mean"], np.trapezoid(run.v_tree, run.t, axis=0) / 0.3, atol=1e-7)
+    assert np.allclose(found["area"], np.trapezoid(error, run.t, axis=0), atol=1e-9)
+    assert np.allclose(found["rms"] ** 2, np.trapezoid(error**2, run.t, axis=0) / 0.3, atol=1e-9)
+    assert np.allclose(found["path"][0], run.u.T, atol=1e-5)
+    assert np.allclose(found["late"], error[-1], atol=1e-9)
+    assert np.allclose(found["max_abs_u"], np.abs(run.u).max(), atol=1e-5)
+    assert np.allclose(found["drift"], np.abs(run.energy - run.energy[0]).max(), atol=1e-6)
+    assert found["settled"].tolist() == [0.0]
+
+
+def desired(run: ckc_pin.Run, t: float) -> list[float]:
+    return [
+        of.get("offset", 0.0) + sum(a * np.sin(w * t + p) for a, w, p in of["harmonics"])
+        for of in (run.scene["controller"]["desired"][name] for name in run.independent)
+    ]
+
+
+def test_members_that_stop_or_cannot_begin_stay_with_their_reason() -> None:
+    names = ("link.link_2.mass", "joint.theta_2.xyz.x", "solver.max_rhs")
+    values = np.array([[0.3, 0.26, 9999], [-1.0, 0.26, 9999], [0.3, 9.0, 9999], [0.3, 0.26, 20], [np.nan, 0.26, 9999]])
+    members = Members("five_bar/swing", SWING, names, OUTPUTS, 5, 2)
+    found = members.run(0, values)
+    assert found.status.tolist() == [DONE, FAILED, FAILED, STOPPED, FAILED]
+    for k, says in ((1, "negative mass -1 kg"), (2, "not closed"), (3, "max_rhs = 20"), (4, "nan")):
+        assert says in found.message[k]
+    assert np.isfinite(found.outputs["end"]).all(axis=1).tolist() == [True, False, False, True, False]
+
+
+def test_an_unphysical_member_of_a_batch_is_failed_and_the_others_are_not() -> None:
+    members = Members("five_bar/swing", SWING, ("link.link_2.mass", "joint.theta_2.xyz.x"), OUTPUTS, 3, 2)
+    assert members.batched
+    found = members.run(0, np.array([[0.3, 0.26], [-1.0, 0.26], [0.3, 9.0]]))
+    assert found.status.tolist() == [DONE, FAILED, FAILED]
+    assert "negative mass" in found.message[1]
+
+
+def test_events_end_members_and_give_their_times() -> None:
+    changes = {**SWING, "event": [{"coordinate": "theta_1", "value": -1.2, "stop": True}]}
+    members = Members("five_bar/swing", changes, ("initial.q.theta_3",), {"when": "event.0", "t": "t"}, 2, 1)
+    values = np.array([[-1.2], [-1.1]])
+    found = members.run(0, values)
+    for k, value in enumerate(values):
+        run = ckc_pin.simulate("five_bar/swing", members.changes_of(value))
+        assert found.outputs["when"][k] == pytest.approx(run.events[0]["t"], abs=1e-8)
+        assert found.outputs["t"][k] == found.outputs["when"][k]
+        assert found.message[k].startswith("stopped by the event at t = ")
+
+
+@pytest.mark.parametrize(
+    ("names", "outputs", "says"),
+    [
+        (("link.link_9.mass",), OUTPUTS, "there are link.link_1, link.link_2"),
+        (("initial.q.theta_9",), OUTPUTS, "no such coordinate; there are theta_1"),
+        (("controller.K_P",), OUTPUTS, "is no number of the scene"),
+        (("solver.rtoll",), OUTPUTS, "unknown key"),
+        (("link.link_2.com",), OUTPUTS, "vary link.link_2.com.x, .y or .z"),
+        (("epsilon",), {"x": "theta_9"}, "no 'theta_9'; there are q_tree"),
+        (("epsilon",), {"x": "event.0"}, "the scene has no event '0'"),
+        (("epsilon",), {"x": "error"}, "has no q_d"),
+        (("epsilon",), {"x": lambda run: 1 / 0}, "x raised ZeroDivisionError for the scene itself"),
+    ],
+)
+def test_what_is_not_there_is_refused(names: tuple[str, ...], outputs: dict[str, Any], says: str) -> None:
+    with pytest.raises(CkcError) as error:
+        Members("five_bar/swing", SWING, names, outputs, 1, 1)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_output_that_raises_fails_its_member_only() -> None:
+    def late(run: ckc_pin.Run) -> float:
+        if run.q_tree[0, 0] < -1.2:
+            raise RuntimeError("too far")
+        return float(run.t[-1])
+
+    members = Members("five_bar/swing", SWING, ("initial.q.theta_1",), {"late": late, **OUTPUTS}, 2, 2)
+    found = members.run(0, np.array([[-1.3], [-1.0]]))
+    assert found.status.tolist() == [FAILED, DONE]
+    assert found.message[0] == "output 'late' raised RuntimeError: too far"
+    assert np.isfinite(found.outputs["end"]).all()

@@ -1,0 +1,102 @@
+"""Values of variables: distributed as asked for, the same whatever the chunks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.sources import Sources
+from ckc_pin.simulation.ensembles.spec import sweep_of
+from ckc_pin.simulation.ensembles.variables import Variables
+
+MANY = 20_000
+
+
+def variables(
+    specs: dict[str, Any], members: int | None = None, seed: int = 3, folder: Path | None = None
+) -> Variables:
+    sources = Sources("own.sweep.toml", folder)
+    data = {"scene": "five_bar/swing", "variables": specs, "outputs": {"end": "q_tree"}, "seed": seed}
+    return Variables(sweep_of(data | ({"members": members} if members else {}), sources), sources)
+
+
+@pytest.mark.parametrize(
+    ("spec", "law"),
+    [
+        ({"uniform": [-2.0, 3.0]}, stats.uniform(-2, 5)),
+        ({"normal": [1.0, 0.2]}, stats.norm(1, 0.2)),
+        ({"loguniform": [0.01, 10.0]}, stats.loguniform(0.01, 10)),
+        ({"lognormal": [0.5, 0.3]}, stats.lognorm(0.3, scale=np.exp(0.5))),
+        ({"sobol": [-2.0, 3.0]}, stats.uniform(-2, 5)),
+        ({"lhs": [-2.0, 3.0]}, stats.uniform(-2, 5)),
+    ],
+    ids=lambda x: next(iter(x)) if isinstance(x, dict) else "",
+)
+def test_numbers_are_distributed_as_asked_for(spec: dict[str, Any], law: Any) -> None:
+    found = variables({"gravity.x": spec, "gravity.y": spec}, MANY).values(0, MANY)
+    for column in found.T:
+        assert stats.kstest(column, law.cdf).pvalue > 1e-3
+    assert abs(stats.pearsonr(*found.T).statistic) < 0.03
+    even = stats.kstest(found[:, 0], law.cdf).statistic
+    assert (even < 1e-3) == (next(iter(spec)) in ("sobol", "lhs"))
+
+
+def test_members_do_not_depend_on_the_chunks() -> None:
+    every = variables(
+        {
+            "gravity.x": {"uniform": [0, 1]}, "gravity.y": {"normal": [0, 1]}, "gravity.z": {"sobol": [0, 1]},
+            "epsilon": {"lhs": [0, 1]}, "t_end": [1.0, 2.0, 3.0],
+        },
+        1000,
+    )  # fmt: skip
+    whole = every.values(0, every.count)
+    assert every.count == 3000
+    for first, end in ((0, 1), (1023, 1025), (777, 2900), (2999, 3000)):
+        assert np.array_equal(every.values(first, end), whole[first:end])
+    other = variables({"gravity.x": {"uniform": [0, 1]}}, 1000, seed=4).values(0, 1000)
+    assert not np.isin(other[:, 0], whole[:, 0]).any()
+
+
+def test_grids_lists_and_files_are_crossed(tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_text("gravity.y, epsilon\n1,10\n2,20\n")
+    found = variables(
+        {"gravity.x": {"grid": {"start": 0, "stop": 1, "count": 3}}, "gravity.y": {"file": "pairs.csv"},
+         "epsilon": {"file": "pairs.csv"}, "t_end": [5.0, 6.0]}, folder=tmp_path,
+    )  # fmt: skip
+    values = found.values(0, found.count)
+    assert found.count == 12
+    assert {tuple(row) for row in values} == {(x, y, 10 * y, t) for x in (0, 0.5, 1) for y in (1, 2) for t in (5, 6)}
+    assert values[:3].tolist() == [[0, 1, 10, 5], [0, 1, 10, 6], [0, 2, 20, 5]]
+
+
+@pytest.mark.parametrize(
+    ("specs", "says"),
+    [
+        ({"gravity.x": {"uniform": [1, 0]}}, "from the smaller to the larger"),
+        ({"gravity.x": {"uniform": [0, 1], "normal": [0, 1]}}, "uniform and normal are given; give one of"),
+        ({"gravity.x": {}}, "nothing is given; give one of uniform"),
+        ({"gravity.x": {"loguniform": [0, 1]}}, "greater than 0"),
+        ({"gravity.x": {"normal": [0, -1]}}, "deviation -1 is negative"),
+        ({"gravity.x": {"uniform": [0, 1], "triangle": 1}}, "unknown key"),
+        ({"gravity.x": {"uniform": [0, 1]}}, "members: say how many"),
+        ({"gravity.x": {"file": "none.csv"}}, "no such file"),
+        ({"gravity.x": {"file": "bad.csv"}}, "line 3: gravity.x: a number is needed"),
+        ({"gravity.y": {"file": "bad.csv"}}, "no column 'gravity.y'; there are gravity.x"),
+        (
+            {"gravity.x": {"grid": {"start": 0, "stop": 1, "count": 10**9}}, "gravity.y": [1.0, 2.0]},
+            "at most 1000000000",
+        ),
+        ({}, "name at least one"),
+    ],
+)
+def test_bad_variables_are_refused(tmp_path: Path, specs: dict[str, Any], says: str) -> None:
+    (tmp_path / "bad.csv").write_text("gravity.x\n1\nx\n")
+    with pytest.raises(InputError) as error:
+        variables(specs, folder=tmp_path)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)

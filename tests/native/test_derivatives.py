@@ -1,0 +1,130 @@
+"""Exact derivatives of eq. 1 against extrapolated differences of the NumPy reference, at random states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import load, simulate
+from ckc_pin.dynamics import Terms, dae_acceleration
+from ckc_pin.errors import CkcError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native import _core
+from ckc_pin.native.tables import core_table
+from ckc_pin.simulation.scene import catalogue
+from scripts.experiments.fuzz.mechanisms import random_mechanism
+from tests.native.loops import started
+
+SHIPPED = [name for name, *_ in catalogue()]
+CLOSED = 1e-6  # of the largest: differences next to a loss of rank say nothing
+
+
+def extrapolated(function: Any, h: float) -> Any:
+    """The derivative at zero by central differences at h, h/2 and h/4, and how well two of the orders agree."""
+    one, two, four = ((function(x) - function(-x)) / (2 * x) for x in (h, h / 2, h / 4))
+    first, second = (4 * two - one) / 3, (4 * four - two) / 3
+    return (16 * second - first) / 15, np.abs(second - first).max()
+
+
+def largest_error(mechanism: Mechanism, random: Any) -> float:
+    """Along random motions of the closed loops, relative to the largest change."""
+    n, tree, core = mechanism.n, mechanism.tree, _core.Core(core_table(mechanism))
+    J = mechanism.assembled.J
+    free = np.eye(n) - np.linalg.pinv(J, rcond=1e-9) @ J  # redundant rows contradict each other off the closure
+    v, u = free @ random.uniform(-1, 1, n), random.uniform(-1, 1, n)
+    found = core.derivatives(mechanism.q_tree, v, u)
+    worst = 0.0
+    for _ in range(3):
+        dq, dv, du = free @ random.uniform(-1, 1, n), free @ random.uniform(-1, 1, n), random.uniform(-1, 1, n)
+
+        def moved(h: float, dq: Any = dq, dv: Any = dv, du: Any = du) -> Any:
+            at = mechanism.kinematics(tree.integrate(mechanism.q_tree, h * dq))
+            return dae_acceleration(Terms(mechanism, at, v + h * dv), u + h * du)
+
+        wanted, open_by = extrapolated(moved, 4e-3)
+        size = np.abs(wanted).max()
+        if open_by > CLOSED * size:
+            continue
+        ours = found["by_q"] @ dq + found["by_v"] @ dv + found["by_u"] @ du
+        worst = max(worst, float(np.abs(ours - wanted).max() / size))
+    return worst
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_derivatives_of_the_acceleration_are_exact(name: str) -> None:
+    assert largest_error(load(name), np.random.default_rng(0)) <= 1e-10
+
+
+@pytest.mark.parametrize("seeds", [range(0, 15), range(15, 30), range(30, 45)], ids=str)
+def test_those_of_random_mechanisms_are(seeds: range, tmp_path: Path) -> None:
+    """Every kind of loop, springs and dampers, free roots."""
+    met = 0
+    for seed in seeds:
+        try:
+            mechanism = load(str(random_mechanism(seed).write(tmp_path / str(seed))))
+        except CkcError:
+            continue
+        met += 1
+        assert largest_error(mechanism, np.random.default_rng(seed)) <= 2e-8, seed
+    assert met >= 10
+
+
+SPF = {"formulation": "spf", "initial.w": [0.01, -0.02], "epsilon": 1e-2}
+STATES = [
+    ("five_bar/tracking", {"formulation": "dae"}),
+    ("five_bar/tracking", {"formulation": "reduced"}),
+    ("five_bar/tracking", SPF),
+    ("five_bar/set_point", {"formulation": "reduced"}),
+    ("five_bar/swing", {"formulation": "dae", "solver.baumgarte": [5.0, 5.0], "solver.projection": False}),
+    ("flyball/default", {"formulation": "reduced"}),
+    ("talos/squat", {"formulation": "dae"}),
+    ("three_rrr/circle", {"formulation": "reduced"}),
+    ("delta/default", {"formulation": "reduced"}),
+    ("two_ur5/default", {"formulation": "dae"}),
+    ("stewart/default", {"formulation": "reduced"}),
+]
+
+
+@pytest.mark.parametrize(("scene", "changes"), STATES, ids=lambda x: x if isinstance(x, str) else x.get("formulation"))
+def test_jacobians_of_right_hand_sides_are_exact(scene: str, changes: dict[str, Any]) -> None:
+    """Without generated terms, controllers included: along motions of closed loops, off rest."""
+    ready = started(scene, {**changes, "solver.terms": "pinocchio", "solver.rtol": 1e-12})
+    loop, mechanism, random = ready.loop, ready.mechanism, np.random.default_rng(3)
+    n, tree, d = mechanism.n, mechanism.tree, mechanism.d
+    reduced = len(loop.y) == 2 * d
+    y = loop.y.copy()
+    J = ready.start.at.J
+    free = np.eye(n) - np.linalg.pinv(J, rcond=1e-9) @ J
+    y[-(d if reduced else n) :] += 0.3 * (random.uniform(-1, 1, d) if reduced else free @ random.uniform(-1, 1, n))
+    t, found, before = 0.1, loop.jacobian(0.1, y), loop.stats()["differences"]
+    assert before == 0
+    for _ in range(3):
+        if reduced:
+            change = random.uniform(-1, 1, 2 * d)
+
+            def moved(h: float, change: Any = change) -> Any:
+                return loop.rhs(t, y + h * change)
+        else:
+            dq, dv = free @ random.uniform(-1, 1, n), free @ random.uniform(-1, 1, n)
+            change = np.concatenate([tree.configuration_rate(y[: tree.nq], dq), dv])
+
+            def moved(h: float, dq: Any = dq, dv: Any = dv) -> Any:
+                return loop.rhs(t, np.concatenate([tree.integrate(y[: tree.nq], h * dq), y[tree.nq :] + h * dv]))
+
+        wanted, _ = extrapolated(moved, 2e-3)
+        assert np.abs(found @ change - wanted).max() <= 1e-8 * np.abs(wanted).max()
+
+
+def test_only_what_a_caller_wrote_is_differentiated_by_differences() -> None:
+    class Own:
+        def u(self, t: float, terms: Any) -> Any:
+            return -3.0 * terms.q_dot
+
+    changes = {"formulation": "reduced", "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 0.5}
+    theirs = simulate("five_bar/swing", changes, controller=Own()).stats
+    assert theirs["differences"] == theirs["jacobians"] > 0
+    ours = simulate("five_bar/tracking", changes).stats
+    assert ours["differences"] == 0 < ours["jacobians"]

@@ -1,0 +1,29 @@
+"""The figure of how a run changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.view.sensitivity_figure import draw_sensitivities, save_sensitivities
+from tests.sensitivity.changed import written
+
+
+def test_a_panel_a_parameter_with_the_independent_coordinates(tmp_path: Path) -> None:
+    found = sensitivities(written(tmp_path), ["link.crank.mass", "initial.q.a"])
+    figure = draw_sensitivities(found)
+    assert [ax.get_title("left") for ax in figure.axes] == ["by link.crank.mass", "by initial.q.a"]
+    for k, ax in enumerate(figure.axes):
+        assert np.array_equal(ax.lines[0].get_ydata(), found.q_tree[:, 0, k])
+    (path,) = save_sensitivities(found, tmp_path)
+    assert path.name == "sensitivities.png"
+    assert path.stat().st_size > 5000
+
+
+def test_only_the_six_that_matter_most(tmp_path: Path) -> None:
+    found = sensitivities(written(tmp_path), ["gravity", "joint.c.xyz", "initial.q.a", "spring.0.stiffness"])
+    titles = {ax.get_title("left").removeprefix("by ") for ax in draw_sensitivities(found).axes}
+    most = np.abs(found.q_tree[:, 0]).max(axis=0)
+    assert titles == {found.parameters[k] for k in np.argsort(-most)[:6]}

@@ -1,0 +1,92 @@
+"""Floquet multipliers against Mathieu's equation: a pendulum on a mass that swings up and down on a spring.
+
+Where the pendulum hangs still, what it answers to a push is theta'' + (g - A w^2 cos(w t)) / L theta = 0 exactly.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import mathieu_a
+
+from ckc_pin import InputError
+from ckc_pin.simulation.floquet import floquet
+
+M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
+PERIOD = 2 * np.pi / w
+TIGHT = {"solver.rtol": 1e-12, "solver.atol": 1e-14}
+
+URDF = f"""<robot name="swing"><link name="base"/>
+<link name="slide"><inertial><mass value="{M}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="bob"><inertial><origin xyz="0 0 -{L}"/><mass value="{m}"/>
+<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="y" type="prismatic"><parent link="base"/><child link="slide"/><axis xyz="0 0 1"/>
+<limit lower="-9" upper="9" effort="1" velocity="1"/></joint>
+<joint name="theta" type="continuous"><parent link="slide"/><child link="bob"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+def written(folder: Path, gravity: float, amplitude: float) -> str:
+    """y = amplitude cos(w t) about where the spring holds both."""
+    stiffness = (M + m) * w**2
+    (folder / "swing.urdf").write_text(URDF, encoding="utf-8")
+    (folder / "swing.toml").write_text(
+        f'name = "swing"\nurdf = "swing.urdf"\ngravity = [0.0, 0.0, {-gravity!r}]\n'
+        f'[[spring]]\njoint = "y"\nstiffness = {stiffness!r}\nrest = {(M + m) * gravity / stiffness!r}\n',
+        encoding="utf-8",
+    )
+    scene = folder / "swing.scene.toml"
+    scene.write_text(
+        'mechanism = "swing.toml"\nformulation = "reduced"\nt_end = 1.0\n'
+        f"[initial.q]\ny = {amplitude!r}\ntheta = 0.0\n",
+        encoding="utf-8",
+    )
+    return str(scene)
+
+
+def block(gravity: float, amplitude: float) -> np.ndarray:
+    """Of the pendulum alone, by another program."""
+
+    def rate(t: float, x: np.ndarray) -> list[float]:
+        pull = (gravity - amplitude * w**2 * np.cos(w * t)) / L
+        return [x[1], -pull * x[0], x[3], -pull * x[2]]
+
+    found = solve_ivp(rate, (0, PERIOD), [1.0, 0.0, 0.0, 1.0], method="DOP853", rtol=1e-13, atol=1e-14)
+    return found.y[:, -1].reshape(2, 2).T
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 0.2, 0.4])
+def test_multipliers_are_those_of_mathieus_equation(amplitude: float, tmp_path: Path) -> None:
+    found = floquet(written(tmp_path, g, amplitude), PERIOD, TIGHT)
+    assert found.states == ("y", "theta", "y_dot", "theta_dot")
+    wanted = block(g, amplitude)
+    assert np.abs(found.monodromy[np.ix_([1, 3], [1, 3])] - wanted).max() <= 1e-9 * np.abs(wanted).max()
+    of_pendulum = np.linalg.eigvals(wanted)
+    for value in of_pendulum:
+        assert np.abs(found.multipliers - value).min() <= 1e-8
+    assert np.prod(found.multipliers).real == pytest.approx(1.0, abs=1e-8)  # it keeps its energy
+
+
+def test_on_the_edge_of_the_first_tongue_both_are_minus_one(tmp_path: Path) -> None:
+    """a = a_1(q) of x'' + (a - 2 q cos 2 tau) x = 0, tau = w t / 2."""
+    amplitude = 0.1
+    gravity = float(mathieu_a(1, 2 * amplitude / L)) * L * w**2 / 4
+    found = floquet(written(tmp_path, gravity, amplitude), PERIOD, TIGHT)
+    assert found.monodromy[1, 1] + found.monodromy[3, 3] == pytest.approx(-2.0, abs=1e-9)
+
+
+def test_a_period_that_is_none_is_refused_by_how_much_it_misses(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"period = 0\.9 s is none: after it y is off by -?0\.\d+ from its 0\.2"):
+        floquet(written(tmp_path, g, 0.2), 0.9)
+    for period in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(InputError, match="positive number of seconds"):
+            floquet(written(tmp_path, g, 0.2), period)
+
+
+def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
+    plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
+    assert set(plain) == {"states", "period", "monodromy", "multipliers"}
+    assert all(len(pair) == 2 for pair in plain["multipliers"])
