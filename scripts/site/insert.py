@@ -18,6 +18,12 @@ def _file(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8").rstrip()
 
 
+def _changes(text: str) -> str:
+    """Return the change log below its title, with links as the site has them."""
+    below = text.partition("\n")[2].replace("](docs/", "](/")
+    return re.sub(r"\]\(examples/(\w+)\.\w+\)", lambda at: f"](/gallery.md#example-{at[1].replace('_', '-')})", below)
+
+
 INSERTS: dict[str, Callable[..., str]] = {
     "keys": keys.markdown,
     "commands": commands.markdown,
@@ -26,7 +32,7 @@ INSERTS: dict[str, Callable[..., str]] = {
     "python": lambda name: f"```python\n{_file(name)}\n```",
     "toml": lambda name: f"```toml\n{_file(name)}\n```",
     "xml": lambda name: f"```xml\n{_file(name)}\n```",
-    "changes": lambda: _file("CHANGELOG.md").partition("\n")[2].replace("](docs/", "](/"),
+    "changes": lambda: _changes(_file("CHANGELOG.md")),
 }
 
 
