@@ -17,6 +17,8 @@ from ckc_pin.mechanism.tree import Array
 __all__ = ["h_gradient", "stable_equilibrium"]
 
 STEPS = 300
+LONGEST = 0.3  # rad or m along each principal direction of the Hessian
+FLAT = 1e-9  # of its largest eigenvalue: nothing to tell from zero
 SHORT = 0.25  # of a step: where less of it can be taken, other coordinates are tried
 POOR = 10.0  # times further from failing: other coordinates are taken at any rate
 SINGULAR = 1e-9  # margin of phi_z below which q is none
@@ -49,7 +51,8 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
     Raises
     ------
     NumericalError
-        The descent runs into a configuration where the loops lose rank, or does not end.
+        The descent runs into a configuration where the loops lose rank, does not end, or ends where the mechanism's
+        own independent coordinates do not determine the others.
     """
     terms = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
     scale = 1e-13 * (1.0 + _weight(mechanism))
@@ -58,30 +61,23 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
     for _ in range(STEPS):
         values, vectors = np.linalg.eigh((hessian := h_gradient(mechanism, terms.at)) / 2 + hessian.T / 2)
         steepest = np.abs(values).max()
-        falls_away = values[0] < -1e-9 * steepest
+        falls_away = values[0] < -FLAT * steepest
         calm = np.abs(terms.h).max() <= scale
         if calm and not falls_away:
             return _in_own_coordinates(mechanism, terms)
         if calm:  # balanced on a top or a saddle, as an upright start is: off it, either way leads down
             step = 0.1 * vectors[:, 0]
         else:
-            step = -vectors @ ((vectors.T @ terms.h) / np.maximum(np.abs(values), 1e-3 * steepest))
-            step *= min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
+            wanted = (vectors.T @ terms.h) / np.maximum(np.abs(values), max(FLAT * steepest, 1e-200))
+            step = -vectors @ np.clip(wanted, -LONGEST, LONGEST)  # each by itself: a soft direction stops no stiff one
         moved, fraction = _downhill(mechanism, terms, step)
         if moved is None and np.abs(terms.h).max() <= 1e3 * scale and not falls_away:
             return _in_own_coordinates(mechanism, terms)  # energy differences are rounding here
         other = _other_coordinates(mechanism, moved or terms, 2.0 if fraction < SHORT else POOR)
         if moved is None and other is None:
-            raise NumericalError(
-                f"no stable equilibrium of {mechanism.name!r} was reached from q_guess: the descent ends at a "
-                "singular configuration; give [initial.q] instead",
-                q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.at.q_tree)),
-            )
+            raise _none(mechanism, terms, "the descent ends where the loops lose rank")
         terms = other or moved or terms
-    raise NumericalError(
-        f"no stable equilibrium of {mechanism.name!r} was reached from q_guess in {STEPS} steps",
-        q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.at.q_tree)),
-    )
+    raise _none(mechanism, terms, f"after {STEPS} steps it still falls, as something does that nothing holds")
 
 
 def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> tuple[Terms | None, float]:
@@ -117,9 +113,18 @@ def _in_own_coordinates(mechanism: Mechanism, terms: Terms) -> Kinematics:
     own = mechanism.kinematics(terms.at.q_tree)
     if own.margin() > SINGULAR:
         return own
-    raise NumericalError(
-        f"{mechanism.name!r} comes to rest where {', '.join(mechanism.independent)} do not determine the others; take "
-        f"other independent coordinates ({', '.join(mechanism.coordinates[k] for k in terms.at.partition.q)} would do)",
+    names = ", ".join(mechanism.coordinates[k] for k in terms.at.partition.q)
+    raise _none(
+        mechanism,
+        terms,
+        f"where it comes to rest, {', '.join(mechanism.independent)} do not determine the other coordinates; take "
+        f"independent = {names}",
+    )
+
+
+def _none(mechanism: Mechanism, terms: Terms, why: str) -> NumericalError:
+    return NumericalError(
+        f"{mechanism.name}: no stable equilibrium is reached from q_guess: {why}",
         q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.at.q_tree)),
     )
 
