@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Run, check, linearize
+from ckc_pin import Run, check, floquet, linearize
 from ckc_pin.simulation.locus import gain_locus
 from ckc_pin.simulation.sway import sways
 from ckc_pin.view.linear_figure import draw_locus, draw_modes, draw_poles
@@ -111,6 +111,41 @@ def test_no_equilibrium_is_for_the_numerics(tmp_path: Path) -> None:
     assert answer.code == 3
     assert "no stable equilibrium is reached from q_guess: after 300 steps it still falls" in answer.json["message"]
     assert "or linearize it as assembled" in answer.json["message"]
+
+
+PERIOD = "4.99171151369"  # of bricard/period, which swings to and fro and keeps its energy
+
+
+def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Path) -> None:
+    found = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
+    assert list(found) == ["name", "states", "period", "monodromy", "multipliers"]
+    assert found == floquet("bricard/period", float(PERIOD)).plain()
+    # one freedom without damping: the area of pushes stays, and one along the motion comes back as it was
+    monodromy = np.array(found["monodromy"])
+    assert np.linalg.det(monodromy) == pytest.approx(1.0, abs=1e-7)
+    assert [complex(*x) for x in found["multipliers"]] == pytest.approx([1.0, 1.0], abs=1e-3)
+    folder = tmp_path / "motion"
+    answer = ckc("linearize", "bricard/period", "--period", PERIOD, "--out", str(folder))
+    assert "neither grow nor die out" in answer.out
+    with np.load(folder / "floquet.npz") as file:
+        assert np.array_equal(file["monodromy"], monodromy)
+        assert file["states"].tolist() == found["states"]
+    assert Run.load(folder / "run.npz").t[-1] == float(PERIOD)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (("bricard/period", "--period", "4"), "period = 4 s is none: after it"),
+        (("bricard/period", "--period", "-1"), "period = -1: a positive number of seconds is needed"),
+        (("bricard/period", "--period", "4", "--at", "2"), "--at and --period are both given"),
+        (("talos/default", "--period", "1"), "period = 1 s is none"),
+    ],
+)
+def test_a_period_that_is_none_is_refused(line: tuple[str, ...], says: str) -> None:
+    answer = ckc("linearize", *line)
+    assert answer.code == 2
+    assert says in answer.err
 
 
 def test_check_tells_of_the_closed_loop() -> None:
