@@ -139,7 +139,6 @@ def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Pat
         (("bricard/period", "--period", "4"), "period = 4 s is none: after it"),
         (("bricard/period", "--period", "-1"), "period = -1: a positive number of seconds is needed"),
         (("bricard/period", "--period", "4", "--at", "2"), "--at and --period are both given"),
-        (("talos/default", "--period", "1"), "period = 1 s is none"),
     ],
 )
 def test_a_period_that_is_none_is_refused(line: tuple[str, ...], says: str) -> None:
