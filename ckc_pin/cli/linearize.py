@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,8 +15,11 @@ from ckc_pin.cli.output import errors, make_folder, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes, read_table
-from ckc_pin.simulation.linear_report import linear_plain, linear_text, save_linear
+from ckc_pin.simulation.linear_report import floquet_text, linear_plain, linear_text, save_floquet, save_linear
 from ckc_pin.simulation.linearize import At
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 __all__ = ["linearize"]
 
@@ -26,32 +30,57 @@ __all__ = ["linearize"]
         'ckc linearize five_bar --at \'{"theta_1": -1.2, "theta_3": -1.9}\'',
         "ckc linearize five_bar/tracking --at 2.5",
         "ckc linearize stewart --out modes; ckc play modes/mode_1.npz",
+        "ckc linearize bricard/period --period 4.99171151369",
     )
 )
 @click.argument("what", metavar="MECHANISM|SCENE", help="A mechanism or a scene.")
 @click.option(
     "--at",
     metavar="equilibrium|assembled|T|JSON",
-    default="equilibrium",
-    help="About the stable equilibrium, an instant of the scene's run in s, or as assembled or at coordinates, held by "
-    "its motors.",
+    help="About the stable equilibrium (what is taken without it), an instant of the scene's run in s, or as assembled "
+    "or at coordinates, held by its motors.",
+)
+@click.option(
+    "--period",
+    metavar="SECONDS",
+    type=float,
+    help="Instead along the scene's motion, which comes back after this time: monodromy matrix, Floquet multipliers.",
 )
 @options.changes
-@click.option("--out", metavar="DIR", type=Path, help="Folder for linear.npz, figures, and the modes as runs to play.")
+@click.option(
+    "--out",
+    metavar="DIR",
+    type=Path,
+    help="Folder for linear.npz, figures, and the modes as runs to play; of a period floquet.npz and run.npz.",
+)
 @options.as_json
-def linearize(what: str, at: str, changes: tuple[str, ...], out: Path | None, as_json: bool) -> None:
+def linearize(
+    what: str, at: str | None, period: float | None, changes: tuple[str, ...], out: Path | None, as_json: bool
+) -> None:
     """Linear model in minimal coordinates: A, B, C, D, modes. Exact, about a state of rest or of a run."""
+    if at is not None and period is not None:
+        raise InputError("--at and --period are both given: one is about a state, the other along a motion; give one")
     if out is not None:
         make_folder(out)
-    model = ckc_pin.linearize(what, _at(at), read_changes("--set", changes))
+    if period is not None:
+        found = ckc_pin.floquet(what, period, read_changes("--set", changes))
+        if out is not None:
+            _write_floquet(found, out)
+        _print(found.plain() if as_json else floquet_text(found), out)
+        return
+    model = ckc_pin.linearize(what, _at(at or "equilibrium"), read_changes("--set", changes))
     if out is not None:
         _write(model, what, changes, out)
-    if as_json:
-        print_json(linear_plain(model))
-    else:
-        print_table(linear_text(model))
-        if out is not None:
-            print(f"written to {out}")
+    _print(linear_plain(model) if as_json else linear_text(model), out)
+
+
+def _print(found: dict[str, Any] | Text, out: Path | None) -> None:
+    if isinstance(found, dict):
+        print_json(found)
+        return
+    print_table(found)
+    if out is not None:
+        print(f"written to {out}")
 
 
 def _at(given: str) -> At:
@@ -65,6 +94,13 @@ def _at(given: str) -> At:
         raise InputError(
             f"--at {given!r:.80}: give equilibrium, assembled, a time in seconds, or a table of coordinates as JSON"
         ) from None
+
+
+def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
+    with interrupts.deferred(), ExitStack() as stack:
+        stack.enter_context(alone_in(out))
+        save_floquet(found, out / "floquet.npz")
+        found.run.save(out / "run.npz")
 
 
 def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> None:

@@ -8,12 +8,20 @@ import pinocchio as pin
 from ckc_pin.dynamics.derivatives import multiplier_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.kinematics.continuation import same_branch
+from ckc_pin.kinematics.sigma import newton, predict
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["h_gradient", "stable_equilibrium"]
+
+STEPS = 300
+LONGEST = 0.3  # rad or m along each principal direction of the Hessian
+FLAT = 1e-9  # of its largest eigenvalue: nothing to tell from zero
+SHORT = 0.25  # of a step: where less of it can be taken, other coordinates are tried
+POOR = 10.0  # times further from failing: other coordinates are taken at any rate
+SINGULAR = 1e-9  # margin of phi_z below which q is none
 
 
 def h_gradient(mechanism: Mechanism, at: Kinematics) -> Array:
@@ -37,57 +45,88 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
     """Return the minimum of the potential energy reached from the assembled configuration by descent.
 
     Newton's steps on h(q) = 0, with the Hessian shifted until it is positive definite and the step
-    shortened until the energy falls, along sigma all the way: the branch is kept.
+    shortened until the energy falls, on the loops all the way. Where q fails as coordinates the descent goes on in
+    others, as a mechanism falls through there.
 
     Raises
     ------
     NumericalError
-        The descent runs into a singular configuration, or does not end.
+        The descent runs into a configuration where the loops lose rank, does not end, or ends where the mechanism's
+        own independent coordinates do not determine the others.
     """
-    at = mechanism.assembled
-    terms = Terms(mechanism, at, np.zeros(mechanism.n))
+    terms = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
     scale = 1e-13 * (1.0 + _weight(mechanism))
     if mechanism.d == 0:
-        return at
-    for _ in range(300):
-        values, vectors = np.linalg.eigh((hessian := h_gradient(mechanism, at)) / 2 + hessian.T / 2)
+        return terms.at
+    for _ in range(STEPS):
+        values, vectors = np.linalg.eigh((hessian := h_gradient(mechanism, terms.at)) / 2 + hessian.T / 2)
         steepest = np.abs(values).max()
-        falls_away = values[0] < -1e-9 * steepest
+        falls_away = values[0] < -FLAT * steepest
         calm = np.abs(terms.h).max() <= scale
         if calm and not falls_away:
-            return at
+            return _in_own_coordinates(mechanism, terms)
         if calm:  # balanced on a top or a saddle, as an upright start is: off it, either way leads down
             step = 0.1 * vectors[:, 0]
         else:
-            step = -vectors @ ((vectors.T @ terms.h) / np.maximum(np.abs(values), 1e-3 * steepest))
-            step *= min(1.0, 0.3 / max(np.abs(step).max(), 1e-300))
-        moved = _downhill(mechanism, terms, step)
-        if moved is None:
-            if np.abs(terms.h).max() <= 1e3 * scale and not falls_away:  # energy differences are rounding here
-                return at
-            raise NumericalError(
-                f"no stable equilibrium of {mechanism.name!r} was reached from q_guess: the descent ends at a "
-                "singular configuration; give [initial.q] instead",
-                q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
-            )
-        at, terms = moved.at, moved
-    raise NumericalError(f"no stable equilibrium of {mechanism.name!r} was reached from q_guess in 300 steps")
+            wanted = (vectors.T @ terms.h) / np.maximum(np.abs(values), max(FLAT * steepest, 1e-200))
+            step = -vectors @ np.clip(wanted, -LONGEST, LONGEST)  # each by itself: a soft direction stops no stiff one
+        moved, fraction = _downhill(mechanism, terms, step)
+        if moved is None and np.abs(terms.h).max() <= 1e3 * scale and not falls_away:
+            return _in_own_coordinates(mechanism, terms)  # energy differences are rounding here
+        other = _other_coordinates(mechanism, moved or terms, 2.0 if fraction < SHORT else POOR)
+        if moved is None and other is None:
+            raise _none(mechanism, terms, "the descent ends where the loops lose rank")
+        terms = other or moved or terms
+    raise _none(mechanism, terms, f"after {STEPS} steps it still falls, as something does that nothing holds")
 
 
-def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> Terms | None:
-    """Shorten a step until the potential energy falls, or |h| does where the energy is flat."""
+def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> tuple[Terms | None, float]:
+    """Shorten a step until the potential energy falls, or |h| does where the energy is flat; say how much.
+
+    A step is one of Newton's corrections, not a way that is followed: what cannot be reached at once is not looked for.
+    """
     fraction = 1.0
     while fraction > 1e-8:
-        outcome = sigma(mechanism, terms.q + fraction * step, terms.at)
-        if outcome.verdict == "converged":
-            trial = Terms(mechanism, outcome.at, np.zeros(mechanism.n))
+        closed = newton(predict(terms.at, fraction * step), 0.0, mechanism.tolerance)
+        if closed.converged and same_branch(terms.at, closed.at) and closed.at.margin() > SINGULAR:
+            trial = Terms(mechanism, closed.at, np.zeros(mechanism.n))
             flat = 1e-14 * abs(terms.potential_energy)
             falls = trial.potential_energy < terms.potential_energy - flat
             calmer = np.abs(trial.h).max() < np.abs(terms.h).max()
             if falls or (calmer and trial.potential_energy <= terms.potential_energy + flat):
-                return trial
+                return trial, fraction
         fraction /= 2
-    return None
+    return None, fraction
+
+
+def _other_coordinates(mechanism: Mechanism, terms: Terms, factor: float) -> Terms | None:
+    """Return the same state in the coordinates that are best there; None where they are not better by a factor."""
+    best = mechanism.best_partition(terms.at)
+    if best is None:
+        return None
+    other = Kinematics(terms.at.tree, terms.at.closure, best, terms.at.q_tree)
+    better = other.margin() > max(factor * terms.at.margin(), SINGULAR)
+    return Terms(mechanism, other, np.zeros(mechanism.n)) if better else None
+
+
+def _in_own_coordinates(mechanism: Mechanism, terms: Terms) -> Kinematics:
+    own = mechanism.kinematics(terms.at.q_tree)
+    if own.margin() > SINGULAR:
+        return own
+    names = ", ".join(mechanism.coordinates[k] for k in terms.at.partition.q)
+    raise _none(
+        mechanism,
+        terms,
+        f"where it comes to rest, {', '.join(mechanism.independent)} do not determine the other coordinates; take "
+        f"independent = {names}",
+    )
+
+
+def _none(mechanism: Mechanism, terms: Terms, why: str) -> NumericalError:
+    return NumericalError(
+        f"{mechanism.name}: no stable equilibrium is reached from q_guess: {why}",
+        q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.at.q_tree)),
+    )
 
 
 def _weight(mechanism: Mechanism) -> float:

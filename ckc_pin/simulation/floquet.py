@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.sensitivities import sensitivities
 
 __all__ = ["Floquet", "floquet"]
@@ -47,6 +49,7 @@ class Floquet:
     def plain(self) -> dict[str, Any]:
         """Return it as JSON has it, complex numbers as [re, im]."""
         return {
+            "name": self.run.scene_name,
             "states": list(self.states),
             "period": self.period,
             "monodromy": self.monodromy.tolist(),
@@ -81,15 +84,13 @@ def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any]
     if isinstance(scene, Scene):
         raise InputError("floquet: name the scene, or give its path; a Scene is complete, t_end included")
     loaded = load_scene(scene, {**(changes or {}), "t_end": period})
-    if loaded.spec.initial.at is not None:
-        raise InputError(
-            f'{loaded.name}: initial.at = "{loaded.spec.initial.at}" has no motion; give initial.q and q_dot'
-        )
     from ckc_pin.simulation.prepare import scene_mechanism
 
     mechanism = scene_mechanism(loaded)
     if mechanism.rooted:
         raise InputError(f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates")
+    if loaded.spec.initial.at is not None:
+        loaded = _from_coordinates(loaded, mechanism)
     names = mechanism.independent
     found = sensitivities(loaded, [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names])
     run = found.run
@@ -102,6 +103,15 @@ def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any]
     order = np.argsort(-np.abs(multipliers), kind="stable")
     states = (*names, *(f"{name}_dot" for name in names))
     return Floquet(states, monodromy, multipliers[order], float(period), run)
+
+
+def _from_coordinates(scene: Scene, mechanism: Mechanism) -> Scene:
+    """Start where a scene does, with its coordinates as numbers: they are what is pushed."""
+    start = find_start(mechanism, scene)
+    q = mechanism.tree.named(mechanism.tree.to_coordinates(start.at.q_tree))
+    return make_scene(
+        with_changes(scene.plain(), {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}), scene.name, scene.sources
+    )
 
 
 def _require_back(run: Run) -> None:

@@ -16,16 +16,21 @@ from ckc_pin.simulation.stability import Stability
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from ckc_pin.simulation.floquet import Floquet
+
 __all__ = [
+    "floquet_text",
     "linear_plain",
     "linear_text",
     "pairs",
+    "save_floquet",
     "save_linear",
     "stability_plain",
     "stability_text",
     "stability_warning",
 ]
 
+NEUTRAL = 1e-4  # of a multiplier's size: what the error of a run does to a double one at 1 (its square root)
 SHOWN = 6  # eigenvalues, in what people read
 
 
@@ -95,6 +100,41 @@ def save_linear(model: LinearModel, path: Path) -> Path:
         arrays["closed_loop"] = model.closed_loop
     with written_whole(path) as file:
         np.savez_compressed(file, **arrays, meta=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8))
+    return path
+
+
+# --- periodic motions ----------------------------------------------------------------------------
+
+
+def floquet_text(found: Floquet) -> Text:
+    """Return the multipliers of a periodic motion for people, and what they say."""
+    from rich.text import Text
+
+    largest = float(np.abs(found.multipliers[0]))
+    says = (
+        f"largest {largest:.6g} in size: "
+        + ("pushes grow, the motion is unstable" if largest > 1 + NEUTRAL else
+           "pushes die out" if largest < 1 - NEUTRAL else "to first order pushes neither grow nor die out as a power")
+    )  # fmt: skip
+    return Text(
+        f"Motion of {found.run.scene_name}, period {found.period:.9g} s\n"
+        f"  states  {', '.join(found.states)}\n"
+        f"  Floquet multipliers {eigenvalues_text(found.multipliers)}; {says}"
+    )
+
+
+def save_floquet(found: Floquet, path: Path) -> Path:
+    """Write a periodic motion's monodromy matrix and multipliers as NumPy's npz without pickle (docs/reference.md).
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    arrays: dict[str, Any] = {"monodromy": found.monodromy, "multipliers": found.multipliers}
+    arrays |= {"states": np.array(found.states, dtype=str), "period": found.period, "name": found.run.scene_name}
+    with written_whole(path) as file:
+        np.savez_compressed(file, **arrays)
     return path
 
 

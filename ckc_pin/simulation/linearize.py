@@ -129,8 +129,8 @@ def _at_equilibrium(subject: _Subject) -> LinearModel:
         at = stable_equilibrium(mechanism)
     except NumericalError as error:
         raise NumericalError(
-            f"{mechanism.name}: no stable equilibrium is reached from q_guess; linearize it as assembled, "
-            "or at coordinates, where its motors hold it, or at an instant of a scene's run",
+            f"{error}; or linearize it as assembled, or at coordinates, where its motors hold it, or at an instant of "
+            "a scene's run",
             q_tree=error.q_tree,
         ) from None
     return _at_rest(subject, at, np.zeros(len(mechanism.actuated)), "at its equilibrium")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Run, check, linearize
+from ckc_pin import Run, check, floquet, linearize
 from ckc_pin.simulation.locus import gain_locus
 from ckc_pin.simulation.sway import sways
 from ckc_pin.view.linear_figure import draw_locus, draw_modes, draw_poles
@@ -17,6 +17,12 @@ from tests.contract.helpers.command import ckc
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = ["name", "states", "inputs", "outputs", "A", "B", "C", "D", "eigenvalues", "modes", "at", "locked",
         "closed_loop", "notes"]  # fmt: skip
+FALLING = """<robot name="falling"><link name="base"/>
+<link name="stone"><inertial><mass value="1.0"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="fall" type="prismatic"><parent link="base"/><child link="stone"/><axis xyz="0 0 1"/>
+<limit lower="-9" upper="9" effort="1" velocity="1"/></joint></robot>
+"""
 
 
 def test_json_has_labels_and_matrices() -> None:
@@ -97,10 +103,48 @@ def test_what_was_wrong_is_said(line: tuple[str, ...], says: str) -> None:
     assert says in answer.err
 
 
-def test_no_equilibrium_is_for_the_numerics() -> None:
-    answer = ckc("linearize", "flyball", "--json")
+def test_no_equilibrium_is_for_the_numerics(tmp_path: Path) -> None:
+    falling = tmp_path / "mechanism.toml"
+    falling.write_text('name = "falling"\nurdf = "falling.urdf"\n')
+    (tmp_path / "falling.urdf").write_text(FALLING)
+    answer = ckc("linearize", str(falling), "--json")
     assert answer.code == 3
-    assert "no stable equilibrium" in answer.json["message"]
+    assert "no stable equilibrium is reached from q_guess: after 300 steps it still falls" in answer.json["message"]
+    assert "or linearize it as assembled" in answer.json["message"]
+
+
+PERIOD = "4.99171151369"  # of bricard/period, which swings to and fro and keeps its energy
+
+
+def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Path) -> None:
+    found = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
+    assert list(found) == ["name", "states", "period", "monodromy", "multipliers"]
+    assert found == floquet("bricard/period", float(PERIOD)).plain()
+    # one freedom without damping: the area of pushes stays, and one along the motion comes back as it was
+    monodromy = np.array(found["monodromy"])
+    assert np.linalg.det(monodromy) == pytest.approx(1.0, abs=1e-7)
+    assert [complex(*x) for x in found["multipliers"]] == pytest.approx([1.0, 1.0], abs=1e-3)
+    folder = tmp_path / "motion"
+    answer = ckc("linearize", "bricard/period", "--period", PERIOD, "--out", str(folder))
+    assert "neither grow nor die out" in answer.out
+    with np.load(folder / "floquet.npz") as file:
+        assert np.array_equal(file["monodromy"], monodromy)
+        assert file["states"].tolist() == found["states"]
+    assert Run.load(folder / "run.npz").t[-1] == float(PERIOD)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (("bricard/period", "--period", "4"), "period = 4 s is none: after it"),
+        (("bricard/period", "--period", "-1"), "period = -1: a positive number of seconds is needed"),
+        (("bricard/period", "--period", "4", "--at", "2"), "--at and --period are both given"),
+    ],
+)
+def test_a_period_that_is_none_is_refused(line: tuple[str, ...], says: str) -> None:
+    answer = ckc("linearize", *line)
+    assert answer.code == 2
+    assert says in answer.err
 
 
 def test_check_tells_of_the_closed_loop() -> None:
@@ -169,6 +213,7 @@ def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
         assert run.max_phi_dot < 1e-9
         assert run.t[-1] == pytest.approx(2 / mode.frequency)
         # the rates are those of the motion, by differences around the ring of frames, to the size of a swing squared
-        swing, rates = run.q_tree[:49, 2], run.v_tree[:48, 2]
+        most = int(np.argmax(np.abs(mode.shape)))  # pairs of modes share a frequency, and any mixture is one
+        swing, rates = run.q_tree[:49, most], run.v_tree[:48, most]
         slope = (np.roll(swing[:48], -1) - np.roll(swing[:48], 1)) / (2 * run.t[1])
         assert np.abs(slope - rates).max() <= 0.2 * np.abs(rates).max()

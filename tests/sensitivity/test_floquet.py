@@ -88,5 +88,5 @@ def test_a_period_that_is_none_is_refused_by_how_much_it_misses(tmp_path: Path) 
 
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
     plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
-    assert set(plain) == {"states", "period", "monodromy", "multipliers"}
+    assert set(plain) == {"name", "states", "period", "monodromy", "multipliers"}
     assert all(len(pair) == 2 for pair in plain["multipliers"])

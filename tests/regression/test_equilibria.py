@@ -1,0 +1,55 @@
+"""Where mechanisms come to rest that fall far, and where rest is no place for their coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import NumericalError, load
+from ckc_pin.dynamics import Terms, equilibrium, stable_equilibrium
+from ckc_pin.kinematics.sigma import newton, predict
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.library import library
+
+SLIDER_CRANK = library() / "slider_crank"
+
+
+@pytest.mark.parametrize(("name", "trials"), [("talos", 100), ("two_ur5", 60), ("flyball", 80)])
+def test_what_falls_far_comes_to_rest(name: str, trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Through where q is no chart (talos, two_ur5), along soft and stiff directions at once (flyball, talos)."""
+    model, tried = load(name), []
+
+    def counted(*args: Any) -> Any:
+        tried.append(1)
+        return newton(*args)
+
+    monkeypatch.setattr(equilibrium, "newton", counted)
+    at = stable_equilibrium(model)
+    assert len(tried) <= trials
+    assert np.abs(at.phi).max(initial=0.0) <= model.tolerance
+    # nothing near it is lower, by Pinocchio's own energy
+    tree, random = model.tree, np.random.default_rng(0)
+    lowest = Terms(model, at, np.zeros(model.n)).potential_energy
+    best = model.best_partition(at)
+    assert best is not None
+    here = Kinematics(tree, model.closure, best, at.q_tree)
+    for _ in range(50):
+        near = newton(predict(here, random.normal(size=model.d) * 1e-3), 0.0, model.tolerance)
+        assert near.converged
+        assert Terms(model, near.at, np.zeros(model.n)).potential_energy >= lowest - 1e-12 * abs(lowest)
+    if name == "flyball":
+        q = tree.named(tree.to_coordinates(at.q_tree))
+        assert [q["rod_1"], q["rod_2"]] == pytest.approx([np.pi / 2, np.pi / 2], abs=1e-9)
+
+
+def test_rest_where_q_is_no_chart_is_refused(tmp_path: Path) -> None:
+    """Gravity along the rail: the crank hangs down in line with the rod, where the slider's place says nothing."""
+    text = (SLIDER_CRANK / "mechanism.toml").read_text()
+    text = text.replace('["crank"]', '["slider"]').replace("[0.0, -9.81, 0.0]", "[9.81, 0.0, 0.0]")
+    (tmp_path / "mechanism.toml").write_text(text)
+    (tmp_path / "slider_crank.urdf").write_text((SLIDER_CRANK / "slider_crank.urdf").read_text())
+    with pytest.raises(NumericalError, match=r"slider do not determine the other coordinates; take independent = "):
+        stable_equilibrium(load(tmp_path / "mechanism.toml"))
