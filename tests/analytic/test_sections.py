@@ -67,7 +67,7 @@ def test_the_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
 def test_the_figure_has_a_panel_for_each_section(stack):
     figure = draw_sections(stack)
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
-    assert [title.split(" m:")[0] for title in titles] == [f"$z$ = {one.fixed['z']:.3f}" for one in stack]
+    assert [title.split(":")[0] for title in titles] == [f"$z$ = {one.fixed['z']:.3f} m" for one in stack]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from tests.contract.helpers.bad import STOPPED, Bad, expect
 
 SHIPPED = ("shipped: ", "five_bar, five_bar_as_printed", "or give the path of a")
-SCENES = "it has default, set_point, swing, tracking"
+SCENES = "it has default, friction, set_point, swing, tracking"
 TERMS = ("terms", "five_bar", "--q")
 EMPTY = {"empty/readme.txt": ""}
 
@@ -23,7 +23,7 @@ CASES = [
     Bad(
         "unknown command",
         ["rnu"],
-        ["No such command 'rnu'", "check, terms, compile, run, inverse, linearize, plot, play"],
+        ["No such command 'rnu'", "check, terms, compile, run, inverse, linearize, sweep, plot, play"],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
     Bad("missing argument", ["check"], ["ckc check: Missing argument 'MECHANISM|SCENE'", "--help"]),

@@ -182,10 +182,18 @@ def test_a_start_outside_joint_limits_is_named(bar: Path) -> None:
         "the start is outside joint limits: theta_1 = -0.934309 (limits -1.5 to -1.2)"
     ]
     edit(bar / "five_bar.urdf", ('lower="-1.5" upper="-1.2"', 'lower="-1" upper="-0.5"'))
-    assert warnings("bar/swing.scene.toml") == []
-    assert warnings("bar") == [
-        "the assembled configuration is outside joint limits: theta_1 = -1.434 (limits -1 to -0.5)"
-    ]
+    edit(bar / "mechanism.toml", ("stops = true", "stops = false"))  # limits alone do not say where it is assembled
+    assert "the start is outside" not in "".join(warnings("bar/swing.scene.toml"))
+    assert "the assembled configuration is outside joint limits: theta_1 = -1.434 (limits -1 to -0.5)" in warnings(
+        "bar"
+    )
+
+
+def test_an_assembly_that_stops_have_moved_is_named(bar: Path) -> None:
+    limit(bar, "theta_1", -1.0, -0.5)
+    add(bar, '[[joint]]\nname = "theta_1"\nstops = true')
+    found = warnings("bar")
+    assert found[0].startswith("q_guess leads beyond joints' stops; assembled within them: theta_1 = -0.99")
 
 
 def test_at_a_limit_is_inside(bar: Path) -> None:

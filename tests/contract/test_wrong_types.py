@@ -47,7 +47,10 @@ def five_bar() -> ckc_pin.Mechanism:
 
 
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "simulate a mechanism": (lambda: simulate(five_bar()), "a Mechanism was given, .*five_bar/default, five_bar/set"),
+    "simulate a mechanism": (
+        lambda: simulate(five_bar()),
+        "a Mechanism was given, .*five_bar/default, five_bar/friction, five_bar/set",
+    ),
     "simulate a number": (lambda: simulate(3), "simulate: scene: 3 was given; it takes a scene"),
     "simulate a run": (lambda: simulate(run()), "simulate: scene: a Run was given"),
     "changes as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: changes: 't_end=1' was given"),

@@ -57,12 +57,12 @@ def test_epsilon_costs_nothing_in_eq_17s_coordinates(run: Callable[..., Run]) ->
 
 @pytest.mark.parametrize("scene", ["five_bar/swing", "five_bar/tracking"])
 def test_epsilon_costs_little_off_the_manifold(run: Callable[..., Run], scene: str) -> None:
-    """Against the reduced model at equal tolerance: a quarter more right-hand sides for any epsilon."""
+    """Against the reduced model at equal tolerance: three tenths more right-hand sides for any epsilon."""
     reduced = run(scene, formulation="reduced").stats["rhs"]
     for epsilon in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
         off = run(scene, formulation="spf", epsilon=epsilon, initial__w=[0.01, -0.006])
         assert off.status == "done"
-        assert off.stats["rhs"] <= 1.25 * reduced
+        assert off.stats["rhs"] <= 1.3 * reduced
         assert off.stats["newton"] <= 1.5 * off.stats["rhs"]
 
 
