@@ -11,6 +11,7 @@ from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 from ckc_pin.mechanism.variation import Variation
@@ -21,7 +22,7 @@ _XYZ = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Closure:
+class Closure(Shared):
     """All rows of all loops and couplings.
 
     Attributes
@@ -114,7 +115,7 @@ class Closure:
 
 
 @dataclass(frozen=True)
-class Selected:
+class Selected(Shared):
     """Some rows of a closure, as a group of its own."""
 
     groups: tuple[Rows, ...]

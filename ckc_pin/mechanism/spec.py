@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -30,7 +31,11 @@ LoopType = Literal["point", "point_2d", "hinge", "cylindrical", "universal", "pr
 
 
 class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """Copy the tables; what is frozen stays what it is."""
+        fields = ((name, getattr(self, name)) for name in self.__struct_fields__)
+        copied = {name: twin for name, value in fields if (twin := deepcopy(value, memo)) is not value}
+        return msgspec.structs.replace(self, **copied) if copied else self
 
 
 class FrameSpec(_Spec, frozen=True):
