@@ -156,15 +156,19 @@ def _hash(what: object) -> str:
 def _key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
     """The hash of all that enters the code: our own text, the tree, the table of rows, and which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
+    model = tree.model
     joints = [
         (
-            tree.model.parents[k],
-            tree.model.joints[k].idx_q,
-            tree.model.joints[k].idx_v,
-            tree.model.jointPlacements[k].rotation.tolist(),
-            None if tree.model.joints[k].nq == 7 else (tree.axis(k)[0].tolist(), bool(tree.axis(k)[1])),
+            parent,
+            joint.idx_q,
+            joint.idx_v,
+            placement.rotation.tolist(),
+            None if joint.nq == 7 else (tree.axis(k)[0].tolist(), bool(tree.axis(k)[1])),
         )
-        for k in range(1, tree.model.njoints)
+        for k, (parent, joint, placement) in enumerate(
+            zip(model.parents, model.joints, model.jointPlacements, strict=True)
+        )
+        if k > 0
     ]
     groups = [
         (

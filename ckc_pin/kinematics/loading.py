@@ -70,9 +70,7 @@ def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechan
     key = (text, sources.name, sources.folder, tuple(sorted((changes or {}).items())))
     built = _built.get(key)
     if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
-        twin = deepcopy(built)
-        twin.sources = sources
-        return twin
+        return deepcopy(built, {id(built.sources): sources})
     mechanism = _build(text, sources, changes)
     built = deepcopy(mechanism)
     built.tree.rest()

@@ -11,6 +11,7 @@ from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
@@ -22,7 +23,7 @@ _XYZ = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Closure:
+class Closure(Shared):
     """All rows of all loops and couplings.
 
     Attributes
@@ -115,7 +116,7 @@ class Closure:
 
 
 @dataclass(frozen=True)
-class Selected:
+class Selected(Shared):
     """Some rows of a closure, as a group of its own."""
 
     groups: tuple[Rows, ...]

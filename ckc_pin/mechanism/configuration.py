@@ -11,13 +11,14 @@ from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import scaled
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Kinematics", "Partition", "Psi"]
 
 
 @dataclass(frozen=True)
-class Partition:
+class Partition(Shared):
     """The split q' = [q; z] of eq. 2: where the independent and the dependent coordinates stand."""
 
     q: IntArray

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.errors import MechanismError
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.tree import Array
 
@@ -16,7 +17,7 @@ __all__ = ["Frame", "Frames"]
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Shared):
     """A frame fixed in a joint of the tree (joint 0: the world): rotation (3, 3), translation (3,)."""
 
     joint: int
@@ -50,6 +51,12 @@ class Frames:
         for link, placed in reversed(self.links.items()):
             if np.allclose(placed.rotation, np.eye(3)) and not placed.translation.any():
                 self.bodies[placed.joint] = link
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Frames:
+        """Copy the tables; a frame stays what it is."""
+        twin = Frames.__new__(Frames)
+        twin.links, twin.joints, twin.bodies = dict(self.links), dict(self.joints), list(self.bodies)
+        return twin
 
     def find(self, frame: str | FrameSpec, where: str) -> Frame:
         """Look a frame up.

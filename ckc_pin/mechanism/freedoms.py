@@ -10,13 +10,14 @@ import numpy as np
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
 
 
 @dataclass(frozen=True)
-class Freedoms:
+class Freedoms(Shared):
     """What the rank of J says.
 
     Attributes

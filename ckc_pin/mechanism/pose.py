@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.mechanism.lazy import lazy
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
 __all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
@@ -29,7 +30,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Anchors:
+class Anchors(Shared):
     """What a closure's rows hold on to: pairs of points, and directions, each fixed in a joint (0: world).
 
     Attributes

@@ -23,6 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.mechanism.pose import Pose, Rate, cross
+from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_change, log_jacobian_dot, skew
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 from ckc_pin.mechanism.variation import Variation
@@ -59,7 +60,7 @@ def _along(e: Array, jacobian: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Component:
+class Component(Shared):
     """e . r, the component of a point difference along a direction; `turning` unless e is the world's."""
 
     out: IntArray
@@ -103,7 +104,7 @@ class Component:
 
 
 @dataclass(frozen=True)
-class Dot:
+class Dot(Shared):
     """a . b of two directions: zero when they are perpendicular."""
 
     out: IntArray
@@ -137,7 +138,7 @@ class Dot:
 
 
 @dataclass(frozen=True)
-class Distance:
+class Distance(Shared):
     """(r . r - L^2) / (2 L): to first order the error of the distance itself, in metres."""
 
     out: IntArray
@@ -168,7 +169,7 @@ class Distance:
 
 
 @dataclass(frozen=True)
-class Affine:
+class Affine(Shared):
     """A q' - c in the coordinates of one-freedom joints, whose places in q the tree knows."""
 
     out: IntArray
@@ -192,7 +193,7 @@ class Affine:
 
 
 @dataclass(frozen=True)
-class RelativeLog:
+class RelativeLog(Shared):
     """log(R_A^T R_B): three rows for each pair of frames, zero when they are parallel."""
 
     out: IntArray  # (3 pairs,)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from ckc_pin.mechanism.file_struct import FileStruct
 from ckc_pin.mechanism.spec_frames import Frame, FrameSpec, Name, Positive, Vector3
 from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec
 
@@ -31,11 +32,7 @@ __all__ = [
 LoopType = Literal["point", "point_2d", "hinge", "cylindrical", "universal", "prismatic", "weld", "distance"]
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class TreeSpec(_Spec, frozen=True):
+class TreeSpec(FileStruct, frozen=True):
     """One URDF of the world.
 
     Attributes
@@ -68,7 +65,7 @@ class TreeSpec(_Spec, frozen=True):
     rpy: Vector3 = (0.0, 0.0, 0.0)
 
 
-class LoopSpec(_Spec, frozen=True):
+class LoopSpec(FileStruct, frozen=True):
     """One loop closure between frames A and B.
 
     Attributes
@@ -109,7 +106,7 @@ class LoopSpec(_Spec, frozen=True):
     length: Positive | None = None
 
 
-class PointSpec(_Spec, frozen=True):
+class PointSpec(FileStruct, frozen=True):
     """A point to report and to trace.
 
     Attributes
@@ -126,7 +123,7 @@ class PointSpec(_Spec, frozen=True):
     frame: Frame
 
 
-class MechanismSpec(_Spec, frozen=True):
+class MechanismSpec(FileStruct, frozen=True):
     """The whole file.
 
     Attributes

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import msgspec
 
+from ckc_pin.mechanism.file_struct import FileStruct
+
 __all__ = ["Frame", "FrameSpec", "Name", "NonNegative", "Positive", "Vector3"]
 
 Vector3 = tuple[float, float, float]
@@ -14,11 +16,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Name = Annotated[str, msgspec.Meta(min_length=1)]
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class FrameSpec(_Spec, frozen=True):
+class FrameSpec(FileStruct, frozen=True):
     """A frame placed in a link (or ``joint:NAME``, or ``world``).
 
     Attributes

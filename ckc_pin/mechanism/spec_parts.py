@@ -6,16 +6,13 @@ from typing import Annotated
 
 import msgspec
 
+from ckc_pin.mechanism.file_struct import FileStruct
 from ckc_pin.mechanism.spec_frames import Frame, Name, NonNegative, Positive
 
 __all__ = ["CouplingSpec", "ForceSpec", "JointSpec", "MotorSpec", "SpringSpec"]
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class CouplingSpec(_Spec, frozen=True):
+class CouplingSpec(FileStruct, frozen=True):
     """joint = ratio * other + offset.
 
     Attributes
@@ -40,7 +37,7 @@ class CouplingSpec(_Spec, frozen=True):
     offset: float = 0.0
 
 
-class SpringSpec(_Spec, frozen=True):
+class SpringSpec(FileStruct, frozen=True):
     """A spring and damper between two frames' origins, or on a joint.
 
     Attributes
@@ -77,7 +74,7 @@ class SpringSpec(_Spec, frozen=True):
     damping: NonNegative = 0.0
 
 
-class ForceSpec(_Spec, frozen=True):
+class ForceSpec(FileStruct, frozen=True):
     """A constant force or torque on a joint, N or N m: part of the mechanism, with potential -value * coordinate.
 
     A motor's fixed drive torque, a weight on a string: what pushes a joint without being a controller.
@@ -96,7 +93,7 @@ class ForceSpec(_Spec, frozen=True):
     value: float
 
 
-class JointSpec(_Spec, frozen=True):
+class JointSpec(FileStruct, frozen=True):
     """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s (N s/m).
 
     Attributes
@@ -129,7 +126,7 @@ class JointSpec(_Spec, frozen=True):
     restitution: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
-class MotorSpec(_Spec, frozen=True):
+class MotorSpec(FileStruct, frozen=True):
     """A motor on a joint, or on a sum of joints: its angle is ratio times the sum of what `joints` says.
 
     torque_limit, speed_limit and tau are its own, before the gear: it acts on a joint as ratio * tau.

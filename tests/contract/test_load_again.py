@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import ckc_pin
 from ckc_pin import load
@@ -81,3 +83,19 @@ def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
     assert not built
     load(paths[0])
     assert len(built) == 1
+
+
+def test_what_nobody_may_change_is_shared() -> None:
+    """A copy of what is frozen is itself, its arrays being read-only; tables and springs are everybody's own."""
+    one, other = load("five_bar"), load("five_bar")
+    assert other.closure is one.closure
+    assert other.partition is one.partition
+    assert other.springs.anchors is one.springs.anchors
+    for array in (other.closure.anchors.point_local, other.partition.q, other.frames.find("link_1", "test").rotation):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
+    assert other.frames.links is not one.frames.links
+    assert other.spec.q_guess is not one.spec.q_guess
+    assert other.spec.q_guess == one.spec.q_guess
+    back = pickle.loads(pickle.dumps(one))
+    assert not back.closure.anchors.point_local.flags.writeable

@@ -8,7 +8,7 @@ import pytest
 
 from ckc_pin import Run, simulate
 from tests.conftest import assert_close
-from tests.regression.counts import COUNTED, RUNS, changed, measured, recorded
+from tests.regression.counts import COUNTED, RUNS, TOLERANCE, changed, measured, recorded
 
 # right-hand sides, Newton corrections per right-hand side
 LIMITS = {
@@ -92,6 +92,16 @@ def test_a_crank_that_has_turned_often_is_rounded_as_its_angle_is() -> None:
     assert tight.stats["rhs"] <= 20_000
     dae = simulate("slider_crank", {**changes, "formulation": "dae", "solver.rtol": 1e-13})
     assert_close(tight.q_tree, dae.q_tree, 1e-10)
+
+
+@pytest.mark.parametrize("scene", ["five_bar/friction", "talos/default"])
+def test_auto_is_as_good_as_the_better_method_where_joints_change_often(scene: str) -> None:
+    rhs = {}
+    for method in ("auto", "DOP853", "Radau"):
+        run = simulate(scene, {"solver.method": method})
+        assert run.status == "done"
+        rhs[method] = run.stats["rhs"]
+    assert rhs["auto"] <= (1.0 + TOLERANCE) * min(rhs["DOP853"], rhs["Radau"])
 
 
 def test_an_uncontrolled_run_evaluates_no_matrix_C() -> None:

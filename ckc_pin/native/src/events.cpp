@@ -14,7 +14,6 @@ constexpr double t_tolerance = 1e-12; // s
 constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
 constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
 constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
-constexpr double uncertain = 3.0;     // times how far two interpolations of different order are apart
 
 namespace {
 
@@ -198,32 +197,6 @@ void Events::take_end(End& end) {
   end.accelerated = system_.tree_acceleration(step_.f_new, end.a);
 }
 
-// Whether a coordinate, or its rate, stays away from its value all through the step: by Hermite interpolation of its
-// ends, with the accelerations and without them, which tells how far off that may be.
-bool Events::ruled_out(const Event& event) const {
-  if (!known_ || !start_.accelerated || !end_.accelerated || event.of > Event::q_dot) return false;
-  const int k = event.coordinate;
-  const double h = step_.t_new - step_.t;
-  const double v0 = h * start_.v(k), v1 = h * end_.v(k), a0 = h * h * start_.a(k), a1 = h * h * end_.a(k);
-  const double way = end_.q(k) - start_.q(k), gap = way - v0 - a0 / 2, slope = v1 - v0 - a0, bend = a1 - a0;
-  const double c3 = 10 * gap - 4 * slope + bend / 2, c4 = -15 * gap + 7 * slope - bend, c5 = 6 * gap - 3 * slope + bend / 2;
-  double low = std::numeric_limits<double>::infinity(), high = -low, apart = 0.0;
-  for (double s = 0.0; s <= 1.0; s += 0.125) {
-    double fine_value, coarse;
-    if (event.of == Event::q) {
-      fine_value = start_.q(k) + s * (v0 + s * (a0 / 2 + s * (c3 + s * (c4 + s * c5))));
-      coarse = start_.q(k) + s * (v0 + s * (3 * way - 2 * v0 - v1 + s * (v0 + v1 - 2 * way)));
-    } else {
-      fine_value = (v0 + s * (a0 + s * (3 * c3 + s * (4 * c4 + s * 5 * c5)))) / h;
-      coarse = (v0 + s * (a0 + s * (3 * (v1 - v0) - 2 * a0 - a1 + s * (a0 + a1 - 2 * (v1 - v0))))) / h;
-    }
-    low = std::min(low, fine_value), high = std::max(high, fine_value);
-    apart = std::max(apart, std::abs(fine_value - coarse));
-  }
-  const double room = uncertain * apart + 0.1 * (high - low) + event.floor;
-  return event.value < low - room || event.value > high + room;
-}
-
 bool Events::at(Interpolant& motion, double t) {
   if (t == step_.t_new)
     y_ = step_.y_new;
@@ -272,12 +245,12 @@ void Events::arrived() {
   if (!events_.empty()) take_end(end_);
 }
 
-bool Events::sample(Interpolant& motion) {
+bool Events::sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride) {
   const double h = step_.t_new - step_.t;
   const bool first_known = values_at_ == step_.t && std::none_of(wanted_.begin(), wanted_.end(), [&](int k) {
     return std::isnan(last_[k]);
   });
-  for (Eigen::Index i = 0; i < places_.size(); ++i) {
+  for (Eigen::Index i = first; i < places_.size(); i += stride) {
     if (i == 0 && first_known) {
       for (int k : wanted_) values_(0, k) = last_[k];
       continue;
@@ -293,15 +266,21 @@ bool Events::sample(Interpolant& motion) {
 bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   halt = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
-  wanted_.clear();
+  wanted_.clear(), sampled_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k)
     if (active_[k] && !(silent && !events_[k].own) && (!signs_[k] || !ruled_out(events_[k]))) wanted_.push_back(k);
-  if (!wanted_.empty() && !(sample(motion) && find(motion, last, halt))) return false;
+  if (!wanted_.empty()) {
+    const bool locked = std::any_of(wanted_.begin(), wanted_.end(), [&](int k) { return events_[k].of == Event::holding; });
+    if (!sample(motion, 0, locked ? 2 : 1)) return false;
+    sampled_ = wanted_;
+    wanted_.erase(std::remove_if(wanted_.begin(), wanted_.end(), [&](int k) { return holds(k); }), wanted_.end());
+    if (!wanted_.empty() && !((!locked || sample(motion, 1, 2)) && find(motion, last, halt))) return false;
+  }
   values_at_ = step_.t_new;
   std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
   known_ = !std::isfinite(halt);
   if (known_)
-    for (int k : wanted_) last_[k] = values_(places_.size() - 1, k);
+    for (int k : sampled_) last_[k] = values_(places_.size() - 1, k);
   std::swap(start_, end_);
   return true;
 }

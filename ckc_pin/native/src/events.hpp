@@ -82,14 +82,15 @@ class Events {
   bool value(int k, double t, double& gap);
   bool at(Interpolant& motion, double t);
   void take_end(End& end);
-  bool sample(Interpolant& motion);
+  bool sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride);
+  bool holds(int k) const;  // by the values at every second place
   bool find(Interpolant& motion, bool last, double& halt);
   void add_own();
 
   System& system_;
   Step& step_;
   std::vector<Event> events_;
-  std::vector<int> signs_, wanted_;
+  std::vector<int> signs_, wanted_, sampled_;  // by event; those to look at, those with values
   std::vector<char> active_;
   const Vector& places_;
   End start_, end_;

@@ -110,7 +110,8 @@ class Loop {
   std::optional<Stop> keep_joints();
   void choose(double bound);      // a method, at the start
   void choose_again(double bound);  // of the explicit ones, for another segment
-  bool is_stiff(double duration);
+  double lasts(double bound) const;  // s: the motion's present piece
+  bool is_stiff(double bound);
   void take(Method& method);
   void take_implicit();
 
@@ -133,6 +134,7 @@ class Loop {
   bool jumped_ = false;       // something has changed since the start that a second try would not know
   bool silent_ = false;       // nothing is recorded, no event is looked for
   long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never
+  long restarts_ = 0;         // times that joints have changed since the start
   double last_instant_ = 0.0; // outputs up to there are of the present segment,
   double segment_ = 0.0;      // which ends there; the start, before the first one
   struct Begin {

@@ -15,12 +15,13 @@ constexpr double longer = 1.5;      // times the bounce that follows: the step f
 void Loop::begin_joints() {
   system->core.joints.begin();
   joint_changes_.begin();
-  joints_known_ = !system->core.joints.any(), joints_often_ = 0;
+  joints_known_ = !system->core.joints.any(), joints_often_ = restarts_ = 0;
 }
 
 std::optional<Stop> Loop::change_joints() {
   const double within = located + of_step * std::max(now.t - now.t_old, 0.0);
   joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
+  if (!joints_often_ && now.t > begin_.t) ++restarts_;
   joints_at_ = now.t;
   if (joints_often_ > most_changes || !joint_changes_.decide(now.t, now.y, events.changing, within)) {
     const Stop stop = trouble();

@@ -23,7 +23,7 @@ void Loop::take_implicit() {
 // "auto": implicit where damping or a controller makes the motion stiff.
 void Loop::choose(double bound) {
   const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping || system->core.joints.smooth());
-  if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound - now.t))) {
+  if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound))) {
     take_implicit();
   } else {
     take(options_.method == "RK45" ? rk45_ : dop853_);
@@ -41,11 +41,18 @@ void Loop::choose_again(double bound) {
   now.h = &best == &rk45_ ? reach : std::max(now.h, few_steps * reach);
 }
 
-bool Loop::is_stiff(double duration) {
+// Until joints change next: as long as on average so far, and no less than it has lasted already.
+double Loop::lasts(double bound) const {
+  const double left = bound - now.t;
+  return restarts_ ? std::min(left, std::max((now.t - begin_.t) / static_cast<double>(restarts_), now.t - joints_at_)) : left;
+}
+
+// Within the motion's present piece: where joints change, a mode that had died out is excited anew, and has to be resolved.
+bool Loop::is_stiff(double bound) {
   Matrix jacobian;
   ++work.jacobians;
   return system->jacobian(now.t, now.y, jacobian, work.rhs) && system->modes(now.y, jacobian) &&
-         stiff(jacobian, duration);
+         stiff(jacobian, lasts(bound));
 }
 
 // After a while, and then after twice as long: what was not stiff at the start may have become so.
@@ -53,7 +60,7 @@ std::optional<Stop> Loop::check_stiffness(double bound) {
   if (!check_at_ || ++kept_ < check_at_) return {};
   check_at_ *= 2;
   if (const auto stop = begin(bound)) return stop;
-  if (now.t < bound && is_stiff(bound - now.t)) check_at_ = 0, take_implicit();
+  if (now.t < bound && is_stiff(bound)) check_at_ = 0, take_implicit();
   return {};
 }
 

@@ -1,0 +1,92 @@
+"""Inverse, then forward, for mechanisms that `ckc import` makes of URDFs and MuJoCo models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ckc_pin import InputError, MechanismError, inverse_dynamics, load, simulate
+from ckc_pin.formats.importing import Draft, read, write
+from ckc_pin.mechanism.sources import resolve
+from tests.contract.helpers.models import TWO_ARMS, model
+from tests.contract.test_import_urdf import FOUR_BAR, PIN, YAML, imported, legs, spatial, two_legs
+from tests.regression.test_inverse_forward import assert_gives_back, assert_integrates_back, waves
+
+SCENE = 'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n'
+HINGE = "<equality><connect site1='s1' site2='t1'/><connect site1='s2' site2='t2'/></equality>"
+# a crank that rubs, has a rotor and a gear; a rod on a spring
+RUBBING = TWO_ARMS.replace('<joint name="a"', '<joint name="a" frictionloss=".3" damping=".2" armature=".05"').replace(
+    '<joint name="b"', '<joint name="b" stiffness="4" springref=".3"'
+)
+GEARED = HINGE + "<actuator><motor joint='a' gear='20'/></actuator>"
+
+
+def free(draft: Draft) -> Draft:
+    """Drive every freedom, whatever the file has motors on."""
+    return replace(draft, actuated=None)
+
+
+MODELS: dict[str, Callable[[Path], Draft]] = {
+    "hinge": lambda folder: imported(folder, FOUR_BAR + PIN.format(type="revolute", axis='<axis xyz="0 0 2"/>')),
+    "ball in a plane": lambda folder: imported(folder, FOUR_BAR + PIN.format(type="spherical", axis="")),
+    "legs in a plane": lambda folder: imported(folder, two_legs()),
+    "legs in a plane that turns": lambda folder: imported(folder, two_legs(base="revolute")),
+    "spatial loop": lambda folder: imported(folder, spatial("0.5 0 0")),
+    "robot.yaml": lambda folder: free(imported(folder, legs(), YAML)),
+    "connects": lambda folder: model(folder, TWO_ARMS, HINGE),
+    "connects, friction, rotor and gear": lambda folder: model(folder, RUBBING, GEARED),
+}
+ROBOTS = {
+    "alex": "alex_description/urdf/alex_psyonic_hands.urdf",
+    "panda": "panda_description/urdf/panda.urdf",
+    "pr2": "pr2_description/urdf/pr2.urdf",
+    "talos": "talos_data/robots/talos_full_v2.urdf",
+    "tiago": "tiago_pro_description/robots/tiago_pro.urdf",
+}
+
+
+def robot(file: str) -> Draft:
+    return read(resolve(f"package://example-robot-data/robots/{file}", Path(), "test"))
+
+
+def written(draft: Draft, folder: Path) -> Path:
+    write(draft, folder)
+    scene = folder / "default.scene.toml"
+    scene.write_text(SCENE, encoding="utf-8")
+    return scene
+
+
+def assert_swings_as_it_should(draft: Draft, folder: Path) -> None:
+    scene = written(draft, folder)
+    changes = waves(load(folder / "mechanism.toml"), 0.1)
+    found = inverse_dynamics(scene, changes)
+    assert found.status == "done"
+    assert abs(found.tau).max() > 0.0
+    assert_gives_back(found)
+    assert_integrates_back(scene, changes, found)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_imported_models_swing_as_they_should(name: str, tmp_path: Path) -> None:
+    assert_swings_as_it_should(MODELS[name](tmp_path), tmp_path / "written")
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robots_of_a_package_swing_as_they_should(name: str, tmp_path: Path) -> None:
+    assert_swings_as_it_should(robot(ROBOTS[name]), tmp_path)
+
+
+def test_what_no_motor_holds_is_named(tmp_path: Path) -> None:
+    scene = written(imported(tmp_path, legs(), YAML), tmp_path / "written")
+    with pytest.raises(InputError, match=r"a_hip cannot hold every freedom; the motion along b_knee is held by none"):
+        inverse_dynamics(scene, waves(load(tmp_path / "written" / "mechanism.toml"), 0.1))
+
+
+def test_fingers_without_inertia_have_no_motion_to_give_back(tmp_path: Path) -> None:
+    """Romeo's fingers and what they are geared to weigh nothing: torques leave their accelerations open."""
+    scene = written(robot("romeo_description/urdf/romeo.urdf"), tmp_path)
+    with pytest.raises((InputError, MechanismError), match="mass"):
+        simulate(scene, waves(load(tmp_path / "mechanism.toml"), 0.1))
