@@ -7,11 +7,11 @@ import pinocchio as pin
 
 from ckc_pin.dynamics.derivatives import multiplier_gradient
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import NumericalError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.continuation import same_branch
 from ckc_pin.kinematics.sigma import newton, predict
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 
 __all__ = ["h_gradient", "stable_equilibrium"]
@@ -50,10 +50,14 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
 
     Raises
     ------
+    InputError
+        The loops hold a free root in part.
     NumericalError
         The descent runs into a configuration where the loops lose rank, does not end, or ends where the mechanism's
         own independent coordinates do not determine the others.
     """
+    if mechanism.splits_root:
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     terms = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
     scale = 1e-13 * (1.0 + _weight(mechanism))
     if mechanism.d == 0:
