@@ -43,10 +43,18 @@ def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = F
 
 @pytest.fixture(scope="session", autouse=True)
 def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What the user has compiled before is not there."""
+    """What the user or another test has compiled before is not there: nothing can be put where the folder would be."""
+    cache = tmp_path_factory.mktemp("no_cache")
+    (cache / "ckc_pin").touch()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("no_cache")))
+        patch.setenv("XDG_CACHE_HOME", str(cache))
         yield
+
+
+@pytest.fixture(scope="session")
+def writable_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache for tests that compile, which those that look at whose terms they run on do not see."""
+    return tmp_path_factory.mktemp("writable_cache")
 
 
 @pytest.fixture(scope="session")
