@@ -67,7 +67,7 @@ def main(steps=150):
     figure, ax = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
     ax.plot(*np.transpose(tips))
     ax.plot(*GOAL, "*", ms=14)
-    ax.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the tip under random torques, and the goal")
+    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="the tip under random torques, and the goal")
     return figure
 
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
+from scripts.site import theory_pictures
 
 __all__ = ["main"]
 
@@ -145,7 +147,7 @@ def moving(path: Path, count: int = 60) -> None:
     angles.plot(run.t, np.pi / 3 * np.sin(run.t), ":", color="black", lw=1, label="desired")
     angles.plot(run.t, np.pi / 4 * (1 - np.cos(run.t)), ":", color="black", lw=1)
     now = angles.axvline(0, color=GREY, lw=0.9)
-    angles.set(xlabel="t / s", ylabel="angle / rad")
+    angles.set(xlabel="t (s)", ylabel="angle (rad)")
     angles.legend(fontsize=8)
 
     def draw(k: int) -> list[Any]:
@@ -163,6 +165,10 @@ def main() -> None:
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)
         print(f"written: {IMAGES / place}")
+    for name in theory_pictures.__all__:
+        with look():
+            getattr(theory_pictures, name)().savefig(IMAGES / "theory" / f"{name}.png")
+        print(f"written: {IMAGES / 'theory' / name}.png")
     moving(IMAGES / "moving.gif")
     print(f"written: {IMAGES / 'moving.gif'}")
 
