@@ -29,7 +29,7 @@ def main():
         (~done, "does not run", "."),
     ):
         ax.plot(theta_1[which], theta_3[which], marker, label=label, markersize=4)
-    ax.set(xlabel="θ₁ at the start (rad)", ylabel="θ₃ at the start (rad)", aspect="equal")
+    ax.set(xlabel="θ₁ at the start / rad", ylabel="θ₃ at the start / rad", aspect="equal")
     figure.legend(loc="outside lower center", ncols=3)
     target = ckc_pin.load_scene("five_bar/set_point").plain()["controller"]["q_d"]["theta_1"]
     ends = found["end"].sel(coordinate="theta_1").to_numpy()[settled]

@@ -25,9 +25,9 @@ def main():
 
     figure, (path, torque) = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained")
     path.plot(plate[:, 0], plate[:, 1])
-    path.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="the plate")
+    path.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the plate")
     torque.plot(forces.t, forces.tau, label=forces.actuated)
-    torque.set(xlabel="t (s)", ylabel="torque (N m)", title="what the motors must bear")
+    torque.set(xlabel="t / s", ylabel="torque / N m", title="what the motors must bear")
     torque.legend()
     return figure
 

@@ -33,8 +33,8 @@ def main():
     ax.plot(run.t, tip)
     ax.axhline(HEIGHT, color="black", lw=0.8, ls="--")
     for event in run.events:
-        ax.axvline(event["t"], color="C1", lw=0.8)
-    ax.set(xlabel="t (s)", ylabel="height of the tip (m)", title="events (orange)")
+        ax.axvline(event["t"], color="tab:orange", lw=0.8)
+    ax.set(xlabel="t / s", ylabel="height of the tip / m", title="events (orange)")
     return figure
 
 

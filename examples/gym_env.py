@@ -64,10 +64,10 @@ def main(steps=150):
         if terminated or truncated:
             break
     assert max(rewards) <= 0.0
-    figure, ax = plt.subplots(figsize=(5.6, 2.9), layout="constrained")
+    figure, ax = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
     ax.plot(*np.transpose(tips))
     ax.plot(*GOAL, "*", ms=14)
-    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="the tip under random torques, and the goal")
+    ax.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the tip under random torques, and the goal")
     return figure
 
 

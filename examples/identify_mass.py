@@ -43,7 +43,7 @@ def main():
     ax.plot(slopes, rests, ".", ms=3)
     ends = np.array([slopes.min(), slopes.max()])
     ax.plot(ends, mass * ends, label=f"{mass:.4f} kg")
-    ax.set(xlabel="torque per kg (N m/kg)", ylabel="torque left over (N m)")
+    ax.set(xlabel="torque per kg / N m/kg", ylabel="torque left over / N m")
     ax.set(xlim=(-2, 4), ylim=(-0.5, 1.0))
     ax.legend()
     return figure

@@ -27,9 +27,9 @@ def main():
 
     figure, (path, torque) = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained")
     path.plot(foot[:, 0], foot[:, 1])
-    path.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="the foot, from its start")
+    path.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the foot, from its start")
     torque.plot(forces.t, forces.tau, label=forces.actuated)
-    torque.set(xlabel="t (s)", ylabel="torque (N m)", title="motors, before their gears")
+    torque.set(xlabel="t / s", ylabel="torque / N m", title="motors, before their gears")
     torque.legend()
     return figure
 

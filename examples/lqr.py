@@ -63,7 +63,7 @@ def main() -> Figure:
     figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
     ax.semilogy(alone.t, without, label="torques of the point alone")
     ax.semilogy(run.t, error, label="with the regulator")
-    ax.set(xlabel="t (s)", ylabel="largest error of θ₁, θ₃ (rad)")
+    ax.set(xlabel="t / s", ylabel="largest error of θ₁, θ₃ / rad")
     ax.legend()
     return figure
 

@@ -62,7 +62,7 @@ def main():
 
     figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
     ax.plot(run.t, run.q_tree[:, run.column("slider")])
-    ax.set(xlabel="t (s)", ylabel="slider (m)", title=f"the loop stays closed to {run.max_phi:.0e} m")
+    ax.set(xlabel="t / s", ylabel="slider / m", title=f"the loop stays closed to {run.max_phi:.0e} m")
     return figure
 
 

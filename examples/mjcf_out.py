@@ -34,8 +34,8 @@ def main():
     figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
     ax.semilogy(run.t[1:], error[1:])
     ax.set(
-        xlabel="t (s)",
-        ylabel="largest difference of an angle (rad)",
+        xlabel="t / s",
+        ylabel="largest difference of an angle / rad",
         title="MuJoCo, Runge-Kutta of 0.1 ms, beside ckc_pin",
     )
     return figure

@@ -33,7 +33,7 @@ def main():
         print(f"{size} rad: period {period:.5f} s, of the linear model {1 / mode.frequency:.5f} s")
         ax.plot(run.t * mode.frequency, (run[names[0]] - rest[names[0]]) / size, label=f"{size} rad")
     ax.set(xlabel="t · frequency of the mode", ylabel=f"{names[0]}, by its start")
-    figure.legend(loc="outside lower center", ncols=3)
+    ax.legend()
     assert off[0] < 1e-3
     assert off[0] < off[1] < off[2]
     return figure

@@ -36,7 +36,7 @@ def main():
     figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
     ax.plot(run.t, q, label=run.independent)
     ax.plot(run.t, exact, ":", color="black")
-    ax.set(xlabel="t (s)", ylabel="angle (rad)", title="run, and the closed form (dotted)")
+    ax.set(xlabel="t / s", ylabel="angle / rad", title="run, and the closed form (dotted)")
     ax.legend()
     return figure
 

@@ -39,7 +39,7 @@ def main(seconds=0.5):
     edges = np.geomspace(5e-6, max(late.max(), work.max(), 1e-3), 60)
     ax.hist([np.maximum(late, 5e-6), work], edges, histtype="stepfilled", alpha=0.6, label=["late by", "at work for"])
     ax.axvline(PERIOD, color="black", ls="--", lw=0.8, label="a cycle")
-    ax.set(xscale="log", xlabel="time (s)", ylabel="cycles", title="500 Hz")
+    ax.set(xscale="log", xlabel="s", ylabel="cycles", title="500 Hz")
     ax.legend()
     return figure
 

@@ -25,7 +25,7 @@ def main():
             run.t, np.abs(error), label="continuous" if sample_time is None else f"every {1e3 * sample_time:g} ms"
         )
         ends.append(np.abs(error[run.t > 1.2]).max())
-    ax.set(xlabel="t (s)", ylabel="|error of θ₁| (rad)")
+    ax.set(xlabel="t / s", ylabel="|error of θ₁| / rad")
     ax.legend()
     print("largest error after 1.2 s:", *(f"{end:.1e}" for end in ends))
     assert ends[0] < 1e-5 < ends[1]  # the encoders' step remains

@@ -30,10 +30,10 @@ def main():
     figure, (angle, rank) = plt.subplots(1, 2, figsize=(8.5, 3.4), layout="constrained")
     angle.plot(run.t, theta, label="ckc_pin")
     angle.plot(run.t, exact, ":", label="closed form")
-    angle.set(xlabel="t (s)", ylabel="θ₀ (rad)")
+    angle.set(xlabel="t / s", ylabel="θ₀ / rad")
     angle.legend()
     rank.semilogy(run.t, np.maximum(sigma, 1e-12))
-    rank.set(xlabel="t (s)", ylabel="least singular value of J")
+    rank.set(xlabel="t / s", ylabel="least singular value of J")
     return figure
 
 

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 LENGTHS = {
     "joint.theta_2.xyz.x": "left proximal",
@@ -43,6 +44,7 @@ def slopes(found):
     return moved
 
 
+@look()
 def main():
     found = ckc_pin.sensitivities("five_bar/tracking", list(LENGTHS), SETTINGS)
     moved = slopes(found)

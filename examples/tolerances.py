@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 LENGTHS = {"joint.theta_2.xyz.x": 0.2794, "joint.tip_left_fixed.xyz.x": 0.3048,
            "joint.theta_4.xyz.x": 0.2794, "joint.tip_right_fixed.xyz.x": 0.3048}  # fmt: skip
@@ -34,6 +35,7 @@ def sweep(lengths, masses):
     return found, tip(found["end"].to_numpy(), left)
 
 
+@look()
 def main():
     drawn = ckc_pin.simulate("five_bar/set_point", CHANGES)
     target = tip(drawn.q_tree[-1], list(LENGTHS.values())[:2])

@@ -19,12 +19,12 @@ def main():
     figure, (torque, grip) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     left = [k for k, name in enumerate(run.actuated) if name.startswith("left")]
     right = [k for k, name in enumerate(run.actuated) if name.startswith("right")]
-    torque.plot(run.t, run.tau[:, left], "-", color="C0")
-    torque.plot(run.t, run.tau[:, right], "--", color="C1")
-    torque.set(xlabel="t (s)", ylabel="torque (N m)", title="motors: left arm (blue), right arm (orange)")
+    torque.plot(run.t, run.tau[:, left], "-", color="tab:blue")
+    torque.plot(run.t, run.tau[:, right], "--", color="tab:orange")
+    torque.set(xlabel="t / s", ylabel="torque / N m", title="motors: left arm (blue), right arm (orange)")
     for name, wrench in forces.loop_wrenches.items():
         grip.plot(forces.t, np.linalg.norm(wrench[:, :3], axis=1), label=name)
-    grip.set(xlabel="t (s)", ylabel="force (N)", title="force in the loop")
+    grip.set(xlabel="t / s", ylabel="force / N", title="force in the loop")
     grip.legend()
     return figure
 

@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.view import style
-from ckc_pin.view.canvas import fit_legend, line, look, write
-from ckc_pin.view.labels import plain, symbol
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
 __all__ = ["draw", "draw_basins", "draw_fan", "draw_importance", "draw_map"]
 
@@ -47,47 +44,42 @@ def draw(results: xr.Dataset, out: Path) -> list[Path]:
 
 def draw_fan(x: xr.DataArray, path: Path) -> Path:
     """Draw quantiles over time, of each component one below the other."""
+    plt = _pyplot()
     values = x.to_numpy().reshape(x.sizes["member"], -1, x.sizes["time"])[:, :MOST_FANS]
     labels = [str(label) for label in x[x.dims[1]].to_numpy()] if len(x.dims) > 2 else [str(x.name)]
-    with look():
-        figure = _figure(style.WIDTH, 0.9 + 1.5 * values.shape[1])
-        axes = figure.subplots(values.shape[1], 1, sharex=True, squeeze=False)[:, 0]
-        colour = style.COLOURS[0]
-        for k, ax in enumerate(axes):
-            with np.errstate(all="ignore"):
-                bands = np.nanquantile(values[:, k], QUANTILES, axis=0)
-            t = x["time"].to_numpy()
-            ax.fill_between(t, bands[0], bands[4], alpha=0.2, color=colour, lw=0)
-            ax.fill_between(t, bands[1], bands[3], alpha=0.3, color=colour, lw=0)
-            ax.plot(t, bands[2], color=colour)
-            ax.set_ylabel(symbol(labels[k]))
-        axes[-1].set_xlabel("$t$ (s)")
-        figure.suptitle(plain(str(x.name)), x=0.012, ha="left", fontweight="bold")
-        fit_legend(figure, [line(colour, "median"), line(colour, "25 to 75 %", alpha=0.45, linewidth=6),
-                            line(colour, "5 to 95 %", alpha=0.2, linewidth=6)])  # fmt: skip
-        return _save(figure, path)
+    figure, axes = plt.subplots(values.shape[1], 1, sharex=True, squeeze=False, figsize=(7, 1 + 2 * values.shape[1]))
+    for k, at in enumerate(axes[:, 0]):
+        with np.errstate(all="ignore"):
+            bands = np.nanquantile(values[:, k], QUANTILES, axis=0)
+        t = x["time"].to_numpy()
+        at.fill_between(t, bands[0], bands[4], alpha=0.2, color="C0", lw=0, label="5 to 95 %")
+        at.fill_between(t, bands[1], bands[3], alpha=0.3, color="C0", lw=0, label="25 to 75 %")
+        at.plot(t, bands[2], color="C0", label="median")
+        at.set_ylabel(labels[k])
+    axes[0, 0].legend(loc="upper right", fontsize="small")
+    axes[-1, 0].set_xlabel("t / s")
+    return _save(figure, path)
 
 
 def draw_map(results: xr.Dataset, variables: tuple[str, str], name: str, path: Path) -> Path:
     """Draw an output over two variables: a raster of a grid, else points; crosses are members without it."""
+    plt = _pyplot()
     x, y, z = (results[key].to_numpy() for key in (*variables, name))
-    with look():
-        figure = _figure(style.WIDTH, 4.4)
-        ax = figure.subplots()
-        ax.grid(visible=False)
-        columns, rows = np.unique(x), np.unique(y)
-        if len(columns) * len(rows) == len(z) and len(rows) > 1 < len(columns):
-            order = np.lexsort((y, x))
-            shown: Any = ax.pcolormesh(columns, rows, z[order].reshape(len(columns), len(rows)).T, shading="nearest")
-        else:
-            shown = ax.scatter(x, y, c=z, s=8)
-        missing = np.isnan(z)
-        if missing.any():
-            ax.plot(x[missing], y[missing], "x", color=style.GREY, ms=3)
-            fit_legend(figure, [line(style.GREY, f"{missing.sum()} without", marker="x", linestyle="none")])
-        figure.colorbar(shown, label=plain(name))
-        ax.set(xlabel=plain(variables[0]), ylabel=plain(variables[1]))
-        return _save(figure, path)
+    figure, at = plt.subplots(figsize=(6, 5))
+    columns, rows = np.unique(x), np.unique(y)
+    if len(columns) * len(rows) == len(z) and len(rows) > 1 < len(columns):
+        order = np.lexsort((y, x))
+        shown: Any = at.pcolormesh(columns, rows, z[order].reshape(len(columns), len(rows)).T, shading="nearest")
+    else:
+        shown = at.scatter(x, y, c=z, s=8)
+    missing = np.isnan(z)
+    if missing.any():
+        at.plot(x[missing], y[missing], "x", color="0.6", ms=3, label=f"{missing.sum()} without")
+        at.legend(fontsize="small")
+    figure.colorbar(shown, label=name)
+    at.set_xlabel(variables[0])
+    at.set_ylabel(variables[1])
+    return _save(figure, path)
 
 
 def basins(ends: Array) -> tuple[Array, Array]:
@@ -134,56 +126,58 @@ def draw_basins(
     marks : sequence of (label, x, y)
         Points to name.
     """
+    plt = _pyplot()
     x, y = (results[name].to_numpy() for name in variables)
     ends = results[end].to_numpy().reshape(len(x), -1)
     rests = np.ones(len(x), bool) if settled is None else results[settled].to_numpy() == 1.0
     group, centres = basins(np.where(rests[:, None], ends, np.nan))
+    figure, at = plt.subplots(figsize=(6.5, 6))
     ended = results["status"].to_numpy()
+    for k in range(min(len(centres), MOST_BASINS)):
+        at.plot(
+            x[group == k], y[group == k], "s", ms=3, color=f"C{k}", label=f"settles: {np.count_nonzero(group == k)}"
+        )
     moving, without = (group < 0) & (ended == 1), ended > 1
-    shown = [(group == k, "s", style.COLOURS[k % style.MOST], "settles") for k in range(min(len(centres), MOST_BASINS))]
-    shown += [(moving, "D", "black", "does not settle"), (without, "x", style.GREY, "stopped or cannot begin")]
-    with look():
-        figure = _figure(style.WIDTH, 5.4)
-        ax = figure.subplots()
-        handles = []
-        for which, marker, colour, says in shown:
-            ax.plot(x[which], y[which], marker, ms=2.6, color=colour, linestyle="none")
-            handles.append(line(colour, f"{says}: {np.count_nonzero(which)}", marker=marker, linestyle="none"))
-        for curve in curves:
-            ax.plot(curve[:, 0], curve[:, 1], color="black", lw=0.9)
-        for label, u, v in marks:
-            ax.plot(u, v, "*", ms=12, color="white", markeredgecolor="black")
-            ax.annotate(label, (u, v), xytext=(7, 7), textcoords="offset points", fontweight="bold",
-                        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0})  # fmt: skip
-        ax.set(xlabel=plain(variables[0]), ylabel=plain(variables[1]))
-        fit_legend(figure, [*handles, *([line("black", "singular")] if len(curves) else [])])
-        return _save(figure, path)
+    at.plot(x[moving], y[moving], "s", ms=3, color="0.7", label=f"does not settle: {moving.sum()}")
+    at.plot(x[without], y[without], "x", ms=3, color="0.3", label=f"stopped or cannot begin: {without.sum()}")
+    for curve in curves:
+        at.plot(curve[:, 0], curve[:, 1], color="k", lw=1)
+    for label, u, v in marks:
+        at.plot(u, v, "*", ms=12, color="k")
+        at.annotate(label, (u, v), xytext=(6, 6), textcoords="offset points")
+    at.set_xlabel(variables[0])
+    at.set_ylabel(variables[1])
+    at.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1, 1))
+    return _save(figure, path)
 
 
 def draw_importance(indices: xr.Dataset, path: Path) -> Path:
     """Draw Sobol indices, first order and total, of each variable."""
+    plt = _pyplot()
     names = [str(name) for name in indices["variable"].to_numpy()]
+    figure, at = plt.subplots(figsize=(7, 1.5 + 0.4 * len(names)))
     place = np.arange(len(names))
-    with look():
-        figure = _figure(style.WIDTH, 1.1 + 0.36 * len(names))
-        ax = figure.subplots()
-        kinds = (("first_order", "alone (first order)"), ("total_order", "with all others (total)"))
-        handles = []
-        for (kind, says), colour, aside in zip(kinds, style.COLOURS, (-0.2, 0.2), strict=False):
-            ax.barh(place + aside, indices[kind].to_numpy(), height=0.4, color=colour)
-            handles.append(line(colour, says, linewidth=6))
-        ax.set_yticks(place, [plain(name) for name in names])
-        ax.invert_yaxis()
-        ax.set_xlabel("share of the variance")
-        fit_legend(figure, handles)
-        return _save(figure, path)
+    at.barh(place - 0.2, indices["first_order"].to_numpy(), height=0.4, label="alone (first order)")
+    at.barh(place + 0.2, indices["total_order"].to_numpy(), height=0.4, label="with all others (total)")
+    at.set_yticks(place, names)
+    at.invert_yaxis()
+    at.set_xlabel("share of the variance")
+    at.legend(fontsize="small")
+    return _save(figure, path)
 
 
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
+def _pyplot() -> Any:
+    try:
+        import matplotlib
 
-    return Figure(figsize=(width, height), layout="constrained")
+        matplotlib.use("agg")
+        import matplotlib.pyplot as plt
+    except ModuleNotFoundError:
+        raise InputError("figures are drawn by matplotlib, which is not installed: pip install ckc_pin[view]") from None
+    return plt
 
 
-def _save(figure: Figure, path: Path) -> Path:
-    return write(figure, path.parent, path.stem, (path.suffix[1:],))[0]
+def _save(figure: Any, path: Path) -> Path:
+    figure.savefig(path, bbox_inches="tight", dpi=110)
+    _pyplot().close(figure)
+    return path

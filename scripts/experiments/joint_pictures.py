@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view import style
-from ckc_pin.view.canvas import fit_legend, line, say, write
-from ckc_pin.view.labels import rate_symbol
 
 RATES = ("theta_1", "theta_3")
 IMPACT = 0.02  # s, of the run: shown by itself
@@ -18,27 +16,24 @@ PRELOAD = {"left_elbow_joint": 10.0, "right_elbow_joint": -10.0}
 SHOWN = ("left_shoulder_lift_joint", "left_elbow_joint", "right_shoulder_lift_joint", "right_elbow_joint")
 
 
-def draw_friction(path: Path) -> None:
+def draw_friction(path: Path, dpi: float) -> None:
     """Impact at a stop, and stick-slip at the turns of a tracked swing."""
-    from matplotlib.figure import Figure
-
     whole = ckc_pin.simulate("five_bar/friction")
     start = ckc_pin.simulate("five_bar/friction", {"t_end": IMPACT, "solver.output_dt": IMPACT / 400})
-    figure = Figure(figsize=(style.WIDTH_BESIDE, 2.9), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 2))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.2), width_ratios=(1, 2), layout="constrained")
     for ax, run in ((left, start), (right, whole)):
-        for colour, name in zip(style.COLOURS, RATES, strict=False):
+        for k, name in enumerate(RATES):
             rate = run.v_tree[:, run.column(name)]
-            ax.plot(run.t, rate, color=colour)
+            ax.plot(run.t, rate, color=f"C{k}", label=name)
             for begin, end in _sticking(run, name):
-                ax.axvspan(begin, end, color=colour, alpha=0.15, linewidth=0)
-        ax.set(xlabel="$t$ (s)", xlim=(0, run.t[-1]))
-    left.set(ylabel="rate (rad/s)")
-    right.set(ylim=(-1.5, 1.5))
-    say(left, "a)  impact at a stop")
-    say(right, "b)  stick-slip: shaded where a joint sticks")
-    fit_legend(figure, [line(c, rate_symbol(name)) for c, name in zip(style.COLOURS, RATES, strict=False)])
-    write(figure, path.parent, path.stem, ("png",))
+                ax.axvspan(begin, end, color=f"C{k}", alpha=0.15, linewidth=0)
+        ax.set(xlabel="t [s]", xlim=(0, run.t[-1]))
+        ax.grid(alpha=0.3)
+    left.set(ylabel="rate [rad/s]", title="impact at a stop")
+    right.set(ylim=(-1.5, 1.5), title="stick-slip: shaded where a joint sticks")
+    right.legend(loc="upper right")
+    figure.savefig(path, dpi=dpi)
+    plt.close(figure)
 
 
 def _sticking(run: ckc_pin.Run, name: str) -> list[tuple[float, float]]:
@@ -53,25 +48,21 @@ def _sticking(run: ckc_pin.Run, name: str) -> list[tuple[float, float]]:
     return found if since is None else [*found, (since, float(run.t[-1]))]
 
 
-def draw_preload(path: Path) -> None:
+def draw_preload(path: Path, dpi: float) -> None:
     """What motors of two_ur5 do in its lift, with and without preload: one motion."""
-    from matplotlib.figure import Figure
-
     plain, loaded = _lift({}), _lift({"controller.allocation.preload": PRELOAD})
     if not np.abs(plain.q_tree - loaded.q_tree).max() < 1e-6:
         raise AssertionError("the preload changes the motion")
-    figure = Figure(figsize=(style.WIDTH_BESIDE, 3.4), layout="constrained")
-    ax = figure.subplots()
-    handles = []
-    for colour, name in zip(style.COLOURS, SHOWN, strict=False):
+    figure, ax = plt.subplots(figsize=(9.0, 3.2), layout="constrained")
+    for k, name in enumerate(SHOWN):
         column = plain.actuated.index(name)
-        ax.plot(plain.t, plain.tau[:, column], color=colour)
-        ax.plot(loaded.t, loaded.tau[:, column], "--", color=colour)
-        handles.append(line(colour, name.removesuffix("_joint").replace("_", " ")))
-    ax.set(xlabel="$t$ (s)", ylabel=r"$\tau$ (N m)", xlim=(0, plain.t[-1]))
-    say(ax, "without preload, and with it (dashed)")
-    fit_legend(figure, handles)
-    write(figure, path.parent, path.stem, ("png",))
+        ax.plot(plain.t, plain.tau[:, column], color=f"C{k}", label=name)
+        ax.plot(loaded.t, loaded.tau[:, column], "--", color=f"C{k}")
+    ax.set(xlabel="t [s]", ylabel="tau [N m]", xlim=(0, plain.t[-1]), title="without preload, and with it (dashed)")
+    ax.grid(alpha=0.3)
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+    figure.savefig(path, dpi=dpi)
+    plt.close(figure)
 
 
 def _lift(changes: Mapping[str, object]) -> ckc_pin.Run:

@@ -51,5 +51,5 @@ def main(chromium: Path) -> None:
         for name in ("five_bar", "five_bar_as_printed"):
             draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
-        draw_friction(IMAGES / "five_bar_friction.png")
-        draw_preload(IMAGES / "two_ur5_preload.png")
+        draw_friction(IMAGES / "five_bar_friction.png", DPI)
+        draw_preload(IMAGES / "two_ur5_preload.png", DPI)

@@ -9,13 +9,11 @@ from importlib import import_module
 from io import BytesIO
 from typing import Any
 
-from ckc_pin.view import style
-from ckc_pin.view.canvas import look
 from scripts.site.gallery import Example, examples
 
 __all__ = ["main", "picture", "run"]
 
-DPI = 110
+DPI = 90
 
 
 def run(example: Example) -> Any:
@@ -27,12 +25,8 @@ def picture(example: Example) -> bytes:
     """Run an example and return its picture, as PNG: of a notebook the first that it shows."""
     if example.path.suffix == ".ipynb":
         return _first_shown(example)
-    import matplotlib.pyplot as plt
-    from cycler import cycler
-
     drawn = BytesIO()
-    with look(), plt.rc_context({"axes.prop_cycle": cycler(color=style.COLOURS)}):  # the site's look
-        run(example).savefig(drawn, dpi=DPI)
+    run(example).savefig(drawn, dpi=DPI)
     return drawn.getvalue()
 
 
