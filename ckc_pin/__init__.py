@@ -141,7 +141,8 @@ def play(
     InputError
         No run, runs of several mechanisms, numbers that cannot be, a port in use, meshcat missing.
     """
-    from ckc_pin.view.inline import Playback, in_notebook
+    from ckc_pin.simulation.notebook import in_notebook
+    from ckc_pin.view.inline import Playback
     from ckc_pin.view.player import play as play_runs
 
     if in_notebook() if inline is None else inline:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -12,22 +11,16 @@ from typing import TYPE_CHECKING
 
 from ckc_pin.simulation.run import Run
 from ckc_pin.view.figures import draw, write_figures
+from ckc_pin.view.gif import save_gif
 from ckc_pin.view.player import html, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Figures", "Playback", "in_notebook"]
+__all__ = ["Figures", "Playback"]
 
 HEIGHT = 480  # of a playback in a page, in its pixels
 RESOLUTION = 100  # of a figure in a page
-
-
-def in_notebook() -> bool:
-    """Whether what a cell returns is shown in a page: a kernel runs us, and not a terminal."""
-    ipython = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    return shell is not None and hasattr(shell, "kernel")
 
 
 class Figures(Mapping[str, "Figure"]):
@@ -87,11 +80,12 @@ class Playback:
         meshes: str | Path | None = None,
         forces: bool = False,
     ) -> None:
-        self._runs = tuple(runs)
+        self._runs, self._speed = tuple(runs), speed
         self.html = html(self._runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
 
     def __repr__(self) -> str:
-        return f"Playback({', '.join(run.scene_name for run in self._runs)}); save(FILE) writes a page that plays"
+        names = ", ".join(run.scene_name for run in self._runs)
+        return f"Playback({names}); save(FILE) writes a page that plays, or a GIF"
 
     def _repr_html_(self) -> str:
         page = escape(self.html, quote=True)  # a page within the page; its scripts can reach nothing of ours
@@ -101,7 +95,15 @@ class Playback:
         )
 
     def save(self, path: str | Path) -> Path:
-        """Write one HTML file that plays from disk, without a network; errors are those of `save_html`."""
+        """Write one HTML file that plays from disk, without a network, or where its name ends in .gif a moving picture.
+
+        Raises
+        ------
+        InputError
+            As of `save_html` and `save_gif`.
+        """
+        if str(path).lower().endswith(".gif"):
+            return save_gif(self._runs, path, speed=self._speed)
         return write_page(self.html, path)
 
 

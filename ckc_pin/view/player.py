@@ -24,7 +24,7 @@ from ckc_pin.view.style import drawing_order
 if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
-__all__ = ["caption", "html", "play", "save_html", "write_page"]
+__all__ = ["caption", "file_in_folder", "html", "play", "save_html", "shown_runs", "write_page"]
 
 
 def play(
@@ -116,12 +116,27 @@ def save_html(
 
 def write_page(text: str, path: str | Path) -> Path:
     """Write a page as `save_html` does."""
-    require_path(path, "save_html: path")
+    path = file_in_folder(path, "save_html: path")
+    write_whole(path, text)
+    return path
+
+
+def file_in_folder(path: str | Path, who: str) -> Path:
+    """Return where to write a file (InputError where its folder is not there)."""
+    require_path(path, who)
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
-    write_whole(path, text)
     return path
+
+
+def shown_runs(runs: Run | Sequence[Run], speed: float) -> list[Run]:
+    """Return the runs that lie on each other, those with thin lines last (InputError where they cannot be shown)."""
+    runs = given_runs(runs, "play")
+    if not (is_number(speed) and math.isfinite(speed) and speed > 0):
+        raise InputError(f"play: speed = {speed!r:.80}; it must be a number above zero, 1 is real time")
+    _require_one_tree(runs)
+    return drawing_order(runs)
 
 
 def html(
@@ -140,18 +155,14 @@ def html(
 def _drawing(
     runs: Run | Sequence[Run], speed: float, gap: float, meshes: str | Path | None, forces: bool
 ) -> tuple[list[Run], list[Command]]:
-    runs = given_runs(runs, "play")
-    if not (is_number(speed) and math.isfinite(speed) and speed > 0):
-        raise InputError(f"play: speed = {speed!r:.80}; it must be a number above zero, 1 is real time")
+    ordered = shown_runs(runs, speed)
     if not (is_number(gap) and math.isfinite(gap) and gap >= 0):
         raise InputError(f"play: gap = {gap!r:.80}; it says how many times larger gaps are drawn, 0 draws none")
-    _require_one_tree(runs)
     if meshes is not None:
         require_path(meshes, "play: meshes", "the mechanism's folder")
     folder = None if meshes is None else Path(meshes)
     if folder is not None and not folder.is_dir():
         raise InputError(f"play: meshes = {folder}: no such folder; give the one that the mechanism.toml is in")
-    ordered = drawing_order(runs)
     drawing = scene(ordered, speed=speed, gap=gap, meshes=folder, forces=forces)
     missing = list(dict.fromkeys(name for run in ordered for name in missing_meshes(run.mechanism, folder)))
     if missing:

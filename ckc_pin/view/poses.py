@@ -15,15 +15,15 @@ from ckc_pin.view import style
 from ckc_pin.view.canvas import Slot
 from ckc_pin.view.group import Group, columns
 from ckc_pin.view.labels import rate_symbol, symbol, with_unit
+from ckc_pin.view.outline import base, outline
 from ckc_pin.view.panels import unit_of
-from ckc_pin.view.skeleton import Placements, Projection, placements, slides, sticks
+from ckc_pin.view.skeleton import Placements, Projection, placements
 
 __all__ = ["INITIAL", "PATH", "TARGET", "configuration_space", "linkage", "snapshots"]
 
 SNAPSHOTS = 5
 WIDEST = 0.85  # of the colour map: beyond it is too pale for print
 RING = 3.4  # pt
-ENDWAYS = 0.3  # sine of the angle to the line of sight below which a slider is seen from its end
 INITIAL, TARGET, PATH = style.COLOURS[:3]
 
 
@@ -104,51 +104,24 @@ def snapshots(slots: Sequence[Slot], group: Group, planes: Sequence[Projection])
 
 def _base(ax: Any, mechanism: Mechanism, moved: Placements, plane: Projection) -> None:
     """Draw what stands still: the base, and its rails as far as sliders go on them in the poses shown."""
-    rails = [slide for slide in slides(mechanism) if not slide.parent]
-    for stick in sticks(mechanism):
-        if stick.joint == stick.end_joint == 0:
-            ends = plane.axes @ np.array([stick.start, stick.end]).T
-            ax.plot(*ends, color=style.GREY, linewidth=3.0, zorder=1, alpha=0.5 if rails else 1.0)
-    for slide in rails:
-        far = (moved.translation[:, slide.joint] - slide.origin) @ slide.along
-        room = 0.08 * mechanism.size
-        span = np.outer([far.min() - room, far.max() + room], slide.along) + slide.origin
-        ax.plot(*(plane.axes @ span.T), color="black", linewidth=1.0, zorder=2, marker="|", markersize=5)
+    bars, rails = base(mechanism, moved, plane)
+    for bar in bars:
+        ax.plot(*bar.T, color=style.GREY, linewidth=3.0, zorder=1, alpha=0.5 if rails else 1.0)
+    for rail in rails:
+        ax.plot(*rail.T, color="black", linewidth=1.0, zorder=2, marker="|", markersize=5)
 
 
 def _pose(ax: Any, mechanism: Mechanism, at: Placements, plane: Projection, colour: Any, thick: float) -> None:
-    sliding = {slide.joint: slide for slide in slides(mechanism)}
-    rings: list[Array] = []
-    for stick in sticks(mechanism):
-        if stick.joint == stick.end_joint == 0:
-            rings += [stick.start, stick.end]
-            continue
-        rail = stick.joint != stick.end_joint
-        if rail and not stick.joint:
-            continue  # its rail is drawn
-        ends = np.vstack([at.of(stick.joint, stick.start), at.of(stick.end_joint, stick.end)])
-        ax.plot(*(plane.axes @ ends.T), color=colour, linewidth=thick, zorder=3)
-        if not rail:
-            rings += [end for end, local in zip(ends, (stick.start, stick.end), strict=True)
-                      if stick.joint not in sliding or np.any(local)]  # fmt: skip
-    for slide in sliding.values():  # on a rail of the base a slider, of another body a sleeve round the rod
-        carrier = at.rotation[0, slide.parent]
-        where = at.translation[0, slide.joint] if not slide.parent else at.of(slide.parent, slide.origin)[0]
-        _block(ax, plane, where, carrier @ slide.along, mechanism.size, colour)
-        rings = [ring for ring in rings if np.linalg.norm(ring - where) > 1e-9 * mechanism.size]
-    if rings:
-        ax.plot(*(plane.axes @ np.array(rings).T), color=colour, linestyle="none", marker="o", markersize=RING,
-                markerfacecolor="white", markeredgewidth=min(thick, 1.0), zorder=4)  # fmt: skip
-
-
-def _block(ax: Any, plane: Projection, where: Array, along: Array, size: float, colour: Any) -> None:
     from matplotlib.patches import Polygon
 
-    middle, way = plane.axes @ where, plane.axes @ along
-    long = 0.045 * size * (way if np.linalg.norm(way) > ENDWAYS else np.array([0.5, 0.0]))
-    wide = 0.022 * size * np.array([-long[1], long[0]]) / np.linalg.norm(long)
-    corners = [middle + a * long + b * wide for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-    ax.add_patch(Polygon(corners, facecolor="white", edgecolor=colour, linewidth=1.1, zorder=4))
+    drawn = outline(mechanism, at, plane)
+    for bar in drawn.bars:
+        ax.plot(*bar.T, color=colour, linewidth=thick, zorder=3)
+    for block in drawn.blocks:
+        ax.add_patch(Polygon(block, facecolor="white", edgecolor=colour, linewidth=1.1, zorder=4))
+    if len(drawn.rings):
+        ax.plot(*drawn.rings.T, color=colour, linestyle="none", marker="o", markersize=RING,
+                markerfacecolor="white", markeredgewidth=min(thick, 1.0), zorder=4)  # fmt: skip
 
 
 def _frame(ax: Any, plane: Projection) -> None:

@@ -25,6 +25,11 @@ class Listed(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+def examples(*lines: str) -> str:
+    """Return the end of a command's help: ways to call it."""
+    return "\b\nExamples:\n" + "\n".join(f"  ./scripts/experiment {line}" for line in lines)
+
+
 app = typer.Typer(
     cls=Listed,
     help="Experiments on the package, each with --help.",
@@ -54,7 +59,7 @@ def chosen(given: Sequence[str] | None, known: Collection[str], what: str) -> li
     return list(given or ())
 
 
-@app.command()
+@app.command(epilog=examples("paper", "paper figure-3 cost --out out"))
 def paper(
     keys: Keys = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="default: docs; with KEY out")] = None,
@@ -77,7 +82,7 @@ def paper(
         print(f"written: {path}")
 
 
-@app.command()
+@app.command(epilog=examples("errata", "errata multipliers"))
 def errata(keys: Keys = None) -> None:
     """The paper's errata, each with its number.
 
@@ -89,7 +94,7 @@ def errata(keys: Keys = None) -> None:
     print(page.errata_entries(find(chosen(keys, ERRATA, "erratum"))), end="")
 
 
-@app.command()
+@app.command(epilog=examples("stability", "stability length"))
 def stability(
     groups: Annotated[list[str] | None, typer.Argument(metavar="GROUP", show_default=False)] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="for page and table")] = DOCS,
@@ -115,7 +120,7 @@ def stability(
     raise typer.Exit(0 if not cells or satisfied(table) else 1)
 
 
-@app.command("rank_loss")
+@app.command("rank_loss", epilog=examples("rank_loss --quick", "rank_loss --formulation reduced"))
 def rank_loss(
     formulation: Formulation = Formulation.dae,
     quick: Annotated[bool, typer.Option("--quick", help="N = 1, 2, 7 and every third tolerance")] = False,
@@ -129,7 +134,7 @@ def rank_loss(
     rank_loss.show(formulation.value, quick)
 
 
-@app.command("generated_sizes")
+@app.command("generated_sizes", epilog=examples("generated_sizes", "generated_sizes 4 delta ring_12"))
 def generated_sizes(
     mechanisms: Annotated[
         list[str] | None,
@@ -145,7 +150,7 @@ def generated_sizes(
     generated_sizes.main(mechanisms or ())
 
 
-@app.command()
+@app.command(epilog=examples("benchmark --quick --out out/report", "benchmark --page"))
 def benchmark(
     quick: Annotated[bool, typer.Option("--quick", help="fewer motions, methods and tolerances: minutes")] = False,
     out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "report",
@@ -169,7 +174,7 @@ def fuzz(context: typer.Context) -> None:
     raise typer.Exit(suite.main(context.args))
 
 
-@app.command()
+@app.command(epilog=examples("scenes"))
 def scenes() -> None:
     """Errors of all shipped scenes, by SciPy.
 
@@ -180,7 +185,7 @@ def scenes() -> None:
     raise typer.Exit(scenes.main())
 
 
-@app.command("map")
+@app.command("map", epilog=examples("map --cells 200"))
 def map_(cells: Annotated[int, typer.Option(min=8, help="along each axis")] = 400) -> None:
     """How long the five-bar's singularity map takes."""
     from scripts.experiments import bench_map
@@ -188,7 +193,7 @@ def map_(cells: Annotated[int, typer.Option(min=8, help="along each axis")] = 40
     bench_map.main(cells)
 
 
-@app.command()
+@app.command(epilog=examples("stream --runs 3"))
 def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
     """Right-hand sides per second with viewers and without."""
     from scripts.experiments import bench_stream
@@ -196,7 +201,7 @@ def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
     bench_stream.main(runs)
 
 
-@app.command()
+@app.command(epilog=examples("ensembles --quick"))
 def ensembles(
     out: Annotated[Path, typer.Option(metavar="DIR", help="gets the figures")] = Path("out/ensembles"),
     quick: Annotated[bool, typer.Option("--quick", help="fewer members")] = False,
@@ -207,7 +212,7 @@ def ensembles(
     ensemble_studies.main(out, quick)
 
 
-@app.command("bench_ensembles")
+@app.command("bench_ensembles", epilog=examples("bench_ensembles --runs 1"))
 def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of members")] = 3) -> None:
     """Print what ensembles cost, beside MuJoCo's rollout, and what 10^9 members would on many cores."""
     from scripts.experiments import bench_ensembles, ensemble_scaling
@@ -217,7 +222,7 @@ def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of 
     ensemble_scaling.main()
 
 
-@app.command()
+@app.command(epilog=examples("bench", 'bench --only "five_bar"'))
 def bench(
     only: Annotated[str, typer.Option(metavar="WORDS", help="lines that have these words")] = "",
 ) -> None:
@@ -232,7 +237,7 @@ def bench(
     raise typer.Exit(max(missed, bench_generated.main(only)))
 
 
-@app.command()
+@app.command(epilog=examples("allocations build/count_allocations.so"))
 def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the counter, preloaded")]) -> None:
     """Allocations of the step loop, of which a step makes none.
 
@@ -243,7 +248,7 @@ def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the c
     raise typer.Exit(count_allocations.main(library))
 
 
-@app.command()
+@app.command(epilog=examples("robots ~/robots"))
 def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="of checkouts")]) -> None:
     """Import and check of published robots.
 
@@ -254,7 +259,7 @@ def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, 
     published_robots.main(folder)
 
 
-@app.command()
+@app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """The pictures of docs/images, by a browser."""
     from scripts.experiments import pictures

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
+from scripts.site import theory_pictures
 
 __all__ = ["main"]
 
@@ -163,6 +165,10 @@ def main() -> None:
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)
         print(f"written: {IMAGES / place}")
+    for name in theory_pictures.__all__:
+        with look():
+            getattr(theory_pictures, name)().savefig(IMAGES / "theory" / f"{name}.png")
+        print(f"written: {IMAGES / 'theory' / name}.png")
     moving(IMAGES / "moving.gif")
     print(f"written: {IMAGES / 'moving.gif'}")
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import contextmanager
+from html import escape
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
+
+from ckc_pin.simulation.notebook import in_notebook
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,11 +29,14 @@ def bar(title: str, there: int) -> Iterator[Advance | None]:
     there : int
         Members from before, which say nothing about the rate.
     """
+    if in_notebook():
+        yield _NotebookBar(title, there)
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(file=sys.stderr, highlight=False, markup=False, emoji=False)
-    if not (console.is_terminal or console.is_jupyter):
+    if not console.is_terminal:
         yield None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
@@ -42,3 +49,29 @@ def bar(title: str, there: int) -> Iterator[Advance | None]:
             shown.update(task, completed=done, total=total, rate=rate)
 
         yield advance
+
+
+class _NotebookBar:
+    """The page's own element below the cell, which stays there with the last it said; it needs no widgets."""
+
+    def __init__(self, title: str, there: int) -> None:
+        self.title, self.there = title, there
+        self.began = perf_counter()
+        self.shown: Any = None
+
+    def __call__(self, done: int, total: int) -> None:
+        """Say how far it is."""
+        from IPython.display import display
+
+        seconds = perf_counter() - self.began
+        rate = (done - self.there) / seconds if seconds > 0 else 0.0
+        left = f", {(total - done) / rate:.0f} s left" if rate > 0 and done < total else ""
+        said = f"{done} of {total} members, {rate:.3g} a second{left}"
+        bundle = {
+            "text/plain": f"{self.title}: {said}",
+            "text/html": f'{escape(self.title)} <progress value="{done}" max="{total}"></progress> {said}',
+        }
+        if self.shown is None:
+            self.shown = display(bundle, raw=True, display_id=True)  # type: ignore[no-untyped-call]
+        else:
+            self.shown.update(bundle, raw=True)

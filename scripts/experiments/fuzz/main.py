@@ -66,9 +66,17 @@ def show(seed: int, kind: str, name: str | None, *, shrunk: bool = False) -> Non
             print(f"events       {run.events[:4]}\nstats        {run.stats}")
 
 
+EXAMPLES = """Examples:
+  ./scripts/experiment fuzz --runs 200
+  ./scripts/experiment fuzz --one 17 --shipped --shrink"""
+
+
 def main(arguments: list[str]) -> int:
     """Run the suite."""
-    parser = argparse.ArgumentParser(prog="fuzz", description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(
+        prog="fuzz", description=__doc__.splitlines()[0] if __doc__ else "", epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--one", type=int, metavar="SEED")

@@ -259,7 +259,7 @@ def _draw_eigenvalues(inside: Array, times: Array, on: Array, off: Array, radius
     low, high = np.nanmin(off, axis=1), np.nanmax(off, axis=1)
     right.fill_between(times, low, high, color=COLOURS[5], alpha=0.5, label=f"off it, |w| = {radius:.4g} m")
     right.plot(times, on, color=BLACK, label=["on φ = 0", *[None] * (on.shape[1] - 1)])
-    right.set(xlabel="t (s)", ylabel="Re λ")
+    right.set(xlabel="$t$ (s)", ylabel="Re λ")
     right.set_title(f"Along {SCENE}")
     for ax in (left, right):
         ax.legend(fontsize=8)

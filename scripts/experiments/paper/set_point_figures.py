@@ -12,6 +12,7 @@ from ckc_pin.analysis.certificate import Certificate, rest_height, sublevel_set
 from ckc_pin.analysis.gradient import Bound
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.run import Run
+from ckc_pin.view.labels import symbol, with_unit
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.set_point_experiments import Case
@@ -26,12 +27,12 @@ def draw_lyapunov(records: Mapping[str, Record], folder: Path) -> str:
     figure, (left, right) = chart(2)
     for (name, record), colour, style in zip(records.items(), COLOURS, STYLES, strict=False):
         left.semilogy(record.t, np.maximum(record.value, 1e-18), style, color=colour, label=name)
-        right.semilogy(record.t, np.maximum(-record.rate, 1e-18), style, color=colour, label=f"-dV_L/dt, {name}")
+        right.semilogy(record.t, np.maximum(-record.rate, 1e-18), style, color=colour, label=f"$-dV_L/dt$, {name}")
     last = list(records.values())[-1]
-    right.semilogy(last.t, -last.predicted, color=BLACK, linewidth=0.8, label="q_dot^T K_V q_dot")
+    right.semilogy(last.t, -last.predicted, color=BLACK, linewidth=0.8, label=r"$\dot{q}^T K_V \dot{q}$")
     left.axhline(last.round_off, color=BLACK, linewidth=0.8, linestyle=":", label="rounding and closure")
-    left.set(xlabel="t (s)", ylabel="V_L (J)", title="Lyapunov function of eq. 14", ylim=(1e-17, None))
-    right.set(xlabel="t (s)", ylabel="power (W)", title="its rate, and what the paper says it is", ylim=(1e-12, None))
+    left.set(xlabel="$t$ (s)", ylabel="$V_L$ (J)", title="Lyapunov function of eq. 14", ylim=(1e-17, None))
+    right.set(xlabel="$t$ (s)", ylabel="power (W)", title="its rate, and what the paper says it is", ylim=(1e-12, None))
     for ax in (left, right):
         ax.legend()
     return save(figure, folder, "set_point_lyapunov.png")
@@ -44,15 +45,25 @@ def draw_bounds(branches: list[list[Bound]], K_P: Array, folder: Path) -> str:
     for k, bounds in enumerate(branches):
         of = "assembled branch" if k == 0 else f"branch {k + 1}"
         norms, lows = (np.array([getattr(bound, name) for bound in bounds]) for name in ("norm", "low"))
-        ax.loglog(margins, norms, "o-" if k == 0 else "^:", color=COLOURS[k], label=f"largest |dh/dq|, {of}")
+        ax.loglog(
+            margins,
+            norms,
+            "o-" if k == 0 else "^:",
+            color=COLOURS[k],
+            label=rf"largest $|\partial h/\partial q|$, {of}",
+        )
         ax.loglog(margins, -lows, "s--", color=COLOURS[k + 2], label=f"minus the least eigenvalue, {of}")
     tail = branches[0][-1]
     fit = tail.norm * (margins / tail.margin) ** -3.0
-    ax.loglog(margins, fit, color=BLACK, linewidth=0.8, label=f"{tail.norm * tail.margin**3:.3f} / s_min^3")
-    ax.axhline(float(np.linalg.eigvalsh(K_P)[0]), color=BLACK, linestyle=":", label="K_P of eq. 20")
+    ax.loglog(margins, fit, color=BLACK, linewidth=0.8, label=rf"{tail.norm * tail.margin**3:.3f} / $s_{{\min}}^3$")
+    ax.axhline(float(np.linalg.eigvalsh(K_P)[0]), color=BLACK, linestyle=":", label="$K_P$ of eq. 20")
     ax.set_xticks(margins, [f"{s:g}" for s in margins])
     ax.set_xticks([], minor=True)
-    ax.set(xlabel="s_min, |s| = |det phi_z| / (l2 l4)", ylabel="dh/dq (N m/rad)", title="dh/dq where |s| >= s_min")
+    ax.set(
+        xlabel=r"$s_{\min}$, $|s| = |\det\varphi_z| / (l_2 l_4)$",
+        ylabel=r"$\partial h/\partial q$ (N m/rad)",
+        title=r"$\partial h/\partial q$ where $|s| \geq s_{\min}$",
+    )
     ax.legend(fontsize=8)
     return save(figure, folder, "set_point_gradient.png")
 
@@ -66,18 +77,20 @@ def draw_set(case: Case, certificate: Certificate, run: Run, divisions: int, fol
     fails, safe = found.eigenvalues <= 0, height <= certificate.safe_level
     dots: dict[str, Any] = {"s": 14 * (50 / divisions) ** 2, "marker": "s", "linewidths": 0}
     ax.scatter(
-        *q[~fails & ~safe].T, color="#dddddd", label=f"connected to q_d, V_L <= {certificate.level:.1f} J", **dots
+        *q[~fails & ~safe].T, color="#dddddd", label=f"connected to $q_d$, $V_L$ ≤ {certificate.level:.1f} J", **dots
     )
-    ax.scatter(*q[fails].T, color=COLOURS[1], label="there K_P + dh/dq is not positive definite", **dots)
-    ax.scatter(*q[safe].T, color=COLOURS[2], label=f"certified: V_L <= {certificate.safe_level:.2f} J", **dots)
+    ax.scatter(
+        *q[fails].T, color=COLOURS[1], label=r"there $K_P + \partial h/\partial q$ is not positive definite", **dots
+    )
+    ax.scatter(*q[safe].T, color=COLOURS[2], label=f"certified: $V_L$ ≤ {certificate.safe_level:.2f} J", **dots)
     if len(ends):
         ax.scatter(*ends.T, color=BLACK, s=6, label="there the set reaches a singular configuration")
     path = run.q_tree[:, [run.column(name) for name in run.independent]]
     ax.plot(*path.T, color=COLOURS[0], label="the run")
     ax.plot(*path[0], "o", color=COLOURS[0])
-    ax.plot(*case.controller.q_d, "*", color=BLACK, markersize=12, label="q_d")
+    ax.plot(*case.controller.q_d, "*", color=BLACK, markersize=12, label="$q_d$")
     names = case.mechanism.independent
-    ax.set(xlabel=f"{names[0]} (rad)", ylabel=f"{names[1]} (rad)", aspect="equal")
+    ax.set(xlabel=with_unit(symbol(names[0]), "rad"), ylabel=with_unit(symbol(names[1]), "rad"), aspect="equal")
     figure.set_size_inches(7.5, 8.8)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return save(figure, folder, "set_point_set.png")

@@ -200,7 +200,9 @@ def _draw_map(figures: Path, found: dict[str, list[Locus]]) -> str:
         ax.legend(
             handles.values(), handles.keys(), loc="upper center", bbox_to_anchor=(0.5, -0.14), fontsize=9, ncols=3
         )
-        ax.set(xlabel="theta_1 (rad)", ylabel="theta_3 (rad)", title=f"{name} (unreachable: gray)", aspect="equal")
+        ax.set(
+            xlabel=r"$\theta_1$ (rad)", ylabel=r"$\theta_3$ (rad)", title=f"{name} (unreachable: gray)", aspect="equal"
+        )
         ax.set(xlim=(-np.pi, np.pi), ylim=(-np.pi, np.pi))
     return save(figure, figures, "singular_configurations.png")
 
@@ -230,8 +232,8 @@ def _draw_crossings(figures: Path, crossings: Sequence[tuple[str, str, Crossing]
         left.plot(1e3 * crossing.t, crossing.det_phi_z, color=colour, lw=2, label=f"{name} crossed")
         right.plot(1e3 * crossing.t, crossing.sigma_min_J, color=colour, lw=2, label=f"{name} crossed")
     left.axhline(0.0, color=BLACK, lw=0.8)
-    left.set(xlabel="time (ms)", ylabel="det phi_z (m²)", title="the chart (theta_1, theta_3) fails ...")
-    right.set(xlabel="time (ms)", ylabel="sigma_min(J) (m)", title="... the mechanism does not")
+    left.set(xlabel="$t$ (ms)", ylabel=r"$\det\varphi_z$ (m²)", title="the chart (θ₁, θ₃) fails ...")
+    right.set(xlabel="$t$ (ms)", ylabel="least singular value of J (m)", title="... the mechanism does not")
     right.set_ylim(0.0, 1.2 * max(crossing.sigma_min_J.max() for crossing in shown.values()))
     for ax in (left, right):
         ax.legend()

@@ -22,14 +22,14 @@ def draw_lyapunov(on: Record, off: Mapping[str, Record], epsilon: float, folder:
     """Eq. 18's function and its rate along a run, and the rate in the boundary layer against eq. 19."""
     figure, (left, right) = chart(2)
     left.semilogy(on.t, on.value, color=COLOURS[0], label="V of eq. 18 (J)")
-    left.semilogy(on.t, np.maximum(-on.rate, FLOOR), color=COLOURS[1], label="-dV/dt, differentiated (W)")
-    left.semilogy(on.t, -on.predicted, ":", color=BLACK, linewidth=2, label="-dV/dt, eq. 19 (W)")
-    left.set(xlabel="t (s)", title="from w(0) = 0")
+    left.semilogy(on.t, np.maximum(-on.rate, FLOOR), color=COLOURS[1], label="$-dV/dt$, differentiated (W)")
+    left.semilogy(on.t, -on.predicted, ":", color=BLACK, linewidth=2, label="$-dV/dt$, eq. 19 (W)")
+    left.set(xlabel="$t$ (s)", title="from w(0) = 0")
     for (name, record), colour in zip(off.items(), COLOURS, strict=False):
         gap = np.abs(record.rate - record.predicted) / np.abs(record.predicted).max()
         right.semilogy(record.t / epsilon, np.maximum(gap, FLOOR), color=colour, linewidth=0.9, label=name)
     title = f"moving, from w(0) ≠ 0, ε = {epsilon:g}: in the boundary layer"
-    right.set(xlabel="t / ε", ylabel="|dV/dt - eq. 19| / largest", title=title)
+    right.set(xlabel="fast time τ = t/ε", ylabel="$|dV/dt$ - eq. 19| over the largest", title=title)
     for ax in (left, right):
         ax.legend()
     return save(figure, folder, "tracking_lyapunov.png")
@@ -39,14 +39,14 @@ def draw_deviations(t: Array, error: Array, shown: Mapping[str, Deviation], fold
     """How far runs are from the exact one: on a log scale, and each on its own scale by the period of eq. 21."""
     figure, (left, right) = chart(2)
     figure.set_size_inches(12.8, 6.2)
-    left.semilogy(t, error, color=BLACK, label="|q - q_d| of the exact run")
+    left.semilogy(t, error, color=BLACK, label="$|q - q_d|$ of the exact run")
     after = t >= SETTLED * PERIOD
     for row, ((name, found), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
         left.semilogy(t[1:], np.maximum(found.size[1:], FLOOR), color=colour, linewidth=0.9, label=name)
         trace = found.size[after] / found.size[after].max()
         right.fill_between(t[after] / PERIOD, -row, SHARE * trace - row, color=colour, linewidth=0)
-    left.set(xlabel="t (s)", ylabel="largest of the angles (rad)", title="deviation from the exact run")
-    right.set(xlabel="t / (2 pi s)", title="the same after the first period, each on its own scale", yticks=[])
+    left.set(xlabel="$t$ (s)", ylabel="largest of the angles (rad)", title="deviation from the exact run")
+    right.set(xlabel="$t$ (2π s)", title="the same after the first period, each on its own scale", yticks=[])
     right.margins(x=0)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     return save(figure, folder, "tracking_deviations.png")

@@ -1,0 +1,132 @@
+"""Playback as a GIF: every instant in its place, without a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+import ckc_pin
+from ckc_pin import InputError, Run, load, simulate
+from ckc_pin.view.gif import save_gif
+from ckc_pin.view.outline import base, outline
+from ckc_pin.view.skeleton import configurations, placements, planes
+from tests.contract.helpers.command import ckc
+
+L1, L2, BASE = 0.2794, 0.3048, 0.3048  # m, of five_bar
+BLUE = (0, 0x72, 0xB2)
+
+
+@pytest.fixture(scope="module")
+def swing() -> Run:
+    return simulate("five_bar/swing", {"t_end": 0.5})
+
+
+def frames(path: Path) -> list[Image.Image]:
+    with Image.open(path) as image:
+        assert image.format == "GIF"
+        assert image.info["loop"] == 0
+        return [frame.copy() for frame in ImageSequence.Iterator(image)]
+
+
+def test_its_frames_take_as_long_as_the_run(swing: Run, tmp_path: Path) -> None:
+    whole = frames(save_gif(swing, tmp_path / "a.gif"))
+    slow = frames(save_gif(swing, tmp_path / "b.gif", speed=0.25))
+    assert [len(whole), len(slow)] == [11, 41]
+    assert {frame.info["duration"] for frame in whole[:-1]} == {50}
+    assert whole[-1].info["duration"] == 1000
+    assert len({frame.convert("RGB").tobytes() for frame in slow}) == 41
+    assert {frame.convert("RGB").getpixel((2, frame.height - 2)) for frame in whole} == {(255, 255, 255)}
+
+
+def test_a_bar_is_where_the_closed_form_has_it(swing: Run) -> None:
+    """Ends of links by the angles alone; the base joins its two pins."""
+    plane = planes(swing.mechanism)[0]
+    rows = np.array([0, 20, 50])
+    moved = placements(swing.mechanism, configurations(swing, rows))
+    for k, row in enumerate(rows):
+        one, two, three, four = swing.q_tree[row]
+        elbows = [L1 * np.array([np.cos(a), np.sin(a)]) + [x, 0] for a, x in ((one, 0.0), (three, BASE))]
+        tips = [
+            e + L2 * np.array([np.cos(a), np.sin(a)]) for e, a in zip(elbows, (one + two, three + four), strict=True)
+        ]
+        drawn = outline(swing.mechanism, moved.row(k), plane)
+        wanted = [[[0, 0], elbows[0]], [elbows[0], tips[0]], [[BASE, 0], elbows[1]], [elbows[1], tips[1]]]
+        for bar in wanted:
+            assert min(np.abs(own - np.array(bar)).max() for own in drawn.bars) < 1e-9
+        for ring in (*elbows, *tips, [0, 0], [BASE, 0]):
+            assert np.abs(drawn.rings - ring).max(axis=1).min() < 1e-9
+        assert drawn.blocks == []
+    assert [bar.tolist() for bar in base(swing.mechanism, moved, plane)[0]] == [[[0, 0], [BASE, 0]]]
+
+
+def test_a_slider_goes_along_its_rail() -> None:
+    mechanism = load("slider_crank")
+    run = simulate("slider_crank", {"t_end": 0.3})
+    moved = placements(mechanism, configurations(run))
+    (plane,) = planes(mechanism)
+    middles = np.array([outline(mechanism, moved.row(k), plane).blocks[0].mean(axis=0) for k in range(len(run.t))])
+    np.testing.assert_allclose(middles, np.column_stack([run["slider"], np.zeros(len(run.t))]), atol=1e-12)
+    (rail,) = base(mechanism, moved, plane)[1]
+    assert rail[:, 0].min() < middles[:, 0].min() < middles[:, 0].max() < rail[:, 0].max()
+
+
+def test_the_picture_moves_as_the_run_does(swing: Run, tmp_path: Path) -> None:
+    """What is blue lies around the middle of the links, in one scale, upwards where y grows."""
+    pictures = [np.asarray(frame.convert("RGB")).astype(int) for frame in frames(save_gif(swing, tmp_path / "a.gif"))]
+    blue = [np.abs(picture - BLUE).max(axis=2) < 60 for picture in pictures]
+    middles = np.array([[x.mean() for x in np.nonzero(where)[::-1]] for where in blue])
+    rows = [swing.at(k / 20) for k in range(11)]
+    plane = planes(swing.mechanism)[0]
+    moved = placements(swing.mechanism, configurations(swing, np.array(rows)))
+    bars = [outline(swing.mechanism, moved.row(k), plane).bars for k in range(11)]
+    lengths = [np.linalg.norm(bar[1] - bar[0]) for bar in bars[0]]
+    x, y = np.array([np.average([bar.mean(axis=0) for bar in each], axis=0, weights=lengths) for each in bars]).T
+    one, none = np.ones(11), np.zeros(11)
+    equations = np.vstack([np.column_stack([x, one, none]), np.column_stack([-y, none, one])])
+    found, *_ = np.linalg.lstsq(equations, middles.T.ravel())
+    off = np.abs(equations @ found - middles.T.ravel()).max()
+    assert off < 0.05 * np.ptp(middles[:, 0])
+    assert found[0] > 500, "pixels a metre"
+
+
+def test_several_runs_with_what_was_wanted_and_of_robots_in_space(tmp_path: Path) -> None:
+    runs = [simulate("five_bar/tracking", {"t_end": 0.3, "formulation": name}) for name in ("reduced", "spf")]
+    one, both = (save_gif(which, tmp_path / f"{len(which)}.gif") for which in (runs[:1], runs))
+    assert frames(one)[0].size[1] != frames(both)[0].size[1] or one.read_bytes() != both.read_bytes()
+    lift = simulate("delta", {"t_end": 0.2})
+    assert len(frames(save_gif(lift, tmp_path / "delta.gif"))) == 5
+
+
+def test_the_command_and_the_notebook_write_it(swing: Run, tmp_path: Path) -> None:
+    swing.save(tmp_path / "run.npz")
+    found = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"))
+    assert found.code == 0, found.err
+    assert found.out == f"written: {tmp_path / 'own.gif'}\n"
+    playback = ckc_pin.play(swing, inline=True)
+    assert playback.save(tmp_path / "again.gif").read_bytes() == (tmp_path / "own.gif").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--html", "x.html"], "--gif draws lines alone: it goes with --speed, not with --html"),
+        (["--forces"], "--gif draws lines alone"),
+        (["--speed", "0.001"], "10001 frames, and 1200 the most; speed 0.0083 or more is short enough"),
+        (["--gif", "nowhere/x.gif"], "nowhere/x.gif: cannot be written"),
+    ],
+)
+def test_what_cannot_be_is_refused(options: list[str], says: str, swing: Run, tmp_path: Path) -> None:
+    swing.save(tmp_path / "run.npz")
+    found = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"), *options)
+    assert found.code == 2
+    assert says in found.err
+    assert not (tmp_path / "own.gif").exists()
+
+
+def test_runs_of_two_mechanisms_are_refused(swing: Run, tmp_path: Path) -> None:
+    other = simulate("slider_crank", {"t_end": 0.1})
+    with pytest.raises(InputError, match="only runs of one mechanism lie on each other"):
+        save_gif([swing, other], tmp_path / "x.gif")
