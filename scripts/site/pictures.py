@@ -145,7 +145,7 @@ def moving(path: Path, count: int = 60) -> None:
     angles.plot(run.t, np.pi / 3 * np.sin(run.t), ":", color="black", lw=1, label="desired")
     angles.plot(run.t, np.pi / 4 * (1 - np.cos(run.t)), ":", color="black", lw=1)
     now = angles.axvline(0, color=GREY, lw=0.9)
-    angles.set(xlabel="t / s", ylabel="angle / rad")
+    angles.set(xlabel="t (s)", ylabel="angle (rad)")
     angles.legend(fontsize=8)
 
     def draw(k: int) -> list[Any]:
