@@ -7,10 +7,12 @@ tip first rises above a height.
 import matplotlib.pyplot as plt
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 HEIGHT = -0.45  # m
 
 
+@look()
 def main():
     mechanism = ckc_pin.load("five_bar")
 
@@ -29,12 +31,14 @@ def main():
     assert run.events[-1]["name"] == "high enough"
     assert abs(tip[-1] - HEIGHT) < 1e-9
 
-    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
-    ax.plot(run.t, tip)
-    ax.axhline(HEIGHT, color="black", lw=0.8, ls="--")
-    for event in run.events:
-        ax.axvline(event["t"], color="tab:orange", lw=0.8)
-    ax.set(xlabel="t / s", ylabel="height of the tip / m", title="events (orange)")
+    figure, ax = plt.subplots()
+    ax.plot(run.t, tip, label="tip")
+    turns = [event["t"] for event in run.events[:-1]]
+    ax.plot(turns, tip[[run.at(t) for t in turns]], "D", label="θ₁ turns")
+    ax.plot(run.t[-1], tip[-1], "k*", markersize=11, label="high enough: stop")
+    ax.axhline(HEIGHT, color="black", lw=0.8, ls="--", label="threshold")
+    ax.set(xlabel="t (s)", ylabel="height of the tip (m)", title="Events of a free swing")
+    figure.legend(loc="outside lower center", ncols=4)
     return figure
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 GOAL = np.array([0.15, -0.45])
 TORQUE = 1.0  # N m
@@ -51,6 +52,7 @@ class FiveBar(gym.Env):
         return np.concatenate([np.sin(state.q), np.cos(state.q), state.q_dot, tip])
 
 
+@look()
 def main(steps=150):
     check_env(FiveBar(), skip_render_check=True)
     env = FiveBar()
@@ -64,10 +66,12 @@ def main(steps=150):
         if terminated or truncated:
             break
     assert max(rewards) <= 0.0
-    figure, ax = plt.subplots(figsize=(4.6, 3.8), layout="constrained")
-    ax.plot(*np.transpose(tips))
-    ax.plot(*GOAL, "*", ms=14)
-    ax.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the tip under random torques, and the goal")
+    figure, ax = plt.subplots(figsize=(5.2, 2.9))
+    ax.plot(*np.transpose(tips), label="path of the tip")
+    ax.plot(*tips[0], "ko", label="its start")
+    ax.plot(*GOAL, "*", ms=14, label="goal")
+    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="An episode of random torques")
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 

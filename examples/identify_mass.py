@@ -9,11 +9,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 NAME = "theta_2.mass"
 NOISE = 0.01  # N m, of the measured torques
 
 
+@look()
 def main():
     run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced", "solver.rtol": 1e-10})
     forces = ckc_pin.inverse_dynamics(run)
@@ -39,13 +41,14 @@ def main():
     print(f"{NAME} = {mass:.5f} ± {sigma:.5f} kg; it is {model.values[k]:.5f}")
     assert abs(mass - model.values[k]) < 4 * sigma
 
-    figure, ax = plt.subplots(figsize=(5, 3.6), layout="constrained")
-    ax.plot(slopes, rests, ".", ms=3)
+    figure, ax = plt.subplots()
+    ax.plot(slopes, rests, ".", ms=3, alpha=0.5, label="measured, with noise")
     ends = np.array([slopes.min(), slopes.max()])
-    ax.plot(ends, mass * ends, label=f"{mass:.4f} kg")
-    ax.set(xlabel="torque per kg / N m/kg", ylabel="torque left over / N m")
-    ax.set(xlim=(-2, 4), ylim=(-0.5, 1.0))
-    ax.legend()
+    ax.plot(ends, mass * ends, label=f"slope: {mass:.4f} ± {sigma:.4f} kg")
+    ax.set(xlabel="torque per mass of the link (N m/kg)", ylabel="torque that the rest leaves (N m)")
+    ax.set(xlim=(-0.5, 3.1), ylim=(-0.15, 0.85))  # a few points of the start lie far along the line
+    ax.set(title=f"Mass of the left distal link, {model.values[k]:.4f} kg")
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 

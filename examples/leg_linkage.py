@@ -11,10 +11,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 SCENE = Path(__file__).parent / "leg" / "step.scene.toml"
 
 
+@look()
 def main():
     run = ckc_pin.simulate(SCENE)
     foot = run.points["foot"]
@@ -25,12 +27,13 @@ def main():
     forces = ckc_pin.inverse_dynamics(SCENE)
     assert not forces.exceeded  # 0.3 N m is enough
 
-    figure, (path, torque) = plt.subplots(1, 2, figsize=(8.5, 3.6), layout="constrained")
-    path.plot(foot[:, 0], foot[:, 1])
-    path.set(xlabel="x / m", ylabel="y / m", aspect="equal", title="the foot, from its start")
-    torque.plot(forces.t, forces.tau, label=forces.actuated)
-    torque.set(xlabel="t / s", ylabel="torque / N m", title="motors, before their gears")
-    torque.legend()
+    figure, (path, torque) = plt.subplots(1, 2, figsize=(7.0, 3.2), width_ratios=(1, 1.4))
+    path.plot(foot[:, 0], foot[:, 1], "k")
+    path.plot(*foot[0, :2], "ko", label="the foot's start")
+    path.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="Path of the foot")
+    torque.plot(forces.t, 1e3 * forces.tau, label=[f"{name} motor" for name in forces.actuated])
+    torque.set(xlabel="t (s)", ylabel="torque (N mm)", title="On the circle: motors, before their gears")
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 

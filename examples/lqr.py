@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from scipy.linalg import solve_continuous_are
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 POINT = {"theta_1": 1.9, "theta_3": 1.2}
 OFF = {"theta_1": 0.08, "theta_3": -0.05}  # rad, at the start
@@ -47,6 +48,7 @@ def hold(regulator: Regulator | None) -> ckc_pin.Run:
     return ckc_pin.simulate("five_bar/swing", changes, controller=regulator)
 
 
+@look()
 def main() -> Figure:
     """Design, run, and say how it went."""
     model, regulator = design()
@@ -60,11 +62,11 @@ def main() -> Figure:
         print(f"t = {t:3.1f} s: {error[run.at(t)]:.2e} rad off")
     assert np.all(np.linalg.eigvals(closed).real < 0)
     assert error[-1] < 1e-4 < 0.5 < without.max()
-    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
+    figure, ax = plt.subplots()
     ax.semilogy(alone.t, without, label="torques of the point alone")
     ax.semilogy(run.t, error, label="with the regulator")
-    ax.set(xlabel="t / s", ylabel="largest error of θ₁, θ₃ / rad")
-    ax.legend()
+    ax.set(xlabel="t (s)", ylabel="largest error of θ₁, θ₃ (rad)", title="Started 0.08 rad off an unstable equilibrium")
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 

@@ -8,8 +8,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 
+@look()
 def main():
     model = ckc_pin.linearize("five_bar")
     mode = model.modes[0]
@@ -18,7 +20,7 @@ def main():
     shape = np.array([mode.shape[model.coordinates.index(name)] for name in names]).real
     shape /= np.abs(shape).max()
     print(model)
-    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
+    figure, ax = plt.subplots()
     off = []
     for size in (0.02, 0.2, 0.4):
         start = {name: rest[name] + size * x for name, x in zip(names, shape, strict=True)}
@@ -31,9 +33,10 @@ def main():
         period = np.diff(turns).mean()
         off.append(abs(period * mode.frequency - 1))
         print(f"{size} rad: period {period:.5f} s, of the linear model {1 / mode.frequency:.5f} s")
-        ax.plot(run.t * mode.frequency, (run[names[0]] - rest[names[0]]) / size, label=f"{size} rad")
-    ax.set(xlabel="t · frequency of the mode", ylabel=f"{names[0]}, by its start")
-    ax.legend()
+        ax.plot(run.t * mode.frequency, (run[names[0]] - rest[names[0]]) / size, label=f"from {size} rad")
+    ax.set(xlabel="time (periods of the linear model)", ylabel="swing of θ₁, scaled")
+    ax.set(title="The larger the swing, the longer its period")
+    figure.legend(loc="outside lower center", ncols=3)
     assert off[0] < 1e-3
     assert off[0] < off[1] < off[2]
     return figure

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 TARGET = np.array([0.2, 0.4])
 RATE = 4.0  # 1/s
@@ -22,6 +23,7 @@ class ComputedTorque:
         return terms.D @ wanted + terms.C @ terms.q_dot + terms.h
 
 
+@look()
 def main():
     changes = {"formulation": "reduced", "initial": {"at": "equilibrium"}, "t_end": 3.0}
     run = ckc_pin.simulate("five_bar/swing", changes, controller=ComputedTorque())
@@ -33,11 +35,11 @@ def main():
     )
     assert np.abs(q - exact).max() < 1e-6
 
-    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
-    ax.plot(run.t, q, label=run.independent)
-    ax.plot(run.t, exact, ":", color="black")
-    ax.set(xlabel="t / s", ylabel="angle / rad", title="run, and the closed form (dotted)")
-    ax.legend()
+    figure, ax = plt.subplots()
+    ax.plot(run.t, q, lw=3, alpha=0.4, label=["θ₁", "θ₃"])
+    ax.plot(run.t, exact, "k:", label=["closed form", None])
+    ax.set(xlabel="t (s)", ylabel="angle (rad)", title="From rest to the target, critically damped")
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 

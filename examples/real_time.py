@@ -14,10 +14,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 PERIOD = 0.002  # s
 
 
+@look()
 def main(seconds=0.5):
     plant = ckc_pin.Simulator("five_bar/swing", {"formulation": "dae", "solver.rtol": 1e-6})
     cycles = round(seconds / PERIOD)
@@ -35,12 +37,12 @@ def main(seconds=0.5):
               f"largest {1e6 * x.max():.0f} µs of {1e6 * PERIOD:.0f}")  # fmt: skip
     assert abs(plant.state.t - cycles * PERIOD) < 1e-9
 
-    figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
+    figure, ax = plt.subplots()
     edges = np.geomspace(5e-6, max(late.max(), work.max(), 1e-3), 60)
     ax.hist([np.maximum(late, 5e-6), work], edges, histtype="stepfilled", alpha=0.6, label=["late by", "at work for"])
-    ax.axvline(PERIOD, color="black", ls="--", lw=0.8, label="a cycle")
-    ax.set(xscale="log", xlabel="s", ylabel="cycles", title="500 Hz")
-    ax.legend()
+    ax.axvline(PERIOD, color="black", ls="--", lw=0.8, label="a cycle, 2 ms")
+    ax.set(xscale="log", xlabel="time (s)", ylabel="number of cycles", title=f"{cycles} cycles at 500 Hz")
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 

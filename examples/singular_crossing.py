@@ -10,11 +10,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import ckc_pin
+from ckc_pin.view.canvas import look
 
 N = 4
 K = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))  # 1/s²
 
 
+@look()
 def main():
     run = ckc_pin.simulate("n_four_bar", {"t_end": 2.0, "mechanism.N": N})
     theta = run.q_tree[:, run.column("theta_0")]
@@ -27,13 +29,13 @@ def main():
 
     sigma = [np.linalg.svd(ckc_pin.terms(run.mechanism, dict(zip(run.coordinates, q, strict=True))).at.J)[1][-1]
              for q in run.q_tree.tolist()]  # fmt: skip
-    figure, (angle, rank) = plt.subplots(1, 2, figsize=(8.5, 3.4), layout="constrained")
-    angle.plot(run.t, theta, label="ckc_pin")
-    angle.plot(run.t, exact, ":", label="closed form")
-    angle.set(xlabel="t / s", ylabel="θ₀ / rad")
-    angle.legend()
+    figure, (angle, rank) = plt.subplots(1, 2, figsize=(7.0, 3.0))
+    angle.plot(run.t, theta, lw=3, alpha=0.4, label="ckc_pin")
+    angle.plot(run.t, exact, "k:", label="θ'' = -k cos θ, by SciPy")
+    angle.set(xlabel="t (s)", ylabel="θ₀ (rad)", title="The row swings through flat")
     rank.semilogy(run.t, np.maximum(sigma, 1e-12))
-    rank.set(xlabel="t / s", ylabel="least singular value of J")
+    rank.set(xlabel="t (s)", ylabel="least singular value of J (m)", title="There the closure loses rank")
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 

@@ -20,6 +20,8 @@ import ckc_pin
 from ckc_pin.errors import NumericalError
 from ckc_pin.generated.symbolic import Symbolic
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.view.canvas import look
+from ckc_pin.view.style import COLOURS
 
 T_END, INTERVALS = 1.6, 40  # s, and on how many parts of it u is constant
 PIECES, DEGREE = 2, 4  # of an interval; Gauss points of a piece
@@ -28,7 +30,6 @@ CALM = 0.05  # N^2 m^2 s^2: weight of the rates' squares beside the torques'
 UP = np.array([np.pi / 2, np.pi / 2])
 EQUAL = 1e-6  # rad, rad/s: how far the replay may be off
 POSES = 5  # of the figure
-COLOURS, BLACK = ("#0072B2", "#D55E00"), "#000000"
 
 
 @dataclass(frozen=True)
@@ -138,28 +139,28 @@ def replay(found: Plan) -> Array:
     return np.array([np.concatenate([state.q_tree, state.v_tree]) for state in states])
 
 
+@look()
 def figure(found: Plan, replayed: Array) -> Any:
     """Return angles, torques, and poses with the tip's path."""
     import matplotlib.pyplot as plt
 
-    drawn, (angles, torques, poses) = plt.subplots(1, 3, figsize=(12.0, 3.6), layout="constrained")
-    for k, name in enumerate(("θ₁", "θ₃")):
-        angles.plot(found.t, found.states[:, 2 * k], color=COLOURS[k], label=name)
-        angles.plot(found.t, replayed[:, 2 * k], ".", color=COLOURS[k])
-        torques.stairs(found.u[:, k], found.t, baseline=None, color=COLOURS[k], label=f"motor of {name}")
-    angles.axhline(UP[0], color=BLACK, lw=0.8, ls=":", label="upright")
-    for sign in (-1, 1):
-        torques.axhline(sign * TORQUE, color=BLACK, lw=0.8, ls="--", label="limit" if sign > 0 else None)
-    angles.set(xlabel="t (s)", ylabel="angle (rad)", title="arms: planned (lines), replayed (dots)")
-    torques.set(xlabel="t (s)", ylabel="torque (N m)", title="torques")
+    drawn, (angles, torques, poses) = plt.subplots(1, 3, figsize=(7.0, 3.0), width_ratios=(1, 1, 0.75))
+    for k, arm in enumerate(("left arm, θ₁", "right arm, θ₃")):
+        angles.plot(found.t, found.states[:, 2 * k], color=COLOURS[k], label=arm)
+        angles.plot(found.t, replayed[:, 2 * k], ".", ms=4, color=COLOURS[k])
+        torques.stairs(found.u[:, k], found.t, baseline=None, lw=1.5, color=COLOURS[k])
+    angles.axhline(UP[0], color="black", lw=0.8, ls=":", label="upright")
+    torques.axhline(TORQUE, color="black", lw=0.8, ls="--", label="limits")
+    torques.axhline(-TORQUE, color="black", lw=0.8, ls="--")
+    angles.set(xlabel="t (s)", ylabel="angle (rad)", title="Arms (dots: replayed)")
+    torques.set(xlabel="t (s)", ylabel="torque (N m)", title="Torques")
     path = _pins(found)[:, :, :2]
     for pins in path[:: (len(path) - 1) // (POSES - 1)]:
         for ends, colour in ((pins[:3], COLOURS[0]), (pins[2:], COLOURS[1])):
             poses.plot(*ends.T, "-o", color=colour, lw=1.2, ms=2.5, alpha=0.55)
-    poses.plot(*path[:, 2].T, color=BLACK, lw=1.5)
-    poses.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"poses every {T_END / (POSES - 1):.1f} s")
-    for ax in (angles, torques):
-        ax.legend(fontsize=8)
+    poses.plot(*path[:, 2].T, color="black", lw=1.5, label="path of the tip")
+    poses.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Poses every {T_END / (POSES - 1):.1f} s")
+    drawn.legend(loc="outside lower center", ncols=5)
     return drawn
 
 

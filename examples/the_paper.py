@@ -8,26 +8,34 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import limit, look
+from ckc_pin.view.style import COLOURS
 
-FORMULATIONS = {"SPF, ε = 1e-3": {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-3},
-                "reduced": {"formulation": "reduced"}}  # fmt: skip
+FORMULATIONS = {"reduced": {"formulation": "reduced"},
+                "SPF, ε = 1e-3": {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-3}}  # fmt: skip
+CASES = {"set_point": ("Set-point control", 0.6), "tracking": ("Tracking control", 9.5)}  # s, shown
+LOOKS = {"lw": 3, "alpha": 0.4}, {"ls": "--", "lw": 1.2}
 
 
+@look()
 def main():
-    figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex="col", layout="constrained")
-    for column, case in zip(axes.T, ("set_point", "tracking"), strict=True):
+    figure, axes = plt.subplots(2, 2, figsize=(7.0, 4.6), sharex="col")
+    for (angles, torques), (case, (title, shown)) in zip(axes.T, CASES.items(), strict=True):
+        for ax in (angles, torques):
+            ax.set_prop_cycle(color=COLOURS[:2])  # a colour an arm, whatever the formulation
         ends = []
-        for (name, changes), style in zip(FORMULATIONS.items(), ("-", "--"), strict=True):
+        for (name, changes), style in zip(FORMULATIONS.items(), LOOKS, strict=True):
             run = ckc_pin.simulate(f"five_bar/{case}", changes)
             q = run.q_tree[:, [run.column(joint) for joint in run.independent]]
-            column[0].plot(run.t, q, style, label=[f"{joint}, {name}" for joint in run.independent])
-            column[1].plot(run.t, run.u, style)
+            angles.plot(run.t, q, **style, label=[f"{joint}, {name}" for joint in ("θ₁", "θ₃")])
+            torques.plot(run.t, run.u, **style)
             assert np.abs(run.u).max() < 30.0  # N m, what the paper allows
             ends.append(q[-1])
         assert np.abs(ends[0] - ends[1]).max() < 1e-6
-        column[0].set(title=case, ylabel="angle / rad")
-        column[1].set(xlabel="t / s", ylabel="u / N m")
-    axes[0, 0].legend(fontsize=7)
+        angles.set(title=title, ylabel="angle (rad)")
+        torques.set(xlabel="t (s)", ylabel="torque (N m)", xlim=(0, shown))
+        torques.set(title=f"Torques {limit(torques, [(run.t, run.u)], shown)}")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 

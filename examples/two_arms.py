@@ -8,24 +8,26 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
+from ckc_pin.view.style import COLOURS
 
 
+@look()
 def main():
     run = ckc_pin.simulate("two_ur5/lift", {"formulation": "reduced", "t_end": 2.0})
     assert run.status == "done"
     assert run.max_phi < 1e-8  # m, rad: the bar stays in both hands
     forces = ckc_pin.inverse_dynamics(run)
 
-    figure, (torque, grip) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    left = [k for k, name in enumerate(run.actuated) if name.startswith("left")]
-    right = [k for k, name in enumerate(run.actuated) if name.startswith("right")]
-    torque.plot(run.t, run.tau[:, left], "-", color="tab:blue")
-    torque.plot(run.t, run.tau[:, right], "--", color="tab:orange")
-    torque.set(xlabel="t / s", ylabel="torque / N m", title="motors: left arm (blue), right arm (orange)")
-    for name, wrench in forces.loop_wrenches.items():
-        grip.plot(forces.t, np.linalg.norm(wrench[:, :3], axis=1), label=name)
-    grip.set(xlabel="t / s", ylabel="force / N", title="force in the loop")
-    grip.legend()
+    figure, (torque, grip) = plt.subplots(1, 2, figsize=(7.0, 3.2))
+    for arm, line, colour in (("left", "-", COLOURS[0]), ("right", "--", COLOURS[1])):
+        motors = [k for k, name in enumerate(run.actuated) if name.startswith(arm)]
+        torque.plot(run.t, run.tau[:, motors], line, color=colour)
+        wrench = forces.loop_wrenches[f"{arm}_grip"]
+        grip.plot(forces.t, np.linalg.norm(wrench[:, :3], axis=1), line, color=colour, label=f"{arm} arm")
+    torque.set(xlabel="t (s)", ylabel="torque (N m)", title="Six motors an arm")
+    grip.set(xlabel="t (s)", ylabel="force (N)", title="Force in its grip")
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 

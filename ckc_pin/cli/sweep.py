@@ -95,6 +95,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
     """Write which variable matters, a row an output and variable, and draw it."""
     from ckc_pin.mechanism.whole_file import write_whole
     from ckc_pin.simulation.ensembles.importance import importance
+    from ckc_pin.simulation.ensembles.store import array_name
 
     found = importance(task, count, threads)
     rows = ["output,variable,first_order,total_order"]
@@ -107,7 +108,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
             try:
                 from ckc_pin.view.ensemble_figures import draw_importance
 
-                draw_importance(of, out / f"indices_{name}.png")
+                draw_importance(of, out / f"indices_{array_name(str(name))}.png")
             except InputError as error:
                 errors().print(f"no figures: {error}")
     write_whole(out / "indices.csv", "\n".join(rows) + "\n")

@@ -279,10 +279,11 @@ def _label(e: Array, otherwise: str) -> str:
 
 def _unit(axis: Sequence[float], where: str) -> Array:
     vector = np.array(axis, dtype=float)
-    length = np.linalg.norm(vector)
-    if not np.isfinite(length) or length == 0:
+    largest = np.abs(vector).max()
+    if not np.isfinite(largest) or largest == 0:
         raise MechanismError(f"{where}: {list(axis)} is no direction; give three finite numbers, not all zero")
-    return np.asarray(vector / length)
+    vector /= largest  # whose squares are numbers
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _columns(table: Sequence[tuple[int, ...]]) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:

@@ -93,10 +93,11 @@ def faults(data: Any, kind: Any, steps: tuple[Step, ...] = ()) -> Iterator[Fault
     elif isinstance(data, Mapping) and mapping is not None:
         for key, value in data.items():
             yield from faults(value, get_args(mapping)[1], (*steps, key))
-    elif isinstance(data, list | tuple) and items and len(items) in (1, len(data)):
+    elif isinstance(data, list | tuple) and data and items and len(items) in (1, len(data)):
         yield from _in_list(data, items, steps)
     else:
-        yield _of_value(data, kind, len(items) if items and isinstance(data, list | tuple) else None, steps)
+        several = items and len(items) > 1 and isinstance(data, list | tuple)
+        yield _of_value(data, kind, len(items) if items and several else None, steps)
 
 
 def numbers(data: Any, steps: tuple[Step, ...] = ()) -> Iterator[Fault]:
@@ -196,6 +197,7 @@ def _is_struct(kind: Any) -> bool:
 
 def _items(kind: Any) -> tuple[Any, ...]:
     """Return the types of a list's entries, one for all or one for each; nothing for what is no list."""
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     arguments = get_args(kind) if get_origin(kind) in (list, tuple) else ()
     return tuple(argument for argument in arguments if argument is not Ellipsis)
 

@@ -214,7 +214,7 @@ class Mechanism(Shown):
 
     def _driven_first(self, best: list[str], motors: Motors | None) -> list[str]:
         """Return coordinates that can serve as q: those with motors as far as phi_z stays sound, then others."""
-        if motors is None or self.freedoms.dependent is None:
+        if motors is None or not motors.names or self.freedoms.dependent is None:
             return best
         driven = np.flatnonzero(motors.turns.any(axis=0))
         driven = driven[np.argsort(np.argmax(motors.turns[:, driven] != 0, axis=0), kind="stable")]  # in tau's order

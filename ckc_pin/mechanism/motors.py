@@ -117,7 +117,14 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
                 f"{where}: rotor_inertia goes with a motor on one joint; on several it would couple their inertias. "
                 "Leave it out, or give the joints an armature"
             )
-        armature += turns[k] ** 2 * motor.rotor_inertia
+        if motor.rotor_inertia:
+            with np.errstate(over="ignore"):
+                armature += turns[k] ** 2 * motor.rotor_inertia
+            if not np.all(np.isfinite(armature)):
+                raise MechanismError(
+                    f"{where}: ratio = {motor.ratio:g} with rotor_inertia = {motor.rotor_inertia:g} is too large: what "
+                    "they make of the joint's inertia is no finite number"
+                )
     tree.model.armature = armature
     limits = np.array([(m.torque_limit or np.inf, m.speed_limit or np.inf) for m in spec.motor])
     return Motors(names, turns, limits[:, 0], limits[:, 1])

@@ -35,6 +35,7 @@ class Springs:
     ) -> None:
         self.tree = tree
         ends_a, ends_b, lines = [], [], []
+        self._on_joint = set[int]()
         self.joint_stiffness, self.joint_rest = np.zeros(tree.n), np.zeros(tree.n)
         self.joint_damping = np.array(tree.model.damping, dtype=float)
         for k, spec in enumerate(specs):
@@ -66,8 +67,9 @@ class Springs:
         self.any_damping = bool(self.damping.any()) or bool(self.joint_damping.any())
 
     def _add_joint(self, at: int, spec: SpringSpec) -> None:
-        if self.joint_stiffness[at]:
-            raise MechanismError(f"two springs on joint {spec.joint!r}; give one with their sum")
+        if at in self._on_joint:
+            raise MechanismError(f"two springs on joint {spec.joint!r}; give one with their stiffness and damping")
+        self._on_joint.add(at)
         self.joint_stiffness[at] = spec.stiffness
         self.joint_rest[at] = spec.rest or 0.0
         self.joint_damping[at] += spec.damping

@@ -39,6 +39,7 @@ from ckc_pin.simulation.workspace import leaving
 __all__ = ["inverse_dynamics"]
 
 LEFT_OVER = 1e-7  # of the forces along a freedom: rounding, which no actuator needs to produce
+ROUNDING = 1e-4  # of that along the others: a freedom that no force acts along has nothing of its own
 DEAD = 1e-7  # of a motion: what an actuator moves by where it is at a dead centre
 
 
@@ -160,7 +161,7 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
     u_tree = mechanism.motors.force(instant.tau)
     lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
-    if np.any(np.abs(lacking) > enough):
+    if np.any(np.abs(lacking) > enough + ROUNDING * enough.max(initial=0.0)):
         _require_grip(mechanism, tangent, actuation, t)
     tau = instant.tau + actuation.distribute(tangent, lacking)
     forces = multipliers(terms, mechanism.motors.force(tau) + instant.of_joints, acceleration)

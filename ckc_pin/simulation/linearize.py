@@ -21,6 +21,7 @@ from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.kinds import require_kind, require_table
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -28,7 +29,7 @@ from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.simulate import simulate
 
 __all__ = ["At", "linearize"]
@@ -89,6 +90,10 @@ def linearize(
     >>> model.A.shape, model.inputs
     ((4, 4), ('theta_1', 'theta_3'))
     """
+    takes = "a mechanism or a scene: itself, its name or path"
+    require_kind(what, (Mechanism, Scene, str, Path), "linearize: what", takes)
+    if changes is not None:
+        require_table(changes, "linearize: changes", CHANGES)
     with one_blas_thread():
         subject = _subject(what, at, changes)
         if subject.mechanism.d == 0:

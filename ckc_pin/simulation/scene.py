@@ -25,7 +25,7 @@ from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 from ckc_pin.simulation.cards import scene_card
 from ckc_pin.simulation.scene_spec import EventSpec, SceneSpec, SolverSpec
 
-__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "load_scene", "scene_names", "with_changes"]
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "as_toml", "load_scene", "scene_names", "with_changes"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
@@ -241,7 +241,7 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
         if value is None:
             at.pop(last, None)
         else:
-            at[last] = _plain(value)
+            at[last] = as_toml(value)
     return changed
 
 
@@ -254,12 +254,12 @@ def _place_of(key: str) -> list[str]:
     return key.split(".")
 
 
-def _plain(value: Any) -> Any:
+def as_toml(value: Any) -> Any:
     """Return a value that a Python program gave as TOML would: NumPy's numbers and arrays as Python's."""
     if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: as_toml(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [as_toml(inner) for inner in value]
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 

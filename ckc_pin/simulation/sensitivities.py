@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run
@@ -20,6 +21,7 @@ from ckc_pin.simulation.varying import varying_of
 
 __all__ = ["Sensitivities", "sensitivities"]
 
+NAMES = 'a list of names, as ["link.link_2.mass"]'
 RATES = ("q", "q_dot")  # of which an event's time is known to change
 
 
@@ -104,8 +106,10 @@ def sensitivities(
         As `simulate`.
     """
     scene = as_scene(scene, changes, "sensitivities")
-    if isinstance(parameters, str):
-        parameters = [parameters]
+    parameters = [parameters] if isinstance(parameters, str) else parameters
+    require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)
+    for name in parameters:
+        require_kind(name, str, "sensitivities: parameters", NAMES)
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, parameters=tuple(parameters))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,8 @@ from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.view import style
 
 if TYPE_CHECKING:
+    from contextlib import _GeneratorContextManager
+
     from matplotlib.figure import Figure
 
 __all__ = ["Slot", "fit_legend", "head", "limit", "line", "look", "note_on", "page", "say", "write"]
@@ -27,8 +28,10 @@ UNDER = 0.4  # in, below an axes: its numbers and its label
 HEAD = 0.44  # in, of a title and the line below it
 
 
-def look() -> AbstractContextManager[None]:
+def look() -> _GeneratorContextManager[None]:
     """Our style on matplotlib's defaults, whatever the user has set, and that as it was afterwards.
+
+    What it returns is for a ``with``, or decorates a function that draws: ``@look()``.
 
     Raises
     ------
@@ -39,8 +42,7 @@ def look() -> AbstractContextManager[None]:
         from matplotlib import style as styles
     except ModuleNotFoundError:
         raise InputError("figures need matplotlib: pip install 'ckc_pin[view]'") from None
-    context: AbstractContextManager[None] = styles.context(["default", style.RC])
-    return context
+    return styles.context(["default", style.RC])
 
 
 def write(figure: Figure, folder: Path, stem: str, formats: Sequence[str]) -> list[Path]:

@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.errors import InputError
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, BoolArray
+from ckc_pin.view import style
+from ckc_pin.view.canvas import fit_legend, line, look, say, write
+from ckc_pin.view.labels import plain, symbol, with_unit
 
 if TYPE_CHECKING:
     import xarray as xr
+    from matplotlib.figure import Figure
 
 __all__ = ["draw", "draw_basins", "draw_fan", "draw_importance", "draw_map"]
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MOST_FANS = 12  # components of one output
 APART = 0.05  # rad, m: ends further apart than that are others
-MOST_BASINS = 9
 
 
 def draw(results: xr.Dataset, out: Path) -> list[Path]:
@@ -43,42 +45,42 @@ def draw(results: xr.Dataset, out: Path) -> list[Path]:
 
 
 def draw_fan(x: xr.DataArray, path: Path) -> Path:
-    """Draw quantiles over time, of each component one below the other."""
-    plt = _pyplot()
+    """Draw quantiles over time, of each component one below the other, in the unit of its attribute `units`."""
     values = x.to_numpy().reshape(x.sizes["member"], -1, x.sizes["time"])[:, :MOST_FANS]
-    labels = [str(label) for label in x[x.dims[1]].to_numpy()] if len(x.dims) > 2 else [str(x.name)]
-    figure, axes = plt.subplots(values.shape[1], 1, sharex=True, squeeze=False, figsize=(7, 1 + 2 * values.shape[1]))
-    for k, at in enumerate(axes[:, 0]):
-        with np.errstate(all="ignore"):
-            bands = np.nanquantile(values[:, k], QUANTILES, axis=0)
-        t = x["time"].to_numpy()
-        at.fill_between(t, bands[0], bands[4], alpha=0.2, color="C0", lw=0, label="5 to 95 %")
-        at.fill_between(t, bands[1], bands[3], alpha=0.3, color="C0", lw=0, label="25 to 75 %")
-        at.plot(t, bands[2], color="C0", label="median")
-        at.set_ylabel(labels[k])
-    axes[0, 0].legend(loc="upper right", fontsize="small")
-    axes[-1, 0].set_xlabel("t / s")
+    labels = [symbol(str(label)) for label in x[x.dims[1]].to_numpy()] if len(x.dims) > 2 else [plain(str(x.name))]
+    with look():
+        figure, axes = _page((style.WIDTH, 0.9 + 1.3 * values.shape[1]), values.shape[1])
+        t, blue = x["time"].to_numpy(), style.COLOURS[0]
+        for k, at in enumerate(axes):
+            with np.errstate(all="ignore"):
+                bands = np.nanquantile(values[:, k], QUANTILES, axis=0)
+            at.fill_between(t, bands[0], bands[4], alpha=0.2, color=blue, lw=0, label="5 to 95 %")
+            at.fill_between(t, bands[1], bands[3], alpha=0.4, color=blue, lw=0, label="25 to 75 %")
+            at.plot(t, bands[2], color=blue, lw=1.2, label="median")
+            at.set_ylabel(with_unit(labels[k], x.attrs.get("units", "")))
+        say(axes[0], f"{plain(str(x.name))} of {x.sizes['member']} members")
+        axes[-1].set_xlabel(with_unit("$t$", "s"))
+        fit_legend(figure, axes[0].get_legend_handles_labels()[0])
     return _save(figure, path)
 
 
 def draw_map(results: xr.Dataset, variables: tuple[str, str], name: str, path: Path) -> Path:
     """Draw an output over two variables: a raster of a grid, else points; crosses are members without it."""
-    plt = _pyplot()
     x, y, z = (results[key].to_numpy() for key in (*variables, name))
-    figure, at = plt.subplots(figsize=(6, 5))
-    columns, rows = np.unique(x), np.unique(y)
-    if len(columns) * len(rows) == len(z) and len(rows) > 1 < len(columns):
-        order = np.lexsort((y, x))
-        shown: Any = at.pcolormesh(columns, rows, z[order].reshape(len(columns), len(rows)).T, shading="nearest")
-    else:
-        shown = at.scatter(x, y, c=z, s=8)
-    missing = np.isnan(z)
-    if missing.any():
-        at.plot(x[missing], y[missing], "x", color="0.6", ms=3, label=f"{missing.sum()} without")
-        at.legend(fontsize="small")
-    figure.colorbar(shown, label=name)
-    at.set_xlabel(variables[0])
-    at.set_ylabel(variables[1])
+    with look():
+        figure, (at,) = _page((style.WIDTH, 4.2))
+        columns, rows = np.unique(x), np.unique(y)
+        if len(columns) * len(rows) == len(z) and len(rows) > 1 < len(columns):
+            order = np.lexsort((y, x))
+            shown: Any = at.pcolormesh(columns, rows, z[order].reshape(len(columns), len(rows)).T, shading="nearest")
+        else:
+            shown = at.scatter(x, y, c=z, s=8)
+        missing = np.isnan(z)
+        if missing.any():
+            crosses = at.plot(x[missing], y[missing], "x", color=style.GREY, ms=3, label=f"{missing.sum()} without")
+            fit_legend(figure, crosses)
+        figure.colorbar(shown, label=_axis(results, name))
+        at.set(xlabel=_axis(results, variables[0]), ylabel=_axis(results, variables[1]))
     return _save(figure, path)
 
 
@@ -126,58 +128,69 @@ def draw_basins(
     marks : sequence of (label, x, y)
         Points to name.
     """
-    plt = _pyplot()
     x, y = (results[name].to_numpy() for name in variables)
     ends = results[end].to_numpy().reshape(len(x), -1)
     rests = np.ones(len(x), bool) if settled is None else results[settled].to_numpy() == 1.0
-    group, centres = basins(np.where(rests[:, None], ends, np.nan))
-    figure, at = plt.subplots(figsize=(6.5, 6))
+    group, _ = basins(np.where(rests[:, None], ends, np.nan))
     ended = results["status"].to_numpy()
-    for k in range(min(len(centres), MOST_BASINS)):
-        at.plot(
-            x[group == k], y[group == k], "s", ms=3, color=f"C{k}", label=f"settles: {np.count_nonzero(group == k)}"
-        )
-    moving, without = (group < 0) & (ended == 1), ended > 1
-    at.plot(x[moving], y[moving], "s", ms=3, color="0.7", label=f"does not settle: {moving.sum()}")
-    at.plot(x[without], y[without], "x", ms=3, color="0.3", label=f"stopped or cannot begin: {without.sum()}")
-    for curve in curves:
-        at.plot(curve[:, 0], curve[:, 1], color="k", lw=1)
-    for label, u, v in marks:
-        at.plot(u, v, "*", ms=12, color="k")
-        at.annotate(label, (u, v), xytext=(6, 6), textcoords="offset points")
-    at.set_xlabel(variables[0])
-    at.set_ylabel(variables[1])
-    at.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1, 1))
+    kinds: list[tuple[BoolArray, str, dict[str, Any]]] = [
+        (group == k, "settles", {"marker": "s", "color": colour}) for k, colour in enumerate(style.COLOURS)
+    ]
+    kinds += [
+        (group >= style.MOST, "settles elsewhere", {"marker": "s", "color": style.REST}),
+        ((group < 0) & (ended == 1), "does not settle", {"marker": "X", "ms": 5, "color": "black"}),
+        (ended > 1, "stopped or cannot begin", {"marker": ".", "ms": 2, "color": style.GREY}),
+    ]
+    with look():
+        figure, (at,) = _page((style.WIDTH, style.WIDTH))
+        for curve in curves:
+            at.plot(*curve.T, color="black", lw=0.8)
+        shown = []
+        for members, said, how in kinds:
+            if members.any():
+                named = {"label": f"{said}: {members.sum()}", "linestyle": "none"}
+                shown += at.plot(x[members], y[members], **({"ms": 3} | named | how))
+        for label, u, v in marks:
+            shown += at.plot(u, v, "*", ms=12, color="black", mec="white", label=label, linestyle="none")
+        if curves:
+            shown.append(line("black", "singular configurations", linewidth=0.8))
+        at.set(xlabel=_axis(results, variables[0]), ylabel=_axis(results, variables[1]))
+        fit_legend(figure, shown)
     return _save(figure, path)
 
 
 def draw_importance(indices: xr.Dataset, path: Path) -> Path:
     """Draw Sobol indices, first order and total, of each variable."""
-    plt = _pyplot()
-    names = [str(name) for name in indices["variable"].to_numpy()]
-    figure, at = plt.subplots(figsize=(7, 1.5 + 0.4 * len(names)))
+    names = [plain(str(name)) for name in indices["variable"].to_numpy()]
     place = np.arange(len(names))
-    at.barh(place - 0.2, indices["first_order"].to_numpy(), height=0.4, label="alone (first order)")
-    at.barh(place + 0.2, indices["total_order"].to_numpy(), height=0.4, label="with all others (total)")
-    at.set_yticks(place, names)
-    at.invert_yaxis()
-    at.set_xlabel("share of the variance")
-    at.legend(fontsize="small")
+    with look():
+        figure, (at,) = _page((style.WIDTH, 1.2 + 0.35 * len(names)))
+        bars = [
+            at.barh(place + side, indices[key].to_numpy(), height=0.4, label=label)
+            for side, key, label in ((-0.2, "first_order", "alone (first order)"),
+                                     (0.2, "total_order", "with all others (total)"))
+        ]  # fmt: skip
+        at.set_yticks(place, names)
+        at.invert_yaxis()
+        at.grid(visible=False, axis="y")
+        at.set_xlabel("share of the variance")
+        fit_legend(figure, bars)
     return _save(figure, path)
 
 
-def _pyplot() -> Any:
-    try:
-        import matplotlib
+def _page(size: tuple[float, float], rows: int = 1) -> tuple[Figure, list[Any]]:
+    from matplotlib.figure import Figure
 
-        matplotlib.use("agg")
-        import matplotlib.pyplot as plt
-    except ModuleNotFoundError:
-        raise InputError("figures are drawn by matplotlib, which is not installed: pip install ckc_pin[view]") from None
-    return plt
+    figure = Figure(figsize=size)
+    return figure, list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
 
 
-def _save(figure: Any, path: Path) -> Path:
-    figure.savefig(path, bbox_inches="tight", dpi=110)
-    _pyplot().close(figure)
-    return path
+def _axis(results: xr.Dataset, name: str) -> str:
+    """What an axis over a variable or an output shows: its key, a start's by its symbol."""
+    coordinate = name.removeprefix("initial.q.")
+    shown = plain(name) if coordinate == name else f"{symbol(coordinate)} at the start"
+    return with_unit(shown, results[name].attrs.get("units", ""))
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    return write(figure, path.parent, path.stem, ("png",))[0]

@@ -112,6 +112,6 @@ def _plane(ax: Any, values: Any) -> None:
     size = max(float(np.abs(values).max(initial=0.0)), 1e-9)
     low, high = min(float(values.real.min()), 0.0), max(float(values.real.max()), 0.0)
     margin = 0.1 * (high - low) + 0.05 * size
-    ax.set(xlabel="real part, 1/s", ylabel="imaginary part, rad/s", xlim=(low - margin, high + margin))
+    ax.set(xlabel="real part (1/s)", ylabel="imaginary part (rad/s)", xlim=(low - margin, high + margin))
     ax.axvspan(0.0, high + margin, color=style.COLOURS[1], alpha=0.08, linewidth=0)
     ax.axhline(0.0, color=style.GREY, linewidth=0.8)

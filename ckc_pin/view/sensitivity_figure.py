@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin.simulation.sensitivities import Sensitivities
 from ckc_pin.view import style
 from ckc_pin.view.canvas import look, write
-from ckc_pin.view.labels import plain, symbol
+from ckc_pin.view.labels import plain, symbol, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,5 +63,5 @@ def draw_sensitivities(found: Sensitivities) -> Figure:
             ax.set(title=f"by {plain(found.parameters[p])}", ylabel=r"$\partial q / \partial p$")
         if len(run.independent) <= NAMED:
             axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-        axes[-1].set_xlabel("t, s")
+        axes[-1].set_xlabel(with_unit("$t$", "s"))
         return figure

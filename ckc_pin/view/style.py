@@ -25,7 +25,10 @@ WIDTH_BESIDE = 7.2  # in, with a long legend beside the axes
 NOTE = 7.5  # pt, of what is said beside a title
 
 RC: dict[str, Any] = {
+    "figure.figsize": (WIDTH, 3.1),
+    "figure.constrained_layout.use": True,
     "font.size": 8.5,
+    "axes.prop_cycle": f"cycler('color', {list(COLOURS)})",
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
     "axes.labelsize": 8.5,

@@ -44,8 +44,8 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
     found = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, changes=TRACKING)
     exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, changes=TRACKING)
     change = found["error"] - exact["error"][0]
-    draw_fan(change.rename("change of the error"), out / "tolerances_fan.png")
-    lines = ["| joint | rms error, exact lengths / rad | change by wrong lengths: 95 % stay below, the most / rad |",
+    draw_fan(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
+    lines = ["| joint | rms error, exact lengths (rad) | change by wrong lengths: 95 % stay below, the most (rad) |",
              "|---|---|---|"]  # fmt: skip
     for name in found["independent"].to_numpy():
         most = abs(change.sel(independent=name)).max("time")
@@ -74,6 +74,8 @@ def basin(out: Path, count: int) -> str:
         "five_bar/set_point", dict.fromkeys(names, grid), {"end": "q_tree", "settled": "settled", "u": "max_abs_u"},
         changes={"formulation": "reduced", "solver.rtol": 1e-6, "t_end": 10.0},
     )  # fmt: skip
+    for name in names:
+        found[name].attrs["units"] = "rad"
     starts = np.column_stack([found[name].to_numpy() for name in names])
     home = (found["settled"].to_numpy() == 1.0) & (found["status"].to_numpy() == 1)
     inside = _proved(case, proved.safe_level, starts)
@@ -82,7 +84,7 @@ def basin(out: Path, count: int) -> str:
     curves = [_broken(locus.q_tree[:, q]) for locus in found_map.loci if locus.kind != "serial"]
     target = case.controller.q_d
     draw_basins(found, names, "end", out / "basin.png", settled="settled", curves=curves,
-                marks=[("q_d", float(target[0]), float(target[1]))])  # fmt: skip
+                marks=[("$q_d$", float(target[0]), float(target[1]))])  # fmt: skip
     can = found["status"].to_numpy() != 3
     return "\n".join(
         [

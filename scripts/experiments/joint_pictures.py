@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import fit_legend, line
+from ckc_pin.view.labels import rate_symbol, symbol, with_unit
+from ckc_pin.view.style import WIDTH_BESIDE, colours
 
 RATES = ("theta_1", "theta_3")
 IMPACT = 0.02  # s, of the run: shown by itself
@@ -20,18 +24,18 @@ def draw_friction(path: Path, dpi: float) -> None:
     """Impact at a stop, and stick-slip at the turns of a tracked swing."""
     whole = ckc_pin.simulate("five_bar/friction")
     start = ckc_pin.simulate("five_bar/friction", {"t_end": IMPACT, "solver.output_dt": IMPACT / 400})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.2), width_ratios=(1, 2), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH_BESIDE, 3.0), width_ratios=(1, 2))
+    shown: dict[str, Any] = {}
     for ax, run in ((left, start), (right, whole)):
-        for k, name in enumerate(RATES):
-            rate = run.v_tree[:, run.column(name)]
-            ax.plot(run.t, rate, color=f"C{k}", label=name)
+        for name, colour in colours(RATES).items():
+            (shown[name],) = ax.plot(run.t, run.v_tree[:, run.column(name)], color=colour, label=rate_symbol(name))
             for begin, end in _sticking(run, name):
-                ax.axvspan(begin, end, color=f"C{k}", alpha=0.15, linewidth=0)
-        ax.set(xlabel="t [s]", xlim=(0, run.t[-1]))
-        ax.grid(alpha=0.3)
-    left.set(ylabel="rate [rad/s]", title="impact at a stop")
-    right.set(ylim=(-1.5, 1.5), title="stick-slip: shaded where a joint sticks")
-    right.legend(loc="upper right")
+                stuck = ax.axvspan(begin, end, color=colour, alpha=0.15, linewidth=0, label=f"{symbol(name)} sticks")
+                shown[f"{name} sticks"] = stuck
+        ax.set(xlabel=with_unit("$t$", "s"), xlim=(0, run.t[-1]))
+    left.set(ylabel=with_unit("rate", "rad/s"), title="a)  impact at a stop")
+    right.set(ylim=(-1.5, 1.5), title="b)  stick-slip")
+    fit_legend(figure, list(shown.values()))
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
 
@@ -53,16 +57,22 @@ def draw_preload(path: Path, dpi: float) -> None:
     plain, loaded = _lift({}), _lift({"controller.allocation.preload": PRELOAD})
     if not np.abs(plain.q_tree - loaded.q_tree).max() < 1e-6:
         raise AssertionError("the preload changes the motion")
-    figure, ax = plt.subplots(figsize=(9.0, 3.2), layout="constrained")
-    for k, name in enumerate(SHOWN):
+    figure, ax = plt.subplots(figsize=(WIDTH_BESIDE, 3.4))
+    shown = []
+    for name, colour in colours(SHOWN).items():
         column = plain.actuated.index(name)
-        ax.plot(plain.t, plain.tau[:, column], color=f"C{k}", label=name)
-        ax.plot(loaded.t, loaded.tau[:, column], "--", color=f"C{k}")
-    ax.set(xlabel="t [s]", ylabel="tau [N m]", xlim=(0, plain.t[-1]), title="without preload, and with it (dashed)")
-    ax.grid(alpha=0.3)
-    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+        shown += ax.plot(plain.t, plain.tau[:, column], color=colour, label=_words(name))
+        ax.plot(loaded.t, loaded.tau[:, column], "--", color=colour)
+    preload = line("black", "with the preload", linestyle="--", linewidth=1.5)
+    ax.set(xlabel=with_unit("$t$", "s"), ylabel=with_unit(r"$\tau$", "N m"), xlim=(0, plain.t[-1]),
+           title="Lift by two arms: one motion, without and with a preload of the elbows")  # fmt: skip
+    fit_legend(figure, [*shown, preload])
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
+
+
+def _words(joint: str) -> str:
+    return joint.removesuffix("_joint").replace("_", " ")
 
 
 def _lift(changes: Mapping[str, object]) -> ckc_pin.Run:

@@ -56,7 +56,7 @@ def markdown() -> str:
     found = examples()
     if not found:
         return ""
-    lines = ["::::{grid} 2 3 3 4", ":gutter: 2", ""]
+    lines = ["::::{grid} 2 2 3 3", ":gutter: 2", ""]
     for example in found:
         lines += [f":::{{grid-item-card}} {example.title}", f":img-top: {PICTURES}/{example.name}.png"]
         lines += [f":link: example-{example.name}", ":link-type: ref", ":::", ""]

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import ckc_pin
+from ckc_pin.view.canvas import look
+from ckc_pin.view.style import COLOURS, GREY
 
 __all__ = ["main"]
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
-RED, GREEN, BLUE, ORANGE, GREY = "#C0392B", "#009E73", "#0072B2", "#D55E00", "#777777"
+BLUE, ORANGE, GREEN = COLOURS[:3]
+FORBIDDEN = {"color": ORANGE, "lw": 2.4}
+FREE = {"color": BLUE, "lw": 1.4, "ls": (0, (4.0, 1.6))}  # told apart without colours, too
 # Which of the moves along e1, e2, a and of the turns about them a type forbids.
 FORBIDS = {
     "point": ("111", "000"), "point_2d": ("110", "000"), "hinge": ("111", "110"), "cylindrical": ("110", "110"),
@@ -25,31 +30,31 @@ def rows() -> Any:
     """The eight loop types, with what each forbids."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 5.4), dpi=100, layout="constrained")
+    figure = Figure(figsize=(10, 5.0), dpi=100, layout="constrained")
     axes: Any = figure.subplots(2, 4)
     for ax, (kind, (moves, turns)) in zip(axes.flat, FORBIDS.items(), strict=True):
         for k, (name, axis) in enumerate(AXES.items()):
-            colour = RED if moves[k] == "1" else GREEN
+            how = FORBIDDEN if moves[k] == "1" else FREE
             label = "r" if kind == "distance" and name == "a" else name
-            ax.annotate("", axis, (0, 0), arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.4})
-            ax.text(*(1.16 * axis), label, ha="center", va="center", color=colour, fontsize=10)
-            _arc(ax, axis, RED if turns[k] == "1" else GREEN)
+            ax.annotate("", axis, (0, 0), arrowprops={"arrowstyle": "-|>", **how})
+            ax.text(*(1.16 * axis), label, ha="center", va="center", color=how["color"], fontsize=11)
+            _arc(ax, axis, FORBIDDEN if turns[k] == "1" else FREE)
         ax.plot(0, 0, "o", color="black", ms=5)
         count = sum(map(int, moves + turns))
         ax.set_title(f"{kind}: {count} row{'s' if count > 1 else ''}", fontsize=11, family="monospace")
-        ax.set(xlim=(-1.3, 1.3), ylim=(-0.9, 1.4), aspect="equal")
+        ax.set(xlim=(-1.3, 1.3), ylim=(-0.6, 1.3), aspect="equal")
         ax.axis("off")
     return figure
 
 
-def _arc(ax: Any, axis: Any, colour: str) -> None:
+def _arc(ax: Any, axis: Any, how: Mapping[str, Any]) -> None:
     """A turn about an axis: an open ellipse across it, with a head."""
     along = axis / np.linalg.norm(axis)
     across = np.array([-along[1], along[0]])
     angle = np.linspace(0.6, 5.4, 40)[:, np.newaxis]
     at = 0.62 * axis + 0.21 * np.cos(angle) * across + 0.08 * np.sin(angle) * along
-    ax.plot(*at.T, color=colour, lw=1.7)
-    ax.annotate("", at[-1], at[-4], arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.2})
+    ax.plot(*at.T, **how)
+    ax.annotate("", at[-1], at[-4], arrowprops={"arrowstyle": "-|>", "color": how["color"], "lw": 1.2})
 
 
 def frames() -> Any:
@@ -81,8 +86,8 @@ def frames() -> Any:
             ax.annotate("", tip, where, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2})
             ax.text(*(where + 0.115 * np.array([np.cos(angle), np.sin(angle)])), letter, color=colour, ha="center")
         ax.text(where[0] - 0.14, where[1] + (0.075 if colour == ORANGE else 0.045), name, color=colour, ha="right")
-    ax.plot(*knee, "o", ms=13, mfc="none", mec=RED, mew=2)
-    ax.text(knee[0] - 0.14, knee[1] + 0.012, "cut here; the loop closes it: r = 0", color=RED, ha="right")
+    ax.plot(*knee, "o", ms=13, mfc="none", mec="black", mew=2)
+    ax.text(knee[0] - 0.14, knee[1] + 0.012, "cut here; the loop closes it: r = 0", color="black", ha="right")
     ax.set(aspect="equal", xlim=(-0.15, 0.82), ylim=(-0.09, 0.53))
     ax.axis("off")
     return figure
@@ -115,6 +120,7 @@ def pipeline() -> Any:
     return figure
 
 
+@look()
 def moving(path: Path, count: int = 60) -> None:
     """The five-bar under tracking control, as it moves."""
     from matplotlib.animation import FuncAnimation, PillowWriter
@@ -129,7 +135,7 @@ def moving(path: Path, count: int = 60) -> None:
         pose = ckc_pin.terms(mechanism, named).at.pose
         pins.append(np.vstack([pose.translation[[1, 2]], pose.p[:1], pose.translation[[4, 3]]])[:, :2])
     path_of_tip = run.points["tip"]
-    figure = Figure(figsize=(7.2, 3.8), dpi=80, layout="constrained")
+    figure = Figure(figsize=(6.0, 3.2), dpi=110)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
@@ -139,14 +145,15 @@ def moving(path: Path, count: int = 60) -> None:
     (right,) = pose_ax.plot([], [], "-o", color=ORANGE, lw=4, ms=5)
     pose_ax.set(aspect="equal", xlim=(-0.35, 0.6), ylim=(-0.6, 0.55))
     pose_ax.axis("off")
+    pose_ax.set_title("The paper's five-bar")
     columns = [run.column(name) for name in run.independent]
     for column, colour, name in zip(columns, (BLUE, ORANGE), ("θ₁", "θ₃"), strict=True):
         angles.plot(run.t, run.q_tree[:, column], color=colour, label=name)
-    angles.plot(run.t, np.pi / 3 * np.sin(run.t), ":", color="black", lw=1, label="desired")
-    angles.plot(run.t, np.pi / 4 * (1 - np.cos(run.t)), ":", color="black", lw=1)
+    angles.plot(run.t, np.pi / 3 * np.sin(run.t), ":", color="black", label="desired")
+    angles.plot(run.t, np.pi / 4 * (1 - np.cos(run.t)), ":", color="black")
     now = angles.axvline(0, color=GREY, lw=0.9)
-    angles.set(xlabel="t / s", ylabel="angle / rad")
-    angles.legend(fontsize=8)
+    angles.set(xlabel="t (s)", ylabel="angle (rad)", title="Tracking control")
+    figure.legend(loc="outside lower right", ncols=3)
 
     def draw(k: int) -> list[Any]:
         left.set_data(*pins[k][:3].T)

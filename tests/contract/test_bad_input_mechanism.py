@@ -101,6 +101,11 @@ LOOPS = [
     _add("spring on nothing", "[[spring]]\nstiffness = 1.0", "spring 1: give either joint, or frame_a and frame_b"),
     _add("spring on an unknown joint", '[[spring]]\njoint = "x"\nstiffness = 1.0', "'x'", COORDINATES),
     _add("negative spring", '[[spring]]\njoint = "theta_1"\nstiffness = -1.0', "stiffness = -1.0: a number of at"),
+    _add(
+        "damper and spring on a joint",
+        '[[spring]]\njoint = "theta_1"\ndamping = 1.0\n[[spring]]\njoint = "theta_1"\nstiffness = 1.0',
+        "two springs on joint 'theta_1'; give one with their stiffness and damping",
+    ),
     _add("force on nothing", '[[force]]\njoint = "x"\nvalue = 1.0', "'x'", COORDINATES),
     _edit("point frame", 'frame = "tip_left"\n', 'frame = "x"\n', "point 'tip': no link 'x'", LINKS),
 ]
@@ -186,6 +191,11 @@ COORDINATE_CHOICES = [
         "rotor on two joints",
         'name = "belt"\njoints = {theta_1 = 1.0, theta_3 = 1.0}\nrotor_inertia = 1e-3',
         "motor 'belt': rotor_inertia goes with a motor on one joint",
+    ),
+    _motor(
+        "gear beyond numbers",
+        'joint = "theta_1"\nratio = 1e200\nrotor_inertia = 1e-3',
+        "motor 'theta_1': ratio = 1e+200 with rotor_inertia = 0.001 is too large",
     ),
     _add("motors in two ways", '[[motor]]\njoint = "theta_1"', "actuated, motor: give one of them"),
     _edit("unknown guess", "theta_4 = -0.248", "theta_5 = 1.0", "q_guess: no coordinate 'theta_5'", COORDINATES),

@@ -16,10 +16,16 @@ from ckc_pin import InputError, NumericalError, inverse_dynamics
 from tests.conftest import assert_close
 from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
+from tests.contract.test_mechanism_keys import write
 
 KEYS = """t coordinates q_tree v_tree a_tree actuated tau loop_forces joint_forces exceeded redundant status
           message"""
 SHORT = ("--set", "t_end=0.2")
+
+
+class Swing:
+    def tau(self, t: float, terms: ckc_pin.Terms) -> list[float]:
+        return [0.2 * np.sin(5 * t + 1)]
 
 
 def test_json() -> None:
@@ -227,6 +233,24 @@ def test_a_passive_run_of_too_few_motors_is_no_mistake(bar: Path) -> None:
     broken = replace(recorded, v_tree=np.full_like(recorded.v_tree, np.nan))
     with pytest.raises(NumericalError):
         inverse_dynamics(broken)
+
+
+def test_what_moves_freely_needs_no_motor(tmp_path: Path) -> None:
+    """An arm turns on a body that floats: along the body's freedoms the forces are nothing, but for rounding."""
+    write(tmp_path, "free", "root.z = 0.5")
+    text = (tmp_path / "mechanism.toml").read_text(encoding="utf-8")
+    motor = text.replace("[[tree]]", 'actuated = ["turn"]\n[[tree]]')
+    (tmp_path / "mechanism.toml").write_text(motor, encoding="utf-8")
+    scene = tmp_path / "default.scene.toml"
+    scene.write_text(
+        'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n'
+        '[initial]\nat = "assembled"\n[initial.q_dot]\nroot.rx = 0.4\nroot.y = -0.2\nturn = 0.3\n'
+    )
+    recorded = ckc_pin.simulate(scene, controller=Swing())
+    found = inverse_dynamics(recorded)
+    assert found.status == "done"
+    assert np.ptp(recorded.tau) > 0.3
+    assert_close(found.tau, recorded.tau, 1e-12)
 
 
 def test_changes_go_with_a_name() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin import InputError, Run, Sampled, Simulator, Terms, simulate
+from ckc_pin import InputError, Run, Sampled, Simulator, Terms, load, simulate
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
 from tests.conftest import assert_close
 from tests.contract.helpers.bad import Bad, expect
@@ -291,6 +291,17 @@ class Both(Spring):
 def test_a_controller_has_one_method(controller: Any, says: str) -> None:
     with pytest.raises(InputError, match=says):
         simulate("five_bar/swing", controller=controller)
+
+
+def test_without_motors_q_is_chosen_as_without_the_key(bar: Path) -> None:
+    text = (bar / "mechanism.toml").read_text("utf-8")
+    chosen = []
+    for motors in ("", "actuated = []\n"):
+        keys = 'independent = ["theta_1", "theta_3"]\nactuated = ["theta_1", "theta_3"]\n'
+        (bar / "mechanism.toml").write_text(text.replace(keys, motors), "utf-8")
+        chosen.append(load(bar))
+    assert chosen[1].independent == chosen[0].independent == chosen[0].actuated
+    assert chosen[1].actuated == ()
 
 
 def test_what_no_motor_drives_is_named_and_torques_still_act(bar: Path) -> None:

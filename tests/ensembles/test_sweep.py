@@ -131,6 +131,17 @@ def test_a_full_disk_is_said_and_what_is_there_stays(tmp_path: Path) -> None:
     assert ckc("sweep", str(path), "--out", str(out), "--json", "--no-figures").json["done"] == 4000
 
 
+def test_names_may_have_slashes(tmp_path: Path) -> None:
+    """As joints of a robot description in a namespace have."""
+    path = written(tmp_path, 4, more='"a/b" = "energy"\n')
+    options = ("--worst", "a/b", "--worst", "end", "--indices", "2")
+    done = ckc("sweep", str(path), "--out", str(tmp_path / "o"), *options)
+    assert done.code == 0, done.err
+    assert results(tmp_path / "o")["a_b"].shape == (4,)
+    assert (tmp_path / "o" / "indices_a_b.png").exists()
+    assert len(list((tmp_path / "o").glob("worst_a_b_*/run.npz"))) == 3
+
+
 def test_the_store_of_another_sweep_is_left_alone(tmp_path: Path) -> None:
     path, out = written(tmp_path, members=3), tmp_path / "o"
     assert ckc("sweep", str(path), "--out", str(out), "--no-figures").code == 0
@@ -154,6 +165,10 @@ def test_the_store_of_another_sweep_is_left_alone(tmp_path: Path) -> None:
         ('path = "u"\n', [], "malformed TOML"),
         ("[extra]\n", [], "unknown key 'extra'"),
         ('status = "u"\n', [], "'status' is taken"),
+        ('member = "t"\n', [], "'member' is taken"),
+        ('"a/b" = "t"\na_b = "t"\n', [], "'a_b' is taken"),
+        ('"" = "t"\n', [], "'' can be no array's name"),
+        ('"zarr.json" = "t"\n', [], "'zarr.json' can be no array's name"),
     ],
 )
 def test_bad_input_is_one_message(tmp_path: Path, more: str, options: list[str], says: str) -> None:

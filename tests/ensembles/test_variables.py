@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,22 @@ def test_grids_lists_and_files_are_crossed(tmp_path: Path) -> None:
     assert values[:3].tolist() == [[0, 1, 10, 5], [0, 1, 10, 6], [0, 2, 20, 5]]
 
 
+def test_a_grid_takes_no_more_memory_than_is_asked_for() -> None:
+    tracemalloc.start()
+    try:
+        found = variables({"gravity.x": {"grid": {"start": -1.0, "stop": 2.0, "count": 10**9}}})
+        first, last = found.values(0, 3)[:, 0], found.values(10**9 - 2, 10**9)[:, 0]
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
+    assert found.count == 10**9
+    assert np.allclose(first, -1.0 + 3.0 / (10**9 - 1) * np.arange(3), rtol=0, atol=1e-15)
+    assert last[0] < last[1] == 2.0
+    for count in (1, 2, 7):
+        few = variables({"gravity.x": {"grid": {"start": -0.1, "stop": 0.7, "count": count}}}).values(0, count)
+        assert np.array_equal(few[:, 0], np.linspace(-0.1, 0.7, count))
+
+
 @pytest.mark.parametrize(
     ("specs", "says"),
     [
@@ -86,16 +103,21 @@ def test_grids_lists_and_files_are_crossed(tmp_path: Path) -> None:
         ({"gravity.x": {"uniform": [0, 1]}}, "members: say how many"),
         ({"gravity.x": {"file": "none.csv"}}, "no such file"),
         ({"gravity.x": {"file": "bad.csv"}}, "line 3: gravity.x: a number is needed"),
+        ({"epsilon": {"file": "endless.csv"}}, "line 3: epsilon: inf is not a finite number"),
         ({"gravity.y": {"file": "bad.csv"}}, "no column 'gravity.y'; there are gravity.x"),
         (
             {"gravity.x": {"grid": {"start": 0, "stop": 1, "count": 10**9}}, "gravity.y": [1.0, 2.0]},
             "at most 1000000000",
         ),
+        ({"gravity.x": ["x"]}, "gravity.x.list[0] = 'x': a number is needed"),
+        ({"gravity.x": [[1.0]]}, "gravity.x.list[0] = [1.0]: a number is needed"),
+        ({"gravity.x": [True]}, "gravity.x.list[0] = true: a number is needed"),
         ({}, "name at least one"),
     ],
 )
 def test_bad_variables_are_refused(tmp_path: Path, specs: dict[str, Any], says: str) -> None:
     (tmp_path / "bad.csv").write_text("gravity.x\n1\nx\n")
+    (tmp_path / "endless.csv").write_text("epsilon\n1\ninf\n")
     with pytest.raises(InputError) as error:
         variables(specs, folder=tmp_path)
     assert says in str(error.value)

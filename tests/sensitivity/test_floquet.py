@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a
 
-from ckc_pin import InputError
+from ckc_pin import InputError, load_scene
 from ckc_pin.simulation.floquet import floquet
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
@@ -84,6 +84,20 @@ def test_a_period_that_is_none_is_refused_by_how_much_it_misses(tmp_path: Path) 
     for period in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(InputError, match="positive number of seconds"):
             floquet(written(tmp_path, g, 0.2), period)
+
+
+def test_what_hardly_moves_has_not_come_back(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"period = 1e-06 s is none: after it y \(rate\) is off by"):
+        floquet(written(tmp_path, g, 0.2), 1e-6)
+    small = floquet(written(tmp_path, g, 1e-5), PERIOD, TIGHT)  # as small a motion that does come back
+    assert np.abs(small.run.q_tree[:, 0]).max() == pytest.approx(1e-5, rel=1e-6)
+
+
+def test_a_scene_is_taken_as_its_name_is(tmp_path: Path) -> None:
+    name = written(tmp_path, g, 0.05)
+    wanted = floquet(name, PERIOD, {"solver.rtol": 1e-9})
+    found = floquet(load_scene(name, {"solver.rtol": 1e-9}), PERIOD)
+    assert np.array_equal(found.monodromy, wanted.monodromy)
 
 
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:

@@ -44,12 +44,16 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         )
         raise InputError(says) from None
     if scheduler is None:
-        with (
-            LocalCluster(  # type: ignore[no-untyped-call]
+        try:
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
-            ) as cluster,
-            Client(cluster) as client,  # type: ignore[no-untyped-call]
-        ):
+            )
+        except (OSError, RuntimeError) as error:
+            raise InputError(
+                f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
+                '`if __name__ == "__main__":`, since each process reads the script again'
+            ) from None
+        with cluster, Client(cluster) as client:  # type: ignore[no-untyped-call]
             yield client
         return
     try:

@@ -11,9 +11,9 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
-import numpy as np
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.kinds import a_kind, require_flag, require_kind, require_path, require_table
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.simulation.ensembles.members import Chunk, Members
 from ckc_pin.simulation.ensembles.outputs import Function
@@ -21,6 +21,7 @@ from ckc_pin.simulation.ensembles.progress import Advance, bar
 from ckc_pin.simulation.ensembles.spec import read_sweep, scene_path, sweep_of
 from ckc_pin.simulation.ensembles.store import RESULTS, Store, require_libraries
 from ckc_pin.simulation.ensembles.task import SweepTask
+from ckc_pin.simulation.scene import CHANGES, as_toml
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -109,17 +110,19 @@ def ensemble(
     KeyboardInterrupt
         Chunks that were finished are in `out`.
     """
+    _require_tables(scene, variables, outputs, changes)
+    _require_means(out, threads, workers, scheduler, chunk, progress)
     require_libraries()
     import xarray as xr
 
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
-        "scene": str(scene), "seed": seed, "changes": dict(changes or {}),
+        "scene": str(scene), "seed": as_toml(seed), "changes": as_toml(changes or {}),
         "variables": {name: _plain(x) for name, x in variables.items()},
         "outputs": {name: _plain(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
     if members is not None:
-        data["members"] = members
+        data["members"] = as_toml(members)
     spec = sweep_of(data, Sources("ensemble", Path()))
     if functions and len(functions) == len(outputs):
         spec = msgspec.structs.replace(spec, outputs={})  # a file has to name one
@@ -134,6 +137,29 @@ def ensemble(
         raise InputError(summary.message)
     found = xr.open_zarr(summary.place, consolidated=False, decode_timedelta=False)
     return found.load() if out is None else found
+
+
+def _require_tables(scene: Any, variables: Any, outputs: Any, changes: Any) -> None:
+    """Refuse what says what to run, where it is of the wrong kind (InputError); what is in it is checked later."""
+    require_kind(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
+    require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
+    require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
+    if changes is not None:
+        require_table(changes, "ensemble: changes", CHANGES)
+
+
+def _require_means(out: Any, threads: Any, workers: Any, scheduler: Any, chunk: Any, progress: Any) -> None:
+    """Refuse what says how to run it, where it is of the wrong kind (InputError)."""
+    if out is not None:
+        require_path(out, "ensemble: out")
+    if scheduler is not None:
+        require_kind(scheduler, str, "ensemble: scheduler", 'an address, as "tcp://10.0.0.1:8786"')
+    require_flag(progress, "ensemble: progress")
+    for name, count in (("threads", threads), ("workers", workers), ("chunk", chunk)):
+        if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+            raise InputError(f"ensemble: {name}: {a_kind(count)} was given; it takes a whole number of at least 1")
+    if scheduler and workers:
+        raise InputError("ensemble: workers and scheduler: give one of them")
 
 
 def sweep_task(path: str | Path) -> SweepTask:
@@ -237,6 +263,4 @@ def _chunk(members: Members, count: int, threads: int) -> int:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else as_toml(value)

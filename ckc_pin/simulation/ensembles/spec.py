@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import is_path
@@ -207,8 +206,8 @@ def _variables(key: str, table: Mapping[str, Any]) -> Any:
     for name, value in table.items():
         if isinstance(value, dict) and value and not any(inner in KINDS for inner in value):
             yield from _variables(f"{key}{name}.", value)
-        elif isinstance(value, list | np.ndarray):
-            yield f"{key}{name}", {"list": [float(x) for x in value]}
+        elif isinstance(value, list):
+            yield f"{key}{name}", {"list": value}
         else:
             yield f"{key}{name}", value
 

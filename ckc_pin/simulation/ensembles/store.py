@@ -14,7 +14,7 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
 
-__all__ = ["RESULTS", "Store", "require_libraries"]
+__all__ = ["RESULTS", "Store", "array_name", "require_libraries"]
 
 RESULTS = "results.zarr"
 FORMAT = 1
@@ -116,9 +116,9 @@ class Store:
         group: Any = self._group
         try:
             for k, name in enumerate(names):
-                group[_key(name)][at] = chunk.values[:, k]
+                group[array_name(name)][at] = chunk.values[:, k]
             for name, values in chunk.outputs.items():
-                group[_key(name)][at] = values
+                group[array_name(name)][at] = values
             if any(chunk.message):
                 group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
             group[STATUS_NAME][at] = chunk.status
@@ -163,7 +163,7 @@ class Store:
         every = dict.fromkeys(members.names, ((), ())) | members.shapes
         for name, (dims, shape) in every.items():
             group.create_array(
-                _key(name), shape=(self.count, *shape), chunks=(chunk, *shape), dtype="f8", fill_value=np.nan,
+                array_name(name), shape=(self.count, *shape), chunks=(chunk, *shape), dtype="f8", fill_value=np.nan,
                 dimension_names=("member", *dims), attributes={"is": "variable" if name in members.names else "output"},
             )  # fmt: skip
         group.create_array(
@@ -181,17 +181,20 @@ class Store:
 
 def _require_free_names(members: Members) -> None:
     """Refuse outputs that are called like something else in the store."""
-    for name in (*members.names, *members.shapes):
-        if name in (STATUS_NAME, MESSAGE_NAME, *members.outputs.labels, "time") or (
-            name in members.names and name in members.shapes
-        ):
+    taken = {STATUS_NAME, MESSAGE_NAME, "member", "time", *members.outputs.labels, *map(array_name, members.names)}
+    for name in members.shapes:
+        key = array_name(name)
+        if key in taken:
             raise InputError(f"outputs: {name!r} is taken; choose another name")
+        if key in ("", ".", "..", "zarr.json") or key.startswith("__") or "\0" in key:
+            raise InputError(f"outputs: {name!r} can be no array's name in Zarr; choose another name")
+        taken.add(key)
 
 
 def _is_used(dimension: str, members: Members) -> bool:
     return any(dimension in dims for dims, _ in members.shapes.values())
 
 
-def _key(name: str) -> str:
-    """An array's name in the group: a slash would make groups of it."""
+def array_name(name: str) -> str:
+    """Return what a variable or an output is called in the store: a slash would make groups of it."""
     return name.replace("/", "_")

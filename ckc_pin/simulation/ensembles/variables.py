@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from io import StringIO
 
 import numpy as np
@@ -13,12 +13,14 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.ensembles.spec import MOST, SweepSpec, VariableSpec
+from ckc_pin.simulation.ensembles.spec import MOST, GridSpec, SweepSpec, VariableSpec
 
 __all__ = ["Variables"]
 
 BLOCK = 1024  # members that one stream of random numbers serves
 MOST_LHS = 10_000_000  # members of a Latin hypercube, which is one whole permutation a variable
+ByPoint = Callable[[IntArray], Array]
+
 CROSSED = ("grid", "list", "file")
 
 
@@ -46,7 +48,7 @@ class Variables:
         self._seed, self._source = spec.seed, sources.name
         self._axes = self._crossed(sources)
         self._random = [name for name in self.names if spec.variables[name].kind not in CROSSED]
-        points = math.prod(len(next(iter(axis.values()))) for axis in self._axes)
+        points = math.prod(size for size, _ in self._axes)
         if self._random and spec.members is None:
             raise InputError(f"{sources.name}: members: say how many; {self._random[0]} is drawn at random")
         self._each = spec.members or 1
@@ -70,27 +72,27 @@ class Variables:
     def _of(self, kind: str) -> list[str]:
         return [name for name in self.names if self._specs[name].kind == kind]
 
-    def _crossed(self, sources: Sources) -> list[dict[str, Array]]:
-        """What is crossed: values by variable, several where they are columns of one file."""
-        axes: list[dict[str, Array]] = []
-        files: dict[str, dict[str, Array]] = {}
+    def _crossed(self, sources: Sources) -> list[tuple[int, dict[str, ByPoint]]]:
+        """What is crossed: how many points, and values by variable, several where they are columns of one file."""
+        axes: list[tuple[int, dict[str, ByPoint]]] = []
+        files: dict[str, dict[str, ByPoint]] = {}
         for name, spec in self._specs.items():
             if spec.grid is not None:
-                axes.append({name: np.linspace(spec.grid.start, spec.grid.stop, spec.grid.count)})
+                axes.append((spec.grid.count, {name: partial(_on_grid, spec.grid)}))
             elif spec.values is not None:
-                axes.append({name: np.array(spec.values, dtype=float)})
+                axes.append((len(spec.values), {name: np.array(spec.values, dtype=float).__getitem__}))
             elif spec.file is not None:
+                column = _column(sources, spec.file, name)
                 if spec.file not in files:
                     files[spec.file] = {}
-                    axes.append(files[spec.file])
-                files[spec.file][name] = _column(sources, spec.file, name)
+                    axes.append((len(column), files[spec.file]))
+                files[spec.file][name] = column.__getitem__
         return axes
 
     def _points(self, point: IntArray) -> dict[str, Array]:
         found: dict[str, Array] = {}
-        for axis in reversed(self._axes):
-            size = len(next(iter(axis.values())))
-            found |= {name: values[point % size] for name, values in axis.items()}
+        for size, axis in reversed(self._axes):
+            found |= {name: values(point % size) for name, values in axis.items()}
             point = point // size
         return found
 
@@ -137,6 +139,13 @@ class Variables:
         return qmc.LatinHypercube(len(self._of("lhs")), rng=np.random.default_rng(self._seed)).random(self.count)
 
 
+def _on_grid(grid: GridSpec, point: IntArray) -> Array:
+    """Return the values of some points, as `numpy.linspace` has them: a grid may have more than memory holds."""
+    step = (grid.stop - grid.start) / max(grid.count - 1, 1)
+    inner = point * step + grid.start
+    return np.where((point == grid.count - 1) & (grid.count > 1), grid.stop, inner)
+
+
 def _draw(spec: VariableSpec, random: np.random.Generator) -> Array:
     """Draw a whole block, so that a member's number does not depend on who else is asked for."""
     a, b = getattr(spec, spec.kind)
@@ -162,6 +171,8 @@ def _column(sources: Sources, file: str, name: str) -> Array:
             values.append(float(row[at]))
         except (IndexError, ValueError):
             raise InputError(f"{where}: line {k}: {name}: a number is needed") from None
+        if not math.isfinite(values[-1]):
+            raise InputError(f"{where}: line {k}: {name}: {row[at].strip()} is not a finite number")
     if not values:
         raise InputError(f"{where}: no rows")
     return np.array(values)

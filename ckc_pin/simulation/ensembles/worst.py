@@ -9,6 +9,7 @@ import numpy as np
 
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation.ensembles.members import DONE, STOPPED, Members
+from ckc_pin.simulation.ensembles.store import array_name
 from ckc_pin.simulation.simulate import simulate
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ MOST = 3
 
 def worst_members(results: xr.Dataset, name: str, most: int = MOST) -> list[int]:
     """Return the members where the largest number of an output is largest, the worst first."""
-    values = np.abs(results[name].to_numpy().reshape(results.sizes["member"], -1))
+    values = np.abs(results[array_name(name)].to_numpy().reshape(results.sizes["member"], -1))
     size = np.where(np.isin(results["status"].to_numpy(), (DONE, STOPPED)), np.fmax.reduce(values, axis=1), np.nan)
     order = np.argsort(-size, kind="stable")  # NaN last
     return [int(k) for k in order[:most] if np.isfinite(size[k])]
@@ -34,8 +35,8 @@ def save_worst(members: Members, results: xr.Dataset, name: str, out: Path, most
     """
     folders = []
     for k in worst_members(results, name, most):
-        values = np.array([float(results[variable][k]) for variable in members.names])
-        folder = out / f"worst_{name.replace('/', '_')}_{k}"
+        values = np.array([float(results[array_name(variable)][k]) for variable in members.names])
+        folder = out / f"worst_{array_name(name)}_{k}"
         try:
             run = simulate(members.scene_name, members.changes_of(values))
         except CkcError:

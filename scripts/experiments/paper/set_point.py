@@ -74,7 +74,7 @@ def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
         key="set-point-lyapunov",
         verdict="holds" if holds else "does not hold",
         figures=(draw_lyapunov(records, figures),),
-        table=(("formulation", "largest increase / J", "rounding / J", "rate: relative difference"), rows),
+        table=(("formulation", "largest increase (J)", "rounding (J)", "rate: relative difference"), rows),
         **said(
             "claims/set-point-lyapunov",
             start=records[rows[0][0]].value[0],
@@ -142,7 +142,7 @@ def gain_claim(
         verdict="holds" if own.status == "certified" else "holds with a condition",
         figures=(draw_set(case, own, run, DIVISIONS, figures),),
         table=(
-            ("start, gain", "verdict", "V_L(start) / J", "safe up to / J", "least eigenvalue", "least |s|", "points"),
+            ("start, gain", "verdict", "V_L(start) (J)", "safe up to (J)", "least eigenvalue", "least |s|", "points"),
             rows,
         ),
         **said("claims/set-point-gain-condition", own=own, entered=entered, cases=len(rows), certified=certified),
@@ -164,7 +164,7 @@ def uniqueness_claim(
         key="set-point-unique",
         verdict="holds" if unique else "does not hold",
         commands=(f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60",),
-        table=(("start, gain", "gain condition", "solutions", "stable", "stable at / rad"), rows),
+        table=(("start, gain", "gain condition", "solutions", "stable", "stable at (rad)"), rows),
         **said(
             "claims/set-point-unique",
             unique=unique,

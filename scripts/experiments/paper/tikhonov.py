@@ -194,12 +194,12 @@ def _draw(rho: Sequence[Convergence], actual: Sequence[Convergence], figures: Pa
         ax.set(xscale="log", yscale="log", xlabel="ε (s)", ylabel=f"largest difference from the DAE at t = {T_END:g} s")
         ax.set_title(title)
     for c, name, colour in zip(rho, ("from rest", "moving"), COLOURS, strict=False):
-        axes[0].plot(c.epsilons, c.x, "o-", color=colour, label=f"{name}: (q, q̇) [rad, rad/s]")
-        axes[0].plot(c.epsilons, c.z, "s--", color=colour, label=f"{name}: z [rad]", markerfacecolor="none")
+        axes[0].plot(c.epsilons, c.x, "o-", color=colour, label=f"{name}: q, q̇ (rad, rad/s)")
+        axes[0].plot(c.epsilons, c.z, "s--", color=colour, label=f"{name}: z (rad)", markerfacecolor="none")
     axes[0].plot(rho[0].epsilons, rho[0].epsilons, ":", color=BLACK, label="slope 1")
     names = ("from rest", "moving", "moving, against the DAE with\nq̇ from behind the layer")
     for c, name, colour in zip(actual, names, COLOURS, strict=False):
-        axes[1].plot(c.epsilons, c.x, "o-", color=colour, label=f"{name}: (q, q̇)")
+        axes[1].plot(c.epsilons, c.x, "o-", color=colour, label=f"{name}: q, q̇")
     axes[1].plot(actual[0].epsilons, actual[0].epsilons, ":", color=BLACK, label="slope 1")
     axes[1].sharey(axes[0])
     for ax in axes:

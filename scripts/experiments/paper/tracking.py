@@ -97,7 +97,7 @@ def lyapunov_claim(
         key="tracking-lyapunov",
         verdict="does not hold" if not kept else "holds" if rho <= SAME else "holds with a condition",
         figures=(draw_lyapunov(whole, drawn, layer, figures),),
-        table=(("run", "w(0) / m", "C at", "t / s", "rate: relative difference", "V rises by / J"), tuple(rows)),
+        table=(("run", "w(0) (m)", "C at", "t (s)", "rate: relative difference", "V rises by (J)"), tuple(rows)),
         **said(
             "claims/tracking-lyapunov",
             on=max(x.mismatch for x in on),
@@ -210,7 +210,7 @@ def deviations_claim(t: Array, error: Array, found: Mapping[str, Deviation], fig
         verdict="does not hold" if largest < EXACT else "holds",
         figures=(draw_deviations(t, error, {name: found[name] for name in SHOWN}, figures),),
         table=(
-            ("run", "largest deviation / rad", "share that repeats", "strongest period / 2 pi s", "largest |phi| / m"),
+            ("run", "largest deviation (rad)", "share that repeats", "strongest period (2π s)", "largest |phi| (m)"),
             tuple((name, *_deviation_cells(x)) for name, x in found.items()),
         ),
         **said(
