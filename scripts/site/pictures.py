@@ -11,7 +11,6 @@ import numpy as np
 import ckc_pin
 from ckc_pin.view.canvas import look
 from ckc_pin.view.style import COLOURS, GREY
-from scripts.site import theory_pictures
 
 __all__ = ["main"]
 
@@ -171,10 +170,6 @@ def main() -> None:
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)
         print(f"written: {IMAGES / place}")
-    for name in theory_pictures.__all__:
-        with look():
-            getattr(theory_pictures, name)().savefig(IMAGES / "theory" / f"{name}.png")
-        print(f"written: {IMAGES / 'theory' / name}.png")
     moving(IMAGES / "moving.gif")
     print(f"written: {IMAGES / 'moving.gif'}")
 

@@ -1,4 +1,4 @@
-"""The theory's figures, drawn from runs that give the same numbers each time, and from a page's own table."""
+"""The theory's figures, of runs that give the same numbers each time: ``python -m scripts.site.theory_pictures``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import ckc_pin
 from ckc_pin.mechanism.library import library
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.view import style
-from ckc_pin.view.canvas import say
+from ckc_pin.view.canvas import line, look, say
 
-__all__ = ["error_control", "friction", "generated"]
+__all__ = ["error_control", "friction", "generated", "main"]
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TURN = (1.5, 3.0)  # s, of five_bar/friction: theta_1 comes to rest and turns round
@@ -65,7 +65,7 @@ def friction() -> Any:
     rate.set(ylabel=r"$\dot{\theta}_1$ (rad/s)", ylim=(-0.3, 0.6))
     rate.legend()
     say(rate, "a)  a joint turns round", "events: it rests, shaded; smoothed: it creeps")
-    force.set(xlabel="$t$ (s)", ylabel="friction / F", ylim=(-1.25, 1.25), yticks=[-1, 0, 1])
+    force.set(xlabel="$t$ (s)", ylabel="friction over F", ylim=(-1.25, 1.25), yticks=[-1, 0, 1])
     say(force, "b)  what friction gives", "F against the motion, and at rest what is needed, up to F")
     _bounces(bounce)
     return figure
@@ -122,8 +122,6 @@ def generated() -> Any:
     say(text, "a)  how long the text is")
     time.set(xlabel="operations", ylabel="a right-hand side (µs)")
     say(time, "b)  what it takes to run")
-    from ckc_pin.view.canvas import line
-
     shape = {"marker": "o", "linestyle": "none", "markersize": 4}
     time.legend(handles=[line(style.GREY, "written out", **shape),
                          line(style.GREY, "Pinocchio's terms", markerfacecolor="white", **shape)],
@@ -135,10 +133,10 @@ def _table(page: str) -> list[tuple[Any, ...]]:
     """Rows of the page's table: the mechanism's name, then numbers, None where there is none."""
     head = page.index("| mechanism | n |")
     found: list[tuple[Any, ...]] = []
-    for line in page[head:].splitlines()[2:]:
-        if not line.startswith("|"):
+    for row in page[head:].splitlines()[2:]:
+        if not row.startswith("|"):
             break
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
         numbers = [float(x.replace(",", "")) if re.fullmatch(r"[\d.,]+", x) else None for x in cells[1:]]
         found.append((cells[0], *numbers))
     return found
@@ -192,3 +190,16 @@ def _amplified() -> tuple[Any, Any, Any]:
         of_z.append(np.linalg.norm(rho, 2))
         of_rate.append(np.linalg.norm(bent[:, 0]))
     return np.array(margins), np.array(of_z), np.array(of_rate)
+
+
+def main() -> None:
+    """Draw all of them."""
+    for draw in (friction, generated, error_control):
+        path = DOCS / "images" / "theory" / f"{draw.__name__}.png"
+        with look():
+            draw().savefig(path)
+        print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main()
