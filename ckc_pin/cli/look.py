@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
 import ckc_pin
@@ -78,16 +80,20 @@ def compile_(mechanism: str, as_json: bool) -> None:
     """Compile a mechanism's terms; its runs take them from then on."""
     from time import perf_counter
 
-    from ckc_pin.generated.library import compiled, find
+    from ckc_pin.generated.library import cache_folder, compiled, find
 
     loaded, started = ckc_pin.load(mechanism), perf_counter()
     there = find(loaded)
     with Working(f"compiling {mechanism}"):
         library = there or compiled(loaded, on_written=_expected)
     seconds = perf_counter() - started
+    kept = Path(library.path).parent == cache_folder()
+    if not kept:  # in a folder that goes with this process
+        errors().print(f"not kept: {cache_folder()} cannot be written to; XDG_CACHE_HOME names another folder's parent")
+    file = library.path if kept else None
     if as_json:
-        print_json({"mechanism": loaded.name, "file": library.path, "compiled": there is None, "seconds": seconds})
+        print_json({"mechanism": loaded.name, "file": file, "compiled": there is None, "seconds": seconds})
     elif there:
-        print(f"{loaded.name}: its terms were compiled before: {library.path}")
+        print(f"{loaded.name}: its terms were compiled before: {file}")
     else:
-        print(f"{loaded.name}: compiled and checked against Pinocchio in {seconds:.1f} s: {library.path}")
+        print(f"{loaded.name}: compiled and checked against Pinocchio in {seconds:.1f} s: {file or 'not kept'}")

@@ -31,7 +31,7 @@ def new(folder: Path, as_json: bool) -> None:
     there = next((path for path in (folder, *paths) if path.exists() and (path != folder or not folder.is_dir())), None)
     if there is not None:
         raise InputError(f"{there}: is there already; give another name")
-    make_folder(folder)
+    make_folder(folder, "")
     for path, template in zip(paths, templates, strict=True):
         write_whole(path, template.read_text(encoding="utf-8").replace("NAME", name))
     if as_json:

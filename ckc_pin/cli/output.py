@@ -64,13 +64,13 @@ def kept(out: Path | None, what: str) -> str:
     return f"not saved: --out DIR keeps {what}" if out is None else f"written to {out}"
 
 
-def make_folder(out: Path) -> None:
-    """Find out before a run, not after it, whether it can be saved."""
+def make_folder(out: Path, option: str = "--out ") -> None:
+    """Find out before a run, not after it, whether it can be saved; `option` is what the command calls the folder."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
-        raise InputError(f"--out {out}: no folder that can be written to: {error.strerror}") from None
+        raise InputError(f"{option}{out}: no folder that can be written to: {error.strerror}") from None
 
 
 class ProgressBar:

@@ -45,6 +45,7 @@ def assemble(
     tolerance: float,
     restarts: int = RESTARTS,
     within: tuple[Array, Array] | None = None,
+    rounded: float = 0.0,
 ) -> Assembly:
     """Close the loops from a guess by damped Gauss-Newton, moving as little as it takes.
 
@@ -61,11 +62,14 @@ def assemble(
         How many perturbed starts to try when the guess itself does not lead there.
     within : pair of (n,) arrays, or None
         Bounds of the coordinates. What one is beyond them counts as open too, in its own unit.
+    rounded : float
+        What |phi| may be in the end where rows contradict each other so far: no other start is looked for then, which
+        would end at another configuration for the sake of a miss that is a little less.
 
     Returns
     -------
     Assembly
-        From the guess itself when that closes; otherwise the best of some perturbed restarts.
+        From the guess itself when that closes; otherwise the first of some perturbed restarts that does, or the best.
     """
 
     def at(q: Array) -> tuple[Array, Callable[[], Array]]:
@@ -78,19 +82,22 @@ def assemble(
         rows = np.eye(tree.n)[beyond != 0]
         return np.concatenate([phi, beyond[beyond != 0]]), lambda: np.vstack([closure.jacobian(pose), rows]) * free
 
-    def outcome(q: Array) -> Assembly:
+    def outcome(start: Array) -> tuple[Assembly, bool]:
+        """Where a start leads, and whether that is closed as far as the numbers allow."""
+        q = _gauss_newton(tree, start, at, tolerance)
         phi, _ = at(q)
-        return Assembly(q, float(np.abs(phi).max(initial=0.0)), closure.misses(phi[: closure.rows]))
+        open_, beyond = (float(np.abs(part).max(initial=0.0)) for part in np.split(phi, [closure.rows]))
+        found = Assembly(q, max(open_, beyond), closure.misses(phi[: closure.rows]))
+        return found, open_ <= max(tolerance, rounded) and beyond <= tolerance
 
     random = np.random.default_rng(0)  # the same answer every time
-    best = outcome(_gauss_newton(tree, q_tree, at, tolerance))
+    best, closed = outcome(q_tree)
     for attempt in range(restarts):
-        if best.residual <= tolerance:
+        if closed:
             break
         spread = 0.1 * 1.4**attempt
-        start = tree.integrate(q_tree, free * tree.reach * random.uniform(-spread, spread, tree.n))
-        trial = outcome(_gauss_newton(tree, start, at, tolerance))
-        if trial.residual < best.residual:
+        trial, closed = outcome(tree.integrate(q_tree, free * tree.reach * random.uniform(-spread, spread, tree.n)))
+        if closed or trial.residual < best.residual:
             best = trial
     return best
 
@@ -180,13 +187,13 @@ def _close(linkage: Linkage, start: Array) -> Assembly:
 def _nearest(linkage: Linkage, start: Array, within: tuple[Array, Array] | None = None) -> Assembly:
     """Assemble with the independent coordinates held at their guess; if that fails, with all free."""
     closed: Assembly | None = None
-    tree, exact = linkage.tree, EXACT * linkage.size
+    tree, exact, rounded = linkage.tree, EXACT * linkage.size, ROUNDED * linkage.size
     if linkage.spec.independent is not None:
         free = np.ones(tree.n)
         free[tree.indices(tuple(linkage.spec.independent), "independent")] = 0.0
-        closed = assemble(tree, linkage.closure, start, free, exact, within=within)
-    if closed is None or closed.residual > ROUNDED * linkage.size:
-        closed = assemble(tree, linkage.closure, start, np.ones(tree.n), exact, within=within)
+        closed = assemble(tree, linkage.closure, start, free, exact, within=within, rounded=rounded)
+    if closed is None or closed.residual > rounded:
+        closed = assemble(tree, linkage.closure, start, np.ones(tree.n), exact, within=within, rounded=rounded)
     return closed
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from copy import deepcopy
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import numpy as np
+
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.kinds import require_kind
+from ckc_pin.mechanism.kinds import is_number, require_kind, require_table
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Changes
@@ -44,7 +48,24 @@ def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Me
         A mechanism that cannot exist as described.
     """
     require_kind(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*texts_of(name), changes)
+    return build(*texts_of(name), None if changes is None else _as_read(changes))
+
+
+def _as_read(changes: Any) -> Changes:
+    """Return numbers by name as a file has them: Python's, three of them as a tuple (InputError)."""
+    takes = 'a table of numbers by name, three of a vector, as {"link.link_2.mass": 0.3}'
+    require_table(changes, "load: changes", takes)
+    found: dict[str, Any] = {}
+    for name, given in changes.items():
+        value = given.tolist() if isinstance(given, np.generic | np.ndarray) else given
+        several = isinstance(value, list | tuple)
+        for x in value if several else (value,):
+            if not is_number(x) or not abs(x) <= sys.float_info.max:
+                raise InputError(f"load: changes: {name} = {given!r:.80}; it takes {takes}")
+        found[name] = tuple(map(float, value)) if several else float(value)
+        if several and len(value) != 3:
+            raise InputError(f"load: changes: {name}: {len(value)} numbers were given; a vector has three")
+    return found
 
 
 def as_mechanism(given: Any, who: str) -> Mechanism:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.kinds import is_number
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.spec_parts import MotorSpec
 from ckc_pin.mechanism.tree import Array, Tree
@@ -84,9 +85,11 @@ class Motors:
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(self.names)}")
         try:
-            return np.array([float(values.get(name, fill)) for name in self.names])
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{what}: {dict(values)!r:.80} is no table of numbers by actuator") from None
+            if all(map(is_number, values.values())):
+                return np.array([float(values.get(name, fill)) for name in self.names])
+        except OverflowError:  # an integer of any size
+            pass
+        raise InputError(f"{what}: {dict(values)!r:.80} is no table of numbers by actuator")
 
 
 def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:

@@ -126,6 +126,13 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
     assert load(tmp_path / "robots" / "arm-2").name == "arm-2"
 
 
+def test_a_new_folder_that_cannot_be_is_refused_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    answer = ckc("new", str(tmp_path / "file" / "mine"))
+    assert answer.code == 2
+    assert answer.err == f"error: {tmp_path / 'file' / 'mine'}: no folder that can be written to: Not a directory\n"
+
+
 def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mine)
     Path("default.scene.toml").rename("drop.scene.toml")

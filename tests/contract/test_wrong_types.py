@@ -12,6 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import Event, InputError, Run, Sampled, SetPoint, Simulator, Terms, Tracking, load, load_scene, simulate
 
+MASS = "link.link_2.mass"
 SWING, SHORT = "five_bar/swing", {"t_end": 0.01}
 Q = {"theta_1": -1.2, "theta_3": -1.9}
 
@@ -67,6 +68,15 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "on_output": (lambda: simulate(SWING, SHORT, on_output=3), r"on_output: 3 was given; .* \(t, q_tree\)"),
     "profile": (lambda: simulate(SWING, SHORT, profile="no"), "profile: 'no' was given; it takes True or False"),
     "load": (lambda: load(None), "load: name: None was given; it takes a mechanism's shipped name or its path"),
+    "load with words": (lambda: load("five_bar", {MASS: "x"}), "load: changes: link.link_2.mass = 'x'; it takes"),
+    "load with a flag": (lambda: load("five_bar", {MASS: True}), "load: changes: link.link_2.mass = True; it takes"),
+    "load with no number": (lambda: load("five_bar", {MASS: np.nan}), "load: changes: link.link_2.mass = nan; it"),
+    "load beyond numbers": (lambda: load("five_bar", {MASS: 10**400}), "load: changes: link.link_2.mass = 1000"),
+    "load half a vector": (lambda: load("five_bar", {"gravity": [0, 0]}), "gravity: 2 numbers were given; a vector"),
+    "load a number": (lambda: load("five_bar", 3), "load: changes: 3 was given; it takes a table of numbers by name"),
+    "load by number": (lambda: load("five_bar", {3: 1.0}), "load: changes, a key: 3 was given"),
+    "torques in words": (lambda: Simulator(SWING).step(None, 0.01, tau={"theta_1": "0.5"}), "tau: .* is no table of"),
+    "torques as flags": (lambda: Simulator(SWING).step(None, 0.01, tau={"theta_1": True}), "tau: .* is no table of"),
     "load a scene by name": (lambda: load(SWING), "'five_bar/swing' is a scene; its mechanism is 'five_bar'"),
     "load_scene": (lambda: load_scene(five_bar()), "load_scene: name: a Mechanism was given"),
     "check": (lambda: ckc_pin.check(run()), "check: what: a Run was given; it takes a mechanism or a scene"),
@@ -119,6 +129,20 @@ def test_it_says_what_it_takes(name: str) -> None:
     assert re.search(says, message), message
     assert "\n" not in message
     assert len(message) < 400
+
+
+def test_numbers_of_numpy_and_lists_are_taken_as_pythons() -> None:
+    wanted = load("five_bar", {MASS: 0.3, "gravity": (0.0, -5.0, 0.0)}).tree.model
+    for mass, gravity in ((np.float64(0.3), np.array([0, -5.0, 0])), (np.array(0.3), [0, -5, 0])):
+        found = load("five_bar", {MASS: mass, "gravity": gravity}).tree.model
+        assert found == wanted
+    pair = np.array([-1.5, -1.0])
+    taken = ckc_pin.ensemble(
+        SWING, {"initial.q.theta_1": {"uniform": pair}}, {"e": "energy"}, members=np.int64(2), seed=np.int32(3),
+        changes={"t_end": np.float64(0.01), "solver.terms": "pinocchio"}, progress=False,
+    )  # fmt: skip
+    assert taken.sizes["member"] == 2
+    assert (np.abs(taken["initial.q.theta_1"] + 1.25) <= 0.25).all()
 
 
 def test_a_plain_function_is_a_controller_as_good_as_an_object() -> None:

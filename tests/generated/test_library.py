@@ -176,6 +176,17 @@ def test_the_command_tells_what_it_did(folder: Path, tmp_path: Path) -> None:
     assert "41 coordinates; terms are written out for trees of up to 40" in too_large.err
 
 
+def test_the_command_tells_what_it_could_not_keep(folder: Path) -> None:
+    """As in a container whose home is read-only: what it compiled goes with it, and there is no file to name."""
+    folder.parent.parent.mkdir(exist_ok=True)
+    folder.parent.write_text("no folder")
+    answer = ckc("compile", NAME, "--json")
+    assert answer.code == 0
+    assert answer.json["file"] is None
+    assert answer.json["compiled"] is True
+    assert f"not kept: {folder} cannot be written to" in answer.err
+
+
 def test_a_caller_says_another_limit(folder: Path) -> None:
     mechanism = load(NAME)
     with pytest.raises(InputError, match="3 coordinates; terms are written out for trees of up to 2"):

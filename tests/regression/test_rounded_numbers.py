@@ -1,0 +1,55 @@
+"""Loops whose numbers are rounded: rows contradict each other a little, and the mechanism is where its guess says."""
+
+from __future__ import annotations
+
+from math import sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin import load
+
+# Bennett's linkage: opposite links alike, a / sin(alpha) = b / sin(beta); of its five rows two are independent
+A, ALPHA, BETA = 0.6, 0.4, 1.1
+B = A * sin(BETA) / sin(ALPHA)
+GUESS = (0.7, -3.33, -0.73)
+
+LINK = (
+    '<link name="{0}"><inertial><origin xyz="0.1 0.02 0.01"/><mass value="1"/>'
+    '<inertia ixx="0.01" iyy="0.011" izz="0.012" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = (
+    '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/>'
+    '<origin xyz="{3} 0 0" rpy="{4} 0 0"/><axis xyz="0 0 1"/></joint>'
+)
+
+
+def bennett(folder: Path, digits: int) -> Path:
+    folder.mkdir()
+    b = round(B, digits)
+    chain = [("j1", "base", "one", 0, 0), ("j2", "one", "two", A, ALPHA), ("j3", "two", "three", b, BETA)]
+    links = ['<link name="base"/>', *(LINK.format(name) for name in ("one", "two", "three"))]
+    (folder / "bennett.urdf").write_text(
+        f'<robot name="bennett">{"".join(links)}{"".join(JOINT.format(*joint) for joint in chain)}</robot>'
+    )
+    (folder / "mechanism.toml").write_text(
+        'name = "bennett"\nurdf = "bennett.urdf"\n'
+        f"q_guess = {{j1 = {GUESS[0]}, j2 = {GUESS[1]}, j3 = {GUESS[2]}}}\n"
+        '[[loop]]\nname = "pin"\ntype = "hinge"\n'
+        f'frame_a = {{link = "three", xyz = [{A}, 0.0, 0.0], rpy = [{ALPHA}, 0.0, 0.0]}}\n'
+        f'frame_b = {{link = "world", xyz = [{-b}, 0.0, 0.0], rpy = [{-BETA}, 0.0, 0.0]}}\n'
+    )
+    return folder
+
+
+@pytest.mark.parametrize("digits", [8, 7, 6])
+def test_assembled_where_the_exact_one_is(digits: int, tmp_path: Path) -> None:
+    """Not where another start happens to leave a little less open, here on the other side of a folded pose."""
+    exact, found = load(bennett(tmp_path / "exact", 17)), load(bennett(tmp_path / "rounded", digits))
+    assert np.abs(exact.assembled.phi).max() < 1e-12
+    assert np.abs(exact.q_tree - GUESS).max() < 0.2
+    assert found.d == exact.d == 1
+    assert 1e-11 < np.abs(found.assembled.phi).max() < 10.0**-digits
+    assert any("numbers in the files are rounded" in warning for warning in found.warnings)
+    assert np.abs(found.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
