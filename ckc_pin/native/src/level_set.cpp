@@ -91,6 +91,12 @@ bool LevelSet::at_last(double t, In y) {
   return true;
 }
 
+bool LevelSet::shows(In y, int k, bool rate, double& value) const {
+  const auto at = std::find(core.q.begin(), core.q.end(), k);
+  if (at == core.q.end() || !(rate || chart_.plain())) return false;
+  return value = y((rate ? core.d : 0) + (at - core.q.begin())), true;
+}
+
 // Close phi(q, z) = w on z from q_tree_; J and phi_z's factorization are those of where it ends.
 bool LevelSet::newton(double tolerance) {
   double size = 0.0;

@@ -17,6 +17,7 @@ class LevelSet : public System {
   bool exact(double t, In y) override { return state(t, y, tolerance_); }
   bool at_start(double t, In y) override { return exact(t, y) && (arrived_ = core.q_tree, true); }
   bool at_last(double t, In y) override;
+  bool shows(In y, int k, bool rate, double& value) const override;
   double margin() override { return phi_z_margin(); }
   Accepted accept(double t, Out y, double margin) override;
   bool own_partition(double t, Out y, bool& changed) override;
