@@ -17,7 +17,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.many import integrate
+from ckc_pin.mechanism.many import difference, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec_frames import Vector3
@@ -212,7 +212,8 @@ class PointPath:
         weights = [_lagrange(np.arange(1, STRIDE + 1) / STRIDE + k) for k in range(NODES - 1)]
         for k, at in enumerate(coarse[:-1]):
             first = int(np.clip(k - NODES // 2 + 1, 0, len(coarse) - NODES))
-            steps = np.array([tree.difference(at.q_tree, other.q_tree) for other in coarse[first : first + NODES]])
+            around = np.array([other.q_tree for other in coarse[first : first + NODES]])
+            steps = difference(tree, np.tile(at.q_tree, (NODES, 1)), around)
             near.append(integrate(tree, np.tile(at.q_tree, (STRIDE, 1)), weights[k - first] @ steps))
         return self.point.meet(np.concatenate(near), self.place(self.times)[0], self.start)
 
@@ -243,13 +244,7 @@ class PointPath:
     def _follow(self, at: Kinematics, t: float) -> Kinematics | None:
         """Go on to the place at t, unless the inverse kinematics or the independent coordinates fail on the way."""
         there = self.point.follow(at, self.place(t)[0])
-        return there if there is not None and self._side(at) * self._side(there) > 0 else None
-
-    def _side(self, at: Kinematics) -> float:
-        """The sign of det phi_z, which changes where the assembly branch does: q cannot lead across."""
-        own = self.point.mechanism.kinematics(at.q_tree)
-        square = own.phi_z.shape[0] == own.phi_z.shape[1]
-        return float(np.sign(own.phi_z_factor.determinant())) if square else 1.0
+        return there if there is not None and self.point.side(at.J) * self.point.side(there.J) > 0 else None
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
         """Return q_d, its rate and its acceleration at time t (s), each of shape (d,).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,7 +15,7 @@ from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.closure import Closure, Selected
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.kinds import require_kind
-from ckc_pin.mechanism.many import evaluate, integrate
+from ckc_pin.mechanism.many import difference, evaluate, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.tree import Array
@@ -206,36 +205,44 @@ class Point:
         (count, nq) array, or None
             None unless each is met, from nearer by than neighbours are apart, on one side of what is singular.
         """
-        tree, z = self.mechanism.tree, self.mechanism.partition.z
+        tree = self.mechanism.tree
         levels = self._level(wanted, begin)
         if levels.shape[1] != self.mechanism.n:
             return None
-        room = max(np.abs(tree.difference(a, b)).max() for a, b in itertools.pairwise(near))
-        q_tree, moved = near, np.zeros(len(near))
+        room = np.abs(difference(tree, near[:-1], near[1:])).max()
+        q_tree, moved, place = near.copy(), np.zeros(len(near)), np.empty((len(near), 3))
+        left, side = np.arange(len(near)), np.zeros((2, len(near)))
         for _ in range(MOST_CORRECTIONS):
-            rows, J_rows = evaluate(tree, self.extended.closure, q_tree)
+            rows, J_rows = evaluate(tree, self.extended.closure, q_tree[left])
             phi, J = rows[:, self._chosen], J_rows[:, self._chosen]
-            side = np.sign(np.linalg.det(J))
-            if not side.all() or np.any(side != side[0]):
+            place[left], side[:, left] = rows[:, self.extended.place[:3]], (np.sign(np.linalg.det(J)), self.side(J))
+            if not side.all() or np.any(side != side[:, :1]):
                 return None
-            if np.abs(phi - levels).max() <= self.mechanism.tolerance:
+            miss = levels[left] - phi
+            open_ = np.abs(miss).max(axis=1) > self.mechanism.tolerance
+            left = left[open_]
+            if not len(left):
                 break
-            step = np.asarray(np.linalg.solve(J, (levels - phi)[..., np.newaxis])[..., 0], dtype=float)
-            moved += np.abs(step).max(axis=1)
+            step = np.asarray(np.linalg.solve(J[open_], miss[open_][..., np.newaxis])[..., 0], dtype=float)
+            moved[left] += np.abs(step).max(axis=1)
             if not np.all(moved <= room):
                 return None
-            q_tree = integrate(tree, q_tree, step)
+            q_tree[left] = integrate(tree, q_tree[left], step)
         else:
             return None
-        place = rows[:, self.extended.place[:3]]
         place += self.position(q_tree[0]) - place[0]
-        if not np.abs(place - wanted).max() <= OFF * self.mechanism.size:
-            return None
-        if len(z) == len(self.extended.loops):
-            side = np.sign(np.linalg.det(J_rows[:, self.extended.loops][:, :, z]))
-            if not side.all() or np.any(side != side[0]):
-                return None
-        return q_tree
+        return q_tree if np.abs(place - wanted).max() <= OFF * self.mechanism.size else None
+
+    def side(self, J: Array) -> Array:
+        """Return on which side of where q stops to be coordinates Psi is, by its Jacobians (..., n, n).
+
+        The sign of det phi_z, which changes where the assembly branch does: q cannot lead across. 1 where phi_z is not
+        square.
+        """
+        loops, z = len(self.extended.loops), self.mechanism.partition.z
+        if loops != len(z):
+            return np.ones(J.shape[:-2])
+        return np.asarray(np.sign(np.linalg.det(J[..., :loops, :][..., z])))
 
     def rates(self, psi: Kinematics, x_dot: Array, x_ddot: Array) -> tuple[Array, Array]:
         """Return v' and its rate, shape (n,) each, that give the point a velocity and an acceleration (3,)."""

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
 
-__all__ = ["ManyPoses", "evaluate", "integrate", "joined"]
+__all__ = ["ManyPoses", "difference", "evaluate", "integrate", "joined"]
 
 Renumber = Callable[[IntArray], IntArray]
 
@@ -120,6 +120,13 @@ def integrate(tree: Tree, q_tree: Array, step: Array) -> Array:
     return np.array([pin.integrate(tree.model, q, dq) for q, dq in zip(q_tree, step, strict=True)]).reshape(
         q_tree.shape
     )
+
+
+def difference(tree: Tree, start: Array, end: Array) -> Array:
+    """Return the tangent steps (count, n) from configurations to others, (count, nq) each."""
+    if tree.flat:
+        return end - start
+    return np.array([pin.difference(tree.model, a, b) for a, b in zip(start, end, strict=True)]).reshape(-1, tree.n)
 
 
 class ManyPoses(Pose):

@@ -17,7 +17,7 @@ from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.native.tables import closure_table, core_table
+from ckc_pin.native.tables import closure_table, core_table, packed
 
 __all__ = ["control_table"]
 
@@ -163,7 +163,7 @@ def _point(path: PointPath) -> dict[str, Any] | None:
     level = np.concatenate([np.zeros(len(extended.free)), kept])
     return {
         "kind": "point",
-        "model": mechanism.tree.model.saveToString(),
+        "model": packed(mechanism.tree.model),
         "place": mechanism.tree.place.tolist(),
         "closure": closure_table(extended.closure, mechanism.n),
         "psi": psi.tolist(),

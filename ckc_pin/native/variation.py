@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, Tree
-from ckc_pin.native.tables import core_table
+from ckc_pin.native.tables import core_table, packed
 
 __all__ = ["Varying", "variation_table"]
 
@@ -99,7 +99,7 @@ def variation_table(
         springs[key] = _spread(springs[key], real_v, model.nv)
     index = {x.name: model.joints[column[x.name]].idx_v if x.name in column else x.index for x in varying}
     return {
-        "model": model.saveToString(),
+        "model": packed(model),
         "place": Tree(model).place.tolist(),
         "real_q": real_q.tolist(),
         "real_v": real_v.tolist(),

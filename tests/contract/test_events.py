@@ -77,6 +77,28 @@ def test_what_ends_on_zero_waits_for_the_next_step() -> None:
     assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0)[0] == []
 
 
+@pytest.mark.parametrize(("root", "slope"), [(0.3, 1.0), (0.3, -40.0), (0.0007, 1.0), (0.9995, 3.0)])
+def test_a_root_is_looked_for_where_that_costs_less(root: float, slope: float) -> None:
+    """In a function that is off by 1e-7, and then in the right one, which is asked little more than once."""
+    asked: list[float] = []
+
+    def exact(t: float) -> float:
+        asked.append(t)
+        return float(slope * np.sinh(t - root))
+
+    found, _, _ = _core.walk(lambda t: float(slope * np.sinh(t - root) + 1e-7 * np.cos(5 * t)), 0.0, 1.0, 0, 0.0, exact)
+    assert_close([t for t, _ in found], [root], 2e-12)
+    assert len(asked) <= 2
+
+
+@pytest.mark.parametrize("lift", [1e-7, -1e-7])
+def test_where_two_roots_are_nearly_one_what_costs_less_decides(lift: float) -> None:
+    """The right function crosses by less than the other is off by, or does not: both are the same to the tolerance."""
+    found, _, _ = _core.walk(lambda t: (t - 0.3) ** 2 - R**2, 0.0, 1.0, 0, 0.0, lambda t: (t - 0.3) ** 2 + lift)
+    assert [direction for _, direction in found] == [-1, 1]
+    assert_close([t for t, _ in found], [0.3 - R, 0.3 + R], 5 * R)
+
+
 # --- against numpy and SciPy ---------------------------------------------------------------------
 
 

@@ -104,6 +104,13 @@ def test_auto_is_as_good_as_the_better_method_where_joints_change_often(scene: s
     assert rhs["auto"] <= (1.0 + TOLERANCE) * min(rhs["DOP853"], rhs["Radau"])
 
 
+def test_events_are_located_with_few_terms() -> None:
+    """Joints that slide and stick are looked at by what the state shows, and by what a right-hand side has left."""
+    run = simulate("talos/default", profile=True)
+    assert len(run.events) > 150
+    assert run.profile["D_tree"]["calls"] <= 1.4 * run.stats["rhs"]
+
+
 def test_an_uncontrolled_run_evaluates_no_matrix_C() -> None:
     """An acceleration asks for D' and the bias, never for C', nor for the matrix rho_dot."""
     profile = simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, profile=True).profile

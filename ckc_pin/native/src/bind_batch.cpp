@@ -70,17 +70,16 @@ class Batch {
  public:
   Batch(const Batch&) = delete;
   Batch(const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
-        const nb::list& events, Given reach, double tolerance, int threads)
-      : events_(nb::len(events)) {
+        const nb::list& events, double tolerance, int threads)
+      : tolerance_(tolerance), events_(nb::len(events)) {
     require(threads > 0, "threads: at least one is needed");
     for (int k = 0; k < threads; ++k) {
       auto worker = std::make_unique<Worker>();
       prepare(worker->run, core, formulation, control, solver, events);
       Core& own = *worker->run.core;
       require(own.tree.roots.empty(), "a batch is of joints of one freedom");
-      require(reach, own.n, "reach");
       worker->q = own.q, worker->z = own.z;
-      worker->closing = std::make_unique<Closing>(own, reach, tolerance);
+      worker->closing = std::make_unique<Closing>(own);
       worker->v_tree.setZero(own.n), worker->w.setZero(own.rows.closure.rows);
       workers_.push_back(std::move(worker));
     }
@@ -160,7 +159,8 @@ class Batch {
     task.why.data()[k] = not_started;
     for (const Varied& varied : task.varied) core.vary(varied.part, row(varied.numbers, core.size_of(varied.part)));
     core.split(worker.q, worker.z);
-    if (!worker.closing->close(task.base) || !worker.closing->move(row(task.q, core.d))) return;
+    Closing& closing = *worker.closing;  // nothing moves: w and the start's velocity are zero
+    if (!closing.close(task.base, worker.w, tolerance_) || !closing.move(row(task.q, core.d), tolerance_)) return;
     core.reduce();
     core.velocity(row(task.q_dot, core.d), worker.v_tree);
     if (!worker.v_tree.allFinite()) return;
@@ -192,6 +192,7 @@ class Batch {
     }
   }
 
+  const double tolerance_;
   const size_t events_;
   std::vector<std::unique_ptr<Worker>> workers_;
 };
@@ -203,8 +204,8 @@ void bind_batch(nb::module_& m) {
   for (int k = 0; k < static_cast<int>(Stop::raised) + 1; ++k) names.append(reasons[k]);
   m.attr("reasons") = nb::tuple(names);
   nb::class_<Batch>(m, "Batch")
-      .def(nb::init<const nb::dict&, const nb::dict&, const nb::dict&, const nb::dict&, const nb::list&, Given, double, int>(),
-           "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a, "reach"_a, "tolerance"_a, "threads"_a)
+      .def(nb::init<const nb::dict&, const nb::dict&, const nb::dict&, const nb::dict&, const nb::list&, double, int>(),
+           "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a, "tolerance"_a, "threads"_a)
       .def("run", &Batch::run, "base"_a, "q"_a, "q_dot"_a, "varied"_a, "instants"_a, "columns"_a, "until"_a, "out"_a);
 }
 

@@ -38,7 +38,7 @@ std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
   const auto knots = get<Matrix>(table, "knots");
   const auto times = get<Vector>(table, "times");
   require(knots.cols() == times.size() && times.size() > 1 && knots.allFinite(), "knots: a column a time is needed");
-  return std::make_unique<PointMotion>(get<std::string>(table, "model"), get<Indices>(table, "place"), std::move(task),
+  return std::make_unique<PointMotion>(model_of(table), get<Indices>(table, "place"), std::move(task),
                                        motion_of(get<nb::dict>(table, "path"), 3), get<Indices>(table, "q"), times,
                                        knots, get<double>(table, "tolerance"), get<double>(table, "end"),
                                        get<std::string>(table, "past_end"));

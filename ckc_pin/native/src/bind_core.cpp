@@ -97,7 +97,7 @@ std::unique_ptr<Core> core_of(const nb::dict& table) {
   Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
   std::unique_ptr<Written> written;
   if (table.contains("written")) written = written_of(nb::cast<nb::tuple>(table["written"]));
-  auto core = std::make_unique<Core>(get<std::string>(table, "model"), get<Indices>(table, "place"),
+  auto core = std::make_unique<Core>(model_of(table), get<Indices>(table, "place"),
                                      closure_of(nb::cast<nb::dict>(table["closure"])),
                                      springs_of(nb::cast<nb::dict>(table["springs"])),
                                      joints_of(nb::cast<nb::dict>(table["joints"])), get<int>(table, "rank"), scales,

@@ -10,14 +10,18 @@ using namespace nb::literals;
 
 namespace {
 
-// All sign changes of a function over [start, end], as events find them: ([(t, direction)], sign, on zero).
-nb::tuple walk_over(const nb::callable& function, double start, double end, int sign, double floor) {
+// All sign changes of a function over [start, end], as events find them: ([(t, direction)], sign, on zero); `exact`: the
+// function where the other one is a little off.
+nb::tuple walk_over(const nb::callable& function, double start, double end, int sign, double floor, nb::object exact) {
   const Vector places = walk_places();
   Vector values(places.size());
-  const Gap gap = [&](double t, double& value) { return value = nb::cast<double>(function(t)), true; };
+  const auto gap_of = [](const nb::object& f) -> Gap {
+    return [&f](double t, double& value) { return value = nb::cast<double>(f(t)), true; };
+  };
+  const Gap gap = gap_of(function), better = gap_of(exact);
   for (Eigen::Index k = 0; k < places.size(); ++k) gap(start + (end - start) * places(k), values(k));
   Walk walked;
-  walk(gap, start, end, values, sign, floor, walked);
+  walk(gap, start, end, values, sign, floor, walked, exact.is_none() ? nullptr : &better);
   nb::list found;
   for (const auto& [t, direction] : walked.found) found.append(nb::make_tuple(t, direction));
   return nb::make_tuple(found, walked.sign, walked.on_zero);
@@ -100,7 +104,8 @@ nb::object modes(Run& run, Matrix jacobian) {
 }  // namespace
 
 void bind_parts(nb::module_& m, nb::class_<Run>& loop) {
-  m.def("walk", &walk_over, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a);
+  m.def("walk", &walk_over, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a,
+        "exact"_a.none() = nb::none());
   m.def("stiff", &stiff, "jacobian"_a, "duration"_a);
   m.def("hermite_weights", &weights, "times"_a, "t"_a);
   nb::class_<Predicting>(m, "Predictor")

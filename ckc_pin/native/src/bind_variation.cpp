@@ -57,7 +57,7 @@ nb::object motion(Run& run) {
 }  // namespace
 
 VariationTable variation_of(const nb::dict& table) {
-  VariationTable found{get<std::string>(table, "model"),
+  VariationTable found{model_of(table),
                        get<Indices>(table, "place"),
                        get<Indices>(table, "real_q"),
                        get<Indices>(table, "real_v"),

@@ -46,6 +46,12 @@ T get(const nb::dict& table, const char* key) {
   return nb::cast<T>(table[key]);
 }
 
+// A model as Pinocchio serializes it.
+inline std::string model_of(const nb::dict& table) {
+  const auto model = get<nb::bytes>(table, "model");
+  return {model.c_str(), model.size()};
+}
+
 // Read doubles from an array, ten times sooner than an array's way through DLPack; false where it is none of that size.
 inline bool read(nb::handle from, Out to) {
   Py_buffer found;

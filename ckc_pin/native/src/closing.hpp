@@ -1,4 +1,4 @@
-// The way from a closed configuration to another q, for many starts at once: what `sigma` of the readable reference does
+// Newton's method on z, and the way from a closed configuration to another q: what `sigma` of the readable reference does
 // along its straight line. Where that ends early nobody says why; the reference does.
 #pragma once
 
@@ -8,22 +8,23 @@ namespace ckc {
 
 class Closing {
  public:
-  Closing(Core& core, Vector reach, double tolerance);
+  explicit Closing(Core& core);
 
-  // From a configuration that is nearly closed to the nearest closed one of the same q; the core is there then.
-  bool close(In q_tree);
+  // Close phi(q, z) = w on z from q_tree, the largest part that z can close to `tolerance`, or to rounding; false where
+  // that is not got to. J and phi_z's factorization are those of where the core is then.
+  bool close(In q_tree, In w, double tolerance, bool to_rounding = false);
   // From where the core is, closed, along the straight line to q; false where that cannot be followed on its branch, or
   // phi_z is singular at its end. Joints of one freedom alone.
-  bool move(In q);
+  bool move(In q, double tolerance);
+
+  long corrections = 0;
+  int expected = -1;  // corrections after which D' will be wanted, and which the last time took; negative: it will not
 
  private:
-  bool newton();  // from q_tree_
-  double unclosed();
+  double unclosed();  // of residual_
 
   Core& core_;
-  const Vector reach_;  // (n): what a step is measured in
-  const double tolerance_;
-  Vector q_tree_, at_, step_, residual_, z_, dq_;
+  Vector q_tree_, at_, step_, residual_, z_, dq_, none_;
 };
 
 }  // namespace ckc

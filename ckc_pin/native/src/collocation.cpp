@@ -95,12 +95,7 @@ void Collocation::integrate(const Table& table, double span) {
 }
 
 bool Collocation::rate(double at, In y, Out y_dot) {
-  if (work_.rhs >= work_.most_rhs) {
-    work_.spent = true;
-    return false;
-  }
-  ++work_.rhs;
-  return system_.rate_on_closure(at, y, y_dot);
+  return work_.one_more() && system_.rate_on_closure(at, y, y_dot);
 }
 
 // y' at the stages, NaN where it does not exist.

@@ -35,6 +35,7 @@ void Dae::set(In q_tree, bool with_inertia) {
 bool Dae::place(In y) {
   q_tree_ = y.head(core.tree.nq);
   if (!q_tree_.allFinite()) return false;
+  if (placed_ == core.sets && q_tree_ == core.q_tree) return true;  // though to normalise it again may change a digit
   core.tree.normalize(q_tree_);
   if (placed_ != core.sets || q_tree_ != core.q_tree) set(q_tree_);
   return true;
@@ -211,6 +212,23 @@ bool Dae::at_last(double, In y) {
   return true;
 }
 
+bool Dae::as_is(double, In y) {
+  if (!place(y)) return false;
+  velocity = v_tree = y.segment(core.tree.nq, core.n);
+  independent(core.q_tree, velocity);
+  return true;
+}
+
+bool Dae::shows(In y, int k, bool rate, double& value) const {
+  const int nq = core.tree.nq;
+  if (!rate && nq != core.n && !std::binary_search(core.tree.single.begin(), core.tree.single.end(), k)) return false;
+  return value = y(rate ? nq + k : core.tree.place[k]), true;
+}
+
+void Dae::put_exact(Out y) const {
+  if (projects_) y.head(core.tree.nq) = core.q_tree, y.segment(core.tree.nq, core.n) = velocity;
+}
+
 Accepted Dae::accept(double, Out y, double) {
   const int n = core.n;
   if (!projects_) return Accepted::kept;
@@ -219,7 +237,7 @@ Accepted Dae::accept(double, Out y, double) {
   const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
   if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return Accepted::kept;
   if (!project(y)) return Accepted::refused;
-  y.head(core.tree.nq) = core.q_tree, y.tail(n) = velocity;
+  put_exact(y);
   return Accepted::changed;
 }
 

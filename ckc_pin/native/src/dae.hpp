@@ -14,6 +14,9 @@ class Dae : public System {
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override;
   bool at_last(double t, In y) override;
+  bool as_is(double t, In y) override;
+  bool shows(In y, int k, bool rate, double& value) const override;
+  void put_exact(Out y) const override;
   bool place(In y) override;
   Accepted accept(double t, Out y, double margin) override;
   void rates(std::vector<std::pair<int, int>>& of) const override;

@@ -55,7 +55,12 @@ class PointMotion : public Motion {
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
 
  private:
+  static constexpr int nodes = 3;  // of the interpolation between knots, of degree 5
+  bool place();  // psi's rows at q_tree_; false where they are not finite, or determine nothing
   bool close();
+  void fill(const Vector& path, const Vector* level);  // wanted_, one of psi's rows each
+  bool knot_rate(Eigen::Index knot);
+  bool predict(double t, Eigen::Index first);  // q_tree_, from the knots from there on
 
   Tree tree_;
   Rows rows_;
@@ -66,8 +71,8 @@ class PointMotion : public Motion {
   Matrix knots_;
   double tolerance_, end_;
   std::string past_end_;
-  double t_ = 0;  // of the last one: where it was and how fast it moved
-  bool known_ = false;
+  Matrix rates_;             // (n, count): how fast it moves at the knots,
+  std::vector<char> known_;  // of which that was found; some are asked for, and the last may be singular
   Vector q_tree_, v_, a_, wanted_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
   Matrix J_;
   Factor factor_;

@@ -11,6 +11,8 @@ namespace ckc {
 constexpr double rounding = 1e-12;    // of the largest value in the step: counts as zero
 constexpr double near_zero = 0.25;    // of the function's range in the step: an extremum so near to zero is refined
 constexpr double t_tolerance = 1e-12; // s
+constexpr int most_steps = 6;         // of the secant method from a root that is nearly right,
+constexpr double secant = 1e-3;       // of the step: over which it begins; of its first step, what that may be wrong by
 constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
 constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
 constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
@@ -101,6 +103,28 @@ bool root(const Gap& gap, const std::pair<double, double>& start, const std::pai
   return exists;
 }
 
+// From a root of `gap` to the one next to it of the function that gap is off from by little.
+bool refine(const Gap& gap, const Gap& exact, const std::pair<double, double>& start,
+            const std::pair<double, double>& end, double& t) {
+  const double width = secant * (end.first - start.first), rough = t;
+  const double left = std::max(t - width, start.first), right = std::min(t + width, end.first);
+  double below, above;
+  if (!gap(left, below) || !gap(right, above)) return false;
+  double slope = (above - below) / (right - left), at = t, before = t, value_before = 0.0, value;
+  for (int k = 0; k < most_steps && slope * end.second > 0.0; ++k) {
+    if (!exact(at, value)) return false;
+    if (k && value != value_before) slope = (value - value_before) / (at - before);
+    const double step = value / slope, accuracy = t_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(at);
+    before = at, value_before = value;
+    at = std::clamp(at - step, start.first, end.first);
+    if (!(std::abs(step) * (k ? 1.0 : secant) > accuracy)) return t = at, true;
+  }
+  double first, last;
+  if (!exact(start.first, first) || !exact(end.first, last)) return false;
+  t = rough;
+  return first * last < 0.0 ? root(exact, {start.first, first}, {end.first, last}, t) : true;
+}
+
 }  // namespace
 
 const Vector& walk_places() {
@@ -109,7 +133,7 @@ const Vector& walk_places() {
   return once;
 }
 
-bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked) {
+bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked, const Gap* exact) {
   const double zero = std::max(floor, rounding * values.cwiseAbs().maxCoeff());
   const Vector& places = walk_places();
   Points& points = walked.points;
@@ -125,6 +149,7 @@ bool walk(const Gap& gap, double from, double to, In values, int sign, double fl
     if (now && walked.sign && walked.sign != now) {
       double t;
       if (!root(gap, last, point, t)) return false;
+      if (exact && last.second * point.second < 0.0 && !refine(gap, *exact, last, point, t)) return false;
       walked.found.emplace_back(t, now);
     }
     if (now) walked.sign = now, last = point;
@@ -186,28 +211,57 @@ void Events::monitor_joints(In coordinates, In velocity) {
 }
 
 void Events::jump() {
-  known_ = false;
+  known_ = false, end_holds_ = std::numeric_limits<double>::quiet_NaN();
   last_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN());
 }
 
-// The core is at the end of the step, which the right-hand side was evaluated at last.
-void Events::take_end(End& end) {
+// The core is at the end of a step, which the right-hand side was evaluated at last, as f.
+void Events::take_end(End& end, In f) {
   system_.core.tree.to_coordinates(system_.core.q_tree, end.q);
   end.v = system_.velocity;
-  end.accelerated = system_.tree_acceleration(step_.f_new, end.a);
+  end.accelerated = system_.tree_acceleration(f, end.a);
+}
+
+double Events::holding() const {
+  Joints& joints = system_.core.joints;
+  return joints.locked.empty() ? std::numeric_limits<double>::quiet_NaN() : joints.margin();
+}
+
+void Events::begun() {
+  if (events_.empty()) return;
+  if (values_at_ != step_.t) jump();
+  take_end(start_, step_.f), known_ = true, values_at_ = step_.t;
+  for (size_t k = 0; k < events_.size(); ++k)
+    if (events_[k].of == Event::holding) last_[k] = holding();
 }
 
 bool Events::at(Interpolant& motion, double t) {
+  closed_ = only_y;
   if (t == step_.t_new)
     y_ = step_.y_new;
   else if (t == step_.t)
     y_ = step_.y;
-  else if (!motion.between(t, y_))
-    return false;
-  return system_.exact(t, y_);
+  else
+    return motion.between(t, y_);
+  return true;
+}
+
+bool Events::place(double t, Closed wanted) {
+  if (closed_ >= wanted) return true;
+  closed_ = wanted;
+  return wanted == exactly ? system_.exact(t, y_) : system_.as_is(t, y_);
 }
 
 bool Events::value(int k, double t, double& gap) {
+  const Event& event = events_[k];
+  if (event.of <= Event::q_dot && system_.shows(y_, event.coordinate, event.of == Event::q_dot, gap))
+    return gap = event.sign * (gap - event.value), true;
+  return place(t, event.of == Event::holding ? as_y_is : exactly) && value_there(k, t, gap);
+}
+
+bool Events::exact_value(int k, double t, double& gap) { return place(t, exactly) && value_there(k, t, gap); }
+
+bool Events::value_there(int k, double t, double& gap) {
   const Event& event = events_[k];
   Core& core = system_.core;
   switch (event.of) {
@@ -242,23 +296,24 @@ bool Events::value(int k, double t, double& gap) {
 }
 
 void Events::arrived() {
-  if (!events_.empty()) take_end(end_);
+  if (!events_.empty()) take_end(end_, step_.f_new), end_holds_ = holding();
 }
 
 bool Events::sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride) {
   const double h = step_.t_new - step_.t;
-  const bool first_known = values_at_ == step_.t && std::none_of(wanted_.begin(), wanted_.end(), [&](int k) {
-    return std::isnan(last_[k]);
-  });
   for (Eigen::Index i = first; i < places_.size(); i += stride) {
-    if (i == 0 && first_known) {
-      for (int k : wanted_) values_(0, k) = last_[k];
-      continue;
-    }
-    const double t = i + 1 == places_.size() ? step_.t_new : step_.t + h * places_(i);
+    const bool ends = i + 1 == places_.size();
+    const double t = ends ? step_.t_new : step_.t + h * places_(i);
     if (!at(motion, t)) return false;
-    for (int k : wanted_)
-      if (!value(k, t, values_(i, k))) return false;
+    for (int k : wanted_) {
+      double known = std::numeric_limits<double>::quiet_NaN();
+      if (i == 0 && values_at_ == step_.t) known = last_[k];
+      if (ends && events_[k].of == Event::holding) known = end_holds_;
+      if (!std::isnan(known))
+        values_(i, k) = known;
+      else if (!value(k, t, values_(i, k)))
+        return false;
+    }
   }
   return true;
 }
@@ -268,7 +323,8 @@ bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   if (events_.empty()) return true;
   wanted_.clear(), sampled_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k)
-    if (active_[k] && !(silent && !events_[k].own) && (!signs_[k] || !ruled_out(events_[k]))) wanted_.push_back(k);
+    if (active_[k] && !(silent && !events_[k].own) && !(signs_[k] && (ruled_out(events_[k]) || holds_by_far(k))))
+      wanted_.push_back(k);
   if (!wanted_.empty()) {
     const bool locked = std::any_of(wanted_.begin(), wanted_.end(), [&](int k) { return events_[k].of == Event::holding; });
     if (!sample(motion, 0, locked ? 2 : 1)) return false;
@@ -280,6 +336,9 @@ bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
   known_ = !std::isfinite(halt);
   if (known_)
+    for (size_t k = 0; k < events_.size(); ++k)
+      if (events_[k].of == Event::holding) last_[k] = end_holds_;
+  if (known_)
     for (int k : sampled_) last_[k] = values_(places_.size() - 1, k);
   std::swap(start_, end_);
   return true;
@@ -288,9 +347,13 @@ bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
 bool Events::find(Interpolant& motion, bool last, double& halt) {
   found_.clear();
   for (int k : wanted_) {
-    const auto gap = [&](double t, double& value_there) { return at(motion, t) && value(k, t, value_there); };
-    if (!walk(std::cref(gap), step_.t, step_.t_new, values_.col(k), signs_[k], events_[k].floor, walks_[k])) return false;
+    const auto value_at = [&](double t, double& there) { return at(motion, t) && value(k, t, there); };
+    const auto exact_at = [&](double t, double& there) { return at(motion, t) && exact_value(k, t, there); };
+    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate nothing
+    const Event& event = events_[k];
+    const bool rough = event.of <= Event::q_dot || event.of == Event::holding;
     Walk& walked = walks_[k];
+    if (!walk(gap, step_.t, step_.t_new, values_.col(k), signs_[k], event.floor, walked, rough ? &exact : nullptr)) return false;
     if (last && walked.on_zero && walked.sign && !events_[k].own) walked.found.emplace_back(step_.t_new, -walked.sign);
     for (const auto& [t, direction] : walked.found) {
       if (events_[k].direction != 0 && events_[k].direction != direction) continue;

@@ -48,9 +48,10 @@ using Gap = std::function<bool(double, double&)>;
 
 constexpr int walk_degree = 8;
 const Vector& walk_places();  // in the step, from 0 to 1
-// `values`: at those places of [from, to]; `sign`: what it came with; `floor`: what counts as zero, beside rounding.
-// False where the function has no value.
-bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked);
+// `values`: at those places of [from, to]; `sign`: what it came with; `floor`: what counts as zero, beside rounding;
+// `exact`: the function where `gap` is one that costs less and is off by little. False where the function has no value.
+bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked,
+          const Gap* exact = nullptr);
 
 class Events {
  public:
@@ -58,6 +59,7 @@ class Events {
 
   void begin();  // a motion begins
   void jump();   // it goes on from a state that is not the last step's end
+  void begun();  // the core is there, as the right-hand side left it
   void arrived();  // the core is where the step just made ends, as the right-hand side left it
   // Locate events in the step just made; `halt`: when the first one that stops happens, else infinite. `last`: the
   // motion ends with this step; `silent`: only the loop's own are looked for. False where a function has no value:
@@ -78,10 +80,18 @@ class Events {
     Vector q, v, a;
     bool accelerated = false;
   };
+  // How closed the loops are where an event is looked at.
+  enum Closed { only_y, as_y_is, exactly };
   bool ruled_out(const Event& event) const;
+  bool holds_by_far(int k);
+  // At y_: a coordinate or a rate from y alone where y shows it, what holds with the loops as open as y has them.
   bool value(int k, double t, double& gap);
+  bool exact_value(int k, double t, double& gap);
+  bool value_there(int k, double t, double& gap);  // the core being at y_
   bool at(Interpolant& motion, double t);
-  void take_end(End& end);
+  bool place(double t, Closed wanted);  // the core at y_
+  void take_end(End& end, In f);
+  double holding() const;  // what holds, at the state that the right-hand side was evaluated at last
   bool sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride);
   bool holds(int k) const;  // by the values at every second place
   bool find(Interpolant& motion, bool last, double& halt);
@@ -96,12 +106,14 @@ class Events {
   End start_, end_;
   bool halted_ = false;
   bool known_ = false;        // whether start_ is that of the step
+  double end_holds_ = 0.0;    // what holds at its end, NaN where that is not known
   double values_at_ = 0.0;    // when the last values were taken
   std::vector<double> last_;  // and what they are; NaN where they were not
   Matrix values_;             // (places, events)
   std::vector<Walk> walks_;   // by event
   std::vector<Crossed> found_;
   Vector y_, coordinates_;
+  Closed closed_ = only_y;    // how the core is at y_
   Eigen::JacobiSVD<Matrix> svd_J_, svd_phi_z_;
   Matrix phi_z_;
 };

@@ -35,6 +35,20 @@ bool Events::ruled_out(const Event& event) const {
   return event.value < low - room || event.value > high + room;
 }
 
+// Whether what holds is so far from giving way that the ends of a step and its middle tell, that from a cubic through
+// both states and rates: by how far the middle is off the line through the ends.
+bool Events::holds_by_far(int k) {
+  if (events_[k].of != Event::holding || values_at_ != step_.t || !known_ || std::isnan(end_holds_)) return false;
+  const double h = step_.t_new - step_.t, start = last_[k];
+  closed_ = only_y;
+  y_ = 0.5 * (step_.y + step_.y_new) + (h / 8) * (step_.f - step_.f_new);
+  double middle;
+  if (!value(k, step_.t + 0.5 * h, middle)) return failed = -1, false;
+  const double low = std::min({start, middle, end_holds_}), high = std::max({start, middle, end_holds_});
+  const double apart = std::abs(middle - 0.5 * (start + end_holds_));
+  return low > uncertain * apart + of_range * (high - low) + events_[k].floor;
+}
+
 // Whether what holds, known at every second place, is far from giving way: by the parabola through both ends and the
 // middle, and by how far off that is at the places between.
 bool Events::holds(int k) const {

@@ -26,8 +26,9 @@ JointChanges::JointChanges(System& system, double rise)
 
 void JointChanges::begin() { known_ = false; }
 
-bool JointChanges::take_state(double t, In y) {
+bool JointChanges::take_state(double t, Out y) {
   if (!system_.exact(t, y)) return false;
+  system_.put_exact(y);
   core_.tree.to_coordinates(core_.q_tree, coordinates);
   v_ = system_.velocity;
   return true;

@@ -19,7 +19,7 @@ class JointChanges {
   double flight = 0.0;  // s: how long the first bounce from there will last, infinite where there is none
 
  private:
-  bool take_state(double t, In y);
+  bool take_state(double t, Out y);  // and close it in y
   static std::vector<System::Met> timed(const std::vector<Event>& met);
   bool impact(double t, Out y);
   bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began

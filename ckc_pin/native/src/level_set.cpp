@@ -6,13 +6,10 @@
 
 namespace ckc {
 
-constexpr double max_step = 0.5;  // rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
-constexpr int max_iterations = 12;
 constexpr double switch_margin = 0.03;  // of |J|: phi_z's least singular value where an uncontrolled run looks for a better q;
 constexpr double fallen = 0.7;          // it looks again at so much of the margin at which none was found,
 constexpr double poor = 1e-3;           // and from there on at every step
 constexpr double clearly = 2.0;         // times as far from singular: a better q
-constexpr double gains = 0.1;  // Newton's method to rounding goes on while a step leaves no more
 constexpr double weight = 3.0, patience = 100.0;  // of a refused step, in steps as before it; until none is tried
 constexpr double rounding = 8 * std::numeric_limits<double>::epsilon();
 constexpr double gone = 100.0;  // epsilons after which w is no more
@@ -25,14 +22,15 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
       actual_(actual),
       own_{core.q, core.z},
       alarm_(switch_margin),
-      predictor_(core, epsilon) {
+      predictor_(core, epsilon),
+      closing_(core) {
   const int m = core.rows.closure.rows;
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m), z_.setZero(core.z.size());
 }
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   if (core.q != own_.q) core.split(own_.q, own_.z);
-  refusals_ = 0, balance_ = 0.0, expected_ = 0;
+  refusals_ = 0, balance_ = 0.0, closing_.expected = 0;
   t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
   core.set(q_tree);
   core.reduce();
@@ -62,10 +60,10 @@ bool LevelSet::state(double t, In y, double tolerance) {
   const int d = core.d;
   level(t);
   predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
-  if (!newton(tolerance)) {
+  if (!close(tolerance)) {
     predict_from_accepted();
     predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
-    if (!newton(tolerance)) return false;
+    if (!close(tolerance)) return false;
   }
   if (chart_.plain())
     q = y.head(d);
@@ -91,40 +89,17 @@ bool LevelSet::at_last(double t, In y) {
   return true;
 }
 
-// Close phi(q, z) = w on z from q_tree_; J and phi_z's factorization are those of where it ends.
-bool LevelSet::newton(double tolerance) {
-  double size = 0.0;
-  for (int iteration = 0; iteration <= max_iterations; ++iteration) {
-    if (!q_tree_.allFinite()) return false;
-    core.set(q_tree_, iteration == expected_);  // D' will be wanted at the end, which is mostly where it was last time
-    core.factor();
-    residual_ = core.rows.phi - w;
-    const double previous = size;
-    size = unclosed();
-    if (iteration && !(size <= std::max(0.5 * previous, tolerance))) return false;
-    const bool polish = (to_rounding_ || refusals_ > 1) && size > 0.0 && (!iteration || size < gains * previous);
-    if (size <= tolerance && (!polish || iteration == max_iterations)) {
-      expected_ = iteration;
-      return true;
-    }
-    if (!std::isfinite(size) || core.phi_z.singular() || iteration == max_iterations) return false;
-    core.z_step(residual_, step_);
-    if (!(step_.cwiseQuotient(core.scales.columns).lpNorm<Eigen::Infinity>() <= max_step)) return false;
-    core.tree.integrate(q_tree_, step_);
-    ++counts.newton, ++counts.factorizations;
-  }
-  return false;
+bool LevelSet::shows(In y, int k, bool rate, double& value) const {
+  const auto at = std::find(core.q.begin(), core.q.end(), k);
+  if (at == core.q.end() || !(rate || chart_.plain())) return false;
+  return value = y((rate ? core.d : 0) + (at - core.q.begin())), true;
 }
 
-// The largest part of the residual that z could still close: redundant rows may contradict each other slightly.
-double LevelSet::unclosed() {
-  if (!residual_.allFinite()) return std::nan("");
-  if (residual_.size() > static_cast<Eigen::Index>(core.z.size())) {
-    core.solve_z(residual_, z_);
-    residual_.setZero();
-    for (size_t k = 0; k < core.z.size(); ++k) residual_ += z_(k) * core.rows.J.col(core.z[k]);
-  }
-  return residual_.size() ? residual_.lpNorm<Eigen::Infinity>() : 0.0;
+bool LevelSet::close(double tolerance) {
+  closing_.corrections = 0;
+  const bool closed = closing_.close(q_tree_, w, tolerance, to_rounding_ || refusals_ > 1);
+  counts.newton += closing_.corrections, counts.factorizations += closing_.corrections;
+  return closed;
 }
 
 bool LevelSet::rhs(double t, In y, Out y_dot) {

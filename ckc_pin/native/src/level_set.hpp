@@ -1,6 +1,7 @@
 // The reduced model, eq. 6, on a level set of phi; with w(t) of eq. 17 that is the SPF. y = (q in a chart, q_dot).
 #pragma once
 
+#include "closing.hpp"
 #include "partition.hpp"
 #include "predictor.hpp"
 #include "system.hpp"
@@ -17,6 +18,7 @@ class LevelSet : public System {
   bool exact(double t, In y) override { return state(t, y, tolerance_); }
   bool at_start(double t, In y) override { return exact(t, y) && (arrived_ = core.q_tree, true); }
   bool at_last(double t, In y) override;
+  bool shows(In y, int k, bool rate, double& value) const override;
   double margin() override { return phi_z_margin(); }
   Accepted accept(double t, Out y, double margin) override;
   bool own_partition(double t, Out y, bool& changed) override;
@@ -42,8 +44,7 @@ class LevelSet : public System {
   void begin(In q_tree);  // coordinates and predictor, with the core's partition
   // Close z at y, then rho and the tree's velocities; false where Newton's method does not get there.
   bool state(double t, In y, double tolerance);
-  bool newton(double tolerance);
-  double unclosed();
+  bool close(double tolerance);  // from q_tree_
   bool exact_jacobian(double t, In y, Matrix& jacobian);
   bool move_to(const Partition& partition, double t, Out y);
   void chart_numbers(Out y);
@@ -59,9 +60,9 @@ class LevelSet : public System {
   double balance_ = 0.0, length_ = 0.0, accepted_ = 0.0;
   double t_start_ = 0.0;
   double alarm_;      // margin at which a better q is looked for
-  int expected_ = 0;  // corrections that closing will take
   Chart chart_;
   Predictor predictor_;
+  Closing closing_;
   Vector anchor_, arrived_;  // configurations of the last accepted state, and of the one that may be next
   Vector w0_, q_tree_, residual_, z_, step_;
   bool written_ = false;  // whether a_tree_ is that of the last right-hand side

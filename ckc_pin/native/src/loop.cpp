@@ -142,7 +142,8 @@ std::optional<Stop> Loop::sample() {
 std::optional<Stop> Loop::begin(double bound) {
   if (!joints_known_)
     if (const auto stop = change_joints()) return stop;
-  if (!begun_) {
+  const bool anew = !begun_;
+  if (anew) {
     if (!system->at_start(now.t, now.y)) return trouble();
     end_ = monitor_.at(*system);
     energy_.from(*system);
@@ -154,6 +155,7 @@ std::optional<Stop> Loop::begin(double bound) {
   if (!f_known_) {
     f_known_ = (method_ ? *method_ : dop853_).evaluate_start();
     if (!f_known_) return trouble();
+    if (anew) events.begun();
     if (!method_) choose(bound);
   }
   return {};
@@ -243,7 +245,7 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
   const bool ends = last && now.t_new == bound;  // right there, perhaps: nothing has to go on from it
   if (!ends && !RankMonitor::kept(after)) return Stop{Stop::rank, now.t_new, after.value};
   if (!ends && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return trouble();
-  events.arrived();
+  if (!ends) events.arrived();
   return made({&motion, met, after, system->margin()}, bound, last);
 }
 

@@ -29,6 +29,12 @@ struct Work {
   long rhs = 0, rejected = 0, jacobians = 0, factorizations = 0;
   long most_rhs = std::numeric_limits<long>::max();
   bool spent = false;  // the budget was met
+  // One more right-hand side; false where none may be.
+  bool one_more() {
+    spent = rhs >= most_rhs;
+    if (!spent) ++rhs;
+    return !spent;
+  }
 };
 
 // y within the step just made.
@@ -63,12 +69,7 @@ class Method : public Interpolant {
   bool evaluate_start();
 
   bool evaluate(double t, In y, Out y_dot) {
-    if (work_.rhs >= work_.most_rhs) {
-      work_.spent = true;
-      return false;
-    }
-    ++work_.rhs;
-    return system_.rhs(t, y, y_dot);
+    return work_.one_more() && system_.rhs(t, y, y_dot);
   }
 
  protected:

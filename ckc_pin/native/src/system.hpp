@@ -43,9 +43,15 @@ class System {
   virtual bool rhs(double t, In y, Out y_dot) = 0;
   // The core at the state, closed as well as the formulation closes it, with everything below; false where it fails.
   virtual bool exact(double t, In y) = 0;
-  // The same where a motion goes on from.
+  // The same, but with the loops as open as y has them, where they can be.
+  virtual bool as_is(double t, In y) { return exact(t, y); }
+  // What y itself has of a coordinate, or of its rate, but for how open the loops are; false where it has it not.
+  virtual bool shows(In, int, bool, double&) const { return false; }
+  // Write the core's state, which is exactly y's, into y: closed.
+  virtual void put_exact(Out) const {}
+  // `exact` where a motion goes on from.
   virtual bool at_start(double t, In y) { return exact(t, y); }
-  // The same for a state that `rhs` was evaluated at last, as closed as it is.
+  // And for a state that `rhs` was evaluated at last, as closed as it is.
   virtual bool at_last(double t, In y) = 0;
   // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
   virtual bool place(In) { return false; }

@@ -23,7 +23,9 @@ struct Tree::Workspace {
 
 static pin::Model read(const std::string& serialized) {
   pin::Model model;
-  pin::serialization::loadFromString(model, serialized);
+  boost::asio::streambuf buffer;
+  buffer.sputn(serialized.data(), static_cast<std::streamsize>(serialized.size()));
+  pin::serialization::loadFromBinary(model, buffer);
   return model;
 }
 

@@ -11,7 +11,7 @@ namespace ckc {
 // Pinocchio computes into one workspace: what `place` gives is read before the next call, what `bias` gives too.
 class Tree {
  public:
-  // A model as Pinocchio serializes it, and where the coordinate of each tangent direction stands in q'.
+  // A model as Pinocchio serializes it in binary, and where the coordinate of each tangent direction stands in q'.
   Tree(const std::string& serialized, Indices place);
   ~Tree();
 

@@ -152,7 +152,7 @@ class Members:
             core, *others = self.ready.tables
             if self._library is not None:
                 core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
-            self._batch = _core.Batch(core, *others, self.mechanism.tree.reach, self.mechanism.tolerance, self._threads)
+            self._batch = _core.Batch(core, *others, self.mechanism.tolerance, self._threads)
         found, sound = self._varied.of(values[:, self._parameters])
         chosen = np.flatnonzero(sound)
         count = len(chosen)
