@@ -10,7 +10,7 @@ from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["alike_branches"]
 
-FEWEST, MOST = 3, 4  # branches that are worth it, and that are done at a time
+FEWEST, MOST = 2, 4  # branches that are done at a time
 
 
 def alike_branches(tree: Tree) -> Mapping[str, Mapping[int, tuple[Lane, int]]]:

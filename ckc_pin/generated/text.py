@@ -9,11 +9,13 @@ from ckc_pin.generated.graph import Graph, Lane, lanes
 
 __all__ = ["text"]
 
-WIDTH = 4
-HEAD = f"""#include <math.h>
-typedef double four __attribute__((vector_size({8 * WIDTH})));
-typedef long long int bits __attribute__((vector_size({8 * WIDTH})));
-#define LESS(a, b) ((four)(((a)<(b))&(bits)(four){{1.,1.,1.,1.}}))
+HEAD = """#include <math.h>
+typedef double two __attribute__((vector_size(16)));
+typedef double four __attribute__((vector_size(32)));
+typedef long long int two_bits __attribute__((vector_size(16)));
+typedef long long int four_bits __attribute__((vector_size(32)));
+static const two two_ones={1.,1.};
+static const four four_ones={1.,1.,1.,1.};
 """
 
 
@@ -32,7 +34,7 @@ def _formats() -> tuple[dict[int, str], dict[int, str]]:
         cs.OP_AND: "({0}&&{1})", cs.OP_OR: "({0}||{1})", cs.OP_IF_ELSE_ZERO: "({0}?{1}:0)",
         cs.OP_FMIN: "fmin({0},{1})", cs.OP_FMAX: "fmax({0},{1})",
     }  # fmt: skip
-    return either | one, {**either, cs.OP_LT: "LESS({0},{1})"}
+    return either | one, {**either, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}
 
 
 def text(functions: Sequence[Any], alike: Mapping[str, Mapping[int, tuple[Lane, int]]]) -> str:
@@ -100,7 +102,8 @@ class _Function:
             else:
                 what = self.together[node.operation]
                 vectors = [self._vector(operands) for operands in zip(*of, strict=True)]
-                self.lines.append(f"const four p{self.pack[nodes[0]][0]}={what.format(*vectors)};")
+                kind = _kind(nodes)
+                self.lines.append(f"const {kind} p{self.pack[nodes[0]][0]}={what.format(*vectors, kind)};")
         for k in nodes:
             self.lines += [f"y{result}[{at}]={self._scalar(k)};" for result, at in self.stored.get(k, ())]
 
@@ -123,9 +126,14 @@ class _Function:
             return parts[0]
         if nodes not in self.gathered:
             self.gathered[nodes] = f"g{len(self.gathered)}"
-            filled = [*parts, *[parts[0]] * (WIDTH - len(parts))]  # ordinary numbers where there is no branch
-            self.lines.append(f"const four {self.gathered[nodes]}={{{','.join(filled)}}};")
+            filled = [*parts, parts[0]] if len(parts) == 3 else parts  # an ordinary number where there is no branch
+            self.lines.append(f"const {_kind(nodes)} {self.gathered[nodes]}={{{','.join(filled)}}};")
         return self.gathered[nodes]
+
+
+def _kind(nodes: Sequence[int]) -> str:
+    """C's type for as many numbers."""
+    return "two" if len(nodes) == 2 else "four"
 
 
 def _sizes(name: str, shapes: Sequence[tuple[int, int]]) -> Iterator[str]:
