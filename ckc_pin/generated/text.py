@@ -24,14 +24,14 @@ def _formats() -> tuple[dict[int, str], dict[int, str]]:
     import casadi as cs
 
     either = {
-        cs.OP_ADD: "({0}+{1})", cs.OP_SUB: "({0}-{1})", cs.OP_MUL: "({0}*{1})", cs.OP_DIV: "({0}/{1})",
-        cs.OP_NEG: "(-{0})", cs.OP_SQ: "({0}*{0})", cs.OP_TWICE: "({0}+{0})", cs.OP_INV: "(1./{0})",
+        cs.OP_ADD: "{0}+{1}", cs.OP_SUB: "{0}-{1}", cs.OP_MUL: "{0}*{1}", cs.OP_DIV: "{0}/{1}",
+        cs.OP_NEG: "(-{0})", cs.OP_SQ: "{0}*{0}", cs.OP_TWICE: "{0}+{0}", cs.OP_INV: "1./{0}",
     }  # fmt: skip
     one = {
         cs.OP_ASSIGN: "{0}", cs.OP_SQRT: "sqrt({0})", cs.OP_SIN: "sin({0})", cs.OP_COS: "cos({0})",
-        cs.OP_TAN: "tan({0})", cs.OP_ATAN2: "atan2({0},{1})", cs.OP_FABS: "fabs({0})", cs.OP_LT: "({0}<{1})",
-        cs.OP_LE: "({0}<={1})", cs.OP_EQ: "({0}=={1})", cs.OP_NE: "({0}!={1})", cs.OP_NOT: "(!{0})",
-        cs.OP_AND: "({0}&&{1})", cs.OP_OR: "({0}||{1})", cs.OP_IF_ELSE_ZERO: "({0}?{1}:0)",
+        cs.OP_TAN: "tan({0})", cs.OP_ATAN2: "atan2({0},{1})", cs.OP_FABS: "fabs({0})", cs.OP_LT: "{0}<{1}",
+        cs.OP_LE: "{0}<={1}", cs.OP_EQ: "{0}=={1}", cs.OP_NE: "{0}!={1}", cs.OP_NOT: "!{0}",
+        cs.OP_AND: "{0}&&{1}", cs.OP_OR: "{0}||{1}", cs.OP_IF_ELSE_ZERO: "{0}?{1}:0",
         cs.OP_FMIN: "fmin({0},{1})", cs.OP_FMAX: "fmax({0},{1})",
     }  # fmt: skip
     return either | one, {**either, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}
@@ -59,6 +59,7 @@ class _Function:
         for to, k in self.graph.results:
             self.stored.setdefault(k, []).append(to)
         self.lines: list[str] = []
+        self.declared = ("", 0)  # the kind of variables that the last line is of, and how many lines there were then
         self.gathered: dict[tuple[int, ...], str] = {}
 
     def text(self) -> str:
@@ -98,14 +99,23 @@ class _Function:
             of = [self.graph.nodes[k].of for k in nodes]
             if nodes[0] not in self.pack:
                 what = self.formats[node.operation]
-                self.lines.append(f"const double a{nodes[0]}={what.format(*map(self._scalar, of[0]))};")
+                self._declare("double", f"a{nodes[0]}={what.format(*map(self._scalar, of[0]))}")
             else:
                 what = self.together[node.operation]
                 vectors = [self._vector(operands) for operands in zip(*of, strict=True)]
                 kind = _kind(nodes)
-                self.lines.append(f"const {kind} p{self.pack[nodes[0]][0]}={what.format(*vectors, kind)};")
+                self._declare(kind, f"p{self.pack[nodes[0]][0]}={what.format(*vectors, kind)}")
         for k in nodes:
             self.lines += [f"y{result}[{at}]={self._scalar(k)};" for result, at in self.stored.get(k, ())]
+
+    def _declare(self, kind: str, what: str) -> None:
+        """Write a variable, behind others of its kind without saying that again."""
+        if self.declared == (kind, len(self.lines)):
+            self.lines[-1] = f"{self.lines[-1][:-1]},"
+            self.lines.append(f"{what};")
+        else:
+            self.lines.append(f"const {kind} {what};")
+        self.declared = (kind, len(self.lines))
 
     def _scalar(self, k: int) -> str:
         node = self.graph.nodes[k]
@@ -127,7 +137,7 @@ class _Function:
         if nodes not in self.gathered:
             self.gathered[nodes] = f"g{len(self.gathered)}"
             filled = [*parts, parts[0]] if len(parts) == 3 else parts  # an ordinary number where there is no branch
-            self.lines.append(f"const {_kind(nodes)} {self.gathered[nodes]}={{{','.join(filled)}}};")
+            self._declare(_kind(nodes), f"{self.gathered[nodes]}={{{','.join(filled)}}}")
         return self.gathered[nodes]
 
 

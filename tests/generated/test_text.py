@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,9 @@ def function(request: pytest.FixtureRequest) -> Any:
 def test_the_code_does_what_casadi_does(function: Any, alike: Any, kind: str | None, tmp_path: Path) -> None:
     (tmp_path / "found.c").write_text(text([function], alike))
     written = (tmp_path / "found.c").read_text()
-    assert [x for x in ("two", "four") if f"const {x} p" in written] == ([kind] if kind else [])
+    assert [x for x in ("two", "four") if f"const {x} " in written.partition("int found")[2]] == (
+        [kind] if kind else []
+    )
     command = ["cc", *FLAGS, "-o", str(tmp_path / "found.so"), str(tmp_path / "found.c"), "-lm"]
     subprocess.run(command, check=True)
     code, random = ctypes.CDLL(str(tmp_path / "found.so")), np.random.default_rng(0)
@@ -89,4 +92,4 @@ def test_the_deltas_arms_are_done_together() -> None:
     mechanism = load("delta")
     acceleration = functions(mechanism)["acceleration"]
     written = text([acceleration], alike_branches(mechanism.tree))
-    assert written.count("const four p") * 3 > 0.7 * acceleration.n_instructions()
+    assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.7 * acceleration.n_instructions()
