@@ -1,4 +1,4 @@
-"""Eq. 1 as expressions: D' and J D'^-1 J^T eliminated as they are, the acceleration, and its derivatives."""
+"""Eq. 1 as expressions: eliminated without pivoting, the acceleration, and its derivatives."""
 
 from __future__ import annotations
 
@@ -22,20 +22,12 @@ class ConstrainedInertia:
     """
 
     def __init__(self, terms: Expressions) -> None:
-        import casadi as cs
-
         self._terms, self._n = terms, terms.v.numel()
-        self._D = SymmetricFactor(terms.D_tree)
-        rows = [[terms.rows.J[i, k] for k in range(self._n)] for i in terms.kept]
-        self._halves = [_entries(self._D.half(row)) for row in rows]  # L^-1 J^T, by rows of J
-        self._scaled = [{k: x * self._D.inverses[k] for k, x in half.items()} for half in self._halves]
-        S = cs.SX(len(rows), len(rows))
-        for i, a in enumerate(self._halves):
-            for j, b in enumerate(self._scaled[: i + 1]):
-                common = [x * b[k] for k, x in a.items() if k in b]
-                if common:
-                    S[i, j] = S[j, i] = sum(common)
-        self._S = SymmetricFactor(S)
+        D, J = terms.D_tree, terms.rows.J
+        entries = {(i, j): D[i, j] for i, j in _filled(D) if j <= i}
+        place = {row: self._n + k for k, row in enumerate(terms.kept)}
+        entries |= {(place[i], j): J[i, j] for i, j in _filled(J) if i in place}
+        self._factor = SymmetricFactor(entries, self._n, terms.order, TRUSTED)
 
     def solve(self, force: Sequence[Any], along: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         """Return a and the kept rows' multipliers: D' a = force + J^T multipliers, J a = along.
@@ -45,17 +37,12 @@ class ConstrainedInertia:
         force : sequence of n casadi.SX
         along : sequence of casadi.SX, one a kept row
         """
-        total = [x * inverse for x, inverse in zip(self._D.half(force), self._D.inverses, strict=True)]
-        left = [
-            x - sum(y * total[k] for k, y in half.items() if total[k].nnz())
-            for x, half in zip(along, self._halves, strict=True)
-        ]
-        multipliers = self._S.solve(left)
-        for half, multiplier in zip(self._scaled, multipliers, strict=True):
-            if multiplier.nnz():
-                for k, x in half.items():
-                    total[k] = total[k] + x * multiplier
-        return self._D.other_half(total), multipliers
+        import casadi as cs
+
+        given = {k: x for k, x in enumerate([*force, *along]) if x.nnz()}
+        found = self._factor.solve(given)
+        whole = [found.get(k, cs.SX(1, 1)) for k in range(self._n + len(along))]
+        return whole[: self._n], whole[self._n :]
 
     def acceleration(self, u: Any, correction: Any) -> tuple[Any, Any]:
         """Return v'_dot where u' acts, and the kept rows' multipliers.
@@ -129,12 +116,7 @@ class ConstrainedInertia:
 
         They are counted: the least of them would cost calls.
         """
-        sound = [
-            whole * TRUSTED < pivot
-            for factor in (self._D, self._S)
-            for pivot, whole in zip(factor.pivots, factor.diagonal, strict=True)
-        ]
-        return sum(sound) - (len(sound) - 0.5)
+        return self._factor.sound - (len(self._terms.order) - 0.5)
 
 
 def _across(by_state: Any, terms: Expressions) -> Any:
@@ -147,5 +129,6 @@ def _across(by_state: Any, terms: Expressions) -> Any:
     return by_state
 
 
-def _entries(column: Sequence[Any]) -> dict[int, Any]:
-    return {k: x for k, x in enumerate(column) if x.nnz()}
+def _filled(x: Any) -> list[tuple[int, int]]:
+    """Where a matrix is not zero by its structure."""
+    return list(zip(*x.sparsity().get_triplet(), strict=True))

@@ -1,33 +1,45 @@
-"""The tree in world axes, as expressions: where its bodies are, how they move, and what that costs in inertia."""
+"""The tree as expressions: where its bodies are, and how they move.
+
+Vectors of a branch are resolved in the axes that its first joint is placed with, in which more of them is zero than in
+the world's.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.parameters import Parameters, constant
-from ckc_pin.mechanism.tree import Tree
+from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Column", "MovingBody", "bodies"]
 
 
 @dataclass(frozen=True)
 class Column:
-    """What one tangent coordinate does to every body above it: it turns about an axis, or slides along one."""
+    """What one tangent coordinate does to every body above it: it turns about an axis, or slides along one.
+
+    `local` is that axis in its joint's frame.
+    """
 
     at: int
     turns: bool
     axis: Any
     origin: Any
+    local: Any
 
 
 @dataclass(frozen=True)
 class MovingBody:
-    """A joint's frame in world axes: rotation, origin, and with dv'/dt = 0 its rates and accelerations."""
+    """A joint's frame in its branch's axes: rotation, origin, and with dv'/dt = 0 its rates and accelerations.
 
+    `axes` is the rotation of those axes in the world, `own` the number of the last columns that are its joint's own.
+    """
+
+    axes: Array
     R: Any
     origin: Any
     omega: Any
@@ -35,6 +47,15 @@ class MovingBody:
     alpha: Any
     acceleration: Any
     columns: tuple[Column, ...]
+    own: int
+
+    def into(self, axes: Array) -> Any:
+        """What turns its vectors into other axes."""
+        return constant(axes.T @ self.axes)
+
+    def in_branch(self, vector: Any) -> Any:
+        """A vector of the world in the branch's axes."""
+        return times(constant(self.axes.T), vector)
 
     def point(self, local: Any) -> tuple[Any, Any, Any]:
         """Position, velocity and acceleration of a point fixed in the body."""
@@ -52,13 +73,31 @@ class MovingBody:
         turned = cross(self.omega, e)
         return e, turned, cross(self.alpha, e) + cross(self.omega, turned)
 
-    def point_jacobian(self, at: Any, n: int) -> Any:
-        """d position / d q', (3, n), of a point that moves with the body."""
+    @property
+    def own_columns(self) -> tuple[Column, ...]:
+        """Its own joint's."""
+        return self.columns[len(self.columns) - self.own :]
+
+    def point_jacobian(self, at: Any, local: Any, n: int) -> Any:
+        """d position / d q', (3, n), of a point fixed in the body."""
+        return self.carried_jacobian(at, n) + self.own_jacobian(self.R, local, n)
+
+    def carried_jacobian(self, at: Any, n: int) -> Any:
+        """The columns of the joints before its own, of any point that moves with the body."""
         import casadi as cs
 
         found = cs.SX(3, n)
-        for column in self.columns:
+        for column in self.columns[: len(self.columns) - self.own]:
             found[:, column.at] = cross(column.axis, at - column.origin) if column.turns else column.axis
+        return cs.sparsify(found)
+
+    def own_jacobian(self, R: Any, local: Any, n: int) -> Any:
+        """The columns of its own joint, of a point at `local`, turned by R from the joint's frame."""
+        import casadi as cs
+
+        found = cs.SX(3, n)
+        for column in self.columns[len(self.columns) - self.own :]:
+            found[:, column.at] = times(R, cross(column.local, local) if column.turns else column.local)
         return cs.sparsify(found)
 
     def turn_jacobian(self, n: int) -> Any:
@@ -109,10 +148,14 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
     import casadi as cs
 
     model, none, q = tree.model, cs.SX(3, 1), angles.q
-    found = [MovingBody(cs.SX.eye(3), none, none, none, none, none, ())]
+    world = MovingBody(np.eye(3), cs.SX.eye(3), none, none, none, none, none, (), 0)
+    found = [world]
     for k in range(1, model.njoints):
         joint, placement, parent = model.joints[k], model.jointPlacements[k], found[model.parents[k]]
         stands = times(parent.R, constant(placement.rotation))
+        if parent is world:
+            parent = replace(world, axes=placement.rotation, R=constant(placement.rotation.T))
+            stands = cs.SX.eye(3)
         d = times(parent.R, parameters.column("offset", k))
         at_q, at_v = joint.idx_q, joint.idx_v
         if joint.nq == 7:
@@ -122,23 +165,24 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
         a = times(stands, constant(local))
         R = times(stands, _turn(local, *angles.turn(at_q))) if turns else stands
         d = d if turns else d + a * q[at_q]
-        found.append(_moved(parent, R, d, a * v[at_v], at_v, turns, a))
+        column = Column(at_v, turns, a, parent.origin + d, constant(local))
+        found.append(_moved(parent, R, d, a * v[at_v], column))
     return found
 
 
-def _moved(parent: MovingBody, R: Any, d: Any, rate: Any, at: int, turns: bool, axis: Any) -> MovingBody:
+def _moved(parent: MovingBody, R: Any, d: Any, rate: Any, column: Column) -> MovingBody:
     omega, alpha = parent.omega, parent.alpha
     swept = cross(omega, d)
     speed = parent.speed + swept
     acceleration = parent.acceleration + cross(alpha, d) + cross(omega, swept)
-    origin = parent.origin + d
-    if turns:
+    if column.turns:
         alpha = alpha + cross(omega, rate)
         omega = omega + rate
     else:
         speed = speed + rate
         acceleration = acceleration + 2 * cross(omega, rate)
-    return MovingBody(R, origin, omega, speed, alpha, acceleration, (*parent.columns, Column(at, turns, axis, origin)))
+    columns = (*parent.columns, column)
+    return MovingBody(parent.axes, R, column.origin, omega, speed, alpha, acceleration, columns, 1)
 
 
 def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> MovingBody:
@@ -149,8 +193,10 @@ def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> M
     slide, spin = times(R, v[:3]), times(R, v[3:])
     omega, swept = parent.omega + spin, cross(parent.omega, d)
     origin = parent.origin + d
-    columns = [Column(at + k, k >= 3, R[:, k % 3], origin) for k in range(6)]
+    unit = cs.SX.eye(3)
+    columns = [Column(at + k, k >= 3, R[:, k % 3], origin, cs.sparsify(unit[:, k % 3])) for k in range(6)]
     return MovingBody(
+        parent.axes,
         R,
         origin,
         omega,
@@ -160,6 +206,7 @@ def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> M
             parent.acceleration + cross(parent.alpha, d) + cross(parent.omega, swept + slide) + cross(omega, slide)
         ),
         (*parent.columns, *columns),
+        6,
     )
 
 

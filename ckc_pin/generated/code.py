@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ckc_pin.generated.acceleration import ConstrainedInertia
+from ckc_pin.generated.branches import alike_branches
 from ckc_pin.generated.expressions import Expressions, expressions
+from ckc_pin.generated.text import text
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import BoolArray
+from ckc_pin.mechanism.tree import BoolArray, Tree
 
 __all__ = ["FUNCTIONS", "functions", "source"]
 
@@ -100,12 +101,6 @@ def _results(terms: Expressions, symbols: dict[str, Any]) -> dict[str, Any]:
     return {name: cs.densify(x) for name, x in found.items()}
 
 
-def source(found: dict[str, Any]) -> str:
-    """Return the C text of functions, all of whose arguments and results are asked for when they are called."""
-    import casadi as cs
-
-    generator = cs.CodeGenerator("written.c", {"with_header": False, "casadi_int": "long long int"})
-    for function in found.values():
-        generator.add(function)
-    text = re.sub(r"(arg\[\d+\])\? (\1\[\d+\]) : 0", r"\2", str(generator.dump()))
-    return re.sub(r"if \((res\[\d+\])!=0\) (\1\[\d+\]=)", r"\2", text)
+def source(found: Mapping[str, Any], tree: Tree) -> str:
+    """Return the C text of a mechanism's functions."""
+    return text(list(found.values()), alike_branches(tree))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
+from ckc_pin.generated.order import elimination_order
 from ckc_pin.generated.parameters import Parameters, numbers, present
 from ckc_pin.generated.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -40,6 +41,8 @@ class Expressions:
     rows : RowTerms
     kept : tuple of int
         Rows that follow from no others.
+    order : tuple of int
+        In which [D', J^T; J, 0] of the kept rows is eliminated: coordinates, and rows from n on.
     kinetic, potential : casadi.SX
         Energies, J; of gravity, springs and constant forces.
     """
@@ -54,6 +57,7 @@ class Expressions:
     damping: Any
     rows: RowTerms
     kept: tuple[int, ...]
+    order: tuple[int, ...]
     kinetic: Any
     potential: Any
 
@@ -75,6 +79,7 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
     D_tree, bias, potential = _inertia(mechanism, found, gravity, parameters)
     elastic, damping, stored = _springs(mechanism, found, q, v, parameters)
     rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), parameters)
+    kept = kept_rows(mechanism)
     return Expressions(
         angles=angles,
         v=v,
@@ -85,7 +90,8 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
         bias_tree=bias - elastic,
         damping=damping,
         rows=rows,
-        kept=tuple(kept_rows(mechanism)),
+        kept=tuple(kept),
+        order=elimination_order(mechanism, kept),
         kinetic=dot(v, times(D_tree, v)) / 2,
         potential=potential + stored,
     )
@@ -113,14 +119,14 @@ def _inertia(
         local, I = parameters.column("centre", k), parameters.symmetric("inertia", k)
         I = I + m * (dot(local, local) * cs.SX.eye(3) - times(local, local.T))
         mass[k], first[k] = m, times(body.R, m * local)
-        second[k] = times(times(body.R, cs.sparsify(I)), body.R.T)
-        falls = body.acceleration - gravity
+        second[k] = _turned(I, body.R)
+        falls = body.acceleration - body.in_branch(gravity)
         swept = cross(body.omega, first[k])
         force[k] = cs.sparsify(m * falls + cross(body.alpha, first[k]) + cross(body.omega, swept))
         torque[k] = cs.sparsify(
             cross(first[k], falls) + times(second[k], body.alpha) + cross(body.omega, times(second[k], body.omega))
         )
-        potential = potential - dot(gravity, m * body.origin + first[k])
+        potential = potential - dot(body.in_branch(gravity), m * body.origin + first[k])
     for k in range(model.njoints - 1, 0, -1):
         body, parent = found[k], model.parents[k]
         own = body.columns[len(found[parent].columns) :]
@@ -139,17 +145,37 @@ def _inertia(
             d = body.origin - found[parent].origin
             force[parent] = force[parent] + force[k]
             torque[parent] = torque[parent] + torque[k] + cross(d, force[k])
-            second[parent] = second[parent] + cs.sparsify(
-                second[k]
-                + 2 * dot(d, first[k]) * cs.SX.eye(3)
-                - times(d, first[k].T)
-                - times(first[k], d.T)
-                + mass[k] * (dot(d, d) * cs.SX.eye(3) - times(d, d.T))
-            )
+            second[parent] = second[parent] + second[k] + _shift(d, first[k] + mass[k] / 2 * d)
             first[parent] = first[parent] + first[k] + mass[k] * d
             mass[parent] = mass[parent] + mass[k]
     armature = cs.vertcat(*(parameters.number("armature", k) for k in range(n)))
     return cs.sparsify(D + cs.diag(armature)), bias, potential
+
+
+def _turned(I: Any, R: Any) -> Any:
+    """R I R^T of a symmetric I; what its diagonal has in common need not be turned."""
+    import casadi as cs
+
+    common = I[0, 0]
+    part = times(R, cs.sparsify(I - common * cs.SX.eye(3)))
+    return _mirrored(lambda i, j: dot(part[i, :].T, R[j, :].T) + (common if i == j else 0))
+
+
+def _shift(d: Any, half: Any) -> Any:
+    """What second moments gain about a point that is d back; half: the first ones, and mass d / 2."""
+    reach = 2 * dot(d, half)
+    return _mirrored(lambda i, j: (reach if i == j else 0) - d[i] * half[j] - half[i] * d[j])
+
+
+def _mirrored(entry: Callable[[int, int], Any]) -> Any:
+    """A symmetric matrix by its lower triangle, so that nothing is computed twice."""
+    import casadi as cs
+
+    found = cs.SX(3, 3)
+    for i in range(3):
+        for j in range(i + 1):
+            found[i, j] = found[j, i] = entry(i, j)
+    return cs.sparsify(found)
 
 
 def _springs(
@@ -173,16 +199,17 @@ def _springs(
     for k, ((a, local_a), (b, local_b)) in enumerate(zip(ends[:count], ends[count:], strict=True)):
         at_a, rate_a, _ = a.point(local_a)
         at_b, rate_b, _ = b.point(local_b)
-        r = at_a - at_b
+        into = b.into(a.axes)
+        r = at_a - times(into, at_b)
         length = cs.sqrt(dot(r, r))
         along = r / cs.if_else(length > 0, length, 1)  # at length zero it pulls nowhere
-        jacobian = times(along.T, a.point_jacobian(at_a, n) - b.point_jacobian(at_b, n))
+        jacobian = times(along.T, a.point_jacobian(at_a, local_a, n) - times(into, b.point_jacobian(at_b, local_b, n)))
         stiffness = parameters.number("stiffness", k)
         stretched = length - parameters.number("rest_length", k)
         elastic = elastic - stiffness * stretched * jacobian.T
         stored = stored + stiffness * stretched**2 / 2
         c = parameters.number("damping", k)
-        damping = damping - c * dot(along, rate_a - rate_b) * jacobian.T
+        damping = damping - c * dot(along, rate_a - times(into, rate_b)) * jacobian.T
     return elastic, damping, stored
 
 

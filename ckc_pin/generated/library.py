@@ -252,7 +252,7 @@ def _compile(
     try:
         from ckc_pin.generated.code import functions, source
 
-        written = source(functions(mechanism, subject.which))
+        written = source(functions(mechanism, subject.which), mechanism.tree)
     except ModuleNotFoundError as error:
         says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(says) from error

@@ -12,6 +12,7 @@ from ckc_pin.generated.bodies import MovingBody, cross, dot, times
 from ckc_pin.generated.parameters import Parameters, constant
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+from ckc_pin.mechanism.tree import Array
 
 __all__ = ["RowTerms", "row_terms"]
 
@@ -44,6 +45,49 @@ class _Moving:
             self.jacobian - other.jacobian,
         )
 
+    def turned(self, R: Any) -> _Moving:
+        """The same in axes that stand still, too."""
+        return _Moving(*(times(R, x) for x in (self.value, self.rate, self.acceleration, self.jacobian)))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point of a body, `local` in its frame, and how it moves in the axes of the body's branch."""
+
+    body: MovingBody
+    local: Any
+    moving: _Moving
+
+    def seen(self, axes: Array) -> _Moving:
+        """How it moves in other axes that stand still."""
+        return self.moving.turned(self.body.into(axes))
+
+    def less(self, other: _Point, axes: Array) -> _Moving:
+        """How it moves against another, in axes that stand still."""
+        return self.seen(axes) - other.seen(axes)
+
+    def within(self, body: MovingBody, n: int, sign: int) -> _Moving:
+        """How it moves in a body's own frame, or the same with the other sign."""
+        import casadi as cs
+
+        here = self.seen(body.axes)
+
+        def less(x: Any, y: Any) -> Any:
+            return x - y if sign > 0 else y - x
+
+        lever = less(here.value, body.origin)
+        swept = cross(body.omega, lever)
+        rate = less(here.rate, body.speed) - swept
+        acceleration = less(here.acceleration, body.acceleration) - cross(body.alpha, lever)
+        acceleration = acceleration - cross(body.omega, swept + 2 * rate)
+        value, rate, acceleration = (times(body.R.T, x) for x in (lever, rate, acceleration))
+        into = self.body.into(body.axes)
+        carried = times(into, self.body.carried_jacobian(self.moving.value, n))
+        carried = times(body.R.T, less(carried, body.carried_jacobian(here.value, n)))
+        own = self.body.own_jacobian(times(body.R.T, times(into, self.body.R)), self.local, n)
+        jacobian = carried + sign * own - sign * body.own_jacobian(cs.SX.eye(3), sign * value, n)
+        return _Moving(value, rate, acceleration, jacobian)
+
 
 def row_terms(
     closure: Closure,
@@ -74,11 +118,11 @@ def row_terms(
     n = v.numel()
     anchors = closure.anchors
     points = [_point(bodies[joint], parameters.column("point", k), n) for k, joint in enumerate(anchors.point_joint)]
+    pairs = list(zip(points[: len(points) // 2], points[len(points) // 2 :], strict=True))
     directions = [
-        _direction(bodies[joint], constant(local), n)
+        (bodies[joint], constant(local))
         for joint, local in zip(anchors.direction_joint, anchors.direction_local, strict=True)
     ]
-    pairs = [a - b for a, b in zip(points[: len(points) // 2], points[len(points) // 2 :], strict=True)]
     phi, J, J_dot_v = cs.SX(closure.rows, 1), cs.SX(closure.rows, n), cs.SX(closure.rows, 1)
 
     def put(out: int, row: tuple[Any, Any, Any]) -> None:
@@ -88,13 +132,15 @@ def row_terms(
         match group:
             case Component():
                 for out, pair, direction in zip(group.out, group.pair, group.direction, strict=True):
-                    put(int(out), _product(directions[direction], pairs[pair]))
+                    one, other = pairs[pair]
+                    put(int(out), _component(directions[direction], one, other, n))
             case Dot():
                 for out, a, b in zip(group.out, group.a, group.b, strict=True):
-                    put(int(out), _product(directions[a], directions[b]))
+                    put(int(out), _dot(directions[a], directions[b], n))
             case Distance():
                 for out, pair in zip(group.out, group.pair, strict=True):
-                    put(int(out), _distance(pairs[pair], parameters.number("length", out)))
+                    one, other = pairs[pair]
+                    put(int(out), _distance(one.less(other, one.body.axes), parameters.number("length", out)))
             case Affine():
                 for out in group.out:
                     row = cs.horzcat(*(parameters.number("affine", out, k) for k in range(n)))
@@ -113,9 +159,9 @@ def row_terms(
     return RowTerms(phi, cs.sparsify(J), J_dot_v)
 
 
-def _point(body: MovingBody, local: Any, n: int) -> _Moving:
+def _point(body: MovingBody, local: Any, n: int) -> _Point:
     at, rate, acceleration = body.point(local)
-    return _Moving(at, rate, acceleration, body.point_jacobian(at, n))
+    return _Point(body, local, _Moving(at, rate, acceleration, body.point_jacobian(at, local, n)))
 
 
 def _direction(body: MovingBody, local: Any, n: int) -> _Moving:
@@ -127,6 +173,23 @@ def _direction(body: MovingBody, local: Any, n: int) -> _Moving:
         if column.turns:
             jacobian[:, column.at] = cross(turns[:, column.at], e)
     return _Moving(e, rate, acceleration, cs.sparsify(jacobian))
+
+
+def _component(direction: tuple[MovingBody, Any], a: _Point, b: _Point, n: int) -> tuple[Any, Any, Any]:
+    """e . (p_A - p_B), e fixed in a body: where that carries one of the points, by how the other moves within it."""
+    body, e = direction
+    for fixed, other, sign in ((a, b, -1), (b, a, 1)):
+        if body is fixed.body and body.columns:
+            seen = other.within(body, n, sign)
+            at = seen.value + fixed.local if sign < 0 else seen.value - fixed.local
+            return dot(e, at), times(e.T, seen.jacobian), dot(e, seen.acceleration)
+    return _product(_direction(body, e, n), a.less(b, body.axes))
+
+
+def _dot(one: tuple[MovingBody, Any], other: tuple[MovingBody, Any], n: int) -> tuple[Any, Any, Any]:
+    """The row of two directions, in the axes of the first one's branch."""
+    (a, e_a), (b, e_b) = one, other
+    return _product(_direction(a, e_a, n), _direction(b, e_b, n).turned(b.into(a.axes)))
 
 
 def _product(a: _Moving, b: _Moving) -> tuple[Any, Any, Any]:
@@ -150,7 +213,8 @@ def _parallel(a: MovingBody, b: MovingBody, rotation_a: Any, rotation_b: Any, n:
     """log(R_A^T R_B) and its Jacobian."""
     import casadi as cs
 
-    R_b = times(b.R, rotation_b)
+    into = b.into(a.axes)
+    R_b = times(into, times(b.R, rotation_b))
     relative = times(times(a.R, rotation_a).T, R_b)
     sine = cs.vertcat(*(relative[j, i] - relative[i, j] for i, j in ((1, 2), (2, 0), (0, 1)))) / 2
     cosine = (cs.trace(relative) - 1) / 2
@@ -165,7 +229,7 @@ def _parallel(a: MovingBody, b: MovingBody, rotation_a: Any, rotation_b: Any, n:
     c = cs.if_else(near, _series(_LOG, theta_2), 1 / away - cs.cos(theta / 2) / cs.sin(theta / 2) / (2 * theta))
     s = cs.skew(u)
     rate = times(cs.SX.eye(3) + s / 2 + c * cs.mtimes(s, s), R_b.T)
-    return u, times(rate, b.turn_jacobian(n) - a.turn_jacobian(n))
+    return u, times(rate, times(into, b.turn_jacobian(n)) - a.turn_jacobian(n))
 
 
 def _series(coefficients: Sequence[float], x: Any) -> Any:

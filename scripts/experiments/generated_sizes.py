@@ -97,7 +97,7 @@ def measure(name: str) -> Size:
         mechanism = scene_mechanism(load_scene(scene))
         began = _spent()
         found = functions(mechanism)
-        text = source(found)
+        text = source(found, mechanism.tree)
         expressions_s, began = _spent() - began, _spent()
         reason, library = "", None
         try:

@@ -1,0 +1,95 @@
+"""C text of CasADi functions, alike branches done together: against CasADi's own evaluation."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import casadi as cs
+import numpy as np
+import pytest
+
+from ckc_pin import load
+from ckc_pin.generated.branches import alike_branches
+from ckc_pin.generated.code import functions
+from ckc_pin.generated.graph import Graph, lanes
+from ckc_pin.generated.library import FLAGS
+from ckc_pin.generated.text import text
+
+TWO = {"q": {k: ((0, k // 2), k % 2) for k in range(4)}}
+THREE = {"q": {k: ((0, k // 2), k % 2) for k in range(6)}}  # two numbers of each of three branches
+
+
+def branch(q: Any, at: int, shared: Any) -> Any:
+    """What a branch does with its own numbers and one of all."""
+    a, b = q[2 * at], q[2 * at + 1]
+    return cs.sqrt(a**2 + b**2 + 1) * shared / (2 + a * b) - (a < b) * 0.3 + cs.if_else(a > shared, -a, 2 * b)
+
+
+def met(q: Any, p: Any) -> list[Any]:
+    """Branches that meet, in a sum that begins with what all share, and go on with what comes of that."""
+    first = [branch(q, k, p[0]) for k in range(3)]
+    total = p[1] + first[0] + first[1] + first[2]
+    again = [x * total - q[2 * k] / (1 + total**2) for k, x in enumerate(first)]
+    last = again[0] * again[1] * again[2]
+    return [cs.vertcat(*again), cs.vertcat(total, last, cs.atan2(last, p[1]), *(x / last for x in first))]
+
+
+def differ(q: Any, p: Any) -> list[Any]:
+    """One branch has a term less, and two of them change places half-way."""
+    first = [q[2 * k] * p[k] + (q[2 * k + 1] if k else 0) for k in range(3)]
+    swapped = [first[1] * q[1], first[0] * q[3], first[2] * q[5]]
+    return [cs.vertcat(*swapped), cs.vertcat(first[0] - swapped[1], *first)]
+
+
+@pytest.fixture(params=[met, differ], ids=["met", "differ"])
+def function(request: pytest.FixtureRequest) -> Any:
+    q, p = cs.SX.sym("q", 6), cs.SX.sym("p", 3)
+    return cs.Function("found", [q, p], [cs.densify(x) for x in request.param(q, p)], ["q", "p"], ["a", "b"])
+
+
+@pytest.mark.parametrize(("alike", "kind"), [({}, None), (TWO, "two"), (THREE, "four")], ids=["one", "two", "three"])
+def test_the_code_does_what_casadi_does(function: Any, alike: Any, kind: str | None, tmp_path: Path) -> None:
+    (tmp_path / "found.c").write_text(text([function], alike))
+    written = (tmp_path / "found.c").read_text()
+    assert [x for x in ("two", "four") if f"const {x} " in written.partition("int found")[2]] == (
+        [kind] if kind else []
+    )
+    command = ["cc", *FLAGS, "-o", str(tmp_path / "found.so"), str(tmp_path / "found.c"), "-lm"]
+    subprocess.run(command, check=True)
+    code, random = ctypes.CDLL(str(tmp_path / "found.so")), np.random.default_rng(0)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    for _ in range(20):
+        given, found = [random.uniform(-2, 2, 6), random.uniform(-2, 2, 3)], [np.zeros(3), np.zeros(6)]
+        if function.size1_out(1) == 4:
+            found[1] = np.zeros(4)
+        arrays = ((pointer * 2)(*(x.ctypes.data_as(pointer) for x in part)) for part in (given, found))
+        code.found(*arrays, None, None, 0)
+        for ours, theirs in zip(found, function(*given), strict=True):
+            assert np.abs(ours - theirs.full()[:, 0]).max() <= 4e-16 * np.abs(theirs.full()).max()
+
+
+def test_what_branches_do_alike_is_found_up_to_where_they_meet_and_after() -> None:
+    q, p = cs.SX.sym("q", 6), cs.SX.sym("p", 3)
+    graph = Graph.of(cs.Function("found", [q, p], met(q, p)))
+    places = {(0, at): place for at, place in THREE["q"].items()}
+    packs = lanes(graph, places, {cs.OP_ADD, cs.OP_SUB, cs.OP_MUL, cs.OP_DIV, cs.OP_SQ, cs.OP_TWICE, cs.OP_NEG})
+    operations = [{graph.nodes[k].operation for k in pack} for pack in packs]
+    assert all(len(pack) == 3 for pack in packs)
+    assert all(len(x) == 1 for x in operations)
+    packed = {k for pack in packs for k in pack}
+    assert len(packed) == sum(map(len, packs))
+    divisions = [k for k, node in enumerate(graph.nodes) if node.operation == cs.OP_DIV]
+    assert sum(k in packed for k in divisions) == len(divisions) == 9
+    adds = [k for k, node in enumerate(graph.nodes) if node.operation == cs.OP_ADD and k not in packed]
+    assert len(adds) == 6  # the sum of what all three do, and 1 + its square, three times
+
+
+def test_the_deltas_arms_are_done_together() -> None:
+    mechanism = load("delta")
+    acceleration = functions(mechanism)["acceleration"]
+    written = text([acceleration], alike_branches(mechanism.tree))
+    assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.7 * acceleration.n_instructions()
