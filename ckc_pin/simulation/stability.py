@@ -96,6 +96,8 @@ def stability(
     Stability or None
         None where the target or the motion cannot be reached, or nothing comes to rest.
     """
+    import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
+
     with one_blas_thread():
         loop = ClosedLoop(mechanism, law, smoothing, library)
         if isinstance(law, SetPoint):
