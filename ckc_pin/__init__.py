@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 from ckc_pin.control.controllers import Controller, SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.dynamics.linearization import LinearModel
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
 from ckc_pin.kinematics import load
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from ckc_pin.simulation.floquet import Floquet, floquet
     from ckc_pin.simulation.inverse import inverse_dynamics
     from ckc_pin.simulation.ivp import as_ivp
+    from ckc_pin.simulation.linear_model import LinearModel
     from ckc_pin.simulation.linearize import linearize
     from ckc_pin.simulation.motion_forces import MotionForces
     from ckc_pin.simulation.run import Run

@@ -11,7 +11,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import interrupts
-from ckc_pin.cli.output import errors, make_folder, print_json, print_table
+from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes, read_table
@@ -63,12 +63,14 @@ def linearize(
     if out is not None:
         make_folder(out)
     if period is not None:
-        found = ckc_pin.floquet(what, period, read_changes("--set", changes))
+        with ProgressBar(what) as progress:
+            found = ckc_pin.floquet(what, period, read_changes("--set", changes), progress)
         if out is not None:
             _write_floquet(found, out)
         _print(found.plain() if as_json else floquet_text(found), out)
         return
-    model = ckc_pin.linearize(what, _at(at or "equilibrium"), read_changes("--set", changes))
+    with Working(f"linearizing {what}"):
+        model = ckc_pin.linearize(what, _at(at or "equilibrium"), read_changes("--set", changes))
     if out is not None:
         _write(model, what, changes, out)
     _print(linear_plain(model) if as_json else linear_text(model), out)

@@ -1,6 +1,5 @@
 """Terms at one state, and the formulations as functions of them."""
 
-from ckc_pin.dynamics.derivatives import AccelerationDerivatives, acceleration_derivatives
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.formulations import (
     dae_acceleration,
@@ -12,19 +11,14 @@ from ckc_pin.dynamics.formulations import (
     tree_force,
 )
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
-from ckc_pin.dynamics.linearization import LinearModel, linear_model
 from ckc_pin.dynamics.terms import Terms, terms
 
 __all__ = [
-    "AccelerationDerivatives",
-    "LinearModel",
     "Terms",
-    "acceleration_derivatives",
     "dae_acceleration",
     "friction_force",
     "h_gradient",
     "joint_wrenches",
-    "linear_model",
     "loop_wrenches",
     "multipliers",
     "reduced_acceleration",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.dynamics.derivatives import multiplier_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.continuation import same_branch
@@ -32,7 +31,15 @@ def h_gradient(mechanism: Mechanism, at: Kinematics) -> Array:
     """
     terms = Terms(mechanism, at, np.zeros(mechanism.n))
     y = at.phi_z_factor.solve_transposed(-terms.h_tree[at.partition.z])
-    return at.rho.T @ (_h_tree_gradient(terms) @ at.rho + multiplier_gradient(terms, y, at.rho))
+    return at.rho.T @ (_h_tree_gradient(terms) @ at.rho + _multiplier_gradient(terms, y))
+
+
+def _multiplier_gradient(terms: Terms, y: Array) -> Array:
+    """Derivative of J^T y along the columns of rho, y constant: shape (n, d)."""
+    steps = terms.at.rho.T
+    if not y.any():
+        return np.zeros((terms.mechanism.n, len(steps)))
+    return np.array([y @ terms.at.J_dot(step) for step in steps]).T
 
 
 def _h_tree_gradient(terms: Terms) -> Array:

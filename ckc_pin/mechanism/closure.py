@@ -15,7 +15,6 @@ from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
-from ckc_pin.mechanism.variation import Variation
 
 __all__ = ["Closure", "ClosureBuilder", "perpendicular"]
 
@@ -80,16 +79,6 @@ class Closure(Shared):
             jacobian_dot[group.out] = group.jacobian_dot(pose, rate)
         return jacobian_dot
 
-    def acceleration_gradient(self, pose: Pose, v: Array, a: Array) -> Array:
-        """Derivative of phi_ddot = J a + J_dot(v) v along the tangent coordinates, shape (rows, n).
-
-        With v = 0 it is that of J a.
-        """
-        by, gradient = Variation(pose, v, a), np.empty((len(self.names), pose.tree.n))
-        for group in self.groups:
-            gradient[group.out] = group.acceleration_gradient(pose, by)
-        return gradient
-
     def in_metres(self, tree: Tree) -> Array:
         """Which rows of phi are lengths (the others are angles or cosines), shape (rows,) of bool."""
         metres = np.zeros(len(self.names), dtype=bool)
@@ -149,10 +138,6 @@ class Selected(Shared):
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         """Time derivative of the Jacobian, shape (rows, n)."""
         return self._gather([group.jacobian_dot(pose, rate) for group in self.groups])
-
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        """Derivative of phi_ddot, shape (rows, n)."""
-        return self._gather([group.acceleration_gradient(pose, by) for group in self.groups])
 
 
 def perpendicular(axis: Array) -> tuple[Array, Array]:

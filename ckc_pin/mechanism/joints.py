@@ -81,10 +81,6 @@ class Joints:
         """Return -F tanh(v / smoothing), N or N m, shape (n,)."""
         return -self.friction * np.tanh(v_tree / smoothing)
 
-    def smooth_friction_rate(self, v_tree: Array, smoothing: float) -> Array:
-        """Return its derivative by v', -F / smoothing / cosh^2(v / smoothing), shape (n,)."""
-        return -self.friction / smoothing * (1.0 - np.tanh(v_tree / smoothing) ** 2)
-
 
 def _open_limits(tree: Tree, limited: BoolArray) -> list[str]:
     """Say which limits a run may pass, and how to make walls of them."""

@@ -6,6 +6,7 @@ slower for a 4 x 4 matrix than a factorization that is kept.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Lock
@@ -21,6 +22,9 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+SCIPY = "scipy.linalg"  # loaded by who needs it, with a BLAS of its own
+
+
 class _OneThread:
     """How many `with` blocks keep BLAS on one thread, in all of Python's threads, and what it had before them."""
 
@@ -28,14 +32,16 @@ class _OneThread:
         self.lock = Lock()
         self.blocks = 0
         self.libraries: Any = None
+        self.of_scipy = False  # whether SciPy's own BLAS is one of them
         self.before: list[int] = []
 
     def enter(self) -> None:
         with self.lock:
-            if self.libraries is None:
+            if not self.blocks and (self.libraries is None or (SCIPY in sys.modules and not self.of_scipy)):
                 from threadpoolctl import ThreadpoolController
 
                 self.libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+                self.of_scipy = SCIPY in sys.modules
             if not self.blocks:  # threadpoolctl's own `limit` asks for much else: 60 us
                 self.before = [library.num_threads for library in self.libraries]
                 for library in self.libraries:

@@ -24,9 +24,8 @@ import pinocchio as pin
 
 from ckc_pin.mechanism.pose import Pose, Rate, cross
 from ckc_pin.mechanism.shared import Shared
-from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_change, log_jacobian_dot, skew
+from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_dot, skew
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
-from ckc_pin.mechanism.variation import Variation
 
 __all__ = ["Affine", "Component", "Distance", "Dot", "RelativeLog", "Rows"]
 
@@ -49,9 +48,6 @@ class Rows(Protocol):
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         """Time derivative of the Jacobian along the rate's velocity, shape (rows, n)."""
-
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        """Derivative of phi_ddot = J a + J_dot v along the tangent coordinates, v and a constant: shape (rows, n)."""
 
 
 def _along(e: Array, jacobian: Array) -> Array:
@@ -91,17 +87,6 @@ class Component(Shared):
             jacobian_dot += _along(cross(e, r), rate.e_angular_dot[self.direction])
         return jacobian_dot
 
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        e, (r_dot, r_ddot) = pose.e[self.direction], (x[self.pair] for x in by.r)
-        r_by, r_dot_by, r_ddot_by = (x[self.pair] for x in (pose.r_jacobian, *by.r_gradient))
-        gradient = _along(e, r_ddot_by)
-        if self.turning:
-            e_dot, e_ddot = (x[self.direction] for x in by.e)
-            e_by, e_dot_by, e_ddot_by = (x[self.direction] for x in by.e_gradient)
-            gradient += _along(e_ddot, r_by) + 2 * _along(e_dot, r_dot_by)
-            gradient += _along(pose.r[self.pair], e_ddot_by) + 2 * _along(r_dot, e_dot_by) + _along(r_ddot, e_by)
-        return gradient
-
 
 @dataclass(frozen=True)
 class Dot(Shared):
@@ -129,13 +114,6 @@ class Dot(Shared):
             cross(a, b), rate.e_angular_dot[self.a] - rate.e_angular_dot[self.b]
         )
 
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        gradient = np.zeros((len(self.out), pose.tree.n))
-        for one, other in ((self.a, self.b), (self.b, self.a)):  # (a . b)_ddot = a . b_ddot + 2 a_dot . b_dot + ...
-            for factor, rates, by_q in zip((1, 2, 1), (pose.e, *by.e), reversed(by.e_gradient), strict=True):
-                gradient += factor * _along(rates[one], by_q[other])
-        return gradient
-
 
 @dataclass(frozen=True)
 class Distance(Shared):
@@ -161,12 +139,6 @@ class Distance(Shared):
             pose.r[self.pair] / length, rate.r_jacobian_dot[self.pair]
         )
 
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        r_dot, r_ddot = (x[self.pair] for x in by.r)
-        r_by, r_dot_by, r_ddot_by = (x[self.pair] for x in (pose.r_jacobian, *by.r_gradient))
-        gradient = 2 * _along(r_dot, r_dot_by) + _along(r_ddot, r_by) + _along(pose.r[self.pair], r_ddot_by)
-        return gradient / self.length[:, None]
-
 
 @dataclass(frozen=True)
 class Affine(Shared):
@@ -186,9 +158,6 @@ class Affine(Shared):
         return self.matrix
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
-        return np.zeros_like(self.matrix)
-
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
         return np.zeros_like(self.matrix)
 
 
@@ -230,27 +199,3 @@ class RelativeLog(Shared):
             rate.angular_dot(self.joint_b) - rate.angular_dot(self.joint_a) - skew(omega_b) @ angular
         )
         return (log_jacobian_dot(u, u_dot) @ body + j_log @ body_dot).reshape(self.out.size, -1)
-
-    def acceleration_gradient(self, pose: Pose, by: Variation) -> Array:
-        """Differentiate u_ddot = Jlog_dot(u, u_dot) w + Jlog(u) w_dot, w = R_B^T (omega_B - omega_A)."""
-        u, r_b_transposed, angular = self._relative(pose)
-        (omega_a, alpha_a), (omega_b, alpha_b) = by.spin(self.joint_a), by.spin(self.joint_b)
-        (omega_a_by, alpha_a_by), (omega_b_by, alpha_b_by) = (by.spin_gradient(x) for x in (self.joint_a, self.joint_b))
-        turning = pose.angular(self.joint_b)
-        w_world = omega_b - omega_a
-        w_dot_world = alpha_b - alpha_a + cross(omega_b, omega_a)
-
-        def in_b(vectors: Array, by_q: Array) -> tuple[Array, Array]:
-            """R_B^T x and its derivative."""
-            moved = by_q - cross(turning, vectors[:, :, None])
-            return (r_b_transposed @ vectors[:, :, None])[:, :, 0], r_b_transposed @ moved
-
-        crossed = cross(omega_b_by, omega_a[:, :, None]) + cross(omega_b[:, :, None], omega_a_by)
-        w, w_by = in_b(w_world, omega_b_by - omega_a_by)
-        w_dot, w_dot_by = in_b(w_dot_world, alpha_b_by - alpha_a_by + crossed)
-        G, u_by = log_jacobian(u), log_jacobian(u) @ r_b_transposed @ angular
-        u_dot = (G @ w[:, :, None])[:, :, 0]
-        u_dot_by = log_jacobian_change(u, u_by, w) + G @ w_by
-        gradient = log_jacobian_change(u, u_by, w_dot) + G @ w_dot_by + log_jacobian_dot(u, u_dot) @ w_by
-        gradient += log_jacobian_change(u, u_dot_by, w) + log_jacobian_change(u, u_by, w, along=u_dot)
-        return gradient.reshape(self.out.size, -1)

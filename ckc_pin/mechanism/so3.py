@@ -1,4 +1,4 @@
-"""The logarithm of a rotation differentiated: u_dot = Jlog(u) omega, omega in body axes, and Jlog twice more.
+"""The logarithm of a rotation differentiated: u_dot = Jlog(u) omega, omega in body axes, and Jlog once more.
 
 Jlog(u) = 1 + [u]/2 + c [u]^2 is the inverse right Jacobian of SO(3), c = 1/theta^2 - cot(theta/2) / (2 theta) and
 theta = |u|.
@@ -10,17 +10,15 @@ import math
 
 import numpy as np
 
-from ckc_pin.mechanism.pose import cross
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["log_jacobian", "log_jacobian_change", "log_jacobian_dot", "skew"]
+__all__ = ["log_jacobian", "log_jacobian_dot", "skew"]
 
 # c = sum of |B_2k| / (2k)! theta^(2k - 2); beyond these terms nothing is left where theta < 1
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330,
               854513 / 138, 236364091 / 2730, 8553103 / 6)  # fmt: skip
 _SERIES = [np.array([b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, 1)])[::-1]]
-for _ in range(2):  # derivatives by theta^2, of which d/dtheta / theta is twice
-    _SERIES.append(2 * np.polyder(_SERIES[-1]))
+_SERIES.append(2 * np.polyder(_SERIES[0]))  # a derivative by theta^2, of which d/dtheta / theta is twice
 
 
 def skew(a: Array) -> Array:
@@ -31,7 +29,7 @@ def skew(a: Array) -> Array:
 
 
 def _coefficients(u: Array, count: int) -> list[Array]:
-    """Return so many of c, c'/theta and (c'/theta)'/theta, (k,) each."""
+    """Return c, or c and c'/theta, (k,) each."""
     square = np.sum(u * u, axis=1)
     if np.all(square < 1.0):
         return [np.polyval(series, square) for series in _SERIES[:count]]
@@ -39,8 +37,7 @@ def _coefficients(u: Array, count: int) -> list[Array]:
     cotangent, sine2 = 1 / np.tan(t / 2), np.sin(t / 2) ** 2
     c = 1 / t**2 - cotangent / (2 * t)
     first = -2 / t**3 + cotangent / (2 * t**2) + 1 / (4 * t * sine2)
-    second = 6 / t**4 - cotangent / t**3 - 1 / (2 * t**2 * sine2) - cotangent / (4 * t * sine2)
-    far = (c, first / t, second / t**2 - first / t**3)
+    far = (c, first / t)
     each = zip(_SERIES[:count], far, strict=False)
     return [np.where(square < 1.0, np.polyval(series, square), x) for series, x in each]
 
@@ -58,32 +55,3 @@ def log_jacobian_dot(u: Array, u_dot: Array) -> Array:
     c_dot = c_rate * np.sum(u * u_dot, axis=1)
     s, s_dot = skew(u), skew(u_dot)
     return s_dot / 2 + c_dot[:, None, None] * (s @ s) + c[:, None, None] * (s_dot @ s + s @ s_dot)
-
-
-def log_jacobian_change(u: Array, steps: Array, x: Array, along: Array | None = None) -> Array:
-    """Derivative of Jlog(u) x along steps (k, 3, n), x constant; or of its derivative along a vector: (k, 3, n).
-
-    Parameters
-    ----------
-    u, x : (k, 3) array
-    steps : (k, 3, n) array
-    along : (k, 3) array, optional
-        Differentiate Jlog_dot(u, along) x instead, `along` constant.
-    """
-    c, c_rate, c_rate_rate = (k[:, None, None] for k in _coefficients(u, 3))
-    U, X = u[:, :, None], x[:, :, None]
-
-    def twice(a: Array, b: Array) -> Array:
-        """d [u]^2 x = a x (b x x) + b x (a x x)."""
-        return cross(a, cross(b, X)) + cross(b, cross(a, X))
-
-    def dot(a: Array, b: Array) -> Array:
-        return np.sum(a * b, axis=1, keepdims=True)
-
-    square_x = twice(U, U) / 2
-    if along is None:
-        return cross(steps, X) / 2 + c_rate * dot(U, steps) * square_x + c * twice(U, steps)
-    Y = along[:, :, None]
-    bent = c_rate_rate * dot(U, Y) * dot(U, steps) + c_rate * dot(Y, steps)
-    turned = c_rate * (dot(U, Y) * twice(U, steps) + dot(U, steps) * twice(U, Y))
-    return bent * square_x + turned + c * twice(Y, steps)

@@ -105,17 +105,6 @@ class Springs:
             force -= (self.damping * (length_jacobian @ v_tree)) @ length_jacobian
         return force
 
-    def damping_gradient(self, q_tree: Array, v_tree: Array) -> tuple[Array, Array]:
-        """Derivatives of `damping_force` along the tangent coordinates and by v', shape (n, n) each."""
-        by_q, by_v = np.zeros((self.tree.n, self.tree.n)), -np.diag(self.joint_damping)
-        if not self.damping.any():
-            return by_q, by_v
-        _, length_jacobian = self._lengths(q_tree)
-        stretched = self.damping * (length_jacobian @ v_tree)
-        for k, bent in enumerate(self._bending(q_tree)):
-            by_q[:, k] = -stretched @ bent - (self.damping * (bent @ v_tree)) @ length_jacobian
-        return by_q, by_v - length_jacobian.T @ (self.damping[:, None] * length_jacobian)
-
     def body_wrenches(self, pose: Pose, v_tree: Array) -> Array:
         """What springs and dampers between frames do to the bodies that they hold on to.
 

@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native.tables import closure_table, core_table, packed
 
-__all__ = ["control_table"]
+__all__ = ["control_table", "law_table"]
 
 QUARTER = math.pi / 2
 
@@ -64,7 +64,9 @@ def control_table(
     if type(controller) is Torques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
         table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.lines)
-    return table | {"law": _law(controller) or {"kind": "call", "function": call(controller), "of_motors": torques}}
+    return table | {
+        "law": law_table(controller) or {"kind": "call", "function": call(controller), "of_motors": torques}
+    }
 
 
 def _clock(period: float, delay: float = 0.0, times: Array | None = None, *, holds: bool = True) -> dict[str, Any]:
@@ -95,7 +97,7 @@ def _drive(drive: DriveSpec, actuation: Actuation) -> dict[str, Any]:
     return table
 
 
-def _law(controller: Controller | TorqueController) -> dict[str, Any] | None:
+def law_table(controller: Controller | TorqueController) -> dict[str, Any] | None:
     """Return eq. 14, eq. 16 or torques over time; None for any other controller."""
     if type(controller) is Torques:
         tau = np.asfortranarray(controller.values.T)

@@ -6,6 +6,7 @@ from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.floquet import Floquet, floquet
 from ckc_pin.simulation.inverse import inverse_dynamics
 from ckc_pin.simulation.ivp import as_ivp
+from ckc_pin.simulation.linear_model import LinearModel
 from ckc_pin.simulation.linearize import linearize
 from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.simulation.run import Run
@@ -20,6 +21,7 @@ __all__ = [
     "Check",
     "Event",
     "Floquet",
+    "LinearModel",
     "MotionForces",
     "Run",
     "Scene",

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.sampling import MOST_DELAYED
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
@@ -26,6 +25,7 @@ from ckc_pin.simulation.cards import check_card
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.linear_report import stability_warning
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.simulation.sampled_loop import MOST_DELAYED, MOST_SAMPLES
 from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
 from ckc_pin.simulation.scene_spec import TermsOf
 from ckc_pin.simulation.stability import Stability, stability
@@ -132,10 +132,13 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     desired = _desired(controller, mechanism, what.spec.t_end)
     stable = None
     if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
-        sampling = _sampling(what) if isinstance(controller, SetPoint) else None
-        stable = stability(mechanism, controller, what.spec.t_end, what.spec.friction_smoothing, sampling)
+        library = None if what.spec.solver.terms == "pinocchio" else find(mechanism)
+        spec = what.spec
+        stable = stability(
+            mechanism, controller, spec.t_end, spec.friction_smoothing, _sampling(what, controller), library
+        )
     if stable is not None:
-        stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.multiplier is not None))
+        stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.sampled))
     warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
     warnings += stability_warning(stable, mechanism.independent)
     found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
@@ -208,10 +211,13 @@ def _desired(
     return None
 
 
-def _sampling(scene: Scene) -> tuple[float, float] | None:
-    """Sample time and delay of a scene's controller; None without, or where more is under way than can be listed."""
+def _sampling(scene: Scene, controller: SetPoint | Tracking) -> tuple[float, float] | None:
+    """Sample time and delay of a scene's controller; None without, or of more samples than are gone through."""
     spec = scene.spec.controller
-    if not isinstance(spec, FeedbackSpec) or spec.sample_time is None or spec.delay > MOST_DELAYED * spec.sample_time:
+    if not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
+        return None
+    along = scene.spec.t_end if isinstance(controller, Tracking) else 0.0
+    if spec.delay > MOST_DELAYED * spec.sample_time or along > MOST_SAMPLES * spec.sample_time:
         return None
     return spec.sample_time, spec.delay
 

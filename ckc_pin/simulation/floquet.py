@@ -14,9 +14,11 @@ from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
 from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.simulation.simulate import Progress, simulate
 
 __all__ = ["Floquet", "floquet"]
 
@@ -58,7 +60,12 @@ class Floquet:
         }
 
 
-def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any] | None = None) -> Floquet:
+def floquet(
+    scene: Scene | str | Path,
+    period: float,
+    changes: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Floquet:
     """Return the monodromy matrix and the Floquet multipliers of a scene's motion, which is periodic from its start.
 
     Parameters
@@ -68,6 +75,8 @@ def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any]
         s.
     changes : mapping, optional
         As of `simulate`.
+    progress : callable, optional
+        Called as progress(t, period) along the variational equations, every 0.05 s or so.
 
     Returns
     -------
@@ -86,19 +95,16 @@ def floquet(scene: Scene | str | Path, period: float, changes: Mapping[str, Any]
         raise InputError(f"period = {period:g}: a positive number of seconds is needed")
     given = as_scene(scene, changes, "floquet")
     loaded = make_scene(with_changes(given.plain(), {"t_end": float(period)}), given.name, given.sources)
-    from ckc_pin.simulation.prepare import scene_mechanism
-
     mechanism = scene_mechanism(loaded)
     if mechanism.rooted:
         raise InputError(f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates")
     if loaded.spec.initial.at is not None:
         loaded = _from_coordinates(loaded, mechanism)
     names = mechanism.independent
-    found = sensitivities(loaded, [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names])
+    _require_period(simulate(loaded), period)  # the motion alone: the variational equations are 2 d more of it
+    found = sensitivities(loaded, [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names], None, progress)
     run = found.run
-    if run.status != "done" or run.t[-1] < period * (1 - 1e-12):
-        raise NumericalError(f"floquet: the motion does not reach the end of its period: {run.message}")
-    _require_back(run)
+    _require_period(run, period)
     q = mechanism.partition.q
     monodromy = np.concatenate([found.q_tree[-1][q], found.v_tree[-1][q]])
     multipliers = np.linalg.eigvals(monodromy).astype(np.complex128)
@@ -116,8 +122,12 @@ def _from_coordinates(scene: Scene, mechanism: Mechanism) -> Scene:
     )
 
 
-def _require_back(run: Run) -> None:
+def _require_period(run: Run, period: float) -> None:
     """A motion is periodic where it ends as it began; turns of a joint are one place."""
+    if run.status == "interrupted":
+        raise KeyboardInterrupt(run.message)
+    if run.status != "done" or run.t[-1] < period * (1 - 1e-12):
+        raise NumericalError(f"floquet: the motion does not reach the end of its period: {run.message}")
     tree = run.mechanism.tree
     for what, values in (("", run.q_tree), (" (rate)", run.v_tree)):
         miss = values[-1] - values[0]

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.dynamics.linearization import LinearModel, eigenvalues_of
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.simulation.linear_model import LinearModel, eigenvalues_of
 from ckc_pin.simulation.stability import Stability
 
 if TYPE_CHECKING:
@@ -157,13 +157,14 @@ def stability_text(found: Stability) -> str:
     says = "stable" if found.stable else "UNSTABLE"
     if found.leaves_out:
         says += f", {' and '.join(found.leaves_out)} left out,"
+    as_sampled = " as sampled" if found.sampled else ""
     if found.growth is not None and found.largest_growth is not None:
         return (
-            f"{says} along the motion: errors grow to {found.largest_growth:.3g} times at most, to {found.growth:.2e} "
-            f"at its end; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
+            f"{says} along the motion{as_sampled}: errors grow to {found.largest_growth:.3g} times at most, to "
+            f"{found.growth:.2e} at its end; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
         )
     if found.multiplier is not None:
-        says += f" as sampled, factor {found.multiplier:.6g} a sample,"
+        says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
     slowest = f", slowest decay {found.slowest:.3g} s" if np.isfinite(found.slowest) else ""
     return f"{says} at its target{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
 
@@ -172,6 +173,11 @@ def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> 
     """Say of an unstable loop what would make it stable."""
     if found is None or found.stable:
         return []
+    if found.least_K_P is None and found.sampled:
+        return [
+            "the closed loop is unstable along the desired motion as sampled: an error may be "
+            f"{found.growth:.3g} times as large at its end; sample more often, delay less, or take other gains"
+        ]
     if found.least_K_P is None:
         return [
             f"the closed loop is unstable along the desired motion: an error may be {found.growth:.3g} times as large "

@@ -12,13 +12,12 @@ import numpy as np
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.gradient import closed_loop
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.formulations import tangent_basis
-from ckc_pin.dynamics.linearization import LinearModel, linear_model
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.kinds import require_kind, require_table
@@ -26,7 +25,9 @@ from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
-from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.simulation.closed_loop import ClosedLoop
+from ckc_pin.simulation.linear_model import LinearModel, linear_model
+from ckc_pin.simulation.prepare import library_of, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes
@@ -51,6 +52,10 @@ class _Subject:
     @property
     def smoothing(self) -> float | None:
         return None if self.scene is None else self.scene.spec.friction_smoothing
+
+    @property
+    def library(self) -> Library | None:
+        return library_of(self.mechanism, "auto" if self.scene is None else self.scene.spec.solver.terms)
 
 
 def linearize(
@@ -197,7 +202,7 @@ def _at_rest(subject: _Subject, at: Kinematics, tau: Array, says: str) -> Linear
     mechanism, smoothing = subject.mechanism, subject.smoothing
     sticks = np.flatnonzero(mechanism.joints.friction) if smoothing is None else np.zeros(0, dtype=np.intp)
     state = Terms(mechanism, at, np.zeros(mechanism.n))
-    return linear_model(state, tau, at=says, locked=sticks, smoothing=smoothing)
+    return linear_model(state, tau, at=says, locked=sticks, smoothing=smoothing, library=subject.library)
 
 
 # --- along a run ---------------------------------------------------------------------------------
@@ -219,9 +224,16 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
     of_joints = RecordedJoints(run)
     locked, smoothing = of_joints.locked[k], subject.smoothing
     sliding = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * of_joints.sign[k]
-    notes = _notes(scene, run, k)
     model = linear_model(
-        state, run.tau[k], at=f"at t = {t:g} s", t=t, u_tree=sliding, locked=locked, smoothing=smoothing, notes=notes
+        state,
+        run.tau[k],
+        at=f"at t = {t:g} s",
+        t=t,
+        u_tree=sliding,
+        locked=locked,
+        smoothing=smoothing,
+        library=subject.library,
+        notes=_notes(scene, run, k),
     )
     law = scene_controller(scene, mechanism)
     if law is None:
@@ -232,7 +244,8 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
     spec = scene.spec.controller
     if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
         says += ", without its sampling and delay"
-    return replace(model, closed_loop=closed_loop(law, t, state, smoothing), notes=(*model.notes, says))
+    closed = ClosedLoop(mechanism, law, smoothing, subject.library).at(t, state).closed
+    return replace(model, closed_loop=closed, notes=(*model.notes, says))
 
 
 def _run_to(scene: Scene, t: float) -> Run:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.gradient import closed_loop
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.closed_loop import ClosedLoop
+from ckc_pin.simulation.prepare import library_of, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import load_scene
 
 __all__ = ["GainLocus", "gain_locus"]
@@ -70,8 +70,10 @@ def gain_locus(what: str | Path, changes: Mapping[str, Any] | None = None) -> Ga
     state = Terms(mechanism, found.at, found.at.rho @ q_dot)
     values = []
     with one_blas_thread():
+        loop = ClosedLoop(mechanism, law, scene.spec.friction_smoothing, library_of(mechanism, scene.spec.solver.terms))
         for factor in FACTORS:
             turned = copy.copy(law)
             setattr(turned, gain, factor * getattr(law, gain))
-            values.append(np.linalg.eigvals(closed_loop(turned, 0.0, state, scene.spec.friction_smoothing)))
+            loop.law = turned
+            values.append(np.linalg.eigvals(loop.at(0.0, state).closed))
     return GainLocus(scene.name, gain, FACTORS, np.array(values))

@@ -41,10 +41,18 @@ from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_spec import SceneSpec
+from ckc_pin.simulation.scene_spec import SceneSpec, TermsOf
 from ckc_pin.simulation.varying import variation_of
 
-__all__ = ["Prepared", "output_instants", "prepare", "scene_actuation", "scene_controller", "scene_mechanism"]
+__all__ = [
+    "Prepared",
+    "library_of",
+    "output_instants",
+    "prepare",
+    "scene_actuation",
+    "scene_controller",
+    "scene_mechanism",
+]
 
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
@@ -199,7 +207,7 @@ def prepare(
         actuation.require_transmission(start.at)
     tables = (
         core_table(
-            mechanism, library or _library(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
+            mechanism, library or library_of(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
         ),
         _formulation(mechanism, scene.spec, np.diagonal(D_tree))
         | (variation_of(mechanism, scene, controller, parameters) if parameters else {}),
@@ -212,7 +220,7 @@ def prepare(
     return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop)
 
 
-def _library(mechanism: Mechanism, terms: str) -> Library | None:
+def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
     """Compiled terms where they are asked for; "auto" takes those that are there, and never makes a run wait."""
     if terms == "pinocchio":
         return None

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinds import require_kind
+from ckc_pin.mechanism.kinds import require_callable, require_kind
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene
-from ckc_pin.simulation.simulate import run_of, run_rows
+from ckc_pin.simulation.simulate import Progress, run_of, run_rows
 from ckc_pin.simulation.varying import varying_of
 
 __all__ = ["Sensitivities", "sensitivities"]
@@ -70,7 +70,10 @@ class Sensitivities:
 
 
 def sensitivities(
-    scene: Scene | str | Path, parameters: Sequence[str], changes: Mapping[str, Any] | None = None
+    scene: Scene | str | Path,
+    parameters: Sequence[str],
+    changes: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
 ) -> Sensitivities:
     """Run a scene together with how its motion changes with parameters, to first order.
 
@@ -91,6 +94,8 @@ def sensitivities(
         A controller with a `model` keeps it; eq. 14 without one compensates what the changed mechanism needs.
     changes : mapping, optional
         As of `simulate`.
+    progress : callable, optional
+        As of `simulate`.
 
     Returns
     -------
@@ -106,6 +111,7 @@ def sensitivities(
         As `simulate`.
     """
     scene = as_scene(scene, changes, "sensitivities")
+    require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
     parameters = [parameters] if isinstance(parameters, str) else parameters
     require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)
     for name in parameters:
@@ -115,7 +121,7 @@ def sensitivities(
     ready = prepare(scene, parameters=tuple(parameters))
     labels = tuple(x.name for x in varying_of(ready.mechanism, scene, ready.controller, parameters))
     started = perf_counter()
-    rows, status, message = run_rows(ready)
+    rows, status, message = run_rows(ready, progress)
     run = run_of(ready, rows, status, message, perf_counter() - started)
     if not ready.loop.together():
         t = float(ready.loop.t)

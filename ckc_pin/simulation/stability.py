@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.gradient import error_loop, feedback
-from ckc_pin.control.sampling import sampled_loop
 from ckc_pin.dynamics.equilibrium import h_gradient
-from ckc_pin.dynamics.linearization import eigenvalues_of
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.closed_loop import ClosedLoop, Feedback
+from ckc_pin.simulation.linear_model import eigenvalues_of
+from ckc_pin.simulation.sampled_loop import sampled_loop, sampled_motion
 
 __all__ = ["Stability", "stability"]
 
@@ -48,6 +49,8 @@ class Stability:
     growth, largest_growth : float or None
         Of tracking: by how much the variational equation multiplies an error of position that starts with e_dot = 0,
         the worst there is, until the end of the motion, and at most on the way.
+    sampled : bool
+        Whether the verdict, `slowest` and `growth` are those of the loop as it is sampled and delayed.
     multiplier : float or None
         Of a set point that is sampled: the largest factor of an error from one sample to the next, delay included.
     leaves_out : tuple of str
@@ -62,6 +65,7 @@ class Stability:
     slowest: float
     growth: float | None = None
     largest_growth: float | None = None
+    sampled: bool = False
     multiplier: float | None = None
     leaves_out: tuple[str, ...] = ()
 
@@ -72,6 +76,7 @@ def stability(
     t_end: float,
     smoothing: float | None = None,
     sampling: tuple[float, float] | None = None,
+    library: Library | None = None,
 ) -> Stability | None:
     """Linearize a controller's closed loop.
 
@@ -82,27 +87,32 @@ def stability(
     smoothing : float, optional
         A scene's friction_smoothing.
     sampling : (sample_time, delay), optional
-        s; a set point's verdict is then that of the sampled loop. Tracking is taken as continuous.
+        s; the verdict is then that of the sampled loop.
+    library : Library, optional
+        The mechanism's terms, compiled.
 
     Returns
     -------
     Stability or None
         None where the target or the motion cannot be reached, or nothing comes to rest.
     """
+    import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
+
     with one_blas_thread():
+        loop = ClosedLoop(mechanism, law, smoothing, library)
         if isinstance(law, SetPoint):
-            return _about(mechanism, law, smoothing, sampling)
-        return _along(mechanism, law, t_end, smoothing)
+            return _about(mechanism, law, loop, sampling)
+        return _along(mechanism, law, loop, t_end, sampling)
 
 
 def _about(
-    mechanism: Mechanism, law: SetPoint, smoothing: float | None, sampling: tuple[float, float] | None
+    mechanism: Mechanism, law: SetPoint, closed_loop: ClosedLoop, sampling: tuple[float, float] | None
 ) -> Stability | None:
     at = _rest(mechanism, law)
     if at is None:
         return None
-    loop = feedback(law, 0.0, Terms(mechanism, at, np.zeros(mechanism.n)), smoothing)
-    values = eigenvalues_of(loop.A + loop.B @ loop.K)
+    loop = closed_loop.at(0.0, Terms(mechanism, at, np.zeros(mechanism.n)))
+    values = eigenvalues_of(loop.closed)
     stable, slowest = bool(values[0].real < -SURE * np.abs(values).max()), _time_constant(float(values[0].real))
     multiplier = None
     if sampling is not None:
@@ -117,6 +127,7 @@ def _about(
         least_K_P=factor * law.K_P,
         least_eigenvalue=float(np.linalg.eigvalsh(K_P + hessian)[0]),
         slowest=slowest,
+        sampled=sampling is not None,
         multiplier=multiplier,
     )
 
@@ -143,56 +154,67 @@ def _time_constant(rate: float) -> float:
 # --- along a motion ------------------------------------------------------------------------------
 
 
-def _along(mechanism: Mechanism, law: Tracking, t_end: float, smoothing: float | None) -> Stability | None:
-    linear = _linear_along(mechanism, law, smoothing)
+def _along(
+    mechanism: Mechanism, law: Tracking, loop: ClosedLoop, t_end: float, sampling: tuple[float, float] | None
+) -> Stability | None:
+    linear = _linear_along(mechanism, law, loop)
     first = linear(0.0)
     if first is None:
         return None
     steps, reach = FEWEST, mechanism.tree.reach[mechanism.partition.q]
     while True:
-        matrices = [linear((k + 0.5) * t_end / steps) for k in range(steps)]
-        known = [A for A in matrices if A is not None and np.all(np.isfinite(A))]
+        pieces = [linear((k + 0.5) * t_end / steps) for k in range(steps)]
+        known = [x for x in pieces if x is not None and np.all(np.isfinite(x.closed))]
         if len(known) < steps:
             return None
-        coarse = [(one + two) / 2 for one, two in zip(known[::2], known[1::2], strict=True)]
-        grown, check = (_growth(x, t_end, reach) for x in (known, coarse))
-        if abs(grown[-1] - check[-1]) <= AGREED * grown[-1] or 2 * steps > MOST:
+        coarse = [one.mean(two) for one, two in zip(known[::2], known[1::2], strict=True)]
+        grown, check = (_growth(x, t_end, reach, sampling) for x in (known, coarse))
+        if not abs(grown[-1] - check[-1]) > AGREED * grown[-1] or 2 * steps > MOST:
             break
         steps *= 2
     return Stability(
         stable=bool(grown[-1] < 1.0),
-        eigenvalues=eigenvalues_of(first),
+        eigenvalues=eigenvalues_of(first.closed),
         least_K_P=None,
         least_eigenvalue=None,
         slowest=_time_constant(float(np.log(max(grown[-1], 1e-300))) / t_end),
         growth=float(grown[-1]),
         largest_growth=float(grown.max()),
+        sampled=sampling is not None,
     )
 
 
-def _linear_along(mechanism: Mechanism, law: Tracking, smoothing: float | None) -> Callable[[float], Array | None]:
-    """Return A of the closed loop by time where the motion is as desired; None where it cannot be."""
+def _linear_along(mechanism: Mechanism, law: Tracking, loop: ClosedLoop) -> Callable[[float], Feedback | None]:
+    """Return the linear loop by time where the motion is as desired; None where it cannot be."""
     near = mechanism.assembled
 
-    def linear(t: float) -> Array | None:
+    def linear(t: float) -> Feedback | None:
         nonlocal near
         q_d, q_d_dot, _ = law.desired(t)
         found = sigma(mechanism, q_d, near)
         if found.verdict != "converged":
             return None
         near = found.at
-        return error_loop(law, t, Terms(mechanism, near, near.rho @ q_d_dot), smoothing)
+        return loop.at(t, Terms(mechanism, near, near.rho @ q_d_dot))
 
     return linear
 
 
-def _growth(matrices: list[Array], t_end: float, reach: Array) -> Array:
-    """Growth of errors of position by time, from the variational equation: exp(A(t + dt/2) dt), step after step."""
+def _growth(pieces: list[Feedback], t_end: float, reach: Array, sampling: tuple[float, float] | None) -> Array:
+    """Growth of errors of position by time, from the variational equation, the loop constant in each piece.
+
+    Infinite where it is no number any more.
+    """
     from scipy.linalg import expm
 
-    d, dt = len(reach), t_end / len(matrices)
-    state, grown = np.eye(2 * d)[:, :d] * reach, [1.0]
-    for A in matrices:
-        state = expm(A * dt) @ state
-        grown.append(float(np.linalg.norm(state[:d] / reach[:, None], 2)))
-    return np.array(grown)
+    d, dt = len(reach), t_end / len(pieces)
+    start = np.eye(2 * d)[:, :d] * reach
+    with np.errstate(over="ignore", invalid="ignore"):
+        if sampling is not None:
+            states = sampled_motion(pieces, dt, start, *sampling)
+        else:
+            states = [start]
+            for piece in pieces:
+                states.append(expm(piece.closed * dt) @ states[-1])
+    sizes = [state[:d] / reach[:, None] for state in states]
+    return np.array([float(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x in sizes])

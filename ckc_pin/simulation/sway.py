@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.dynamics.linearization import LinearModel, Mode
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.sigma import newton
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.linear_model import LinearModel, Mode
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import make_scene
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.dynamics.linearization import LinearModel, Mode
+from ckc_pin.simulation.linear_model import LinearModel, Mode
 from ckc_pin.simulation.locus import GainLocus
 from ckc_pin.view import style
 from ckc_pin.view.canvas import look, write

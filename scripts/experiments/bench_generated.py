@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin import Simulator, load
+from ckc_pin import Simulator, Terms, linearize, load
 from ckc_pin.generated.library import compiled
+from ckc_pin.native.plant import Plant
 from ckc_pin.simulation.simulate import run_prepared
 from scripts.experiments.bench import least, ready
 from scripts.experiments.generated_sizes import empty_cache
@@ -54,6 +56,29 @@ def jacobian() -> Measured:
             for what in (partial(loop.rhs, 0.0, y), partial(loop.jacobian, 0.0, y))
         )
         found.append((whole - (call - alone)) / alone)
+    return found[0], found[1]
+
+
+def plant() -> Measured:
+    """A and B of the five-bar, moving, in right-hand sides as `jacobian` has them."""
+    mechanism = load("five_bar")
+    at = mechanism.assembled
+    state, found = Terms(mechanism, at, at.rho @ np.array([1.0, -2.0])), []
+    for terms, library in zip(TERMS, (compiled(mechanism), None), strict=True):
+        loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
+        alone = loop.seconds(np.append(0.0, loop.y)[np.newaxis], 20000)
+        found.append(Plant(mechanism, library=library).seconds(state, np.zeros(mechanism.n)) / alone)
+    return found[0], found[1]
+
+
+def linearize_ms() -> Measured:
+    """The whole call at coordinates, the mechanism being loaded: terms that are there, or none."""
+    found, q = [], {"theta_1": -1.1, "theta_3": -1.8}
+    mechanism = load("five_bar")
+    compiled(mechanism)
+    for cached in (True, False):
+        with TemporaryDirectory() as folder, nullcontext() if cached else empty_cache(Path(folder)):
+            found.append(1e3 * least(lambda: linearize(mechanism, q), 30))
     return found[0], found[1]
 
 
@@ -98,6 +123,8 @@ def rows() -> Iterator[tuple[str, Any, float, str]]:
     for scene, most in RHS_NS:
         yield f"DAE right-hand side, {scene.partition('/')[0]}", partial(rhs_ns, scene), most, "ns"
     yield "its Jacobian, five_bar", jacobian, 3, "right-hand sides"
+    yield "A and B, five_bar", plant, 5, "right-hand sides"
+    yield "linearize whole, five_bar at coordinates", linearize_ms, 5, "ms"
     for name, most in (("five_bar", 2), ("delta", 10)):
         yield f"compiling {name}, and finding it", partial(compile_seconds, name), most, "s"
     for rtol, bound in SWING_MS:

@@ -10,10 +10,12 @@ import pytest
 
 from ckc_pin import Mechanism, load
 from ckc_pin.dynamics import Terms
-from ckc_pin.dynamics.derivatives import acceleration_derivatives
+from ckc_pin.generated.library import compiled
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_change, log_jacobian_dot
+from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_dot
 from ckc_pin.mechanism.spec import LoopType
+from ckc_pin.native import _core
+from ckc_pin.native.plant import Plant
 from tests.analytic.many_digits import ManyDigits, exact, log, turn
 from tests.analytic.small_models import coupled_four_bar, plate_on_springs
 from tests.property.mechanisms import closed_mechanism
@@ -21,11 +23,11 @@ from tests.property.mechanisms import closed_mechanism
 EQUAL = 1e-10  # relative
 
 
-def compare(terms: Terms, random: np.random.Generator) -> None:
+def compare(terms: Terms, random: np.random.Generator, plant: Plant | None = None) -> None:
     """Along a random step of configuration, velocity and force, off the closure too."""
     mechanism = terms.mechanism
     u_tree, steps = random.uniform(-5, 5, mechanism.n), random.uniform(-1, 1, (3, mechanism.n))
-    found = acceleration_derivatives(terms, u_tree)
+    found = (plant or Plant(mechanism)).at(terms, u_tree)
     theirs = ManyDigits(mechanism).along(terms.q_tree, terms.v_tree, u_tree, (steps[0], steps[1], steps[2]))
     a = found.a_q @ steps[0] + found.a_v @ steps[1] + found.a_u @ steps[2]
     forces = found.multipliers_q @ steps[0] + found.multipliers_v @ steps[1] + found.multipliers_u @ steps[2]
@@ -51,7 +53,9 @@ def test_every_kind_of_loop(kind: LoopType) -> None:
 def test_the_five_bar(seed: int) -> None:
     mechanism, random = load("five_bar"), np.random.default_rng(seed)
     at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.3, 0.3, 2)).at
-    compare(Terms(mechanism, at, at.rho @ random.uniform(-3, 3, 2)), random)
+    state = Terms(mechanism, at, at.rho @ random.uniform(-3, 3, 2))
+    compare(state, random)
+    compare(state, random, Plant(mechanism, library=compiled(mechanism)))
 
 
 @pytest.mark.parametrize("make", [coupled_four_bar, plate_on_springs])
@@ -78,11 +82,13 @@ def test_the_logarithm_of_a_rotation_differentiated_three_times(angle: float) ->
         return (jlog(v + h * Y) - jlog(v - h * Y)) / (2 * h)  # type: ignore[operator]
 
     twice = (change(U + h * Z) - change(U - h * Z)) / (2 * h)
+    value, along, along_twice = _core.log_rates(u, y, z)
     for ours, theirs in (
         (log_jacobian(u[None])[0] @ x, jlog(U)),
         (log_jacobian_dot(u[None], y[None])[0] @ x, change(U)),
-        (log_jacobian_change(u[None], y[None, :, None], x[None])[0, :, 0], change(U)),
-        (log_jacobian_change(u[None], z[None, :, None], x[None], along=y[None])[0, :, 0], twice),
+        (value @ x, jlog(U)),
+        (along @ x, change(U)),
+        (along_twice @ x, twice),
     ):
         wanted = np.array(theirs, dtype=float)
         assert np.abs(ours - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max())

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ckc_pin import Sampled, check, load_scene, simulate
+from ckc_pin import check, load_scene, simulate
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.gradient import closed_loop, error_loop, feedback, u_gradient
-from ckc_pin.control.sampling import sampled_loop
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.library import shipped
+from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import scene_names
 from ckc_pin.simulation.stability import stability
@@ -60,15 +59,17 @@ def test_a_controllers_gradient_is_the_difference(name: str) -> None:
     step = np.random.default_rng(1).uniform(-1, 1, 2 * mechanism.d)
     one, two = ((u(h * step) - u(-h * step)) / (2 * h) for h in (2e-3, 1e-3))
     wanted = (4 * two - one) / 3
-    assert np.abs(np.hstack(u_gradient(law, t, state)) @ step - wanted).max() <= 1e-9 * np.abs(wanted).max()
+    assert np.abs(ClosedLoop(mechanism, law).at(t, state).K @ step - wanted).max() <= 1e-9 * np.abs(wanted).max()
 
 
 @pytest.mark.parametrize("name", TRACKING)
-def test_the_short_way_is_the_long_one_where_the_motion_is_as_desired(name: str) -> None:
+def test_where_the_motion_is_as_desired_the_error_obeys_eq_16(name: str) -> None:
+    """D r_dot + (C + K_D) r = 0 with r = e_dot + Lambda e, the plant's own terms in the controller."""
     mechanism, law = controlled(name)
     state = state_of(mechanism, law, 0.7, 0.0)
-    short, long = error_loop(law, 0.7, state), closed_loop(law, 0.7, state)
-    assert np.abs(short - long).max() <= 1e-10 * np.abs(long).max()
+    G = np.linalg.solve(state.D, state.C + law.K_D)
+    wanted = np.block([[np.zeros_like(G), np.eye(len(G))], [-G @ law.Lambda, -G - law.Lambda]])
+    assert np.abs(ClosedLoop(mechanism, law).at(0.7, state).closed - wanted).max() <= 1e-10 * np.abs(wanted).max()
 
 
 def test_the_set_points_eigenvalues_are_those_of_the_appendix() -> None:
@@ -123,50 +124,6 @@ def test_growth_is_what_two_runs_do() -> None:
     found = stability(mechanism, law, 3.0)
     assert found is not None
     assert found.growth == pytest.approx(np.linalg.norm(np.array(ends).T, 2), rel=2e-3)
-
-
-# --- sampled -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.004, 0.01, 0.013, 0.02, 0.027])
-def test_a_sampled_set_point_is_the_matrix_of_its_samples(delay: float) -> None:
-    """A nonlinear run from a little off, sample by sample, once all that acts came from samples.
-
-    The target is the equilibrium, where no u is needed: before the first one acts there is none.
-    """
-    period, off, count = 0.01, 1e-5, 30
-    q_d = FIVE_BAR.equilibrium()[[0, 2]]
-    target = {"controller.q_d": dict(zip(("theta_1", "theta_3"), q_d.tolist(), strict=True))}
-    mechanism, law = controlled("five_bar/set_point", target)
-    start = {"q": dict(zip(mechanism.independent, (q_d + off * np.array([1, -0.5])).tolist(), strict=True))}
-    q_tree = sigma(mechanism, law.q_d).at
-    loop = feedback(law, 0.0, Terms(mechanism, q_tree, np.zeros(mechanism.n)))
-    matrix = sampled_loop(loop, period, delay)
-
-    m = int(np.floor(delay / period + 1e-9))
-    changes = {**target, "initial": start, "t_end": count * period, "solver.output_dt": period, "solver.rtol": 1e-12,
-               "formulation": "reduced"}  # fmt: skip
-    run = simulate("five_bar/set_point", changes, controller=Sampled(law, period, delay))
-    at = m + 1 if delay else 0  # from here on what is under way came from samples
-    x = np.hstack([run.q_tree[:, [0, 2]] - q_d, run.v_tree[:, [0, 2]]])
-    under_way = (len(matrix) - 4) // 2
-    y = np.concatenate([x[at], *(loop.K @ x[at - k] if at >= k else np.zeros(2) for k in range(1, under_way + 1))])
-    size = np.abs(x[at:]).max()
-    for k in range(at, count + 1):
-        assert np.abs(y[:4] - x[k]).max() <= 2e-3 * size
-        y = matrix @ y
-
-
-def test_sampling_too_seldom_is_unstable() -> None:
-    verdicts = []
-    for period in (0.02, 0.2):
-        scene = load_scene("five_bar/set_point", {"controller.sample_time": period})
-        found = check(scene)
-        assert found.stability is not None
-        assert found.stability.leaves_out == ()
-        assert found.stability.eigenvalues.real.max() < 0
-        verdicts.append((found.stability.stable, any("unstable as sampled" in x for x in found.warnings)))
-    assert verdicts == [(True, False), (False, True)]
 
 
 # --- shipped scenes ------------------------------------------------------------------------------

@@ -156,6 +156,23 @@ def test_check_tells_of_the_closed_loop() -> None:
     assert ckc("check", "five_bar", "--json").json["stability"] is None
 
 
+def test_check_says_that_a_verdict_is_that_of_the_samples(tmp_path: Path) -> None:
+    scene = tmp_path / "seldom.scene.toml"
+    scene.write_text(
+        'mechanism = "five_bar"\nformulation = "reduced"\nt_end = 1.0\ninitial.at = "equilibrium"\n'
+        '[controller]\ntype = "set_point"\nK_P = 10.0\nK_V = 1.0\nsample_time = 0.2\ndelay = 0.05\n'
+        "q_d = { theta_1 = -1.2, theta_3 = -1.9 }\n"
+    )
+    found = ckc("check", str(scene), "--json").json
+    assert found["stability"]["sampled"] is True
+    assert found["stability"]["stable"] is False
+    assert found["stability"]["multiplier"] > 1
+    assert found["stability"]["leaves_out"] == []
+    assert any("unstable as sampled" in warning for warning in found["warnings"])
+    assert "UNSTABLE as sampled, factor" in ckc("check", str(scene)).out.replace("\n", " ")
+    assert ckc("check", "five_bar/set_point", "--json").json["stability"]["sampled"] is False
+
+
 def test_the_regulator_of_the_example_holds() -> None:
     example = runpy.run_path(str(ROOT / "examples" / "lqr.py"))
     model, regulator = example["design"]()

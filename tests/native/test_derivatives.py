@@ -12,8 +12,7 @@ from ckc_pin import load, simulate
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.native import _core
-from ckc_pin.native.tables import core_table
+from ckc_pin.native.plant import Plant
 from ckc_pin.simulation.scene import catalogue
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.native.loops import started
@@ -31,11 +30,11 @@ def extrapolated(function: Any, h: float) -> Any:
 
 def largest_error(mechanism: Mechanism, random: Any) -> float:
     """Along random motions of the closed loops, relative to the largest change."""
-    n, tree, core = mechanism.n, mechanism.tree, _core.Core(core_table(mechanism))
+    n, tree = mechanism.n, mechanism.tree
     J = mechanism.assembled.J
     free = np.eye(n) - np.linalg.pinv(J, rcond=1e-9) @ J  # redundant rows contradict each other off the closure
     v, u = free @ random.uniform(-1, 1, n), random.uniform(-1, 1, n)
-    found = core.derivatives(mechanism.q_tree, v, u)
+    found = Plant(mechanism).at(Terms(mechanism, mechanism.assembled, v), u)
     worst = 0.0
     for _ in range(3):
         dq, dv, du = free @ random.uniform(-1, 1, n), free @ random.uniform(-1, 1, n), random.uniform(-1, 1, n)
@@ -48,7 +47,7 @@ def largest_error(mechanism: Mechanism, random: Any) -> float:
         size = np.abs(wanted).max()
         if open_by > CLOSED * size:
             continue
-        ours = found["by_q"] @ dq + found["by_v"] @ dv + found["by_u"] @ du
+        ours = found.a_q @ dq + found.a_v @ dv + found.a_u @ du
         worst = max(worst, float(np.abs(ours - wanted).max() / size))
     return worst
 
@@ -84,6 +83,8 @@ STATES = [
     ("three_rrr/circle", {"formulation": "reduced"}),
     ("delta/default", {"formulation": "reduced"}),
     ("two_ur5/default", {"formulation": "dae"}),
+    ("two_ur5/lift", {"formulation": "dae"}),
+    ("two_ur5/lift", {"formulation": "reduced"}),
     ("stewart/default", {"formulation": "reduced"}),
 ]
 

@@ -5,6 +5,7 @@ Where the pendulum hangs still, what it answers to a push is theta'' + (g - A w^
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,15 @@ def test_a_scene_is_taken_as_its_name_is(tmp_path: Path) -> None:
     wanted = floquet(name, PERIOD, {"solver.rtol": 1e-9})
     found = floquet(load_scene(name, {"solver.rtol": 1e-9}), PERIOD)
     assert np.array_equal(found.monodromy, wanted.monodromy)
+
+
+def test_before_its_variational_equations_the_motion_is_run_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = import_module("ckc_pin.simulation.floquet")  # whose name is also a function's
+    monkeypatch.setattr(module, "sensitivities", lambda *_: pytest.fail("what they cost"))
+    with pytest.raises(InputError, match="is none: after it y is off by"):
+        floquet(written(tmp_path, g, 0.2), 0.9)
 
 
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:

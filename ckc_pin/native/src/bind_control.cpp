@@ -70,8 +70,10 @@ class Caller : public Controller {
   std::shared_ptr<View> view_;
 };
 
-std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& core, Eigen::Index motors,
-                                          const std::shared_ptr<View>& view) {
+}  // namespace
+
+std::unique_ptr<Controller> law_of(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                   const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
   if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), get<bool>(table, "of_motors"), view);
   if (kind == "torques") {
@@ -97,8 +99,6 @@ std::unique_ptr<Controller> controller_of(const nb::dict& table, const Core& cor
   return std::make_unique<Tracking>(Lambda, K_D, motion_of(get<nb::dict>(table, "desired"), d), std::move(model),
                                     get<bool>(table, "actual"));
 }
-
-}  // namespace
 
 // Its arguments: (view, stamp, t, the numbers of `put`, q, z). Arrays are made once, and filled for each call.
 bool View::call(const nb::object& function, const Measured& at, Problem& problem, nb::object& answer) {
@@ -172,7 +172,7 @@ Sensor sensor_of(const nb::dict& table, const Core& core) {
 std::unique_ptr<Control> control_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view) {
   auto control = std::make_unique<Control>(core, actuation_of(table, core));
   const auto motors = control->tau.size();
-  if (table.contains("law")) control->law = controller_of(get<nb::dict>(table, "law"), core, motors, view);
+  if (table.contains("law")) control->law = law_of(get<nb::dict>(table, "law"), core, motors, view);
   if (table.contains("clock")) {
     const auto clock = get<nb::dict>(table, "clock");
     Sampling& sampling = control->sampling.emplace();

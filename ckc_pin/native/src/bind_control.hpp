@@ -31,6 +31,8 @@ class View : public std::enable_shared_from_this<View> {
   Places places_;
 };
 
+std::unique_ptr<Controller> law_of(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                   const std::shared_ptr<View>& view);
 std::unique_ptr<Control> control_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view);
 
 }  // namespace ckc

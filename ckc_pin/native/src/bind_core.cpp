@@ -150,24 +150,6 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
   return acceleration;
 }
 
-// How eq. 1's acceleration changes by (q', v', u'), tangent, and the rows' parts; none where J has lost rank.
-nb::object derivatives(Core& core, Given q_tree, Given v_tree, Given u_tree) {
-  require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
-  const int n = core.n, m = core.rows.closure.rows;
-  Vector a(n);
-  Matrix by_q, by_v, by_u;
-  core.set(q_tree, true), core.set_velocity(v_tree);
-  if (!core.dae_acceleration(u_tree, Vector::Zero(m), a) || !core.differentiate(u_tree, a)) return nb::none();
-  const Derivatives& by = core.derivatives;
-  if (!core.respond(-by.force_by_q, by.row_by_q, by_q) || !core.respond(-by.force_by_v, by.row_by_v, by_v) ||
-      !core.respond(Matrix::Identity(n, n), Matrix::Zero(m, n), by_u))
-    return nb::none();
-  nb::dict found;
-  found["a"] = a, found["by_q"] = by_q, found["by_v"] = by_v, found["by_u"] = by_u;
-  found["rate_by_q"] = by.rate_by_q, found["J"] = by.J;
-  return found;
-}
-
 }  // namespace
 
 nb::object term_of(Core& core, const std::string& name) {
@@ -217,8 +199,7 @@ void bind_core(nb::module_& m) {
       .def("jacobian", &jacobian, "q_tree"_a)
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)
-      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a)
-      .def("derivatives", &derivatives, "q_tree"_a, "v_tree"_a, "u_tree"_a);
+      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a);
 }
 
 }  // namespace ckc

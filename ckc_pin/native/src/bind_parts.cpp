@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "bind_run.hpp"
+#include "rotation.hpp"
 #include "stiffness.hpp"
 
 namespace ckc {
@@ -52,6 +53,14 @@ nb::tuple weights(const Vector& times, double t) {
   Vector a(times.size()), b(times.size());
   hermite_weights(times.data(), static_cast<int>(times.size()), t, a.data(), b.data());
   return nb::make_tuple(a, b);
+}
+
+// The matrix by which a rotation vector moves, its derivative along a, and of that along b.
+nb::tuple log_rates(const Vector& u, const Vector& a, const Vector& b) {
+  require(u, 3, "u"), require(a, 3, "a"), require(b, 3, "b");
+  const Vector3 along_a = a, along_b = b;
+  const LogRate found{Vector3(u)};
+  return nb::make_tuple(Matrix(found.value), Matrix(found.along(along_a)), Matrix(found.along(along_a, along_b)));
 }
 
 Dae& dae_of(Run& run) {
@@ -107,6 +116,7 @@ void bind_parts(nb::module_& m, nb::class_<Run>& loop) {
   m.def("walk", &walk_over, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a,
         "exact"_a.none() = nb::none());
   m.def("stiff", &stiff, "jacobian"_a, "duration"_a);
+  m.def("log_rates", &log_rates, "u"_a, "a"_a, "b"_a);
   m.def("hermite_weights", &weights, "times"_a, "t"_a);
   nb::class_<Predicting>(m, "Predictor")
       .def(nb::init<const nb::dict&, Given, double>(), "core"_a, "q_tree"_a, "epsilon"_a)

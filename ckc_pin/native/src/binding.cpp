@@ -10,4 +10,5 @@ NB_MODULE(_core, m) {
   ckc::bind_loop(m);
   ckc::bind_gate(m);
   ckc::bind_batch(m);
+  ckc::bind_plant(m);
 }

@@ -91,5 +91,6 @@ void bind_core(nb::module_& m);
 void bind_loop(nb::module_& m);
 void bind_gate(nb::module_& m);
 void bind_batch(nb::module_& m);
+void bind_plant(nb::module_& m);
 
 }  // namespace ckc

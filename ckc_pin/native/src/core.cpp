@@ -225,6 +225,13 @@ void Core::jacobian_rate(In v) {
   rows.jacobian_dot(tree, tree.jacobian_rate(q_tree, v_tree));
 }
 
+// A step x beside v' does not commute with it where axes turn along.
+void Core::closure_rate(In v, Matrix& by_q) {
+  jacobian_rate(v);
+  by_q = rows.J_dot;
+  if (!tree.roots.empty()) jacobian(), by_q.noalias() -= rows.J * tree.brackets(v);
+}
+
 void Core::bias() {
   if (has(bias_of_tree)) return;
   Profile::Entry entry(profile, Profile::bias_tree);

@@ -80,6 +80,7 @@ class Core {
   void bias();                // C'v + h' less springs, J_dot v
   void coriolis();            // C', J_dot and h' less springs
   void jacobian_rate(In v_tree);  // rows.J_dot alone
+  void closure_rate(In v_tree, Matrix& by_q);  // how J v' changes with q', tangent
   Vector v_tree, bias_tree, h_tree, J_dot_v;
   Vector damping_tree;        // what dampers do, zero without
   void velocity(In q_dot, Out v) const;           // rho q_dot
@@ -100,8 +101,12 @@ class Core {
   bool closing_step(In residual, Out x);
   // The same in the metric of the coordinates, along every direction that J determines at all.
   bool shortest_step(In residual, Out x);
-  // Basis of the velocities that the loops allow, (n, n - rank); null where J has lost rank.
+  // Basis of the velocities that the loops allow, (n, n - rank), and the coordinates that its columns are of; null where
+  // J has lost rank.
   const Matrix* tangent();
+  const Indices& free() const { return free_; }
+  // An x with J x = -residual, where there is a tangent basis.
+  void particular(In residual, Out x);
   // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
@@ -113,6 +118,11 @@ class Core {
   void multipliers(In force, Out lambda);
   // How eq. 1's acceleration changes with forces and with what J a is to lack, a column each; false where J has lost rank.
   bool respond(const Matrix& force, const Matrix& residual, Matrix& change);
+  // How the acceleration of eq. 1 changes with (q', v'), tangent, and with u', where `force` acts and changes as `u_by_q`
+  // and `u_by_v`, none where they are empty; what joints do is added to those. At the core's state, which may be another
+  // one where its terms are written out and no joint is locked, so that `a` is not computed. False where J has lost rank.
+  bool slopes(In q_tree, In v, In correction, Vector& force, Matrix& u_by_q, Matrix& u_by_v, Vector& a, Matrix& by_q,
+              Matrix& by_v, Matrix* by_u = nullptr);
   // The same as `dae_acceleration` at any state, whatever the core's; false where there is no such code, or where it would have to pivot.
   bool written_acceleration(In q_tree, In v_tree, In u_tree, In correction, Out acceleration) const;
 
@@ -144,7 +154,7 @@ class Core {
   long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1
   Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
-  Matrix square_;
+  Matrix square_, by_state_, by_u_, responses_;
   Definite square_factor_;
   Vector turned_, negative_, moved_, small_, small_b_;
 };

@@ -145,6 +145,11 @@ const Matrix* Core::tangent() {
   return tangent_basis(residual_, singular) ? &tangent_ : nullptr;
 }
 
+void Core::particular(In residual, Out x) {
+  tangent_basis(residual, singular);
+  x = x_;
+}
+
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   if (written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
   bias();
@@ -172,7 +177,7 @@ bool Core::responses(const Indices& at, Matrix& columns) {
 void Core::multipliers(In force, Out lambda) {
   if (!rows.closure.rows) return;
   jacobian();
-  Eigen::ColPivHouseholderQR<Matrix> transposed;
+  Eigen::CompleteOrthogonalDecomposition<Matrix> transposed;
   transposed.setThreshold(scales.rank);
   transposed.compute(scales.columns.asDiagonal() * rows.J.transpose() * scales.rows.asDiagonal());
   lambda = scales.rows.cwiseProduct(transposed.solve(scales.columns.cwiseProduct(force)));
@@ -199,6 +204,64 @@ bool Core::respond(const Matrix& force, const Matrix& residual, Matrix& change) 
     with_force(y_, change.col(k));
   }
   return true;
+}
+
+bool Core::slopes(In q_at, In v, In correction, Vector& force, Matrix& u_by_q, Matrix& u_by_v, Vector& a, Matrix& by_q,
+                  Matrix& by_v, Matrix* by_u) {
+  joints.add_friction(v, force);
+  if (joints.smooth()) {
+    Vector slope = Vector::Zero(n);
+    joints.add_slopes(v, slope);
+    if (!u_by_v.size()) u_by_v.setZero(n, n);
+    u_by_v.diagonal() += slope;
+  }
+  a.resize(n);
+  const bool locked = !joints.locked.empty();
+  if (locked) {
+    set_velocity(v);
+    if (!dae_acceleration(force, correction, a) || !responses(joints.locked, responses_)) return false;
+    joints.hold(responses_, a);
+    for (size_t i = 0; i < joints.locked.size(); ++i) force(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
+  }
+  Matrix& of_u = by_u ? *by_u : by_u_;
+  if (written && correction.isZero(0) && written->jacobian(q_at, v, force, by_state_, of_u)) {
+    const int nq = tree.nq;
+    by_v = by_state_.bottomRightCorner(n, n);
+    if (nq == n) {
+      by_q = by_state_.bottomLeftCorner(n, n);
+    } else {
+      by_q.resize(n, n);
+      Vector move(nq);
+      for (int k = 0; k < n; ++k) {
+        tree.configuration_rate(q_at, Vector::Unit(n, k), move);
+        by_q.col(k).noalias() = by_state_.bottomLeftCorner(n, nq) * move;
+      }
+    }
+    if (u_by_q.size()) by_q.noalias() += of_u * u_by_q;
+    if (u_by_v.size()) by_v.noalias() += of_u * u_by_v;
+  } else {
+    if (q_tree != q_at) set(q_at, true);
+    set_velocity(v);
+    if (!locked && !dae_acceleration(force, correction, a)) return false;
+    if (!differentiate(force, a)) return false;
+    const Derivatives& by = derivatives;
+    const auto changed = [](const Matrix& u_part, const Matrix& tree_part) {
+      return u_part.size() ? Matrix(u_part - tree_part) : Matrix(-tree_part);
+    };
+    if (!respond(changed(u_by_q, by.force_by_q), by.row_by_q, by_q) ||
+        !respond(changed(u_by_v, by.force_by_v), by.row_by_v, by_v))
+      return false;
+    if (by_u && !respond(Matrix::Identity(n, n), Matrix::Zero(rows.closure.rows, n), of_u)) return false;
+  }
+  if (locked) {
+    Vector back(n);
+    for (Matrix* by : {&by_q, &by_v, by_u})
+      for (int k = 0; by && k < n; ++k) {
+        joints.back(responses_, by->col(k), back);
+        by->col(k) += back;
+      }
+  }
+  return by_q.allFinite() && by_v.allFinite();
 }
 
 bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {

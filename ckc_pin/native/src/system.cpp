@@ -1,7 +1,5 @@
 #include "system.hpp"
 
-#include "written.hpp"
-
 #include <algorithm>
 #include <cmath>
 
@@ -32,50 +30,8 @@ bool System::eq_1(In v, In correction, Out a) {
 }
 
 bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) {
-  Joints& joints = core.joints;
-  const int n = core.n;
   if (!control.slopes(core, u_by_q_, u_by_v_, force_)) return false;
-  core.joints.add_friction(v, force_);
-  Vector damping = Vector::Zero(n);
-  joints.add_slopes(v, damping);
-  u_by_v_.diagonal() += damping;
-  a_.resize(n);
-  const bool locked = !joints.locked.empty();
-  if (locked) {
-    core.set_velocity(v);
-    if (!eq_1(v, correction, a_)) return false;
-    for (size_t i = 0; i < joints.locked.size(); ++i) force_(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
-  }
-  if (core.written && correction.isZero(0) && core.written->jacobian(q_tree, v, force_, by_state_, by_u_)) {
-    const int nq = core.tree.nq;
-    by_v = by_state_.bottomRightCorner(n, n);
-    if (nq == n) {
-      by_q = by_state_.bottomLeftCorner(n, n);
-    } else {
-      by_q.resize(n, n);
-      Vector move(nq);
-      for (int k = 0; k < n; ++k) {
-        core.tree.configuration_rate(q_tree, Vector::Unit(n, k), move);
-        by_q.col(k) = by_state_.bottomLeftCorner(n, nq) * move;
-      }
-    }
-    by_q += by_u_ * u_by_q_, by_v += by_u_ * u_by_v_;
-  } else {
-    if (core.q_tree != q_tree) core.set(q_tree, true);
-    core.set_velocity(v);
-    if (!locked && !core.dae_acceleration(force_, correction, a_)) return false;
-    if (!core.differentiate(force_, a_)) return false;
-    const Derivatives& by = core.derivatives;
-    if (!core.respond(u_by_q_ - by.force_by_q, by.row_by_q, by_q) || !core.respond(u_by_v_ - by.force_by_v, by.row_by_v, by_v))
-      return false;
-  }
-  if (locked)
-    for (Matrix* by : {&by_q, &by_v})
-      for (int k = 0; k < n; ++k) {
-        joints.back(responses_, by->col(k), back_);
-        by->col(k) += back_;
-      }
-  return by_q.allFinite() && by_v.allFinite();
+  return core.slopes(q_tree, v, correction, force_, u_by_q_, u_by_v_, a_, by_q, by_v) || fails(Trouble::rank);
 }
 
 bool System::acceleration(double t, Out a) {

@@ -1,14 +1,21 @@
 // How eq. 16's u changes with the state.
 #include "control.hpp"
 
+#include <algorithm>
+
 namespace ckc {
 
 // u = rho^T m - K_D r with m = D' a' + C' v2 + h', where v1 = v', v2 = rho v and a' = rho a + rho_dot v. C' v2 and
-// J_dot v2 are half of what v1 + v2 and v1 - v2 make of C' v and J_dot v apart. With m = J^T lambda + u on q, and since
-// rho^T J^T = 0, the change of rho is that of J^T lambda.
+// J_dot v2 are half of what v1 + v2 and v1 - v2 make of C' v and J_dot v apart; where a root's axes turn those are means
+// of C'(v1) v2 and C'(v2) v1, which differ by D' times what the two velocities lack in common, and a' by the same.
+// With m = J^T lambda + u on q, and since rho^T J^T = 0, the change of rho is that of J^T lambda.
 bool Tracking::slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) {
   Core& core = model_ ? *model_ : plant;
-  if (!core.tree.roots.empty() || core.q != own) return false;
+  const Indices& single = core.tree.single;
+  for (int k : own)
+    if (!std::binary_search(single.begin(), single.end(), k)) return false;
+  if (core.q != own) return false;
+  const bool turns = !core.tree.roots.empty();
   const int n = core.n, d = core.d, m = core.rows.closure.rows;
   const bool follows = model_ && !actual_;  // v1 = rho q_dot of its own
   core.reduce(), core.tree_inertia();
@@ -26,7 +33,9 @@ bool Tracking::slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_
   };
   Matrix a = Matrix::Zero(n, 1);
   for (int k = 0; k < d; ++k) a(own[k], 0) = a_(k);
-  close(core.rows.J_dot * v2, a);
+  Vector opens = core.rows.J_dot * v2;
+  if (turns) core.jacobian_rate(v2), opens = (opens + core.rows.J_dot * v1) / 2;
+  close(opens, a);
   const Vector none = Vector::Zero(n), no_force = Vector::Zero(m);
   const auto changes = [&](In v, In a_there, In lambda, bool inertial) {
     core.derivatives.compute(core.q_tree, v, a_there, lambda, inertial);
@@ -40,8 +49,11 @@ bool Tracking::slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_
   const Matrix row_1 = row_plus - by->row_by_v / 4, row_2 = row_plus + by->row_by_v / 4;
   Vector moved(n), m_tree(n);
   core.D_times(a.col(0), moved);
+  Vector apart = Vector::Zero(n);
+  if (turns) core.set_velocity(v2), core.coriolis(), core.C_tree_times(v1, apart);
   core.set_velocity(v1), core.coriolis();
   core.C_tree_times(v2, m_tree);
+  if (turns) m_tree = (m_tree + apart) / 2;
   m_tree += moved + core.h_tree;
   Vector u(d), lambda(m);
   core.reduced(m_tree, u);
@@ -58,12 +70,12 @@ bool Tracking::slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_
     return x;
   };
   const Matrix nothing = Matrix::Zero(m, n), zero = Matrix::Zero(d, n);
-  // J v1 = 0 and J v2 = 0 turn with the configuration as J_dot does along either
-  core.jacobian_rate(v1);
-  const Matrix v1_q = follows ? closed(zero, core.rows.J_dot) : Matrix(Matrix::Zero(n, n));
+  Matrix opened;  // J v1 = 0 and J v2 = 0 turn with the configuration
+  core.closure_rate(v1, opened);
+  const Matrix v1_q = follows ? closed(zero, opened) : Matrix(Matrix::Zero(n, n));
   const Matrix v1_v = follows ? closed(in_q, nothing) : Matrix(Matrix::Identity(n, n));
-  core.jacobian_rate(v2);
-  const Matrix v2_q = closed(-Lambda_ * in_q, core.rows.J_dot);
+  core.closure_rate(v2, opened);
+  const Matrix v2_q = closed(-Lambda_ * in_q, opened);
   const Matrix a_q = closed(zero, row_q + row_1 * v1_q + row_2 * v2_q);
   const Matrix a_v = closed(-Lambda_ * in_q, row_1 * v1_v);
   Matrix changed_q = force_q + force_1 * v1_q + force_2 * v2_q, changed_v = force_1 * v1_v;

@@ -1,10 +1,4 @@
-"""The linear model of a mechanism about one state: eq. 1 in minimal coordinates, differentiated exactly.
-
-The state is x = (q, q_dot) in d coordinates. With the tangent basis T, v' = T q_dot, and V what a change of q asks of
-v' so that the loops stay closed, the change of the acceleration a of eq. 1 along those coordinates is
-
-    (a_q T + a_v V) dq + a_v T dq_dot + a_u turns^T dtau.
-"""
+"""The linear model of a mechanism about one state: eq. 1 in minimal coordinates, differentiated exactly."""
 
 from __future__ import annotations
 
@@ -15,19 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ckc_pin.dynamics.derivatives import NONE, AccelerationDerivatives, acceleration_derivatives
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.library import Library
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.native.plant import NONE, Plant
 
-__all__ = ["LinearModel", "MinimalCoordinates", "Mode", "eigenvalues_of", "linear_model", "reduced"]
+__all__ = ["LinearModel", "Mode", "eigenvalues_of", "linear_model"]
 
 ComplexArray = NDArray[np.complex128]
 
 MOST_NAMES, MOST_ROWS = 14, 12  # names in a list, and modes, in what is printed
 ROUNDING = 1e-12  # a damping ratio as small as that is printed as none
-LARGEST = 1e6  # condition of the coordinates' part of a tangent basis: beyond that they are no chart
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,45 +183,6 @@ def eigenvalues_of(A: Array) -> ComplexArray:
     return values[np.lexsort((-values.imag, np.round(np.abs(values.imag), 9), -np.round(values.real, 9)))]
 
 
-@dataclass(frozen=True)
-class MinimalCoordinates:
-    """Eq. 1's derivatives in minimal coordinates.
-
-    Attributes
-    ----------
-    at : (d,) int array
-        Which tangent coordinates the states are.
-    T, V : (n, d) arrays
-        v' by the coordinates' rates, and by the coordinates.
-    A : (2 d, 2 d) array
-    by_u : (2 d, n) array
-        The states' rates by u'.
-    """
-
-    at: IntArray
-    T: Array
-    V: Array
-    A: Array
-    by_u: Array
-
-
-def reduced(terms: Terms, found: AccelerationDerivatives) -> MinimalCoordinates:
-    """Bring derivatives of eq. 1 to minimal coordinates: `independent`, or others where those are no chart."""
-    at, d = found.chart, len(found.chart)
-    own = np.array([k for k in terms.mechanism.partition.q if found.tangent[k].any()], dtype=np.intp)  # not locked
-    if len(own) == d and np.linalg.cond(found.tangent[own]) < LARGEST:
-        at = own
-    T = found.tangent @ np.linalg.inv(found.tangent[at])
-    V = found.v_q @ T
-    V -= T @ V[at]
-    A = np.zeros((2 * d, 2 * d))
-    A[:d, :d] = -(terms.mechanism.tree.bracket(terms.v_tree) @ T)[at]
-    A[:d, d:] = np.eye(d)
-    A[d:, :d] = (found.a_q @ T + found.a_v @ V)[at]
-    A[d:, d:] = (found.a_v @ T)[at]
-    return MinimalCoordinates(at, T, V, A, np.vstack([np.zeros((d, terms.mechanism.n)), found.a_u[at]]))
-
-
 def linear_model(
     terms: Terms,
     tau: Array,
@@ -237,6 +192,7 @@ def linear_model(
     u_tree: Array | float = 0.0,
     locked: IntArray = NONE,
     smoothing: float | None = None,
+    library: Library | None = None,
     notes: tuple[str, ...] = (),
 ) -> LinearModel:
     """Linearize eq. 1 about a state.
@@ -257,6 +213,8 @@ def linear_model(
         Coordinates of joints that stick or touch.
     smoothing : float, optional
         Rate over which dry friction grows, as a scene's friction_smoothing.
+    library : Library, optional
+        The mechanism's terms, compiled.
 
     Raises
     ------
@@ -267,24 +225,23 @@ def linear_model(
     """
     mechanism = terms.mechanism
     names = tuple(mechanism.coordinates[k] for k in locked)
-    found = acceleration_derivatives(terms, mechanism.motors.force(tau) + u_tree, locked, smoothing)
-    if not found.tangent.shape[1]:
+    found = Plant(mechanism, smoothing, library).at(terms, mechanism.motors.force(tau) + u_tree, locked)
+    if not len(found.at):
         why = (
             f"its joints stick or touch ({', '.join(names)}); friction_smoothing lets them slide" if names else "d = 0"
         )
         raise InputError(f"{mechanism.name}: no freedom is left to linearize in: {why}")
-    small = reduced(terms, found)
-    if not np.all(np.isfinite(small.A)):
+    if not np.all(np.isfinite(found.A)):
         raise NumericalError(f"{mechanism.name}: no linear model there, its derivatives are not finite")
-    chart = tuple(mechanism.coordinates[k] for k in small.at)
+    chart = tuple(mechanism.coordinates[k] for k in found.at)
     if chart != mechanism.independent and not names:
         notes = (*notes, f"{', '.join(mechanism.independent)} are no coordinates there; {', '.join(chart)} are")
     if names:
         notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
     points = mechanism.point_jacobians(terms.q_tree)
-    turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(small.at)))
-    places = np.vstack([small.T, *(x @ small.T for x in points.values())])
-    forces_q = found.multipliers_q @ small.T + found.multipliers_v @ small.V
+    turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(found.at)))
+    places = np.vstack([found.T, *(x @ found.T for x in points.values())])
+    forces_q = found.multipliers_q @ found.T + found.multipliers_v @ found.V
     return LinearModel(
         name=mechanism.name,
         mechanism=mechanism,
@@ -297,14 +254,14 @@ def linear_model(
             *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
             *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
         ),
-        A=small.A,
-        B=small.by_u @ turns,
-        C=np.block([[places, zero], [forces_q, found.multipliers_v @ small.T]]),
+        A=found.A,
+        B=found.B,
+        C=np.block([[places, zero], [forces_q, found.multipliers_v @ found.T]]),
         D=np.vstack([np.zeros((len(zero), len(mechanism.actuated))), found.multipliers_u @ turns]),
         q_tree=mechanism.tree.to_coordinates(terms.q_tree),
         v_tree=terms.v_tree,
         tau=tau,
-        motions=small.T,
+        motions=found.T,
         locked=names,
         notes=notes,
     )
