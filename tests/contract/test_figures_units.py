@@ -18,7 +18,9 @@ OTHER = re.compile(rf"^\D.* / {UNIT}$|\[{UNIT}(?:, {UNIT})*\]|^[\w ]+, {UNIT}$")
 PLACES = ("examples", "ckc_pin", "scripts")
 
 
-@pytest.mark.parametrize("said", ["t / s", "rate [rad/s]", "q, q̇ [rad, rad/s]", "at t, s", "stable at / rad", "tau [N m]"])
+@pytest.mark.parametrize(
+    "said", ["t / s", "rate [rad/s]", "q, q̇ [rad, rad/s]", "at t, s", "stable at / rad", "tau [N m]"]
+)
 def test_other_notations_are_known(said):
     assert OTHER.search(said)
 
