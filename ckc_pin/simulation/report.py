@@ -113,7 +113,7 @@ def inverse_table(found: MotionForces) -> Group:
     from rich.text import Text
 
     table = _plain_table("of the motion")
-    for title in ("largest", "at t, s"):
+    for title in ("largest", "at t (s)"):
         table.add_column(title, justify="right")
     beyond = {entry["motor"]: entry for entry in found.exceeded}
     table.add_column("limit")

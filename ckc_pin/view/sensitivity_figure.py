@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.simulation.sensitivities import Sensitivities
 from ckc_pin.view import style
-from ckc_pin.view.canvas import look, write
+from ckc_pin.view.canvas import fit_legend, look, write
 from ckc_pin.view.labels import plain, symbol, with_unit
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def draw_sensitivities(found: Sensitivities) -> Figure:
     with look():
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(8.4, 1.4 + 1.7 * len(chosen)), layout="constrained")
+        figure = Figure(figsize=(style.WIDTH_BESIDE, 1.4 + 1.7 * len(chosen)), layout="constrained")
         axes = figure.subplots(len(chosen), 1, sharex=True, squeeze=False)[:, 0]
         every = len(found.parameters)
         left_out = "" if len(chosen) == every else f", {len(chosen)} of {every} parameters"
@@ -62,6 +62,6 @@ def draw_sensitivities(found: Sensitivities) -> Figure:
             ax.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
             ax.set(title=f"by {plain(found.parameters[p])}", ylabel=r"$\partial q / \partial p$")
         if len(run.independent) <= NAMED:
-            axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+            fit_legend(figure, axes[0].get_legend_handles_labels()[0])
         axes[-1].set_xlabel(with_unit("$t$", "s"))
         return figure

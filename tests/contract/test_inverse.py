@@ -69,7 +69,7 @@ def test_table_names_the_largest_of_each_and_what_exceeds_its_limit() -> None:
     elbow = np.linalg.norm(found.loop_forces["elbow"], axis=1)
     assert f"{elbow.max():.4g} N" in rows["loop elbow"]
     assert "moment" not in answer.out
-    assert answer.out.splitlines()[0].split() == ["of", "the", "motion", "largest", "at", "t,", "s", "limit"]
+    assert answer.out.splitlines()[0].split() == ["of", "the", "motion", "largest", "at", "t", "(s)", "limit"]
 
 
 def test_files(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_for_people(table: Path) -> None:
     answer = ckc("report", "table", "--budget", "5")
     assert (answer.code, answer.err) == (0, "")
     for words in (
-        "least time, ms, to an error of",
+        "least time (ms) to an error of",
         "reduced, auto",
         "spf, z, Radau",
         "MuJoCo, RK4, solref 2 dt",

@@ -77,7 +77,7 @@ def sections_table(found: Sequence[SingularityMap]) -> Group:
     over = ", ".join(f"{a.name} {a.low:.4g} ... {a.high:.4g} {a.unit}" for a in first.axes)
     cell = float(np.prod([(a.high - a.low) / len(a.values) for a in first.axes]))
     (fixed,) = first.fixed
-    table = _table(f"{fixed}, m", "area reached, m²", f"{first.measure} from", "to", "singular curves")
+    table = _table(f"{fixed} (m)", "area reached (m²)", f"{first.measure} from", "to", "singular curves")
     for one in found:
         (aspect,) = one.aspects
         kinds = [_short(locus) for locus in one.loci if locus.on.any()]
@@ -101,7 +101,7 @@ def _branches(found: SingularityMap) -> Table:
 
 
 def _loci(found: SingularityMap) -> Group:
-    table = _table("", "locus", "residual", *(f"{axis.name}, {axis.unit}" for axis in found.axes))
+    table = _table("", "locus", "residual", *(f"{axis.name} ({axis.unit})" for axis in found.axes))
     for k, locus in enumerate(found.loci):
         curve = "" if _is_point(locus) else ", closed" if locus.closed else ", curve"
         table.add_row(str(k + 1), _short(locus) + curve, f"{locus.residual:.0e}", *_where(found, locus))
@@ -126,7 +126,7 @@ def _desired(found: SingularityMap, path: Path) -> list[Any]:
     else:
         says = f"stays inside; least sigma_min(phi_z) = {path.sigma_min:.4g} at t = {path.closest_t:.4f} s"
     unit = " or ".join(dict.fromkeys(axis.unit for axis in found.axes))
-    table = _table("closest to locus", f"distance, {unit}", "at t, s", "desired there")
+    table = _table("closest to locus", f"distance ({unit})", "at t (s)", "desired there")
     for a in path.approaches:
         there = "(" + ", ".join(f"{x:.5f}" for x in a.at) + ")"
         table.add_row(f"{a.locus + 1}, {_short(found.loci[a.locus])}", f"{a.distance:.6f}", f"{a.t:.5f}", there)

@@ -23,7 +23,7 @@ ERROR = (
     "Errors are the largest of q_tree and v_tree at up to {instants} instants, in SI units, relative to the largest "
     "value where that is above 1."
 )
-TIMES = "least time, ms, to an error"
+TIMES = "least time (ms) to an error"
 
 
 def precision_plain(found: WorkPrecision) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def precision_markdown(every: Sequence[WorkPrecision], figures: Mapping[int, str
             "",
             *_rows(head, ((name, *cells) for name, cells, _ in _families(found))),
         ]
-        head = ("setting", "error", "right-hand sides", "time, ms", "status")
+        head = ("setting", "error", "right-hand sides", "time (ms)", "status")
         lines += ["", "### All settings", "", *_rows(head, (_line(row) for row in found.rows))]
     return "\n".join(lines) + "\n"
 
