@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from shlex import quote
 
 import click
 
@@ -39,4 +40,4 @@ def new(folder: Path, as_json: bool) -> None:
         return
     for path in paths:
         print(f"written: {path}")
-    print(f"next: cd {folder} && ckc run .")
+    print(f"next: cd {quote(str(folder))} && ckc run .")

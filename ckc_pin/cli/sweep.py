@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 import click
 
@@ -130,4 +131,4 @@ def _afterwards(found: Summary, out: Path, worst: tuple[str, ...], figures: bool
         from ckc_pin.simulation.ensembles.worst import save_worst
 
         for folder in save_worst(found.prepared, results, name, out):
-            errors().print(f"ckc play {folder}")
+            errors().print(f"ckc play {quote(str(folder))}")

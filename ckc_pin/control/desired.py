@@ -117,7 +117,13 @@ def read_columns(text: str, names: Sequence[str], file: str, fewest: int, who: s
     InputError
         Other columns, too few rows, what is no finite number, times that do not increase or start after 0.
     """
-    lines = [(number, line.split(",")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    import csv
+
+    reader = csv.reader(text.splitlines())  # names may be quoted, and then have commas
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if cells and (len(cells) > 1 or cells[0].strip())]
+    except csv.Error as error:
+        raise InputError(f"{file}, line {reader.line_num}: {error}") from None
     wanted = ["t", *names]
     header = [cell.strip() for cell in lines[0][1]] if lines else []
     if sorted(header) != sorted(wanted):

@@ -126,6 +126,12 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
     assert load(tmp_path / "robots" / "arm-2").name == "arm-2"
 
 
+def test_what_comes_next_can_be_typed_as_it_stands(tmp_path: Path) -> None:
+    (tmp_path / "my robots").mkdir()
+    answer = ckc("new", str(tmp_path / "my robots" / "arm"))
+    assert answer.out.splitlines()[-1] == f"next: cd '{tmp_path}/my robots/arm' && ckc run ."
+
+
 def test_a_new_folder_that_cannot_be_is_refused_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     answer = ckc("new", str(tmp_path / "file" / "mine"))

@@ -199,6 +199,18 @@ def test_torques_of_a_file(geared: Path, formulation: str, interpolation: str) -
     assert "drive.csv" in kept.texts
 
 
+def test_names_with_commas_are_quoted_as_programs_do(geared: Path) -> None:
+    changes = {"t_end": 0.15, "controller": {"type": "torques", "file": "drive.csv"}, "solver.terms": "pinocchio"}
+    csv(geared, VALUES)
+    wanted = simulate(geared / "swing.scene.toml", changes)
+    mechanism, drive = geared / "mechanism.toml", geared / "drive.csv"
+    mechanism.write_text(mechanism.read_text("utf-8").replace('"left"', '"left, upper"'), "utf-8")
+    drive.write_text(drive.read_text("utf-8").replace("left", '"left, upper"').replace("belt", '"belt"'), "utf-8")
+    found = simulate(geared / "swing.scene.toml", changes)
+    assert found.actuated == ("left, upper", "belt")
+    assert np.array_equal(found.q_tree, wanted.q_tree)
+
+
 CONTROLLER = '[controller]\ntype = "torques"\nfile = "drive.csv"\n'
 HEADER = "t,theta_1,theta_3\n"
 
