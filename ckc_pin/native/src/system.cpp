@@ -36,9 +36,11 @@ bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) 
   const int n = core.n;
   if (!control.slopes(core, u_by_q_, u_by_v_, force_)) return false;
   core.joints.add_friction(v, force_);
-  Vector damping = Vector::Zero(n);
-  joints.add_slopes(v, damping);
-  u_by_v_.diagonal() += damping;
+  if (joints.acts()) {
+    back_.setZero();
+    joints.add_slopes(v, back_);
+    u_by_v_.diagonal() += back_;
+  }
   a_.resize(n);
   const bool locked = !joints.locked.empty();
   if (locked) {
@@ -59,7 +61,7 @@ bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) 
         by_q.col(k) = by_state_.bottomLeftCorner(n, nq) * move;
       }
     }
-    by_q += by_u_ * u_by_q_, by_v += by_u_ * u_by_v_;
+    if (control.acts() || joints.acts()) by_q.noalias() += by_u_ * u_by_q_, by_v.noalias() += by_u_ * u_by_v_;
   } else {
     if (core.q_tree != q_tree) core.set(q_tree, true);
     core.set_velocity(v);
