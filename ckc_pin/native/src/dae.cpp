@@ -118,7 +118,7 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
     jacobian.topLeftCorner(nq, nq) = core.tree.rate_changes(q_tree_, v) * tangents;
     jacobian.bottomLeftCorner(n, nq) = by_q_ * tangents;
   }
-  return jacobian.allFinite();
+  return finite(jacobian.reshaped());
 }
 
 // Stiff control would answer to any change of what it sees: where one acts, z alone is moved, unless that takes steps

@@ -77,7 +77,7 @@ bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) 
         joints.back(responses_, by->col(k), back_);
         by->col(k) += back_;
       }
-  return by_q.allFinite() && by_v.allFinite();
+  return finite(by_q.reshaped()) && finite(by_v.reshaped());
 }
 
 bool System::acceleration(double t, Out a) {
