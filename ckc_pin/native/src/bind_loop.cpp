@@ -243,18 +243,24 @@ nb::object jacobian(Run& run, double t, Given y) {
   return system.jacobian(t, y, found, evaluations) ? nb::cast(found) : nb::none();
 }
 
-// Seconds of a right-hand side as the loop calls it, the least of several rounds over states: rows of (t, y).
-double seconds(Run& run, Table states, int rounds) {
+// Seconds of a right-hand side, or of its Jacobian, as the loop calls it, the least of several rounds over states: rows
+// of (t, y).
+double seconds(Run& run, Table states, int rounds, bool of_jacobian) {
   System& system = *run.loop->system;
   require(states.cols() == 1 + system.size && states.rows() > 0 && rounds > 0, "states: rows of (t, y) are needed");
   const Matrix columns = states.transpose();
   Vector y_dot(system.size);
+  Matrix by_y;
+  long evaluations = 0;
   double least = std::numeric_limits<double>::infinity();
   nb::gil_scoped_release released;
   for (int round = 0; round < rounds; ++round) {
     const auto start = std::chrono::steady_clock::now();
-    for (Eigen::Index k = 0; k < columns.cols(); ++k)
-      require(system.rhs(columns(0, k), columns.col(k).tail(system.size), y_dot), "states: no right-hand side there");
+    for (Eigen::Index k = 0; k < columns.cols(); ++k) {
+      const auto y = columns.col(k).tail(system.size);
+      const bool done = of_jacobian ? system.jacobian(columns(0, k), y, by_y, evaluations) : system.rhs(columns(0, k), y, y_dot);
+      require(done, "states: no right-hand side there");
+    }
     least = std::min(least, std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
   }
   return least / static_cast<double>(columns.cols());
@@ -283,7 +289,7 @@ void bind_loop(nb::module_& m) {
       .def("profile", &profile)
       .def("rhs", &rhs, "t"_a, "y"_a)
       .def("jacobian", &jacobian, "t"_a, "y"_a)
-      .def("seconds", &seconds, "states"_a, "rounds"_a)
+      .def("seconds", &seconds, "states"_a, "rounds"_a, "of_jacobian"_a = false)
       .def_prop_ro("t", [](const Run& run) { return run.loop->t(); })
       .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->y()); })
       .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });

@@ -261,7 +261,7 @@ bool Core::slopes(In q_at, In v, In correction, Vector& force, Matrix& u_by_q, M
         by->col(k) += back;
       }
   }
-  return by_q.allFinite() && by_v.allFinite();
+  return finite(by_q.reshaped()) && finite(by_v.reshaped());
 }
 
 bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {

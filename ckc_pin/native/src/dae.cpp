@@ -108,7 +108,9 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
     by_v_ += more_;
   }
   jacobian.setZero(nq + n, nq + n);
-  for (int k = 0; k < n; ++k) core.tree.configuration_rate(q_tree_, Vector::Unit(n, k), jacobian.col(nq + k).head(nq));
+  for (int k : core.tree.single) jacobian(core.tree.place[k], nq + k) = 1.0;
+  for (const Tree::Root& root : core.tree.roots)
+    for (int k = root.v; k < root.v + 6; ++k) core.tree.configuration_rate(q_tree_, Vector::Unit(n, k), jacobian.col(nq + k).head(nq));
   jacobian.bottomRightCorner(n, n) = by_v_;
   if (nq == n) {
     jacobian.bottomLeftCorner(n, n) = by_q_;
@@ -117,7 +119,7 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
     jacobian.topLeftCorner(nq, nq) = core.tree.rate_changes(q_tree_, v) * tangents;
     jacobian.bottomLeftCorner(n, nq) = by_q_ * tangents;
   }
-  return jacobian.allFinite();
+  return finite(jacobian.reshaped());
 }
 
 // Stiff control would answer to any change of what it sees: where one acts, z alone is moved, unless that takes steps
