@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.generated.angles import Angles
-from ckc_pin.generated.parameters import Parameters, constant
+from ckc_pin.generated.arguments import Arguments, constant
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Column", "MovingBody", "bodies"]
@@ -93,7 +93,7 @@ def times(a: Any, b: Any) -> Any:
     return cs.sparsify(cs.mtimes(a, b))
 
 
-def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[MovingBody]:
+def bodies(tree: Tree, angles: Angles, v: Any, arguments: Arguments) -> list[MovingBody]:
     """Return the body of each of Pinocchio's joints, the world first.
 
     Parameters
@@ -103,7 +103,7 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
         Pinocchio's q', a free root's quaternion of unit length.
     v : casadi.SX of n
         v'.
-    parameters : Parameters
+    arguments : Arguments
         Takes the offsets of the joints.
     """
     import casadi as cs
@@ -113,7 +113,7 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
     for k in range(1, model.njoints):
         joint, placement, parent = model.joints[k], model.jointPlacements[k], found[model.parents[k]]
         stands = times(parent.R, constant(placement.rotation))
-        d = times(parent.R, parameters.column("offset", k))
+        d = times(parent.R, arguments.column("offset", k))
         at_q, at_v = joint.idx_q, joint.idx_v
         if joint.nq == 7:
             found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], at_v))

@@ -51,7 +51,7 @@ def functions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None
         "x": cs.SX.sym("x", mechanism.n),
     }
     results = _results(terms, symbols)
-    parameters = terms.parameters.vector
+    parameters = terms.arguments.vector
     # what does not change with the state is computed once
     alike, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), parameters)
     once = cs.vertcat(parameters, *alone)

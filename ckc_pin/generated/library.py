@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.generated.parameters import numbers, present, values
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.tree import Array, BoolArray
@@ -80,7 +80,7 @@ def compiled(
     most : int
         Coordinates, above which terms are not written out.
     which : mapping, optional
-        Which numbers are arguments (`parameters.present`), where that is more than those that are not zero: what is
+        Which numbers are arguments (`arguments.present`), where that is more than those that are not zero: what is
         varied from zero.
     on_written : callable, optional
         Called once before the compiler, with the seconds that it may take.

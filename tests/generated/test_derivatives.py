@@ -9,8 +9,8 @@ from ckc_pin import load
 from ckc_pin.dynamics import Terms
 from ckc_pin.dynamics.derivatives import acceleration_derivatives
 from ckc_pin.generated.acceleration import ConstrainedInertia
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.generated.expressions import expressions
-from ckc_pin.generated.parameters import numbers, present, values
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import shipped
 
@@ -27,7 +27,7 @@ def test_they_are_those_of_the_terms_written_out(name: str) -> None:
     tree, n, terms = mechanism.tree, mechanism.n, expressions(mechanism)
     u, given = cs.SX.sym("u", n), numbers(mechanism)
     by_state, by_u = ConstrainedInertia(terms).derivatives(u)
-    symbols = [terms.angles.q, terms.v, u, terms.parameters.vector]
+    symbols = [terms.angles.q, terms.v, u, terms.arguments.vector]
     theirs = cs.Function("f", symbols, [terms.angles.in_q(by_state), terms.angles.in_q(by_u)])
     for _ in range(3):
         at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.1, 0.1, mechanism.d)).at

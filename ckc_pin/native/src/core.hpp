@@ -35,7 +35,7 @@ class Core {
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
-  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.parameters` has them in, and what the code that
+  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.arguments` has them in, and what the code that
   // is written out takes; nothing that was computed before is known after it.
   enum class Number {
     gravity, offset, mass, centre, inertia, armature, point, length, affine, affine_offset, end, stiffness, rest_length,
