@@ -143,7 +143,8 @@ class Core {
   Factor basis_;
   long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1
   Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
-  Eigen::ColPivHouseholderQR<Matrix> qr_;
+  long inertia_at_ = -1;  // the same of square_factor_
+  Eigen::ColPivHouseholderQR<Matrix> qr_, transposed_;
   Matrix square_;
   Definite square_factor_;
   Vector turned_, negative_, moved_, small_, small_b_;
