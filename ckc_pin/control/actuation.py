@@ -95,7 +95,8 @@ class Actuation:
         motors, count = self.motors, len(self.motors.names)
         self.direct = mechanism.driven_directly
         given = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
-        self.limit = np.minimum(motors.vector(given, "controller.torque_limit", np.inf), motors.torque_limit)
+        self.given_limit = motors.vector(given, "controller.torque_limit", np.inf)
+        self.limit = np.minimum(self.given_limit, motors.torque_limit)
         allocation = allocation or AllocationSpec()
         self.weights = motors.vector(allocation.weights, "controller.allocation.weights", 1.0)
         self.preload = motors.vector(allocation.preload, "controller.allocation.preload", 0.0)

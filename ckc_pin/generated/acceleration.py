@@ -89,18 +89,7 @@ class ConstrainedInertia:
 
         terms, n = self._terms, self._n
         kept = list(terms.kept)
-        J, unknown = terms.rows.J[kept, :], cs.SX.sym("a", n)
-        multipliers = cs.SX.sym("l", len(kept))
-        left = cs.vertcat(
-            cs.mtimes(terms.D_tree, unknown) + terms.bias_tree - terms.damping - cs.mtimes(J.T, multipliers),
-            cs.mtimes(J, unknown) + terms.rows.J_dot_v[kept],
-        )
-        by_state = cs.horzcat(terms.angles.jacobian(left), cs.jacobian(left, terms.v))
-        by_state = cs.substitute(
-            by_state,
-            cs.vertcat(unknown, multipliers),
-            cs.vertcat(*self.acceleration(u, cs.SX(terms.rows.phi.numel(), 1))),
-        )
+        by_state = self.columns(u, terms.v)
         columns = [
             self.solve([-by_state[i, j] for i in range(n)], [-by_state[n + i, j] for i in range(len(kept))])[0]
             for j in range(by_state.shape[1])
@@ -110,6 +99,59 @@ class ConstrainedInertia:
         rates = cs.jacobian(terms.q_dot, cs.vertcat(terms.angles.q, terms.v))
         found = cs.vertcat(rates, cs.horzcat(*(cs.vertcat(*x) for x in columns)))
         return _across(found, terms), cs.horzcat(*(cs.vertcat(*x) for x in by_u))
+
+    def change(self, u: Any, q: Any, v: Any, force: Any, arguments: Any, columns: Any = None) -> Any:
+        """Return how v'_dot changes with all that it depends on, along one direction, (n).
+
+        As in `derivatives`: one more elimination.
+
+        Parameters
+        ----------
+        u : casadi.SX of n
+            u'; nothing is corrected.
+        q, v, force, arguments : casadi.SX
+            Changes of q' (its quaternions' lengths stay one), v', u', and of the numbers that are arguments.
+        columns : casadi.SX, optional
+            What stands for `columns` of v' and the arguments, where many directions are wanted at one state.
+        """
+        import casadi as cs
+
+        n = self._n
+        if columns is None:
+            left, unknown = self._left()
+            change = self._terms.angles.along(left, q)
+            change += cs.jtimes(left, cs.vertcat(self._terms.v, self._terms.arguments.vector), cs.vertcat(v, arguments))
+            change = cs.substitute(change, unknown, self._solution(u))
+        else:
+            change = cs.mtimes(columns, cs.vertcat(q, v, arguments))
+        along = [-change[n + i] for i in range(len(self._terms.kept))]
+        found, _ = self.solve([force[i] - change[i] for i in range(n)], along)
+        return cs.vertcat(*found)
+
+    def columns(self, u: Any, others: Any) -> Any:
+        """Return how what eq. 1 says is u' and zero changes at its solution, with q' and other symbols."""
+        import casadi as cs
+
+        left, unknown = self._left()
+        by_q = self._terms.angles.jacobian(left)
+        return cs.substitute(cs.horzcat(by_q, cs.jacobian(left, others)), unknown, self._solution(u))
+
+    def _left(self) -> tuple[Any, Any]:
+        """What eq. 1 says is u' and zero, in symbols for a and the kept rows' multipliers; those symbols."""
+        import casadi as cs
+
+        terms, kept = self._terms, list(self._terms.kept)
+        J, a, multipliers = terms.rows.J[kept, :], cs.SX.sym("a", self._n), cs.SX.sym("l", len(kept))
+        left = cs.vertcat(
+            cs.mtimes(terms.D_tree, a) + terms.bias_tree - terms.damping - cs.mtimes(J.T, multipliers),
+            cs.mtimes(J, a) + terms.rows.J_dot_v[kept],
+        )
+        return left, cs.vertcat(a, multipliers)
+
+    def _solution(self, u: Any) -> Any:
+        import casadi as cs
+
+        return cs.vertcat(*self.acceleration(u, cs.SX(self._terms.rows.phi.numel(), 1)))
 
     def soundness(self) -> Any:
         """Return a number that is positive where elimination had no need of pivots.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.generated.angles import Angles
-from ckc_pin.generated.parameters import Parameters, constant
+from ckc_pin.generated.arguments import Arguments, constant
 from ckc_pin.mechanism.tree import Array, Tree
 
 __all__ = ["Column", "MovingBody", "bodies"]
@@ -132,7 +132,7 @@ def times(a: Any, b: Any) -> Any:
     return cs.sparsify(cs.mtimes(a, b))
 
 
-def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[MovingBody]:
+def bodies(tree: Tree, angles: Angles, v: Any, arguments: Arguments) -> list[MovingBody]:
     """Return the body of each of Pinocchio's joints, the world first.
 
     Parameters
@@ -142,7 +142,7 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
         Pinocchio's q', a free root's quaternion of unit length.
     v : casadi.SX of n
         v'.
-    parameters : Parameters
+    arguments : Arguments
         Takes the offsets of the joints.
     """
     import casadi as cs
@@ -156,7 +156,7 @@ def bodies(tree: Tree, angles: Angles, v: Any, parameters: Parameters) -> list[M
         if parent is world:
             parent = replace(world, axes=placement.rotation, R=constant(placement.rotation.T))
             stands = cs.SX.eye(3)
-        d = times(parent.R, parameters.column("offset", k))
+        d = times(parent.R, arguments.column("offset", k))
         at_q, at_v = joint.idx_q, joint.idx_v
         if joint.nq == 7:
             found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], at_v))

@@ -33,8 +33,14 @@ FUNCTIONS = {
 LARGEST_JACOBIAN = 3e4  # operations of the acceleration times n, about twice those of its derivatives: above, none
 
 
-def functions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> dict[str, Any]:
+def functions(
+    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
+) -> dict[str, Any]:
     """Return CasADi functions: `numbers`, from what may be varied to what the others take last, and `FUNCTIONS`.
+
+    With `changes` also how the acceleration changes along any direction of q', v', u' and of what may be varied:
+    `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it is
+    sound; `change` takes the first of these, and changes of q', v', u' and of what may be varied.
 
     Left out are `coriolis` of a tree with a free root, whose twist has several C', and `jacobian` where it would be too
     long to be compiled.
@@ -51,12 +57,18 @@ def functions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None
         "residual": cs.SX.sym("residual", mechanism.closure.rows),
         "x": cs.SX.sym("x", mechanism.n),
     }
-    results = _results(terms, symbols)
-    parameters = terms.parameters.vector
+    arguments = terms.arguments.vector
+    along = {
+        "q": cs.SX.sym("q_change", mechanism.tree.nq),
+        "v": cs.SX.sym("v_change", mechanism.n),
+        "force": cs.SX.sym("u_change", mechanism.n),
+        "arguments": cs.SX.sym("arguments_change", arguments.numel()),
+    }
+    results = _results(terms, symbols, along if changes else None)
     # what does not change with the state is computed once
-    alike, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), parameters)
-    once = cs.vertcat(parameters, *alone)
-    found = {"numbers": cs.Function("numbers", [parameters], [cs.vertcat(parameters, *made_of)])}
+    alike, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), arguments)
+    once = cs.vertcat(arguments, *alone)
+    found = {"numbers": cs.Function("numbers", [arguments], [cs.vertcat(arguments, *made_of)])}
     part = dict(zip(results, _split(alike, [x.numel() for x in results.values()]), strict=True))
     for name, (given, gives) in FUNCTIONS.items():
         if not part.keys() >= {*gives}:
@@ -65,7 +77,25 @@ def functions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None
         together = cs.cse(cs.vertcat(*(part[x] for x in gives)))
         parts = _split(together, [results[x].numel() for x in gives])
         found[name] = cs.Function(name, [*(symbols[x] for x in takes), once], parts, [*takes, "numbers"], list(gives))
+    if changes:
+        state, columns = [*(symbols[x] for x in ("q", "trig", "v", "u")), once], symbols.get("columns", cs.SX(0, 1))
+        change, taken, made_of = cs.extract_parametric(cs.cse(part["change"]), cs.vertcat(*state))
+        known = cs.vertcat(columns, *taken, *_symbols_of(change, state))
+        given_by = cs.vertcat(part.get("columns", cs.SX(0, 1)), *made_of)
+        given_by = cs.substitute(known, cs.vertcat(columns, *taken), given_by)
+        whole = cs.cse(cs.vertcat(given_by, part["acceleration_of_u"], part["sound"]))
+        sizes = [known.numel(), mechanism.n, 1]
+        found["state"] = cs.Function("state", state, _split(whole, sizes))
+        found["change"] = cs.Function("change", [known, *along.values()], [cs.cse(change)])
     return found
+
+
+def _symbols_of(x: Any, among: list[Any]) -> list[Any]:
+    """Return those of the given symbols that an expression has in it."""
+    import casadi as cs
+
+    there = {symbol.element_hash() for symbol in cs.symvar(x)}
+    return [symbol for symbol in cs.symvar(cs.vertcat(*among)) if symbol.element_hash() in there]
 
 
 def _split(column: Any, sizes: list[int]) -> list[Any]:
@@ -74,7 +104,7 @@ def _split(column: Any, sizes: list[int]) -> list[Any]:
     return list(cs.vertsplit(column, [0, *np.cumsum(sizes).tolist()]))
 
 
-def _results(terms: Expressions, symbols: dict[str, Any]) -> dict[str, Any]:
+def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] | None) -> dict[str, Any]:
     import casadi as cs
 
     rows = terms.rows
@@ -98,6 +128,16 @@ def _results(terms: Expressions, symbols: dict[str, Any]) -> dict[str, Any]:
         found["C_x"] = cs.jtimes(terms.bias_tree, terms.v, symbols["x"]) / 2
     if cs.n_nodes(acceleration) * terms.v.numel() < LARGEST_JACOBIAN:
         found["by_state"], found["by_u"] = inertia.derivatives(symbols["u"])
+    if along is None:
+        return {name: cs.densify(x) for name, x in found.items()}
+    columns = None
+    if "by_state" in found:  # short enough: what they are once a state, and a product a direction
+        columns = inertia.columns(symbols["u"], cs.vertcat(terms.v, terms.arguments.vector))
+        found["columns"] = cs.vertcat(*columns.nonzeros())
+        symbols["columns"] = cs.SX.sym("columns", columns.nnz())
+        columns = cs.SX(columns.sparsity(), symbols["columns"])
+    found["acceleration_of_u"] = inertia.acceleration(symbols["u"], cs.SX(rows.phi.numel(), 1))[0]  # uncorrected
+    found["change"] = inertia.change(symbols["u"], **along, columns=columns)
     return {name: cs.densify(x) for name, x in found.items()}
 
 

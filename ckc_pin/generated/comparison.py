@@ -26,6 +26,7 @@ SOUND = (
 )
 DIFFERENCE = 1e-5  # rad, or of the mechanism's size, and of v' in their multiples a second
 ALIKE = 1e-6  # derivatives and differences, relative
+FROM_ZERO = 1e-2  # SI units: how far what is zero and may vary does
 SPREAD = 0.5  # rad, or of the mechanism's size: how far states are from the assembled one
 
 
@@ -41,22 +42,26 @@ class Calls:
         self._library = ctypes.CDLL(library.path)
         self._pointer = ctypes.POINTER(ctypes.c_double)
         self._numbers = np.zeros(0)
-        (self._numbers,) = self.call("numbers", library.parameters)
+        self._numbers = self.of_numbers(library.parameters)
 
     def __contains__(self, name: str) -> bool:
         return hasattr(self._library, name)
 
-    def call(self, name: str, *arguments: Array) -> list[Array]:
-        """Return a function's results, vectors by columns of what they are."""
+    def of_numbers(self, parameters: Array) -> Array:
+        """Return what the functions take last, of other numbers of the mechanism."""
+        return self.call("numbers", parameters)[0]
+
+    def call(self, name: str, *arguments: Array, numbers: Array | None = None) -> list[Array]:
+        """Return a function's results, vectors by columns of what they are, of other numbers too."""
         sizes = getattr(self._library, f"{name}_sparsity_out")
         sizes.restype = ctypes.POINTER(ctypes.c_longlong)
         count = getattr(self._library, f"{name}_n_out")
         count.restype = ctypes.c_longlong
         results = [np.zeros(sizes(k)[0] * sizes(k)[1]) for k in range(count())]
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
-        if name != "numbers":
-            q = given[0]
-            given = [q, np.concatenate([np.cos(q), np.sin(q)]), *given[1:], self._numbers]
+        if name not in ("numbers", "change"):
+            q, last = given[0], self._numbers if numbers is None else numbers
+            given = [q, np.concatenate([np.cos(q), np.sin(q)]), *given[1:], last]
         getattr(self._library, name)(self._pointers(given), self._pointers(results), None, None, 0)
         return results
 
@@ -82,7 +87,10 @@ def require_equal(mechanism: Mechanism, library: Library) -> None:
         _compare_terms(terms, code, random.uniform(-1, 1, mechanism.n))
         if mechanism.redundant and not closed:
             continue  # redundant rows contradict each other there
-        compared += _compare_solutions(terms, code, *random.uniform(-1, 1, (2, mechanism.n)))
+        found = _compare_solutions(terms, code, *random.uniform(-1, 1, (2, mechanism.n)))
+        if found and "change" in code:
+            _compare_change(terms, code, library.parameters, random)
+        compared += found
     if not compared:
         raise InputError(f"{mechanism.name}: its acceleration would have to be eliminated with pivoting everywhere")
 
@@ -164,6 +172,27 @@ def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, 
         ):
             ahead, behind = (code.call("acceleration", *at(sign * h * along), none)[0] for sign in (1, -1))
             _compare(mechanism, f"the acceleration by {name}", found, (ahead - behind) / (2 * h), size, ALIKE)
+
+
+def _compare_change(terms: Terms, code: Calls, own: Array, random: np.random.Generator) -> None:
+    """Along a direction of everything at once."""
+    mechanism, tree, q, v = terms.mechanism, terms.mechanism.tree, terms.q_tree, terms.v_tree
+    u, step, faster, more = random.uniform(-1, 1, (4, tree.n)) * tree.reach
+    varied = random.uniform(-1, 1, len(own)) * np.where(own == 0.0, FROM_ZERO, own)
+    none = np.zeros(mechanism.closure.rows)
+    state, acceleration, _ = code.call("state", q, v, u)
+    _compare(mechanism, "acceleration with its change", acceleration, code.call("acceleration", q, v, u, none)[0])
+    (found,) = code.call("change", state, tree.configuration_rate(q, step), faster, more, varied)
+
+    def at(h: float) -> Array:
+        numbers = code.of_numbers(own + h * varied)
+        return code.call(
+            "acceleration", tree.integrate(q, h * step), v + h * faster, u + h * more, none, numbers=numbers
+        )[0]
+
+    h = DIFFERENCE
+    wanted = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+    _compare(mechanism, "the acceleration's change", found, wanted, 0.0, ALIKE)
 
 
 def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:

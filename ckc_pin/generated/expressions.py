@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from ckc_pin.generated.angles import Angles
+from ckc_pin.generated.arguments import Arguments, numbers, present
 from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
 from ckc_pin.generated.order import elimination_order
-from ckc_pin.generated.parameters import Parameters, numbers, present
 from ckc_pin.generated.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import BoolArray
@@ -27,7 +27,7 @@ class Expressions:
         Pinocchio's q', a free root's quaternion of unit length.
     v : casadi.SX of n
         v'.
-    parameters : Parameters
+    arguments : Arguments
         Masses, centres of mass, inertias, offsets, stiffnesses, lengths, gravity.
     quaternions : tuple of int
         Where the quaternions of free roots begin in q'.
@@ -49,7 +49,7 @@ class Expressions:
 
     angles: Angles
     v: Any
-    parameters: Parameters
+    arguments: Arguments
     quaternions: tuple[int, ...]
     q_dot: Any
     D_tree: Any
@@ -68,22 +68,22 @@ def kept_rows(mechanism: Mechanism) -> list[int]:
 
 
 def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> Expressions:
-    """Write a mechanism's terms out, of the numbers that are arguments (`parameters.present`)."""
+    """Write a mechanism's terms out, of the numbers that are arguments (`arguments.present`)."""
     import casadi as cs
 
-    tree, parameters = mechanism.tree, Parameters(which or present(numbers(mechanism)))
+    tree, arguments = mechanism.tree, Arguments(which or present(numbers(mechanism)))
     angles, v = Angles(tree.nq), cs.SX.sym("v", tree.n)
-    q, found = angles.q, bodies(tree, angles, v, parameters)
-    gravity = parameters.column("gravity")
+    q, found = angles.q, bodies(tree, angles, v, arguments)
+    gravity = arguments.column("gravity")
     q_dot = _configuration_rate(mechanism, q, v)
-    D_tree, bias, potential = _inertia(mechanism, found, gravity, parameters)
-    elastic, damping, stored = _springs(mechanism, found, q, v, parameters)
-    rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), parameters)
+    D_tree, bias, potential = _inertia(mechanism, found, gravity, arguments)
+    elastic, damping, stored = _springs(mechanism, found, q, v, arguments)
+    rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), arguments)
     kept = kept_rows(mechanism)
     return Expressions(
         angles=angles,
         v=v,
-        parameters=parameters,
+        arguments=arguments,
         quaternions=tuple(at_q + 3 for at_q, _ in tree.free),
         q_dot=q_dot,
         D_tree=D_tree,
@@ -97,9 +97,7 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
     )
 
 
-def _inertia(
-    mechanism: Mechanism, found: list[MovingBody], gravity: Any, parameters: Parameters
-) -> tuple[Any, Any, Any]:
+def _inertia(mechanism: Mechanism, found: list[MovingBody], gravity: Any, arguments: Arguments) -> tuple[Any, Any, Any]:
     """D', C' v' + h', and the potential energy of gravity.
 
     Composite bodies, and what their bias accelerations ask for, from the leaves to the root: a force along each
@@ -115,8 +113,8 @@ def _inertia(
     force = [cs.SX(3, 1) for _ in found]
     torque = [cs.SX(3, 1) for _ in found]  # about the origin of the joint's own frame
     for k in range(1, model.njoints):
-        body, m = found[k], parameters.number("mass", k)
-        local, I = parameters.column("centre", k), parameters.symmetric("inertia", k)
+        body, m = found[k], arguments.number("mass", k)
+        local, I = arguments.column("centre", k), arguments.symmetric("inertia", k)
         I = I + m * (dot(local, local) * cs.SX.eye(3) - times(local, local.T))
         mass[k], first[k] = m, times(body.R, m * local)
         second[k] = _turned(I, body.R)
@@ -148,7 +146,7 @@ def _inertia(
             second[parent] = second[parent] + second[k] + _shift(d, first[k] + mass[k] / 2 * d)
             first[parent] = first[parent] + first[k] + mass[k] * d
             mass[parent] = mass[parent] + mass[k]
-    armature = cs.vertcat(*(parameters.number("armature", k) for k in range(n)))
+    armature = cs.vertcat(*(arguments.number("armature", k) for k in range(n)))
     return cs.sparsify(D + cs.diag(armature)), bias, potential
 
 
@@ -179,7 +177,7 @@ def _mirrored(entry: Callable[[int, int], Any]) -> Any:
 
 
 def _springs(
-    mechanism: Mechanism, found: list[MovingBody], q: Any, v: Any, parameters: Parameters
+    mechanism: Mechanism, found: list[MovingBody], q: Any, v: Any, arguments: Arguments
 ) -> tuple[Any, Any, Any]:
     """What springs and constant forces do, what dampers do, and the energy stored."""
     import casadi as cs
@@ -188,13 +186,13 @@ def _springs(
     elastic, damping, stored = cs.SX(n, 1), cs.SX(n, 1), cs.SX(1, 1)
     for k in range(n):
         x = q[int(mechanism.tree.place[k])]
-        pull = parameters.number("constant", k)
-        stiffness = parameters.number("joint_stiffness", k)
-        stretched = x - parameters.number("joint_rest", k)
+        pull = arguments.number("constant", k)
+        stiffness = arguments.number("joint_stiffness", k)
+        stretched = x - arguments.number("joint_rest", k)
         elastic[k] = pull - stiffness * stretched
         stored = stored + stiffness * stretched**2 / 2 - pull * x
-        damping[k] = -parameters.number("joint_damping", k) * v[k]
-    ends = [(found[joint], parameters.column("end", k)) for k, joint in enumerate(springs.anchors.point_joint)]
+        damping[k] = -arguments.number("joint_damping", k) * v[k]
+    ends = [(found[joint], arguments.column("end", k)) for k, joint in enumerate(springs.anchors.point_joint)]
     count = len(springs.stiffness)
     for k, ((a, local_a), (b, local_b)) in enumerate(zip(ends[:count], ends[count:], strict=True)):
         at_a, rate_a, _ = a.point(local_a)
@@ -204,11 +202,11 @@ def _springs(
         length = cs.sqrt(dot(r, r))
         along = r / cs.if_else(length > 0, length, 1)  # at length zero it pulls nowhere
         jacobian = times(along.T, a.point_jacobian(at_a, local_a, n) - times(into, b.point_jacobian(at_b, local_b, n)))
-        stiffness = parameters.number("stiffness", k)
-        stretched = length - parameters.number("rest_length", k)
+        stiffness = arguments.number("stiffness", k)
+        stretched = length - arguments.number("rest_length", k)
         elastic = elastic - stiffness * stretched * jacobian.T
         stored = stored + stiffness * stretched**2 / 2
-        c = parameters.number("damping", k)
+        c = arguments.number("damping", k)
         damping = damping - c * dot(along, rate_a - times(into, rate_b)) * jacobian.T
     return elastic, damping, stored
 

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.generated.parameters import numbers, present, values
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.tree import Array, BoolArray
@@ -55,15 +55,17 @@ def cache_folder() -> Path:
     return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "ckc_pin" / "terms"
 
 
-def find(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> Library | None:
+def find(
+    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
+) -> Library | None:
     """Return the mechanism's terms if they were compiled before; None if not, or if the file has changed since.
 
-    `which` as of `compiled`.
+    `which` and `changes` as of `compiled`.
     """
     folder = cache_folder()
     if mechanism.n > MOST_COORDINATES or not folder.is_dir():
         return None
-    return _look(_Subject.of(mechanism, which), folder, _compiler())
+    return _look(_Subject.of(mechanism, which, changes), folder, _compiler())
 
 
 def compiled(
@@ -71,6 +73,8 @@ def compiled(
     most: int = MOST_COORDINATES,
     which: Mapping[str, BoolArray] | None = None,
     on_written: Callable[[float], None] | None = None,
+    *,
+    changes: bool = False,
 ) -> Library:
     """Return the mechanism's terms, from the cache or compiled now.
 
@@ -80,10 +84,12 @@ def compiled(
     most : int
         Coordinates, above which terms are not written out.
     which : mapping, optional
-        Which numbers are arguments (`parameters.present`), where that is more than those that are not zero: what is
+        Which numbers are arguments (`arguments.present`), where that is more than those that are not zero: what is
         varied from zero.
     on_written : callable, optional
         Called once before the compiler, with the seconds that it may take.
+    changes : bool
+        With how the acceleration changes along any direction (`code.functions`), a longer text.
 
     Raises
     ------
@@ -95,7 +101,7 @@ def compiled(
         raise InputError(
             f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {most}"
         )
-    subject, compiler = _Subject.of(mechanism, which), _compiler()
+    subject, compiler = _Subject.of(mechanism, which, changes), _compiler()
     found = _look(subject, cache_folder(), compiler)
     if found is not None:
         return found
@@ -111,12 +117,13 @@ class _Subject:
     key: str
     parameters: Array
     which: Mapping[str, BoolArray]
+    changes: bool
 
     @classmethod
-    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None) -> _Subject:
+    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, changes: bool) -> _Subject:
         given = numbers(mechanism)
         which = which or present(given)
-        return cls(_key(mechanism, which), values(given, which), which)
+        return cls(_key(mechanism, which, changes), values(given, which), which, changes)
 
 
 @dataclass(frozen=True)
@@ -153,7 +160,7 @@ def _hash(what: object) -> str:
     return sha256(msgspec.json.encode(what, order="deterministic")).hexdigest()
 
 
-def _key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
+def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], changes: bool) -> str:
     """The hash of all that enters the code: our own text, the tree, the table of rows, and which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
     model = tree.model
@@ -181,7 +188,8 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
     there = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
-    return _hash((_own_text(), joints, groups, table, there, springs, mechanism.redundant, platform.machine()))[:32]
+    kind = (mechanism.redundant, changes, platform.machine())
+    return _hash((_own_text(), joints, groups, table, there, springs, *kind))[:32]
 
 
 def _is_constant(group: object, name: str) -> bool:
@@ -252,7 +260,7 @@ def _compile(
     try:
         from ckc_pin.generated.code import functions, source
 
-        written = source(functions(mechanism, subject.which), mechanism.tree)
+        written = source(functions(mechanism, subject.which, changes=subject.changes), mechanism.tree)
     except ModuleNotFoundError as error:
         says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(says) from error

@@ -8,8 +8,8 @@ from math import comb
 from typing import Any
 
 from ckc_pin.generated.angles import Angles
+from ckc_pin.generated.arguments import Arguments, constant
 from ckc_pin.generated.bodies import MovingBody, cross, dot, times
-from ckc_pin.generated.parameters import Parameters, constant
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.tree import Array
@@ -96,7 +96,7 @@ def row_terms(
     v: Any,
     q_dot: Any,
     place: Sequence[int],
-    parameters: Parameters,
+    arguments: Arguments,
 ) -> RowTerms:
     """Return a closure's rows.
 
@@ -110,14 +110,14 @@ def row_terms(
         v', and the rate of q' at it.
     place : sequence of int
         Where the coordinates of joints of one freedom stand in q'.
-    parameters : Parameters
+    arguments : Arguments
         Takes the offsets of frames, lengths of rods, ratios and offsets of couplings.
     """
     import casadi as cs
 
     n = v.numel()
     anchors = closure.anchors
-    points = [_point(bodies[joint], parameters.column("point", k), n) for k, joint in enumerate(anchors.point_joint)]
+    points = [_point(bodies[joint], arguments.column("point", k), n) for k, joint in enumerate(anchors.point_joint)]
     pairs = list(zip(points[: len(points) // 2], points[len(points) // 2 :], strict=True))
     directions = [
         (bodies[joint], constant(local))
@@ -140,12 +140,12 @@ def row_terms(
             case Distance():
                 for out, pair in zip(group.out, group.pair, strict=True):
                     one, other = pairs[pair]
-                    put(int(out), _distance(one.less(other, one.body.axes), parameters.number("length", out)))
+                    put(int(out), _distance(one.less(other, one.body.axes), arguments.number("length", out)))
             case Affine():
                 for out in group.out:
-                    row = cs.horzcat(*(parameters.number("affine", out, k) for k in range(n)))
+                    row = cs.horzcat(*(arguments.number("affine", out, k) for k in range(n)))
                     value = times(row, cs.vertcat(*(angles.q[k] for k in place)))
-                    put(int(out), (value - parameters.number("affine_offset", out), row, 0))
+                    put(int(out), (value - arguments.number("affine_offset", out), row, 0))
             case RelativeLog():
                 for k in range(len(group.joint_a)):
                     a, b = bodies[group.joint_a[k]], bodies[group.joint_b[k]]

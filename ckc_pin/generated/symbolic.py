@@ -10,8 +10,8 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.generated.acceleration import ConstrainedInertia
+from ckc_pin.generated.arguments import labels, numbers, present, values
 from ckc_pin.generated.expressions import expressions
-from ckc_pin.generated.parameters import labels, numbers, present, values
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.card import Card, Row, Shown
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -104,7 +104,7 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     except ModuleNotFoundError as error:
         raise InputError("symbolic needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
     terms, given = expressions(mechanism), numbers(mechanism)
-    q, v, p = terms.angles.q, terms.v, terms.parameters.vector
+    q, v, p = terms.angles.q, terms.v, terms.arguments.vector
     u = cs.SX.sym("u", mechanism.n)
     v_dot, _ = ConstrainedInertia(terms).acceleration(u, np.zeros(mechanism.closure.rows))
 

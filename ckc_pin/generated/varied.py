@@ -1,6 +1,6 @@
 """What other values of named numbers make of a mechanism's, for many members at once.
 
-The names are those of `mechanism.parameters`; the numbers those of `generated.parameters`, which the native core and
+The names are those of `mechanism.parameters`; the numbers those of `generated.arguments`, which the native core and
 the code that is written out take. Building a mechanism anew for each value does the same, and says why one cannot be;
 this does it in arrays, a row a member, and only says which members are to be built that way.
 """
@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ckc_pin.generated.parameters import numbers, present, values
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, values_of
 from ckc_pin.mechanism.spec import FrameSpec
@@ -68,7 +68,7 @@ class Varied:
         Returns
         -------
         dict of str to (members, ...) array
-            By the names and shapes of `generated.parameters.numbers`; what does not vary is left out.
+            By the names and shapes of `generated.arguments.numbers`; what does not vary is left out.
         (members,) array of bool
             Which members can be: physical as far as is seen here.
         """

@@ -34,12 +34,15 @@ class Closure(Shared):
         What each row of phi is, e.g. ("elbow", "x").
     aligned : tuple of (loop, a, b)
         Pairs of directions that must point the same way (a . b > 0) in an assembled hinge.
+    turned_by : tuple of (loop, frame)
+        What each of the anchors' directions turns with, e.g. ("elbow", "frame_a"); the world's turn with no frame, "".
     """
 
     anchors: Anchors
     groups: tuple[Rows, ...]
     names: tuple[tuple[str, str], ...]
     aligned: tuple[tuple[str, int, int], ...]
+    turned_by: tuple[tuple[str, str], ...] = ()
 
     @property
     def rows(self) -> int:
@@ -160,6 +163,7 @@ class ClosureBuilder:
         self.aligned: list[tuple[str, int, int]] = []
         self._pairs: list[tuple[Frame, Frame]] = []
         self._directions: list[tuple[int, Array]] = []
+        self._turned_by: list[tuple[str, str]] = []
         self._components: list[tuple[int, int, int]] = []  # row, pair, direction
         self._dots: list[tuple[int, int, int]] = []  # row, a, b
         self._distances: list[tuple[int, int, float]] = []  # row, pair, length
@@ -193,13 +197,17 @@ class ClosureBuilder:
         elif loop.length is not None:
             self._distances.append((self._row(loop.name, "length"), pair, loop.length))
         if loop.type in ("hinge", "cylindrical"):
-            along_b = self._direction(b, axis_b)
+            along_b = self._direction(b, axis_b, loop.name, "frame_b")
             for label, e in (("e1.b", e1), ("e2.b", e2)):
-                self._dots.append((self._row(loop.name, label), self._direction(a, e), along_b))
-            self.aligned.append((loop.name, self._direction(a, axis_a), along_b))
+                self._dots.append((self._row(loop.name, label), self._direction(a, e, loop.name, "frame_a"), along_b))
+            self.aligned.append((loop.name, self._direction(a, axis_a, loop.name, "frame_a"), along_b))
         elif loop.type == "universal":
             row = self._row(loop.name, "a.b")
-            self._dots.append((row, self._direction(a, axis_a), self._direction(b, axis_b)))
+            along_a, along_b = (
+                self._direction(frame, axis, loop.name, label)
+                for frame, axis, label in ((a, axis_a, "frame_a"), (b, axis_b, "frame_b"))
+            )
+            self._dots.append((row, along_a, along_b))
         elif loop.type in ("prismatic", "weld"):
             self._logs.append(([self._row(loop.name, label) for label in ("rx", "ry", "rz")], a, b))
 
@@ -240,20 +248,22 @@ class ClosureBuilder:
             direction_joint=np.array([joint for joint, _ in self._directions], np.intp),
             direction_local=np.array([e for _, e in self._directions]).reshape(-1, 3),
         )
-        return Closure(anchors, tuple(groups), tuple(self.names), tuple(self.aligned))
+        return Closure(anchors, tuple(groups), tuple(self.names), tuple(self.aligned), tuple(self._turned_by))
 
     def _resolve(self, loop: LoopSpec, pair: int, a: Frame, directions: list[tuple[str, Array]]) -> None:
         world = Frame(0, np.eye(3), np.zeros(3))
         for label, e in directions:
-            direction = self._direction(world if loop.rows_in == "world" else a, e)
+            of_world = loop.rows_in == "world"
+            direction = self._direction(world if of_world else a, e, loop.name, "" if of_world else "frame_a")
             self._components.append((self._row(loop.name, label), pair, direction))
 
     def _row(self, loop: str, label: str) -> int:
         self.names.append((loop, label))
         return len(self.names) - 1
 
-    def _direction(self, frame: Frame, e: Array) -> int:
+    def _direction(self, frame: Frame, e: Array, loop: str, label: str) -> int:
         self._directions.append((frame.joint, frame.rotation @ e))
+        self._turned_by.append((loop, label))
         return len(self._directions) - 1
 
 

@@ -110,7 +110,7 @@ def joined(a: Closure, b: Closure) -> Closure:
         np.concatenate([x.direction_local for x, _ in ends]),
     )
     aligned = tuple((loop, x + directions, y + directions) for loop, x, y in b.aligned)
-    return Closure(anchors, a.groups + more, a.names + b.names, a.aligned + aligned)
+    return Closure(anchors, a.groups + more, a.names + b.names, a.aligned + aligned, a.turned_by + b.turned_by)
 
 
 def integrate(tree: Tree, q_tree: Array, step: Array) -> Array:

@@ -7,16 +7,30 @@ follows from them (checks, loops, assembly) is then done as if the files had sai
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.toml import convert
-from ckc_pin.mechanism.urdf_checks import INERTIA, check_inertial, floats
+from ckc_pin.mechanism.urdf_checks import INERTIA, LIMITS, check_inertial, check_range, floats
 
-__all__ = ["AXES", "ROOTS", "Changes", "Value", "changed", "is_parameter", "plain_values", "require_known", "values_of"]
+__all__ = [
+    "AXES",
+    "ROOTS",
+    "Changes",
+    "Value",
+    "changed",
+    "is_parameter",
+    "parts_of",
+    "plain_values",
+    "require_known",
+    "split_component",
+    "split_name",
+    "values_of",
+    "with_components",
+]
 
 Value = float | tuple[float, float, float]
 Changes = Mapping[str, Value]
@@ -24,6 +38,9 @@ Changes = Mapping[str, Value]
 ROOTS = ("gravity", "link", "joint", "loop", "coupling", "spring", "force", "motor")
 AXES = "xyz"
 OF_JOINT = ("armature", "damping", "friction", "restitution")  # keys of [[joint]]
+OF_LINK = ("mass", "com", *(f"inertia.{entry}" for entry in INERTIA))
+VECTORS = ("gravity", "com", "xyz", "rpy")  # keys of three numbers each
+UNBOUNDED = 1e300  # what the URDF's limits are where there is none
 OF_ENTRY = {
     "loop": ("frame_a.xyz", "frame_a.rpy", "frame_b.xyz", "frame_b.rpy", "length"),
     "coupling": ("ratio", "offset"),
@@ -74,59 +91,41 @@ def changed(
     InputError, MechanismError
         Unknown names (those there are are listed), values that are none, bodies that cannot be.
     """
-    require_known(spec, urdf, changes, source)
-    whole = _whole(spec, urdf, changes, source)
+    present = values_of(spec, urdf)
+    require_known(changes, with_components(present), f"{source}: parameters")
+    whole = _whole(present, changes, source)
     data = spec.plain()
     links = {link.attrib["name"]: link for link in urdf.findall("link")}
     joints = {joint.attrib["name"]: joint for joint in urdf.findall("joint")}
     warnings: list[str] = []
-    touched = set()
+    touched, limited = set(), set()
     # masses first: they scale an inertia that may be given too
     for name, value in sorted(whole.items(), key=lambda item: not item[0].endswith(".mass")):
-        root, _, rest = name.partition(".")
+        root, carrier, key = split_name(name)
         if root == "gravity":
             data["gravity"] = value
         elif root == "link":
-            carrier, key = _split(rest, ("mass", "com", *(f"inertia.{entry}" for entry in INERTIA)))
             _change_link(links[carrier], key, value)
             touched.add(carrier)
-        elif root == "joint":
-            carrier, key = _split(rest, ("xyz", "rpy", *OF_JOINT))
-            if key in OF_JOINT:
-                _entry_of_joint(data, carrier)[key] = value
-            else:
-                _child(joints[carrier], "origin").set(key, _text(value))
+        elif root != "joint":
+            _change_entry(root, data[root], carrier, key, value)
+        elif key in OF_JOINT:
+            _entry_of_joint(data, carrier)[key] = value
+        elif key in LIMITS:
+            _child(joints[carrier], "limit").set(key, _text(value))
+            limited.add(carrier)
         else:
-            _change_entry(root, data[root], *_split(rest, OF_ENTRY[root]), value)
+            _child(joints[carrier], "origin").set(key, _text(value))
     for name in sorted(touched):
         check_inertial(name, links[name], f"{source}: parameters", warnings)
+    for name in sorted(limited):
+        check_range(joints[name], f"{source}: parameters: joint {name!r}")
     return convert(data, MechanismSpec, f"{source}: parameters"), warnings
 
 
-def require_known(spec: MechanismSpec, urdf: ElementTree.Element, names: Mapping[str, Any], source: str) -> None:
-    """Refuse names that are none of the mechanism's (InputError): those there are nearby are listed."""
-    known = None
-    for name in names:
-        known = known or _single(values_of(spec, urdf))
-        if name in known:
-            continue
-        root = name.partition(".")[0]
-        if root not in ROOTS:
-            raise InputError(f"{source}: parameters: {name!r} names nothing; names begin with {', '.join(ROOTS)}")
-        carriers = dict.fromkeys(_carrier(other) for other in known if other.partition(".")[0] == root)
-        near = [c for c in carriers if name == c or name.startswith(f"{c}.")]
-        if near:
-            best = max(near, key=len)
-            choices = [other for other in known if _carrier(other) == best]
-        else:
-            choices = list(carriers)
-        there = f"there are {', '.join(choices)}" if choices else f"nothing of this mechanism is a {root}"
-        raise InputError(f"{source}: parameters: no {name!r}; {there}")
-
-
-def _single(values: Mapping[str, Value]) -> dict[str, float | Value]:
-    """Add the components of what has three."""
-    found: dict[str, float | Value] = {}
+def with_components(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Add the components of what has three: `gravity.x`."""
+    found: dict[str, Value] = {}
     for name, value in values.items():
         found[name] = value
         if isinstance(value, tuple):
@@ -134,9 +133,44 @@ def _single(values: Mapping[str, Value]) -> dict[str, float | Value]:
     return found
 
 
-def _whole(spec: MechanismSpec, urdf: ElementTree.Element, changes: Changes, source: str) -> dict[str, Value]:
+def parts_of(name: str, known: Mapping[str, Value]) -> list[str]:
+    """Return the single numbers that a known name stands for: itself, or a vector's three."""
+    return [f"{name}.{axis}" for axis in AXES] if isinstance(known[name], tuple) else [name]
+
+
+def require_known(names: Iterable[str], known: Mapping[str, Value], where: str, roots: Sequence[str] = ROOTS) -> None:
+    """Refuse names that are none of those known (InputError): those there are nearby are listed.
+
+    Parameters
+    ----------
+    names : iterable of str
+    known : mapping
+        As `with_components` gives it.
+    where : str
+        What begins the message.
+    roots : sequence of str
+        What names may begin with.
+    """
+    for name in names:
+        if name in known:
+            continue
+        root = name.partition(".")[0]
+        if root not in roots:
+            raise InputError(f"{where}: {name!r} names nothing; names begin with {', '.join(roots)}")
+        carriers = dict.fromkeys(_carrier(other) for other in known if other.partition(".")[0] == root)
+        near = [c for c in carriers if name == c or name.startswith(f"{c}.")]
+        if near:
+            best = max(near, key=len)
+            choices = [other for other in known if _carrier(other) == best]
+        else:
+            choices = list(carriers)
+        whose = "mechanism" if root in ROOTS else "scene"
+        there = f"there are {', '.join(choices)}" if choices else f"nothing of this {whose} is a {root}"
+        raise InputError(f"{where}: no {name!r}; {there}")
+
+
+def _whole(present: Mapping[str, Value], changes: Changes, source: str) -> dict[str, Value]:
     """Put components into what they are of, and check how many numbers each name takes."""
-    present = values_of(spec, urdf)
     whole: dict[str, Value] = {}
     for name, value in changes.items():
         _require_numbers(name, value, source)
@@ -193,6 +227,11 @@ def _all(spec: MechanismSpec, urdf: ElementTree.Element) -> Iterator[tuple[str, 
                 continue
             of_urdf = _read(joint, "dynamics", key, 1)[0] if key in ("damping", "friction") else 0.0
             yield f"joint.{name}.{key}", of_urdf if given is None else float(given)
+        if entry_ and entry_.stops:  # other limits do nothing
+            for key in LIMITS:
+                at = _read(joint, "limit", key, 1)[0]
+                if abs(at) < UNBOUNDED:
+                    yield f"joint.{name}.{key}", at
     yield from _of_file(spec)
 
 
@@ -228,18 +267,31 @@ def _called(kind: str, k: int, entry: Mapping[str, Any]) -> str:
 def _carrier(name: str) -> str:
     """What a number is of: its name without the key at its end."""
     root, _, rest = name.partition(".")
-    if root == "gravity":
+    keys = _keys(root)
+    if not keys:
         return root
-    ends = {"link": ("mass", "com", "inertia"), "joint": ("xyz", "rpy", *OF_JOINT)}
-    keys = ends.get(root) or tuple({key.partition(".")[0] for key in OF_ENTRY[root]})
-    at = max(rest.rfind(f".{key}") for key in keys)
+    at = max(rest.rfind(f".{key}") for key in {key.partition(".")[0] for key in keys})
     return f"{root}.{rest[:at]}"
 
 
-def _split(rest: str, keys: tuple[str, ...]) -> tuple[str, str]:
-    """Take a known name apart: what it is of, and the key."""
-    key = max((key for key in keys if rest.endswith(f".{key}")), key=len)
-    return rest.removesuffix(f".{key}"), key
+def _keys(root: str) -> tuple[str, ...]:
+    of_urdf = {"link": OF_LINK, "joint": ("xyz", "rpy", *OF_JOINT, *LIMITS)}
+    return of_urdf.get(root) or OF_ENTRY.get(root, ())
+
+
+def split_component(name: str) -> tuple[str, int]:
+    """Take a single number's name apart: the vector's that it is of, and which of its three; or itself, and 0."""
+    of, _, axis = name.rpartition(".")
+    if axis in AXES and of and of.rpartition(".")[2] in VECTORS:
+        return of, AXES.index(axis)
+    return name, 0
+
+
+def split_name(name: str) -> tuple[str, str, str]:
+    """Take a known name apart, without its component: root, what it is of, and key, ("link", "rod", "mass")."""
+    root, _, rest = name.partition(".")
+    key = max((key for key in _keys(root) if rest.endswith(f".{key}")), key=len, default="")
+    return root, rest.removesuffix(f".{key}"), key
 
 
 # --- values ------------------------------------------------------------------------------------------

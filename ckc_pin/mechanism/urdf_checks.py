@@ -15,12 +15,23 @@ import numpy as np
 
 from ckc_pin.errors import InputError, MechanismError
 
-__all__ = ["INERTIA", "Mimic", "by_name", "check_connected", "check_inertial", "check_joint", "floats"]
+__all__ = [
+    "INERTIA",
+    "LIMITS",
+    "Mimic",
+    "by_name",
+    "check_connected",
+    "check_inertial",
+    "check_joint",
+    "check_range",
+    "floats",
+]
 
 Mimic = tuple[str, str, float, float]  # joint, other, ratio, offset
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # what both Python and C read alike
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+LIMITS = ("lower", "upper")
 SHORTEST = 1e-9  # an axis that is not zero by mistake
 ROUNDING = 1e-18  # kg m^2: what is left of a zero tensor that was turned about
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
@@ -161,10 +172,14 @@ def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
         limit.set("lower", "-1e308")
         limit.set("upper", "1e308")
     else:
-        (lower,) = floats(limit, "lower", 1, "0", f"{where}, <limit>")
-        (upper,) = floats(limit, "upper", 1, "0", f"{where}, <limit>")
-        if lower > upper:
-            raise MechanismError(f"{where}: its lower limit {lower:g} is above the upper one {upper:g}")
+        check_range(joint, where)
+
+
+def check_range(joint: ElementTree.Element, where: str) -> None:
+    """Refuse limits that leave nothing between them."""
+    lower, upper = (floats(joint.find("limit"), key, 1, "0", f"{where}, <limit>")[0] for key in LIMITS)
+    if lower > upper:
+        raise MechanismError(f"{where}: its lower limit {lower:g} is above the upper one {upper:g}")
 
 
 def check_connected(

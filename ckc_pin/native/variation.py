@@ -1,25 +1,85 @@
 """How a motion changes with parameters, as the tables that cross to C++.
 
-Lengths and placements are coordinates of joints that are locked: a prismatic joint of no mass where a joint or a frame
-is placed. So their derivatives are what Pinocchio's and the rows' are along any coordinate.
+Lengths, angles and placements are coordinates of joints that are locked: a prismatic or revolute joint of no mass where
+a joint or a frame is placed. So their derivatives are what Pinocchio's and the rows' are along any coordinate. Where
+terms are written out, a number is a direction in the space of the numbers that the code takes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.mechanism.tree import Array, BoolArray, Tree
 from ckc_pin.native.tables import core_table, packed
 
-__all__ = ["Varying", "variation_table"]
+__all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "variation_table"]
 
-Place = Literal["joint", "point", "spring"]
+Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b"]
+
+ACTING = ("friction", "gain_q", "gain_q_dot", "gear", "torque_limit", "restitution", "lower", "upper")  # not terms
+
+
+@dataclass(frozen=True)
+class Lock:
+    """A joint that is locked where something is placed.
+
+    Attributes
+    ----------
+    placed : str
+        What stands on it: a joint, a point of a loop, an end of a spring, a direction, a relative rotation's frame.
+    carrier : int
+        The joint that it is placed in.
+    axis : (3,) array
+        Of unit length, in the carrier's axes through its origin.
+    turns : bool
+        About that axis, or along it.
+    """
+
+    placed: Place
+    carrier: int
+    axis: Array
+    turns: bool = False
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One of the ways in which a number acts; they add up.
+
+    Attributes
+    ----------
+    kind : str
+        As `Effect` in variation.hpp.
+    index : int
+        Of what it is: a coordinate, a joint, a spring, a row, a motor; of a placement what is placed.
+    numbers : array
+        How what it changes does so: an inertia's ten, gravity's three; of a placement how far its joint moves.
+    lock : Lock or None
+        Of a placement.
+    """
+
+    kind: str
+    index: int = 0
+    numbers: Array = field(default_factory=lambda: np.zeros(0))
+    lock: Lock | None = None
+
+    @property
+    def is_term(self) -> bool:
+        """Whether the terms of eq. 1 change with it, and not only what acts or what joints do."""
+        return self.kind not in ACTING
+
+    @property
+    def is_shape(self) -> bool:
+        """Whether where the loops close depends on it."""
+        if self.lock is not None:
+            return self.lock.placed != "spring"
+        return self.kind in ("length", "offset", "ratio")
 
 
 @dataclass(frozen=True)
@@ -29,63 +89,144 @@ class Varying:
     Attributes
     ----------
     name : str
-    kind : str
-        As `Parameter` in variation.hpp.
-    index : int
-        Of what it is: a coordinate, a joint, a spring, a row.
-    numbers : array
-        Of an inertia, of gravity, of a gain: how they change.
-    placed, carrier, axis : str, int, (3,) array
-        Of a placement: what is placed there (`index` says which joint, point of a loop, or end of a spring), the joint
-        that it is placed in, and along which of that one's directions.
-    q : (n,) array
+    effects : tuple of Effect
+    q : (n,) array or None
         How the start's independent coordinates change, tangent.
-    q_dot : (d,) array
+    q_dot : (d,) array or None
     """
 
     name: str
-    kind: str
-    index: int = 0
-    numbers: Array = field(default_factory=lambda: np.zeros(0))
-    placed: Place = "joint"
-    carrier: int = 0
-    axis: Array = field(default_factory=lambda: np.zeros(3))
+    effects: tuple[Effect, ...] = ()
     q: Array | None = None
     q_dot: Array | None = None
 
 
+# --- where terms are written out ---------------------------------------------------------------------
+
+
+def directions_of(mechanism: Mechanism, varying: Sequence[Varying]) -> tuple[dict[str, BoolArray], Array] | None:
+    """Return which numbers the written-out code has to take, and how they change with each parameter.
+
+    Returns
+    -------
+    dict of str to bool arrays
+        As `present` gives it, with what is zero and varies.
+    (k, parameters) array
+        By argument.
+    None where a parameter turns something: angles between joints are no arguments.
+    """
+    own = numbers(mechanism)
+    changes = [_direction(own, x.effects) for x in varying]
+    which = present(own)
+    for found in changes:
+        if found is None:
+            return None
+        for name, part in found.items():
+            which[name] = which[name] | (part != 0.0)
+    changed = [{name: x.get(name, np.zeros_like(own[name])) for name in own} for x in changes if x is not None]
+    columns = [values(x, which) for x in changed]
+    return which, np.array(columns).T
+
+
+def _direction(own: Mapping[str, Array], effects: Sequence[Effect]) -> dict[str, Array] | None:
+    found: dict[str, Array] = {}
+
+    def add(name: str, at: Any, change: Any) -> None:
+        if name not in found:
+            found[name] = np.zeros_like(own[name])
+        found[name][at] += change
+
+    for effect in effects:
+        at, x = effect.index, effect.numbers
+        match effect.kind:
+            case "placement":
+                assert effect.lock is not None
+                name = {"joint": "offset", "point": "point", "spring": "end"}.get(effect.lock.placed)
+                if name is None or effect.lock.turns:
+                    return None
+                add(name, at, _plain(x[0] * effect.lock.axis))
+            case "inertia":
+                if own["mass"][at] <= 0.0:
+                    return None
+                for name, part in _of_body(own, at, x).items():
+                    add(name, at, _plain(part))
+            case "gravity":
+                add("gravity", slice(None), x)
+            case "armature":
+                add("armature", at, x[0])
+            case "offset":
+                add("affine_offset", at, 1.0)
+            case "ratio":
+                add("affine", (at, int(x[0])), -1.0)
+            case kind if kind not in ACTING:
+                add(kind, at, 1.0)
+    return found
+
+
+def _of_body(own: Mapping[str, Array], at: int, x: Array) -> dict[str, Array]:
+    """Return a change of mass, moment and inertia about a joint's origin as one of the body's own three."""
+    m, c = own["mass"][at], own["centre"][at]
+    about = np.zeros((3, 3))
+    about[np.triu_indices(3)] = x[4:]
+    about = about + np.triu(about, 1).T
+    by_c = (x[1:4] - x[0] * c) / m
+
+    def moment(a: Array, b: Array) -> Array:
+        return np.asarray(float(a @ b) * np.eye(3) - (np.outer(a, b) + np.outer(b, a)) / 2)
+
+    return {"mass": x[0], "centre": by_c, "inertia": about - x[0] * moment(c, c) - 2 * m * moment(c, by_c)}
+
+
+def _plain(x: Any) -> Any:
+    """Without what rounding leaves of zeros."""
+    x = np.asarray(x, dtype=float)
+    return np.where(np.abs(x) > 1e-14 * np.abs(x).max(initial=0.0), x, 0.0)
+
+
+# --- in general --------------------------------------------------------------------------------------
+
+
 def variation_table(
-    mechanism: Mechanism, varying: Sequence[Varying], *, at_equilibrium: bool, target: Array
+    mechanism: Mechanism,
+    varying: Sequence[Varying],
+    directions: Array | None,
+    *,
+    at_equilibrium: bool,
+    target: Array,
 ) -> dict[str, Any]:
     """Describe what varies.
 
-    `at_equilibrium`: the start is where the mechanism rests, which moves with it. `target`: q' where a controller
-    compensates what this mechanism needs there; none where it compensates another one's.
+    `directions`: as of `directions_of`, where there is a library that takes them. `at_equilibrium`: the start is where
+    the mechanism rests, which moves with it. `target`: q' where a controller compensates what this mechanism needs
+    there; none where it compensates another one's.
     """
-    tree, locked = mechanism.tree, [x for x in varying if x.kind == "placement"]
+    tree = mechanism.tree
+    locks = _Locks([effect for x in varying for effect in x.effects if effect.lock is not None])
     model = pin.Model()
     model.gravity.linear = tree.model.gravity.linear
     plain = core_table(mechanism)
     closure, springs = plain["closure"], plain["springs"]
-    column: dict[str, int] = {}
-    joint_at, ends = [0], _ends(model, locked, 0, 0, column)
+    joint_at = [0]
+    locks.add_ends(model, 0, 0)
     for joint in range(1, tree.model.njoints):
-        parent = joint_at[tree.model.parents[joint]]
-        for x in locked:
-            if x.placed == "joint" and x.index == joint:
-                parent = _lock(model, parent, x, column)
+        parent = locks.add(model, ("joint", joint), joint_at[tree.model.parents[joint]])
         at = model.addJoint(
             parent, tree.model.joints[joint], tree.model.jointPlacements[joint], tree.model.names[joint]
         )
         model.appendBodyToJoint(at, tree.model.inertias[joint], pin.SE3.Identity())
         joint_at.append(at)
-        ends |= _ends(model, locked, joint, at, column)  # at once: Pinocchio wants branches whole
+        locks.add_ends(model, joint, at)  # at once: Pinocchio wants branches whole
     for table in (closure, springs):
         for key in ("point_joint", "direction_joint"):
             table[key] = [joint_at[k] for k in table.get(key, [])]
     closure["log"] = [[*row[:3], *(joint_at[k] for k in row[3:])] for row in closure["log"]]
-    for (placed, end), at in ends.items():
-        (closure if placed == "point" else springs)["point_joint"][end] = at
+    for (placed, index), at in locks.ends.items():
+        if placed in ("log_a", "log_b"):
+            closure["log"][index][3 if placed == "log_a" else 4] = at
+        elif placed == "direction":
+            closure["direction_joint"][index] = at
+        else:
+            (closure if placed == "point" else springs)["point_joint"][index] = at
     joints = [(tree.model.joints[k], model.joints[joint_at[k]]) for k in range(1, tree.model.njoints)]
     real_q, real_v = np.zeros(tree.nq, np.intp), np.zeros(tree.n, np.intp)
     for own, there in joints:
@@ -97,7 +238,15 @@ def variation_table(
     closure["affine_matrix"] = _spread(closure["affine_matrix"], real_v, model.nv)
     for key in ("joint_stiffness", "joint_rest", "joint_damping", "constant"):
         springs[key] = _spread(springs[key], real_v, model.nv)
-    index = {x.name: model.joints[column[x.name]].idx_v if x.name in column else x.index for x in varying}
+
+    def crossing(effect: Effect) -> tuple[str, int, Array]:
+        index = effect.index
+        if effect.lock is not None:
+            index = model.joints[locks.joint[id(effect)]].idx_v
+        elif effect.kind == "inertia":
+            index = joint_at[index]
+        return effect.kind, index, effect.numbers
+
     return {
         "model": packed(model),
         "place": Tree(model).place.tolist(),
@@ -108,30 +257,42 @@ def variation_table(
         "own": mechanism.partition.q.tolist(),
         "at_equilibrium": at_equilibrium,
         "target": target,
+        "turns": np.asfortranarray(mechanism.motors.turns),
         "parameters": [
-            (x.kind, joint_at[x.index] if x.kind == "inertia" else index[x.name], x.numbers,
-             np.zeros(tree.n) if x.q is None else x.q, np.zeros(mechanism.d) if x.q_dot is None else x.q_dot)
+            ([crossing(effect) for effect in x.effects], np.zeros(tree.n) if x.q is None else x.q,
+             np.zeros(mechanism.d) if x.q_dot is None else x.q_dot)
             for x in varying
         ],
+        "directions": np.zeros((0, len(varying))) if directions is None else np.asfortranarray(directions),
     }  # fmt: skip
 
 
-def _ends(
-    model: Any, locked: Sequence[Varying], joint: int, at: int, column: dict[str, int]
-) -> dict[tuple[str, int], int]:
-    """Add what the points and ends of springs on a joint stand on; say which, by what they are."""
-    found: dict[tuple[str, int], int] = {}
-    for x in locked:
-        if x.placed != "joint" and x.carrier == joint:
-            key = (x.placed, x.index)
-            found[key] = _lock(model, found.get(key, at), x, column)
-    return found
+class _Locks:
+    """The joints that are locked: in a chain where several numbers place the same."""
 
+    def __init__(self, effects: Sequence[Effect]) -> None:
+        self._effects = effects
+        self.joint: dict[int, int] = {}  # by effect
+        self.ends: dict[tuple[Place, int], int] = {}  # by what stands on it, but for joints: the last of a chain
 
-def _lock(model: Any, parent: int, x: Varying, column: dict[str, int]) -> int:
-    joint = pin.JointModelPrismaticUnaligned(np.array(x.axis))
-    column[x.name] = int(model.addJoint(parent, joint, pin.SE3.Identity(), x.name))
-    return column[x.name]
+    def add(self, model: Any, thing: tuple[Place, int], parent: int) -> int:
+        """Add those that one thing stands on; return what it stands on then."""
+        for effect in self._effects:
+            assert effect.lock is not None
+            if (effect.lock.placed, effect.index) == thing:
+                kind = pin.JointModelRevoluteUnaligned if effect.lock.turns else pin.JointModelPrismaticUnaligned
+                name = f"lock {len(self.joint)}"
+                parent = int(model.addJoint(parent, kind(np.array(effect.lock.axis)), pin.SE3.Identity(), name))
+                self.joint[id(effect)] = parent
+        return parent
+
+    def add_ends(self, model: Any, joint: int, at: int) -> None:
+        """Add those that points, directions and ends of springs on a joint stand on."""
+        for effect in self._effects:
+            assert effect.lock is not None
+            thing = (effect.lock.placed, effect.index)
+            if effect.lock.placed != "joint" and effect.lock.carrier == joint and thing not in self.ends:
+                self.ends[thing] = self.add(model, thing, at)
 
 
 def _spread(table: Array, columns: Any, count: int) -> Array:

@@ -33,16 +33,18 @@ from ckc_pin.generated.library import Library, compiled, find
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
+from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
+from ckc_pin.native.variation import Varying, directions_of, variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.scene_spec import SceneSpec, TermsOf
-from ckc_pin.simulation.varying import variation_of
+from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
 
 __all__ = [
     "Prepared",
@@ -65,8 +67,12 @@ MAX_OUTPUTS = 1_000_000
 
 def scene_mechanism(scene: Scene) -> Mechanism:
     """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
+    return _built(scene, scene.spec.parameters)
+
+
+def _built(scene: Scene, changes: Changes) -> Mechanism:
     mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, scene.spec.parameters)
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, changes)
 
 
 def _beside(scene: Scene, name: str) -> str | Path:
@@ -120,6 +126,8 @@ class Prepared:
     tables : tuple
         What the loop is made of: core, formulation, control, solver, events.
     loop : native Loop
+    varying : tuple of str
+        Numbers that the motion's changes with are integrated beside it.
     """
 
     scene: Scene
@@ -132,6 +140,7 @@ class Prepared:
     texts: dict[str, str]
     tables: tuple[Any, ...]
     loop: Any
+    varying: tuple[str, ...] = ()
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Put the loop to a start, as if nothing had been before."""
@@ -205,19 +214,28 @@ def prepare(
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not gives_tau(law):
         actuation.require_transmission(start.at)
+    formulation, labels = _formulation(mechanism, scene.spec, np.diagonal(D_tree)), tuple[str, ...]()
+    terms = scene.spec.solver.terms
+    if parameters:
+        varying = varying_of(mechanism, scene, controller, actuation, parameters)
+        require_known_motion(mechanism, scene, controller, varying)
+        require_movable(mechanism, scene.spec.parameters, varying, partial(_built, scene))
+        library, directions = _changing_library(mechanism, terms, varying)
+        formulation["variation"] = variation_table(
+            mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
+            target=compensated_at(mechanism, controller),
+        )  # fmt: skip
+        labels = tuple(x.name for x in varying)
     tables = (
-        core_table(
-            mechanism, library or library_of(mechanism, scene.spec.solver.terms), scene.spec.friction_smoothing or 0.0
-        ),
-        _formulation(mechanism, scene.spec, np.diagonal(D_tree))
-        | (variation_of(mechanism, scene, controller, parameters) if parameters else {}),
+        core_table(mechanism, library or library_of(mechanism, terms), scene.spec.friction_smoothing or 0.0),
+        formulation,
         control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
         _solver(mechanism, scene.spec, profile),
         [event.row for event in functions],
     )
     loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop)
+    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop, labels)
 
 
 def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
@@ -225,6 +243,21 @@ def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
     if terms == "pinocchio":
         return None
     return compiled(mechanism) if terms == "generated" else find(mechanism)
+
+
+def _changing_library(
+    mechanism: Mechanism, terms: str, varying: Sequence[Varying]
+) -> tuple[Library | None, Array | None]:
+    """Terms that say how they change with what varies, and the parameters in their numbers; or neither.
+
+    What varies from zero has to be an argument too: that is a library of its own. Of angles there is none.
+    """
+    found = None if terms == "pinocchio" else directions_of(mechanism, varying)
+    if found is None:
+        return None, None
+    which, directions = found
+    library = (compiled if terms == "generated" else find)(mechanism, which=which, changes=True)
+    return library, None if library is None else directions
 
 
 def output_instants(scene: Scene) -> Array:

@@ -17,7 +17,6 @@ from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene
 from ckc_pin.simulation.simulate import Progress, run_of, run_rows
-from ckc_pin.simulation.varying import varying_of
 
 __all__ = ["Sensitivities", "sensitivities"]
 
@@ -37,6 +36,9 @@ class Sensitivities:
     q_tree, v_tree : (m, n, p) arrays
         By output instant, coordinate and parameter: rad, m, rad/s and m/s for the parameter's unit. Of a free root
         the twist in its own axes, and how the twist's rate changes.
+    u, tau : (m, d, p) and (m, motors, p) arrays
+        How eq. 6's force and the motors' torques change, as `Run.u` and `Run.tau` have them; NaN where motors that are
+        more than freedoms share a force. Zero without a controller.
     end_time : (p,) array or None
         How the time of the event that ended the run changes, s; None where it ended at `t_end`.
     """
@@ -45,6 +47,8 @@ class Sensitivities:
     parameters: tuple[str, ...]
     q_tree: Array
     v_tree: Array
+    u: Array
+    tau: Array
     end_time: Array | None
 
     @property
@@ -52,21 +56,32 @@ class Sensitivities:
         """Output instants, s."""
         return self.run.t
 
-    def of(self, coordinate: str, parameter: str) -> Array:
-        """Return how a coordinate changes with a parameter along the run, shape (m,).
+    def of(self, name: str, parameter: str) -> Array:
+        """Return how a number changes with a parameter along the run, shape (m,).
+
+        Parameters
+        ----------
+        name : str
+            A coordinate's, ``theta_1``; with ``v.`` before it its rate's; ``u.`` and an independent coordinate, or
+            ``tau.`` and a motor.
+        parameter : str
 
         Raises
         ------
         InputError
-            No such coordinate or parameter; the message lists those there are.
+            No such number or parameter; the message lists those there are.
         """
+        run = self.run
         if parameter not in self.parameters:
             raise InputError(f"no parameter {parameter!r} among these; there are {', '.join(self.parameters)}")
-        if coordinate not in self.run.coordinates:
-            raise InputError(f"no coordinate {coordinate!r}; there are {', '.join(self.run.coordinates)}")
-        return np.array(
-            self.q_tree[:, self.run.coordinates.index(coordinate), self.parameters.index(parameter)], dtype=float
-        )
+        parts = {"": (run.coordinates, self.q_tree), "v.": (run.coordinates, self.v_tree),
+                 "u.": (run.independent, self.u), "tau.": (run.actuated, self.tau)}  # fmt: skip
+        for prefix, (names, array) in parts.items():
+            if name.startswith(prefix) and name.removeprefix(prefix) in names:
+                at = names.index(name.removeprefix(prefix))
+                return np.array(array[:, at, self.parameters.index(parameter)], dtype=float)
+        there = [prefix + of for prefix, (names, _) in parts.items() for of in names]
+        raise InputError(f"no {name!r}; there are {', '.join(there)}")
 
 
 def sensitivities(
@@ -85,12 +100,11 @@ def sensitivities(
     ----------
     scene : Scene, str or Path
     parameters : sequence of str
-        Their names: ``link.NAME.mass`` (the same body of another density), ``.com``, ``.inertia.ixx``;
-        ``joint.NAME.xyz``, ``.damping``, ``.friction``, ``.restitution``, ``.lower``, ``.upper``;
-        ``loop.NAME.frame_a.xyz``, ``.frame_b.xyz``, ``.length``; ``coupling.K.offset``; ``spring.K.stiffness``,
-        ``.damping``, ``.rest_length``, ``.rest``, ``.frame_a.xyz``; ``force.K.value``; ``gravity``;
-        ``controller.K_P``, ``controller.K_P.NAME``, ``controller.K_V``; ``initial.q.NAME``, ``initial.q_dot.NAME``.
-        K counts from 0. A vector stands for its components, which have ``.x``, ``.y`` and ``.z`` behind.
+        Every number of the mechanism that has a name (docs/reference/parameters.md), as ``link.NAME.mass`` (the same
+        body of another density), ``joint.NAME.xyz``, ``spring.K.stiffness``, ``motor.NAME.ratio``, ``gravity``; K
+        counts from 0. Of eq. 14 ``controller.K_P``, ``controller.K_P.NAME``, ``controller.K_V``; of the start
+        ``initial.q.NAME``, ``initial.q_dot.NAME``. A vector stands for its components, which have ``.x``, ``.y`` and
+        ``.z`` behind.
         A controller with a `model` keeps it; eq. 14 without one compensates what the changed mechanism needs.
     changes : mapping, optional
         As of `simulate`.
@@ -119,7 +133,6 @@ def sensitivities(
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, parameters=tuple(parameters))
-    labels = tuple(x.name for x in varying_of(ready.mechanism, scene, ready.controller, parameters))
     started = perf_counter()
     rows, status, message = run_rows(ready, progress)
     run = run_of(ready, rows, status, message, perf_counter() - started)
@@ -130,9 +143,23 @@ def sensitivities(
             "one of them before the other: there the motion has no derivative",
             t=t,
         )
-    n, p = ready.mechanism.n, len(labels)
-    found = rows[:, rows.shape[1] - 2 * n * p :].reshape(len(rows), p, 2, n).transpose(2, 0, 3, 1)
-    return Sensitivities(run, labels, found[0].copy(), found[1].copy(), _end_time(ready))
+    run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
+    q_tree, v_tree, u, tau = _parts(ready, rows)
+    return Sensitivities(run, ready.varying, q_tree, v_tree, u, tau, _end_time(ready))
+
+
+def _parts(ready: Prepared, rows: Array) -> list[Array]:
+    """Split what the loop has recorded behind the motion: by parameter q' and v' together, then u, then tau."""
+    mechanism, p = ready.mechanism, len(ready.varying)
+    sizes = [2 * mechanism.n, mechanism.d, len(mechanism.actuated)]
+    end = rows.shape[1] - p * sum(sizes)
+    found = []
+    for size in sizes:
+        part = rows[:, end : end + p * size].reshape(len(rows), p, size).transpose(0, 2, 1)
+        found.append(np.array(part, dtype=float))
+        end += p * size
+    q_and_v, u, tau = found
+    return [q_and_v[:, : mechanism.n], q_and_v[:, mechanism.n :], u, tau]
 
 
 def _end_time(ready: Prepared) -> Array | None:

@@ -10,9 +10,9 @@ import pytest
 from ckc_pin import Mechanism, load
 from ckc_pin.dynamics import Terms
 from ckc_pin.generated.acceleration import ConstrainedInertia
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.generated.expressions import expressions
 from ckc_pin.generated.library import compiled
-from ckc_pin.generated.parameters import numbers, present, values
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.native.plant import Plant
@@ -33,7 +33,7 @@ def test_they_are_those_of_the_terms_written_out(name: str) -> None:
     tree, n, terms = mechanism.tree, mechanism.n, expressions(mechanism)
     u, given = cs.SX.sym("u", n), numbers(mechanism)
     by_state, by_u = ConstrainedInertia(terms).derivatives(u)
-    symbols = [terms.angles.q, terms.v, u, terms.parameters.vector]
+    symbols = [terms.angles.q, terms.v, u, terms.arguments.vector]
     theirs = cs.Function("f", symbols, [terms.angles.in_q(by_state), terms.angles.in_q(by_u)])
     plant = Plant(mechanism)
     for _ in range(3):

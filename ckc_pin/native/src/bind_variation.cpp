@@ -10,17 +10,23 @@ using namespace nb::literals;
 
 namespace {
 
-constexpr const char* kinds[] = {"start",       "placement",     "inertia",  "gravity",  "stiffness", "rest_length",
-                                 "damping",     "joint_stiffness", "joint_rest", "joint_damping", "constant", "friction",
-                                 "restitution", "lower",         "upper",    "length",   "offset",    "gain_q",
-                                 "gain_q_dot"};
+constexpr const char* kinds[] = {
+    "placement",   "inertia",    "gravity",       "stiffness", "rest_length", "damping",     "joint_stiffness",
+    "joint_rest",  "joint_damping", "constant",   "friction",  "restitution", "lower",       "upper",
+    "armature",    "length",     "offset",        "ratio",     "gain_q",      "gain_q_dot",  "gear",
+    "torque_limit"};
 
-Parameter parameter_of(const nb::tuple& row) {
+Effect effect_of(const nb::tuple& row) {
   const auto name = nb::cast<std::string>(row[0]);
   const auto* found = std::find(std::begin(kinds), std::end(kinds), name);
-  require(found != std::end(kinds), "parameter: no " + name);
-  return {static_cast<Parameter::Kind>(found - std::begin(kinds)), nb::cast<int>(row[1]), nb::cast<Vector>(row[2]),
-          nb::cast<Vector>(row[3]), nb::cast<Vector>(row[4])};
+  require(found != std::end(kinds), "effect: no " + name);
+  return {static_cast<Effect::Kind>(found - std::begin(kinds)), nb::cast<int>(row[1]), nb::cast<Vector>(row[2])};
+}
+
+Parameter parameter_of(const nb::tuple& row) {
+  Parameter found{{}, nb::cast<Vector>(row[1]), nb::cast<Vector>(row[2])};
+  for (const auto& effect : nb::cast<nb::list>(row[0])) found.effects.push_back(effect_of(nb::cast<nb::tuple>(effect)));
+  return found;
 }
 
 WithVariation& varied(Run& run) {
@@ -66,7 +72,9 @@ VariationTable variation_of(const nb::dict& table) {
                        get<Indices>(table, "own"),
                        get<bool>(table, "at_equilibrium"),
                        get<Vector>(table, "target"),
-                       {}};
+                       get<Matrix>(table, "turns"),
+                       {},
+                       get<Matrix>(table, "directions")};
   for (const auto& row : nb::cast<nb::list>(table["parameters"]))
     found.parameters.push_back(parameter_of(nb::cast<nb::tuple>(row)));
   return found;
@@ -76,6 +84,8 @@ void bind_variation(nb::class_<Run>& loop) {
   loop.def("changes", &changes)
       .def("delays", &delays, "coordinate"_a, "of_rate"_a)
       .def("motion", &motion)
+      .def("rates_found",  // by the code that is written out, and by the tree
+           [](Run& run) { return nb::make_tuple(varied(run).variation().written, varied(run).variation().general); })
       .def("together", [](Run& run) { return varied(run).together; });
 }
 

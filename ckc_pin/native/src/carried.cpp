@@ -17,11 +17,10 @@ Vector6 cross(const Vector6& a, const Vector6& b) {
 }  // namespace
 
 // The axes S of all coordinates at or below one turn with it, S x S', and nothing above moves.
-Sway changes_of(const Tree& tree, int joint) {
+void changes_of(const Tree& tree, int joint, Sway& found) {
   const Indices& support = tree.support[joint];
   const auto count = static_cast<Eigen::Index>(support.size());
-  Sway found;
-  for (Matrix6x* x : {&found.place, &found.velocity, &found.rate, &found.rate_by_v}) x->setZero(6, count);
+  for (Matrix6x* x : {&found.place, &found.velocity, &found.rate, &found.rate_by_v}) x->resize(6, count);
   const Vector6 v = tree.motion(joint), a = tree.motion_rate(joint);
   for (Eigen::Index k = 0; k < count; ++k) {
     const int of = tree.joint_of[support[k]], above = tree.parent[of];
@@ -31,11 +30,10 @@ Sway changes_of(const Tree& tree, int joint) {
     found.rate.col(k) = cross(axis, a - tree.motion_rate(above)) + cross(cross(v_above, axis), relative);
     found.rate_by_v.col(k) = cross(tree.motion(of), axis) + cross(axis, relative);
   }
-  return found;
 }
 
-Carried::Carried(const Tree& tree, int joint_, const Vector3& local, bool is_point, const Sway& changes)
-    : joint(joint_) {
+void Carried::set(const Tree& tree, int of, const Vector3& local, bool is_point, const Sway& changes) {
+  joint = of;
   const double moves = is_point ? 1.0 : 0.0;
   const Vector6 v = tree.motion(joint), a = tree.motion_rate(joint);
   const Vector3 turn = v.tail<3>(), turn_dot = a.tail<3>();

@@ -158,7 +158,10 @@ class Control {
   // `force`: what acts, where eq. 6's force is meant as that alone on q.
   bool slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
   // Whether a motor that is q's own is not at its limit.
-  bool answers(Eigen::Index k) const { return !(actuation_.direct && actuation_.limited(tau, k)); }
+  bool answers(Eigen::Index k) const { return !(direct() && limited(k)); }
+  bool limited(Eigen::Index k) const { return actuation_.limited(tau, k); }  // a motor
+  bool direct() const { return actuation_.direct; }
+  bool of_motors() const { return feedback() ? law->of_motors() : constant_of_motors; }  // what acts is their torques
   // Whether u follows the state between samples.
   bool feedback() const { return law && !(sampling && sampling->holds); }
   bool act(const Measured& at);
@@ -167,7 +170,6 @@ class Control {
   double lyapunov(const Measured& at, double potential_energy, In w);
 
  private:
-  bool of_motors() const { return feedback() ? law->of_motors() : constant_of_motors; }
   bool ask(const Measured& at, Out u);
   bool answer(const Measured& at);  // to a sample: sampled_
   bool known(In u);                 // finite

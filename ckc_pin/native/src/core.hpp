@@ -35,7 +35,7 @@ class Core {
 
   void split(Indices q, Indices z);  // the partition q' = [q; z]
 
-  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.parameters` has them in, and what the code that
+  // Other numbers of the mechanism, in the parts that `ckc_pin.generated.arguments` has them in, and what the code that
   // is written out takes; nothing that was computed before is known after it.
   enum class Number {
     gravity, offset, mass, centre, inertia, armature, point, length, affine, affine_offset, end, stiffness, rest_length,
@@ -153,7 +153,9 @@ class Core {
   Factor basis_;
   long basis_at_ = -1;  // `sets` when tangent_ and basis_ were made of that partition, else -1
   Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
+  long inertia_at_ = -1;  // the same of square_factor_
   Eigen::ColPivHouseholderQR<Matrix> qr_;
+  Eigen::CompleteOrthogonalDecomposition<Matrix> transposed_;
   Matrix square_, by_state_, by_u_, responses_;
   Definite square_factor_;
   Vector turned_, negative_, moved_, small_, small_b_;

@@ -99,6 +99,7 @@ bool Core::tangent_basis(In residual, double least) {
 }
 
 void Core::tangent_inertia() {
+  if (inertia_at_ == sets && basis_at_ == sets) return;
   tree_inertia();
   if (dense_)
     D_tangent_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * tangent_;
@@ -106,6 +107,7 @@ void Core::tangent_inertia() {
     for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
   square_.noalias() = tangent_.transpose() * D_tangent_;
   square_factor_.compute(square_);
+  inertia_at_ = basis_at_;
 }
 
 void Core::with_force(In force, Out x) {
@@ -134,7 +136,7 @@ bool Core::closing_step(In residual, Out x) {
 bool Core::shortest_step(In residual, Out x) {
   if (!tangent_basis(residual, singular)) return false;
   square_.noalias() = tangent_.transpose() * tangent_;
-  square_factor_.compute(square_);
+  square_factor_.compute(square_), inertia_at_ = -1;
   y_ = -x_;
   with_force(y_, x);
   return true;
@@ -177,10 +179,9 @@ bool Core::responses(const Indices& at, Matrix& columns) {
 void Core::multipliers(In force, Out lambda) {
   if (!rows.closure.rows) return;
   jacobian();
-  Eigen::CompleteOrthogonalDecomposition<Matrix> transposed;
-  transposed.setThreshold(scales.rank);
-  transposed.compute(scales.columns.asDiagonal() * rows.J.transpose() * scales.rows.asDiagonal());
-  lambda = scales.rows.cwiseProduct(transposed.solve(scales.columns.cwiseProduct(force)));
+  transposed_.setThreshold(scales.rank);
+  transposed_.compute(scales.columns.asDiagonal() * rows.J.transpose() * scales.rows.asDiagonal());
+  lambda = scales.rows.cwiseProduct(transposed_.solve(scales.columns.cwiseProduct(force)));
 }
 
 bool Core::differentiate(In u_tree, In acceleration) {

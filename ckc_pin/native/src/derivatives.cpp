@@ -6,19 +6,44 @@
 
 namespace ckc {
 
+namespace {
+
+void unique(Indices& of) {
+  std::sort(of.begin(), of.end());
+  of.erase(std::unique(of.begin(), of.end()), of.end());
+}
+
+}  // namespace
+
 Derivatives::Derivatives(Tree& tree, const Closure& closure, const SpringTable& springs)
     : tree_(tree), closure_(closure), springs_(springs), pairs_(static_cast<int>(closure.point_joint.size()) / 2) {
   for (Matrix* x : {&row_by_q, &row_by_v, &rate_by_q, &J}) x->setZero(closure.rows, tree.n);
-}
-
-const Sway& Derivatives::sway(int joint) {
-  const auto found = sways_.find(joint);
-  return found != sways_.end() ? found->second : sways_.emplace(joint, changes_of(tree_, joint)).first->second;
+  const auto pair = [&](int k) { used_points_.push_back(k), used_points_.push_back(pairs_ + k); };
+  for (const auto& row : closure.components) pair(row.pair), used_directions_.push_back(row.direction);
+  for (const auto& row : closure.distances) pair(row.pair);
+  for (const auto& row : closure.dots) used_directions_.push_back(row.a), used_directions_.push_back(row.b);
+  unique(used_points_), unique(used_directions_);
+  for (int k : used_points_) joints_.push_back(closure.point_joint[k]);
+  for (int k : used_directions_) joints_.push_back(closure.direction_joint[k]);
+  for (const auto& rows : closure.logs) joints_.push_back(rows.joint_a), joints_.push_back(rows.joint_b);
+  joints_.insert(joints_.end(), springs.point_joint.begin(), springs.point_joint.end());
+  unique(joints_);
+  sways_.resize(tree.joints), points_.resize(closure.point_joint.size());
+  directions_.resize(closure.direction_joint.size()), ends_.resize(springs.point_joint.size());
+  by_.setZero(tree.n), dot_by_.setZero(tree.n);
 }
 
 void Derivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
-  sways_.clear();
   tree_.derivatives(q, v, a, !impulsive, force_by_q, force_by_v);
+  for (int joint : joints_) changes_of(tree_, joint, sways_[joint]);
+  for (int k : used_points_) {
+    const int joint = closure_.point_joint[k];
+    points_[k].set(tree_, joint, closure_.point_local[k], true, sways_[joint]);
+  }
+  for (int k : used_directions_) {
+    const int joint = closure_.direction_joint[k];
+    directions_[k].set(tree_, joint, closure_.direction_local[k], false, sways_[joint]);
+  }
   for (Matrix* x : {&row_by_q, &row_by_v, &rate_by_q, &J}) x->setZero();
   for (const auto& row : closure_.components) add_component(row, lambda(row.out));
   for (const auto& row : closure_.dots) add_dot(row, lambda(row.out));
@@ -60,11 +85,7 @@ void Derivatives::product(const Carried& x, const Carried& y, double weight) {
 }
 
 void Derivatives::add_component(const Component& row, double lambda) {
-  const int in_a = closure_.point_joint[row.pair], in_b = closure_.point_joint[pairs_ + row.pair];
-  const int in_e = closure_.direction_joint[row.direction];
-  const Carried a(tree_, in_a, closure_.point_local[row.pair], true, sway(in_a));
-  const Carried b(tree_, in_b, closure_.point_local[pairs_ + row.pair], true, sway(in_b));
-  const Carried e(tree_, in_e, closure_.direction_local[row.direction], false, sway(in_e));
+  const Carried &a = points_[row.pair], &b = points_[pairs_ + row.pair], &e = directions_[row.direction];
   const Vector3 r = a.x - b.x, r_dot = a.x_dot - b.x_dot, r_ddot = a.x_ddot - b.x_ddot;
   add(row.out, a, e.x, e.x_dot, e.x_ddot), add(row.out, b, -e.x, -e.x_dot, -e.x_ddot), add(row.out, e, r, r_dot, r_ddot);
   bend(a, lambda * e.x), bend(b, -lambda * e.x), bend(e, lambda * r);
@@ -72,18 +93,14 @@ void Derivatives::add_component(const Component& row, double lambda) {
 }
 
 void Derivatives::add_dot(const Dot& row, double lambda) {
-  const int in_a = closure_.direction_joint[row.a], in_b = closure_.direction_joint[row.b];
-  const Carried a(tree_, in_a, closure_.direction_local[row.a], false, sway(in_a));
-  const Carried b(tree_, in_b, closure_.direction_local[row.b], false, sway(in_b));
+  const Carried &a = directions_[row.a], &b = directions_[row.b];
   add(row.out, a, b.x, b.x_dot, b.x_ddot), add(row.out, b, a.x, a.x_dot, a.x_ddot);
   bend(a, lambda * b.x), bend(b, lambda * a.x);
   product(a, b, lambda), product(b, a, lambda);
 }
 
 void Derivatives::add_distance(const Distance& row, double lambda) {
-  const int in_a = closure_.point_joint[row.pair], in_b = closure_.point_joint[pairs_ + row.pair];
-  const Carried a(tree_, in_a, closure_.point_local[row.pair], true, sway(in_a));
-  const Carried b(tree_, in_b, closure_.point_local[pairs_ + row.pair], true, sway(in_b));
+  const Carried &a = points_[row.pair], &b = points_[pairs_ + row.pair];
   const double part = 1.0 / row.length, weight = part * lambda;
   const Vector3 r = part * (a.x - b.x), r_dot = part * (a.x_dot - b.x_dot), r_ddot = part * (a.x_ddot - b.x_ddot);
   add(row.out, a, r, r_dot, r_ddot), add(row.out, b, -r, -r_dot, -r_ddot);
@@ -106,7 +123,7 @@ void Derivatives::add_log(const RelativeLog& rows, In lambda) {
   Carried::Columns place = Carried::Columns::Zero(3, n), velocity = place, rate = place, rate_by_v = place, of_b = place, velocity_b = place;
   const auto put = [&](int joint, double sign) {
     const Indices& support = tree_.support[joint];
-    const Sway& s = sway(joint);
+    const Sway& s = sways_[joint];
     for (size_t k = 0; k < support.size(); ++k) {
       const int j = support[k];
       place.col(j) += sign * s.place.col(k).tail<3>(), velocity.col(j) += sign * s.velocity.col(k).tail<3>();
@@ -148,8 +165,11 @@ void Derivatives::add_springs(In v) {
   const auto count = s.stiffness.size();
   force_by_q.diagonal() += s.joint_stiffness, force_by_v.diagonal() += s.joint_damping;
   for (Eigen::Index k = 0; k < count; ++k) {
-    const int in_a = s.point_joint[k], in_b = s.point_joint[count + k];
-    const Carried a(tree_, in_a, s.point_local[k], true, sway(in_a)), b(tree_, in_b, s.point_local[count + k], true, sway(in_b));
+    for (const Eigen::Index i : {k, count + k}) {
+      const int joint = s.point_joint[i];
+      ends_[i].set(tree_, joint, s.point_local[i], true, sways_[joint]);
+    }
+    const Carried &a = ends_[k], &b = ends_[count + k];
     const Vector3 r = a.x - b.x, r_dot = a.x_dot - b.x_dot;
     const double length = r.norm();
     if (!(length > 0.0)) {  // only without a length at rest it pulls somewhere next to there
@@ -157,7 +177,8 @@ void Derivatives::add_springs(In v) {
       product(a, a, pull), product(b, b, pull), product(a, b, -pull), product(b, a, -pull);
       continue;
     }
-    Vector by = Vector::Zero(tree_.n), dot_by = by;  // of the length, of its rate
+    Vector &by = by_, &dot_by = dot_by_;  // of the length, of its rate
+    by.setZero(), dot_by.setZero();
     const double length_dot = r.dot(r_dot) / length;
     const auto put = [&](const Carried& x, double sign) {
       const Indices& support = tree_.support[x.joint];

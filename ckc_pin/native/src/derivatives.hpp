@@ -4,8 +4,6 @@
 // of points and directions, phi = a . b, so that phi_ddot = a_ddot . b + 2 a_dot . b_dot + a . b_ddot changes as those do.
 #pragma once
 
-#include <map>
-
 #include "carried.hpp"
 #include "rows.hpp"
 #include "springs.hpp"
@@ -22,9 +20,10 @@ class Derivatives {
   Matrix force_by_q, force_by_v;  // (n, n): of D'a + C'v + h' less springs, dampers and J^T lambda
   Matrix row_by_q, row_by_v;      // (rows, n): of J a + J_dot v
   Matrix rate_by_q, J;            // (rows, n): of J v; of phi
+  const Carried& end_a(int spring) const { return ends_[spring]; }  // of springs, unless `impulsive`
+  const Carried& end_b(int spring) const { return ends_[ends_.size() / 2 + spring]; }
 
  private:
-  const Sway& sway(int joint);
   // What a row made of x with these weights of x, x_dot, x_ddot adds; its force.
   void add(int row, const Carried& x, const Vector3& w, const Vector3& w_dot, const Vector3& w_ddot);
   void bend(const Carried& x, const Vector3& force);                    // force . x along two coordinates
@@ -39,7 +38,10 @@ class Derivatives {
   const Closure& closure_;
   const SpringTable& springs_;
   const int pairs_;
-  std::map<int, Sway> sways_;
+  std::vector<Sway> sways_;                         // by joint, of those that rows and springs hold on to:
+  Indices joints_, used_points_, used_directions_;  // and the points and directions that rows are made of
+  std::vector<Carried> points_, directions_, ends_;
+  Vector by_, dot_by_;
 };
 
 }  // namespace ckc

@@ -105,7 +105,7 @@ class System {
   virtual bool after_change(double, Out) { return true; }
   // Numbers that are recorded behind those of the state.
   virtual int extra() const { return 0; }
-  virtual void put_extra(In, Out) const {}
+  virtual void put_extra(In, Out) {}  // at the core's state, that of y, with what acts there
 
   // Add to the velocities, and to the coordinates, in y.
   virtual void push(Out y, In v) const = 0;

@@ -103,11 +103,10 @@ void Tree::derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_
   pin::Data& data = own->data;
   pin::computeRNEADerivatives(model, data, q, v, a);
   by_q = data.dtau_dq, by_v = data.dtau_dv;
-  if (!gravity) {
-    Matrix of_gravity = Matrix::Zero(n, n);
-    pin::computeGeneralizedGravityDerivatives(model, data, q, of_gravity);
-    by_q -= of_gravity;
-  }
+  if (gravity) return;  // placements, motions and the Jacobian are those there
+  Matrix of_gravity = Matrix::Zero(n, n);
+  pin::computeGeneralizedGravityDerivatives(model, data, q, of_gravity);
+  by_q -= of_gravity;
   pin::forwardKinematics(model, data, q, v, a);
   set(q);
 }

@@ -1,29 +1,38 @@
 // How a motion changes with parameters: the variational equations of eq. 1 in tangent coordinates, of first order.
 //
 // A column a parameter, (step of q', change of v'). They are the same in every formulation and in all coordinates, since
-// those are of one motion. Of lengths and placements the derivatives are those along joints that are locked where the
-// frame is, which a tree of its own has beside the mechanism's.
+// those are of one motion. Of lengths, angles and placements the derivatives are those along joints that are locked where
+// the frame is, which a tree of its own has beside the mechanism's. Where the terms are written out with their changes, a
+// parameter is a direction in the space of the numbers that the code takes.
 #pragma once
 
 #include "system.hpp"
 
 namespace ckc {
 
-struct Parameter {
+// One of the ways in which a parameter acts; they add up.
+struct Effect {
   enum Kind {
-    start,         // of nothing but where it starts
-    placement,     // index: of the tree's own coordinates
+    placement,     // index: of the tree's own coordinates; numbers: how far along it (1)
     inertia,       // index: joint of the tree; numbers: of mass, moment and inertia about the joint's origin (10)
     gravity,       // numbers (3)
     stiffness, rest_length, damping,  // index: spring between frames
     joint_stiffness, joint_rest, joint_damping, constant, friction, restitution, lower, upper,  // index: coordinate
+    armature,      // index: coordinate; numbers: by how much (1)
     length,        // index: row
     offset,        // index: row
+    ratio,         // index: row; numbers: the coordinate that it is of (1)
     gain_q, gain_q_dot,  // numbers: a change of K_P, K_V, columns; then q_d
+    gear,          // index: motor; numbers: of what it turns by coordinate (n)
+    torque_limit,  // index: motor; numbers: what it turns by coordinate (n)
   };
   Kind kind;
   int index;
   Vector numbers;
+};
+
+struct Parameter {
+  std::vector<Effect> effects;
   Vector q, q_dot;  // (n), (d): how the start's independent coordinates, tangent, and their rates change with it
 };
 
@@ -35,7 +44,9 @@ struct VariationTable {
   Indices own;  // q of what acts
   bool at_equilibrium;
   Vector target;  // q' where a controller compensates what this mechanism needs to stay, or none
+  Matrix turns;   // (motors, n)
   std::vector<Parameter> parameters;
+  Matrix directions;  // (numbers that the written-out code takes, parameters); none where it does not take them
 };
 
 class Variation {
@@ -43,6 +54,7 @@ class Variation {
   Variation(System& system, VariationTable table);
 
   const int n, count;
+  long written = 0, general = 0;  // how often rates were found by the code that is written out, and by the tree
   // How much later with each parameter what is met there comes; false where two things come that do not come together.
   bool delays(In v, In a, const std::vector<System::Met>& met, const Matrix& s);
   const Vector& delay() const { return delay_; }
@@ -51,8 +63,14 @@ class Variation {
   // Of s at the core's state, where it moves with v and accelerates with a under what acts; false where what acts has no
   // known derivatives.
   bool rates(In v, In a, const Matrix& s, Matrix& s_dot);
+  // The same at any state where the terms are written out with their changes; false where they are not, or lose digits.
+  bool is_written() const;
+  bool written_rates(In q_tree, In v, const Matrix& s, Matrix& s_dot);
   // The same where nothing varies but the start, by eq. 1's derivatives.
   void rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const;
+  // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
+  // what acts there; NaN where that is not known.
+  void efforts(In v, const Matrix& s, Matrix& u, Matrix& tau);
   // Where joints change what they do.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
   bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
@@ -61,26 +79,33 @@ class Variation {
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
   void move(In v, const Matrix& s, Matrix& s_dot) const;  // the places' part of the rates
+  bool what_acts(In v);  // acting_, and its slopes
+  void add_back(Matrix& change);  // what holds the joints that are locked
   // What each parameter adds to the forces that are lacking, and to J a; `impulsive` as there.
-  void add_parameters(In v, In lambda, bool impulsive, Matrix& force, Matrix& row) const;
-  void add_inertia(const Parameter& of, bool impulsive, Out force) const;
-  void add_gravity(const Parameter& of, Out force) const;
-  void add_spring(const Parameter& of, Out force) const;
-  void closure_changes(Matrix& place, Matrix& rate) const;
+  void add_parameters(In v, In a, In lambda, bool impulsive, Matrix& force, Matrix& row);
+  void add_effect(const Effect& of, In a, In lambda, bool impulsive, Out force, Out row);
+  void add_force(const Effect& of, In v, Out force);
+  void add_acting(In q_tree, In v, Matrix& force) const;  // of that the part of what acts
+  void add_control(In q_tree, In v, Matrix& force) const;  // and of that the controller's and the motors'
+  void add_inertia(const Effect& of, bool impulsive, Out force);
+  void add_gravity(const Effect& of, Out force);
+  void add_spring(const Effect& of, Out force);
+  void closure_changes(In v, Matrix& place, Matrix& rate) const;
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
-  void add_gain(const Parameter& of, In v, Out force) const;
-  void add_control(In v, Matrix& force) const;
+  void add_gain(const Effect& of, In q_tree, In v, Out force) const;
   void add_state(const Matrix& s);
-  void put(Out force, const Vector& of_tree) const;  // of the mechanism's coordinates
+  void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
+  bool is_of_stop(const Parameter& of, int coordinate, double v) const;
 
   System& system_;
   Core& core_;
   const VariationTable table_;
   Tree tree_;
   Derivatives derivatives_;
+  bool acting_varies_ = false;  // some effect is of what acts
   Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_;
-  Vector acting_, back_;
+  Vector acting_, back_, move_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };
 

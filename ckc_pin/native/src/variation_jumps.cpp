@@ -16,8 +16,7 @@ bool Variation::delays(In v, In a, const std::vector<System::Met>& met, const Ma
   for (const auto& [k, of_rate] : met) {
     Vector found(count);
     for (int p = 0; p < count; ++p) {
-      const Parameter& of = table_.parameters[p];
-      const bool stop = !of_rate && of.index == k && of.kind == (v(k) < 0.0 ? Parameter::lower : Parameter::upper);
+      const bool stop = !of_rate && is_of_stop(table_.parameters[p], k, v(k));
       found(p) = of_rate ? -s(n + k, p) / a(k) : -(s(k, p) - (stop ? 1.0 : 0.0)) / v(k);
     }
     if (known && !((found - delay_).norm() <= same * delay_.norm())) return false;
@@ -54,7 +53,7 @@ bool Variation::at_impact(In step, const Indices& at, const Matrix& responses, I
   core_.multipliers(lacking, lambda);
   compute(none, step, lambda, true);
   force_.setZero(n, count), row_.setZero(m, count);
-  add_parameters(none, lambda, true, force_, row_);
+  add_parameters(none, step, lambda, true, force_, row_);
   Matrix places = s;
   places.bottomRows(n).setZero();
   add_state(places);
@@ -68,10 +67,10 @@ bool Variation::at_impact(In step, const Indices& at, const Matrix& responses, I
     const double again = back(pushed[i]) > 0.0 ? core_.joints.table.restitution(k) : 0.0;
     wanted.row(i) = -(1.0 + again) * s.row(n + k) - change_.row(k);
     for (int p = 0; p < count; ++p) {
-      const Parameter& of = table_.parameters[p];
       const double speed = again > 0.0 ? back(pushed[i]) / again : 0.0;  // off the stop
       const double side = x(pushed[i]) > 0.0 ? 1.0 : -1.0;
-      if (of.kind == Parameter::restitution && of.index == k) wanted(i, p) += side * speed;
+      for (const Effect& of : table_.parameters[p].effects)
+        if (of.kind == Effect::restitution && of.index == k) wanted(i, p) += side * speed;
     }
   }
   s.bottomRows(n) += change_ + columns * A.completeOrthogonalDecomposition().solve(wanted);

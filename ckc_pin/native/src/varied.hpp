@@ -26,7 +26,7 @@ class Varied : public Base, public WithVariation {
       : Base(std::forward<Given>(given)...),
         size_(Base::size),
         of_start_(std::all_of(table.parameters.begin(), table.parameters.end(),
-                              [](const Parameter& of) { return of.kind == Parameter::start; })),
+                              [](const Parameter& of) { return of.effects.empty(); })),
         variation_(*this, std::move(table)) {
     this->size = size_ + 2 * variation_.n * variation_.count;
     this->crosses = false;
@@ -45,18 +45,8 @@ class Varied : public Base, public WithVariation {
 
   bool rhs(double t, In y, Out y_dot) override {
     if (!Base::rhs(t, y.head(size_), y_dot.head(size_))) return false;
-    if (std::is_same_v<Base, Dae>) Base::at_last(t, y.head(size_));
-    v_ = std::is_same_v<Base, Dae> ? this->velocity : this->v_tree;
-    a_.resize(variation_.n);
-    if (!Base::tree_acceleration(y_dot.head(size_), a_)) return this->fails(Trouble::open);
     take(y);
-    if (of_start_ && this->core.written) {
-      this->core.set_velocity(v_);
-      if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return this->fails(Trouble::infinite);
-      variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
-    } else if (!variation_.rates(v_, a_, s_, s_dot_)) {
-      return this->fails(Trouble::infinite);
-    }
+    if (!written_rates(y) && !rates(t, y, y_dot)) return this->fails(Trouble::infinite);
     Eigen::Map<Matrix>(y_dot.data() + size_, rows(), variation_.count) = s_dot_;
     return true;
   }
@@ -111,19 +101,46 @@ class Varied : public Base, public WithVariation {
     put(y);
     return true;
   }
-  int extra() const override { return 2 * variation_.n * variation_.count; }
-  void put_extra(In y, Out row) const override { row = y.tail(extra()); }
+  int extra() const override { return (rows() + this->core.d + static_cast<int>(this->control.tau.size())) * variation_.count; }
+  void put_extra(In y, Out row) override {
+    take(y);
+    variation_.efforts(this->velocity, s_, u_, tau_);
+    double* place = row.data();
+    for (const Matrix* x : {&s_, &u_, &tau_}) place = std::copy(x->data(), x->data() + x->size(), place);
+  }
 
  private:
   int rows() const { return 2 * variation_.n; }
-  void take(In y) { s_ = changes(y); }
+  void take(In y) { s_ = Eigen::Map<const Matrix>(y.data() + size_, rows(), variation_.count); }
+  // Where the right-hand side was evaluated last, by the code that is written out.
+  bool written_rates(In y) {
+    if (!variation_.is_written()) return false;
+    if constexpr (std::is_same_v<Base, Dae>) {
+      q_tree_ = y.head(this->core.tree.nq);
+      this->core.tree.normalize(q_tree_);
+      return variation_.written_rates(q_tree_, y.segment(q_tree_.size(), variation_.n), s_, s_dot_);
+    } else {
+      return variation_.written_rates(this->core.q_tree, this->v_tree, s_, s_dot_);
+    }
+  }
+  bool rates(double t, In y, In y_dot) {
+    if (std::is_same_v<Base, Dae>) Base::at_last(t, y.head(size_));
+    v_ = std::is_same_v<Base, Dae> ? this->velocity : this->v_tree;
+    a_.resize(variation_.n);
+    if (!Base::tree_acceleration(y_dot.head(size_), a_)) return false;
+    if (!of_start_ || !this->core.written) return variation_.rates(v_, a_, s_, s_dot_);
+    this->core.set_velocity(v_);
+    if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return false;
+    variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
+    return true;
+  }
   void put(Out y) const { Eigen::Map<Matrix>(y.data() + size_, rows(), variation_.count) = s_; }
 
   const int size_;  // of the base's y
   const bool of_start_;  // nothing varies but where it starts
   Variation variation_;
-  Matrix s_, s_dot_, by_q_, by_v_;
-  Vector v_, a_;
+  Matrix s_, s_dot_, by_q_, by_v_, u_, tau_;
+  Vector v_, a_, q_tree_;
 };
 
 }  // namespace ckc

@@ -28,6 +28,11 @@ class Written {
   double potential_energy(In q) const;
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
+  // How that changes: at a state, and then along any direction; `arguments`: of what the library takes. Only of a library
+  // that was made for it. False as above, and none of the changes after that are known.
+  bool has_changes() const { return state_; }
+  bool state(In q, In v, In u_tree) const;
+  void change(In q, In v, In u_tree, In arguments, Out acceleration) const;
   // The x with J x = -residual that is smallest in the metric of D'; false as above.
   bool closing_step(In q, In residual, Out x) const;
   // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
@@ -46,7 +51,10 @@ class Written {
   void* library_;
   Vector numbers_;  // the parameters, and what follows from them alone
   mutable Trig trig_;
+  mutable Vector q_, v_, u_, at_, acceleration_at_;  // the last state that changes were asked for, and what is known there
+  mutable bool sound_ = false;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
+  Code state_, change_;
 };
 
 }  // namespace ckc

@@ -8,7 +8,7 @@ from typing import Any
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import AXES, is_parameter, require_known, values_of
+from ckc_pin.mechanism.parameters import AXES, is_parameter, require_known, values_of, with_components
 from ckc_pin.simulation.scene import Scene, load_scene
 
 __all__ = ["check_names"]
@@ -18,9 +18,9 @@ def check_names(
     scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, mechanism: Mechanism, names: tuple[str, ...]
 ) -> dict[str, tuple[str, int]]:
     """Refuse variables that are none; return those that are components of what the scene gives whole."""
-    known = {name: None for name in names if is_parameter(name)}
-    require_known(mechanism.spec, mechanism.urdf, known, f"{scene.name}: variables")
     present = values_of(mechanism.spec, mechanism.urdf)
+    asked = [name for name in names if is_parameter(name)]
+    require_known(asked, with_components(present), f"{scene.name}: variables")
     vectors: dict[str, tuple[str, int]] = {}
     for name in names:
         if name in present and isinstance(present[name], tuple):

@@ -11,7 +11,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.tree import Array, BoolArray
 
-__all__ = ["Parameters", "constant", "labels", "numbers", "present", "values"]
+__all__ = ["Arguments", "constant", "labels", "numbers", "present", "values"]
 
 NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
 
@@ -60,7 +60,7 @@ def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:
 
 
 def values(given: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
-    """Return the arguments, in the order of `Parameters.vector`."""
+    """Return the arguments, in the order of `Arguments.vector`."""
     return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in given.items()])
 
 
@@ -89,7 +89,7 @@ def labels(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
     return found
 
 
-class Parameters:
+class Arguments:
     """Symbols for those numbers.
 
     Parameters

@@ -1,0 +1,62 @@
+// How what a controller and motors do changes with parameters.
+#include <limits>
+
+#include <Eigen/LU>
+
+#include "variation.hpp"
+
+namespace ckc {
+
+// Eq. 6's force u does on q alone what u' = f does on the tree: f + J^T lambda = E u with E of the user's own q, so that
+// with R = rho in those coordinates du = R^T (df + d(J^T) lambda). f is T^T tau of the motors.
+void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
+  const Control& control = system_.control;
+  const auto d = static_cast<Eigen::Index>(table_.own.size()), motors = table_.turns.rows();
+  const bool torques = control.of_motors();
+  u.setZero(d, count), tau.setZero(motors, count);
+  if (!control.acts()) return;
+  Matrix geared = Matrix::Zero(n, count);  // of f with the gears alone
+  for (int p = 0; p < count; ++p)
+    for (const Effect& of : table_.parameters[p].effects) {
+      if (of.kind == Effect::gear) geared.col(p) += control.tau(of.index) * of.numbers;
+      if (of.kind == Effect::torque_limit && control.limited(of.index))
+        tau(of.index, p) += control.tau(of.index) > 0.0 ? 1.0 : -1.0;
+    }
+  if (!torques) {
+    if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_)) {
+      u.setConstant(std::numeric_limits<double>::quiet_NaN()), tau = Matrix::Constant(motors, count, u(0, 0));
+      return;
+    }
+    force_.setZero();
+    add_control(core_.q_tree, v, force_);
+    force_ = u_by_q_ * s.topRows(n) + u_by_v_ * s.bottomRows(n) - force_;
+    for (Eigen::Index i = 0; i < d; ++i) u.row(i) = force_.row(table_.own[i]);
+    if (control.direct()) {
+      for (Eigen::Index i = 0; i < d; ++i) tau.row(i) = u.row(i) - geared.row(table_.own[i]);
+      return;
+    }
+  }
+  core_.reduce();
+  Matrix own(d, core_.d);
+  for (Eigen::Index i = 0; i < d; ++i) own.row(i) = core_.rho.row(table_.own[i]);
+  const Matrix basis = core_.rho * own.partialPivLu().inverse();
+  lacking_ = -control.u_tree;
+  for (Eigen::Index i = 0; i < d; ++i) lacking_(table_.own[i]) += control.u(i);
+  core_.multipliers(lacking_, lambda_);
+  const Vector none = Vector::Zero(n);
+  compute(none, none, lambda_, true);
+  force_.setZero(), row_.setZero();
+  add_parameters(none, none, lambda_, true, force_, row_);
+  Matrix places = s;
+  places.bottomRows(n).setZero();
+  add_state(places);
+  const Matrix turned = basis.transpose() * (geared - force_), transmission = basis.transpose() * table_.turns.transpose();
+  if (torques)
+    u = turned + transmission * tau;
+  else if (motors == d)
+    tau = transmission.partialPivLu().solve(u - turned);
+  else
+    tau.setConstant(std::numeric_limits<double>::quiet_NaN());  // which of them, when they share u, is not known
+}
+
+}  // namespace ckc

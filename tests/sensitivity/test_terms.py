@@ -1,0 +1,100 @@
+"""Sensitivities by code that is written out against those by Pinocchio's derivatives, and how often each is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import simulate
+from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from tests.sensitivity.changed import TIGHT, written
+from tests.sensitivity.spatial import arms, tethered
+
+SAME = 1e-9  # of the largest: both are integrated
+
+
+@pytest.fixture(autouse=True)
+def cache(writable_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(writable_cache))
+
+
+def both(scene: str, names: list[str], changes: dict[str, Any]) -> tuple[Sensitivities, Sensitivities]:
+    found = [sensitivities(scene, names, {**changes, "solver.terms": terms}) for terms in ("generated", "pinocchio")]
+    assert [x.run.stats["terms"] for x in found] == ["generated", "pinocchio"]
+    return found[0], found[1]
+
+
+def same(found: Sensitivities, other: Sensitivities) -> None:
+    for part in ("q_tree", "v_tree", "u", "tau"):
+        ours, theirs = getattr(found, part), getattr(other, part)
+        for k, name in enumerate(found.parameters):
+            largest = np.abs(theirs[:, :, k]).max(initial=0.0)
+            assert np.abs(ours[:, :, k] - theirs[:, :, k]).max(initial=0.0) <= SAME * max(1e-3, largest), (part, name)
+
+
+NAMES = [
+    "link.crank.mass", "link.coupler.com.x", "link.rocker.inertia.izz", "joint.b.xyz", "joint.b.damping",
+    "joint.c.armature", "loop.knee.frame_a.xyz.x", "loop.knee.frame_b.xyz.y", "spring.0.stiffness",
+    "spring.0.rest_length", "spring.0.damping", "spring.0.frame_b.xyz",
+    "spring.1.stiffness", "spring.1.rest", "force.0.value", "gravity", "initial.q.a",
+    "initial.q_dot.a",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_of_every_kind_of_number(formulation: str, tmp_path: Path) -> None:
+    """Also of what is zero, as a rotor and gravity along x, which a library of its own takes."""
+    scene = written(tmp_path, formulation=formulation)
+    found, other = both(scene, NAMES, TIGHT)
+    same(found, other)
+    counts = found.run.stats["changes_by_terms"]
+    assert counts["pinocchio"] == 0
+    assert 0 < counts["generated"] <= found.run.stats["rhs"]
+    plain = simulate(scene, {**TIGHT, "solver.terms": "generated"})
+    assert found.run.stats["rhs"] <= 2 * plain.stats["rhs"]
+    there = sensitivities(scene, NAMES, {**TIGHT, "solver.terms": "auto", "t_end": 0.1})
+    assert there.run.stats["changes_by_terms"]["pinocchio"] == 0
+    counts = other.run.stats["changes_by_terms"]
+    assert counts["generated"] == 0
+    assert 0 < counts["pinocchio"] <= other.run.stats["rhs"]
+
+
+def test_in_space_and_of_gears(tmp_path: Path) -> None:
+    names = ["joint.rb.xyz", "joint.rb.armature", "coupling.0.ratio", "coupling.0.offset", "link.lhand.mass",
+             "loop.hold.frame_a.xyz.z", "link.ltip.com.y"]  # fmt: skip
+    found, other = both(arms(tmp_path, "prismatic"), names, TIGHT)
+    same(found, other)
+    assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
+
+
+def test_of_angles_the_tree_says_it(tmp_path: Path) -> None:
+    """They are no arguments of the code, which gives the motion all the same."""
+    found, other = both(arms(tmp_path, "hinge"), ["joint.lc.rpy.y", "link.lhand.mass"], TIGHT)
+    same(found, other)
+    assert found.run.stats["changes_by_terms"]["generated"] == 0
+
+
+def test_under_control_and_through_impacts(tmp_path: Path) -> None:
+    names = ["link.crank.mass", "controller.K_P", "controller.K_V", "gravity.y", "initial.q.a"]
+    scene = written(tmp_path / "controlled", controlled=True, formulation="reduced")
+    found, other = both(scene, names, TIGHT)
+    same(found, other)
+    assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
+    names = ["link.crank.mass", "joint.c.upper", "joint.c.restitution", "joint.c.xyz.x"]
+    for restitution in (0.5, 0.0):  # it bounces; it stays there for a while
+        changes = {"joint.c.upper": 1.9, "joint.c.restitution": restitution}
+        found, other = both(written(tmp_path / f"stop{restitution}", changes, stop=True), names, TIGHT)
+        same(found, other)
+        assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
+
+
+def test_of_a_free_root(tmp_path: Path) -> None:
+    """Whose place is a quaternion, whose changes are twists."""
+    names = ["link.body.mass", "link.body.com.y", "gravity.x", "spring.0.stiffness", "spring.0.frame_a.xyz"]
+    names += ["joint.root.xyz", "initial.q_dot.root.rx"]
+    found, other = both(tethered(tmp_path), names, TIGHT)
+    same(found, other)
+    assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
