@@ -179,6 +179,15 @@ def test_bad_input_is_one_message(tmp_path: Path, more: str, options: list[str],
     assert len(done.err.strip().splitlines()) == 1
 
 
+def test_a_scheduler_that_does_not_answer_is_asked_for_nothing_else() -> None:
+    given = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
+    rest: dict[str, Any] = {"changes": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False}
+    for address in ("nonsense://x", "tcp://127.0.0.1:9"):
+        with pytest.raises(InputError, match="does not answer within"):
+            ckc_pin.ensemble(*given, **rest, scheduler=address)
+    assert np.all(np.isfinite(ckc_pin.ensemble(*given, **rest)["end"].to_numpy()))
+
+
 def test_workers_that_die_cost_nothing_that_is_finished(tmp_path: Path) -> None:
     rest: dict[str, Any] = {"members": 4, "changes": {"t_end": 0.1, "solver.terms": "pinocchio"}, "progress": False}
     given = ("five_bar/swing", {"initial.q.theta_1": {"uniform": [-1.5, -1.0]}})

@@ -53,11 +53,12 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
                 f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
                 '`if __name__ == "__main__":`, since each process reads the script again'
             ) from None
-        with cluster, Client(cluster) as client:  # type: ignore[no-untyped-call]
+        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
             yield client
         return
     try:
-        client = Client(scheduler, timeout=PATIENCE)  # type: ignore[no-untyped-call]
+        # no default: one that does not answer would be asked for all that the process computes by Dask afterwards
+        client = Client(scheduler, timeout=PATIENCE, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
@@ -85,7 +86,7 @@ def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], 
             for first, end in islice(todo, count)
         ]
 
-    running = as_completed(submit(AHEAD * workers))  # type: ignore[no-untyped-call]
+    running = as_completed(submit(AHEAD * workers), loop=client.loop)  # type: ignore[no-untyped-call]
     for future in running:
         try:
             chunk = future.result()
