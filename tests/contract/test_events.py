@@ -91,12 +91,17 @@ def test_a_root_is_looked_for_where_that_costs_less(root: float, slope: float) -
     assert len(asked) <= 2
 
 
-@pytest.mark.parametrize("lift", [1e-7, -1e-7])
-def test_where_two_roots_are_nearly_one_what_costs_less_decides(lift: float) -> None:
-    """The right function crosses by less than the other is off by, or does not: both are the same to the tolerance."""
-    found, _, _ = _core.walk(lambda t: (t - 0.3) ** 2 - R**2, 0.0, 1.0, 0, 0.0, lambda t: (t - 0.3) ** 2 + lift)
-    assert [direction for _, direction in found] == [-1, 1]
-    assert_close([t for t, _ in found], [0.3 - R, 0.3 + R], 5 * R)
+@pytest.mark.parametrize("off", [1e-7, -1e-7])
+def test_where_two_roots_are_nearly_one_the_right_function_decides(off: float) -> None:
+    """What costs less crosses twice where the right function does not, or does not where that crosses twice."""
+    for depth in (0.5e-7, -0.5e-7):
+        found, _, _ = _core.walk(
+            lambda t, depth=depth: (t - 0.3) ** 2 - depth + off, 0.0, 1.0, 0, 0.0,
+            lambda t, depth=depth: (t - 0.3) ** 2 - depth,
+        )  # fmt: skip
+        assert [direction for _, direction in found] == ([-1, 1] if depth > 0 else [])
+        if depth > 0:
+            assert_close([t for t, _ in found], [0.3 - np.sqrt(depth), 0.3 + np.sqrt(depth)], 1e-8)
 
 
 # --- against numpy and SciPy ---------------------------------------------------------------------

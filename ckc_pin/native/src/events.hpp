@@ -42,7 +42,7 @@ struct Walk {
   int sign = 0;                               // at the end, or the last one it had; 0 while it has had none
   bool on_zero = false;                       // at the end
   Points points, tips;
-  Vector curve;
+  Vector curve, exact_values;
 };
 using Gap = std::function<bool(double, double&)>;
 

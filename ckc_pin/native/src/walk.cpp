@@ -16,6 +16,7 @@ constexpr int most_steps = 6;         // of the secant method from a root that i
 constexpr double secant = 1e-3;       // of the step: over which it begins; of its first step, what that may be wrong by
 constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
 constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
+constexpr double unsure = 10.0;       // times what the cheap function is off by: an extremum so near to zero may cross
 
 namespace {
 
@@ -125,6 +126,20 @@ bool refine(const Gap& gap, const Gap& exact, const std::pair<double, double>& s
   return first * last < 0.0 ? root(exact, {start.first, first}, {end.first, last}, t) : true;
 }
 
+// Whether the function that gap is off from by little may touch zero where gap does not, or not where gap does.
+bool grazes(const Gap& exact, double spread, const Points& points, bool& may) {
+  may = false;
+  for (size_t k = 1; k + 1 < points.size() && !may; ++k) {
+    const auto& [t, value] = points[k];
+    const bool extreme = (value - points[k - 1].second) * (value - points[k + 1].second) >= 0.0;
+    if (!extreme || !(std::abs(value) < near_zero * spread)) continue;
+    double there;
+    if (!exact(t, there)) return false;
+    may = std::abs(value) <= unsure * std::abs(there - value);
+  }
+  return true;
+}
+
 }  // namespace
 
 const Vector& walk_places() {
@@ -141,6 +156,15 @@ bool walk(const Gap& gap, double from, double to, In values, int sign, double fl
   for (Eigen::Index k = 0; k < places.size(); ++k)
     points.emplace_back(k + 1 == places.size() ? to : from + (to - from) * places(k), values(k));
   if (!with_extrema(gap, from, to, values, zero, walked)) return false;
+  bool may = false;
+  if (exact && !grazes(*exact, values.maxCoeff() - values.minCoeff(), points, may)) return false;
+  if (may) {
+    Vector& exact_values = walked.exact_values;
+    exact_values.resize(places.size());
+    for (Eigen::Index k = 0; k < places.size(); ++k)
+      if (!(*exact)(k + 1 == places.size() ? to : from + (to - from) * places(k), exact_values(k))) return false;
+    return walk(*exact, from, to, exact_values, sign, floor, walked);
+  }
   walked.found.clear(), walked.sign = sign, walked.on_zero = false;
   auto last = points.front();
   for (const auto& point : points) {
