@@ -65,7 +65,7 @@ def find(
     folder = cache_folder()
     if mechanism.n > MOST_COORDINATES or not folder.is_dir():
         return None
-    return _look(_Subject.of(mechanism, which, changes), folder, _compiler())
+    return _look(_Subject.of(mechanism, which, changes), folder)
 
 
 def compiled(
@@ -101,10 +101,11 @@ def compiled(
         raise InputError(
             f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {most}"
         )
-    subject, compiler = _Subject.of(mechanism, which, changes), _compiler()
-    found = _look(subject, cache_folder(), compiler)
+    subject = _Subject.of(mechanism, which, changes)
+    found = _look(subject, cache_folder())
     if found is not None:
         return found
+    compiler = _compiler()
     if compiler is None:
         raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
     return _make(mechanism, subject, compiler, on_written)
@@ -202,14 +203,17 @@ def _own_text() -> str:
     return _hash([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
 
 
-def _look(subject: _Subject, folder: Path, compiler: _Compiler | None) -> Library | None:
-    """A file of that key, of that compiler or, where there is none, of any."""
-    pattern = f"{subject.key}-{compiler.key if compiler else '*'}-*.so"
+def _look(subject: _Subject, folder: Path) -> Library | None:
+    """A file of that key, of the compiler that there is or, where there is none, of any."""
     try:
-        if not _is_usable(folder):
+        there = sorted(folder.glob(f"{subject.key}-*-*.so"))
+        if not there or not _is_usable(folder):
             return None
-        for path in sorted(folder.glob(pattern)):
-            if path.stem.rpartition("-")[2] == sha256(path.read_bytes()).hexdigest()[:32]:
+        compiler = _compiler()
+        for path in there:
+            _, of_compiler, content = path.stem.rsplit("-", 2)
+            fits = compiler is None or of_compiler == compiler.key
+            if fits and content == sha256(path.read_bytes()).hexdigest()[:32]:
                 return Library(str(path), subject.parameters)
     except OSError:
         return None

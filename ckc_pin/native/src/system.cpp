@@ -30,6 +30,10 @@ bool System::eq_1(In v, In correction, Out a) {
 }
 
 bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) {
+  if (!control.acts() && !core.joints.smooth()) {  // nothing that answers to the state
+    force_ = control.u_tree;
+    return core.slopes(q_tree, v, correction, force_, none_, none_, a_, by_q, by_v) || fails(Trouble::rank);
+  }
   if (!control.slopes(core, u_by_q_, u_by_v_, force_)) return false;
   return core.slopes(q_tree, v, correction, force_, u_by_q_, u_by_v_, a_, by_q, by_v) || fails(Trouble::rank);
 }
