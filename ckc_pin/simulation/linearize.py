@@ -26,8 +26,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
+from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.linear_model import LinearModel, linear_model
-from ckc_pin.simulation.prepare import library_of, scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes

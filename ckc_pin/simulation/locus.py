@@ -18,7 +18,8 @@ from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
-from ckc_pin.simulation.prepare import library_of, scene_controller, scene_mechanism
+from ckc_pin.simulation.libraries import library_of
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import load_scene
 
 __all__ = ["GainLocus", "gain_locus"]

@@ -29,7 +29,7 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.generated.library import Library, compiled, find
+from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
@@ -38,17 +38,17 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
-from ckc_pin.native.variation import Varying, directions_of, variation_table
+from ckc_pin.native.variation import variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
+from ckc_pin.simulation.libraries import changing_library, library_of
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_spec import SceneSpec, TermsOf
+from ckc_pin.simulation.scene_spec import SceneSpec
 from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
 
 __all__ = [
     "Prepared",
-    "library_of",
     "output_instants",
     "prepare",
     "scene_actuation",
@@ -220,7 +220,7 @@ def prepare(
         varying = varying_of(mechanism, scene, controller, actuation, parameters)
         require_known_motion(mechanism, scene, controller, varying)
         require_movable(mechanism, scene.spec.parameters, varying, partial(_built, scene))
-        library, directions = _changing_library(mechanism, terms, varying)
+        library, directions = changing_library(mechanism, terms, varying)
         formulation["variation"] = variation_table(
             mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=compensated_at(mechanism, controller),
@@ -236,28 +236,6 @@ def prepare(
     loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
     return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop, labels)
-
-
-def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
-    """Compiled terms where they are asked for; "auto" takes those that are there, and never makes a run wait."""
-    if terms == "pinocchio":
-        return None
-    return compiled(mechanism) if terms == "generated" else find(mechanism)
-
-
-def _changing_library(
-    mechanism: Mechanism, terms: str, varying: Sequence[Varying]
-) -> tuple[Library | None, Array | None]:
-    """Terms that say how they change with what varies, and the parameters in their numbers; or neither.
-
-    What varies from zero has to be an argument too: that is a library of its own. Of angles there is none.
-    """
-    found = None if terms == "pinocchio" else directions_of(mechanism, varying)
-    if found is None:
-        return None, None
-    which, directions = found
-    library = (compiled if terms == "generated" else find)(mechanism, which=which, changes=True)
-    return library, None if library is None else directions
 
 
 def output_instants(scene: Scene) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.card import Card, Shown
-from ckc_pin.mechanism.kinds import a_kind, is_number, require_kind, require_path
+from ckc_pin.mechanism.kinds import a_kind, is_number, require_path
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import plain_values
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ckc_pin.view.inline import Figures, Playback
     from ckc_pin.view.server import ViewServer
 
-__all__ = ["Run", "Status", "given_runs"]
+__all__ = ["Run", "Status"]
 
 Status = Literal["done", "stopped", "interrupted"]
 
@@ -340,19 +340,3 @@ class Run(Shown):
 
     def _meta(self) -> RunMeta:
         return RunMeta(**{name: getattr(self, name) for name in META})
-
-
-def given_runs(given: Any, who: str) -> list[Run]:
-    """Return the runs that a public function was given, one or several.
-
-    Raises
-    ------
-    InputError
-        None at all, or something else among them.
-    """
-    runs = list(given) if isinstance(given, list | tuple) else [given]
-    if not runs:
-        raise InputError(f"{who}: no run given; give at least one")
-    for run in runs:
-        require_kind(run, Run, f"{who}: runs", "runs, as simulate and Run.load return them")
-    return runs

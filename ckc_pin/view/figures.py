@@ -15,10 +15,11 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.kinds import require_path
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run, given_runs
+from ckc_pin.simulation.run import Run
 from ckc_pin.view import panels, poses, style
 from ckc_pin.view.canvas import Slot, fit_legend, line, look, page, write
 from ckc_pin.view.desired import desired_along
+from ckc_pin.view.given_runs import given_runs
 from ckc_pin.view.group import Group
 from ckc_pin.view.labels import effort_units, plain, residual_units, symbol, with_unit
 from ckc_pin.view.skeleton import planes

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.kinds import is_number, require_flag, require_kind, require_path
 from ckc_pin.mechanism.whole_file import write_whole
-from ckc_pin.simulation.run import Run, given_runs
+from ckc_pin.simulation.run import Run
 from ckc_pin.view.bodies import missing_meshes
 from ckc_pin.view.browser import open_in_browser
 from ckc_pin.view.commands import Command
 from ckc_pin.view.drawing import scene
+from ckc_pin.view.given_runs import given_runs
 from ckc_pin.view.labels import run_labels
 from ckc_pin.view.page import page, standalone
 from ckc_pin.view.style import drawing_order
