@@ -27,6 +27,7 @@ Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector 
   for (Vector* x : {&rest_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
   for (Vector* x : {&unlimited_, &raw_, &slope_, &enters_, &leaves_}) x->setZero(motors);
   ends_.setZero(2 * motors);
+  if (d) eigen_.compute(Matrix::Identity(d, d));  // what has computed nothing has no state that may be moved
 }
 
 void Allocation::share(const Matrix& transmission, In u, Out tau) {
