@@ -50,7 +50,7 @@ void Derivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
   for (const auto& row : closure_.distances) add_distance(row, lambda(row.out));
   for (const auto& rows : closure_.logs) add_log(rows, lambda);
   for (const auto& row : closure_.affine) J.row(row.out) = row.coefficients;
-  if (!impulsive) add_springs(v);
+  if (!impulsive) add_springs();
 }
 
 void Derivatives::add(int row, const Carried& x, const Vector3& w, const Vector3& w_dot, const Vector3& w_ddot) {
@@ -160,7 +160,7 @@ void Derivatives::add_log(const RelativeLog& rows, In lambda) {
   }
 }
 
-void Derivatives::add_springs(In v) {
+void Derivatives::add_springs() {
   const SpringTable& s = springs_;
   const auto count = s.stiffness.size();
   force_by_q.diagonal() += s.joint_stiffness, force_by_v.diagonal() += s.joint_damping;

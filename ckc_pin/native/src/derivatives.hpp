@@ -32,7 +32,7 @@ class Derivatives {
   void add_dot(const Dot& row, double lambda);
   void add_distance(const Distance& row, double lambda);
   void add_log(const RelativeLog& rows, In lambda);
-  void add_springs(In v);
+  void add_springs();
 
   Tree& tree_;
   const Closure& closure_;
