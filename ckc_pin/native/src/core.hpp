@@ -109,6 +109,8 @@ class Core {
   void particular(In residual, Out x);
   // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
+  // The same where the locked joints rest.
+  bool eq_1(In force, In correction, Out a);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
   bool responses(const Indices& at, Matrix& columns);
   // How the terms change at the core's state, where the tree accelerates under u'; false where nothing tells J^T lambda.

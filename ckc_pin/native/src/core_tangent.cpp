@@ -164,6 +164,14 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   return true;
 }
 
+bool Core::eq_1(In force, In correction, Out a) {
+  if (!dae_acceleration(force, correction, a)) return false;
+  if (joints.locked.empty()) return true;
+  if (!responses(joints.locked, responses_)) return false;
+  joints.hold(responses_, a);
+  return true;
+}
+
 bool Core::responses(const Indices& at, Matrix& columns) {
   columns.resize(n, static_cast<Eigen::Index>(at.size()));
   residual_.setZero();
@@ -220,8 +228,7 @@ bool Core::slopes(In q_at, In v, In correction, Vector& force, Matrix& u_by_q, M
   const bool locked = !joints.locked.empty();
   if (locked) {
     set_velocity(v);
-    if (!dae_acceleration(force, correction, a) || !responses(joints.locked, responses_)) return false;
-    joints.hold(responses_, a);
+    if (!eq_1(force, correction, a)) return false;
     for (size_t i = 0; i < joints.locked.size(); ++i) force(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
   }
   Matrix& of_u = by_u ? *by_u : by_u_;

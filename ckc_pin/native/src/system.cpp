@@ -21,12 +21,7 @@ const Vector& System::acting(In v) {
 }
 
 bool System::eq_1(In v, In correction, Out a) {
-  Joints& joints = core.joints;
-  if (!core.dae_acceleration(acting(v), correction, a)) return fails(Trouble::rank);
-  if (joints.locked.empty()) return true;
-  if (!core.responses(joints.locked, responses_)) return fails(Trouble::rank);
-  joints.hold(responses_, a);
-  return true;
+  return core.eq_1(acting(v), correction, a) || fails(Trouble::rank);
 }
 
 bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) {
