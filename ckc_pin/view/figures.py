@@ -120,11 +120,8 @@ def _groups(runs: Iterable[Run]) -> list[Group]:
         law = controller["type"] if controller else "torques"
         kind = str(law) if law != "torques" else "own" if np.any(run.tau) else "motion"
         found.setdefault((kind, run.mechanism.name, run.coordinates, run.independent, run.actuated), []).append(run)
-    groups = []
-    for (kind, *_), members in found.items():
-        ordered = style.drawing_order(members)
-        groups.append(Group(kind, ordered, [desired_along(run) for run in ordered]))
-    return groups
+    ordered = [(kind, style.drawing_order(members)) for (kind, *_), members in found.items()]
+    return [Group(kind, members, [desired_along(run) for run in members]) for kind, members in ordered]
 
 
 def _stems(groups: Sequence[Group]) -> list[str]:
