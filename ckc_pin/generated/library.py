@@ -25,12 +25,14 @@ from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.mechanism.whole_file import written_whole
 
-__all__ = ["MOST_COORDINATES", "Library", "cache_folder", "compiled", "find"]
+__all__ = ["Library", "cache_folder", "compiled", "find", "too_large"]
 
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler
 PER_LETTER = 2e-5  # s of the compiler for a letter of the text, as docs/theory/generated.md has them
-MOST_COORDINATES = 40  # of a tree that is written out: a minute of the compiler where all are in one branch
+# Of a tree that is written out, with a minute of the compiler at the most: its coordinates, and the joints that each of
+# them moves, all added up, as many as 40 in one branch do.
+MOST_COORDINATES, MOST_MOVED = 130, 820
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,17 @@ def cache_folder() -> Path:
     return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "ckc_pin" / "terms"
 
 
+def too_large(mechanism: Mechanism) -> str:
+    """Say why a tree is too large for its terms to be written out; an empty text where it is not."""
+    moved = int(mechanism.tree.support.sum())
+    if mechanism.n <= MOST_COORDINATES and moved <= MOST_MOVED:
+        return ""
+    return (
+        f"{mechanism.name}: {mechanism.n} coordinates, which move {moved} joints, each its own and those behind it; "
+        f"terms are written out for trees of up to {MOST_COORDINATES} coordinates that move up to {MOST_MOVED}"
+    )
+
+
 def find(
     mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
 ) -> Library | None:
@@ -63,26 +76,24 @@ def find(
     `which` and `changes` as of `compiled`.
     """
     folder = cache_folder()
-    if mechanism.n > MOST_COORDINATES or not folder.is_dir():
+    if too_large(mechanism) or not folder.is_dir():
         return None
     return _look(_Subject.of(mechanism, which, changes), folder)
 
 
 def compiled(
     mechanism: Mechanism,
-    most: int = MOST_COORDINATES,
     which: Mapping[str, BoolArray] | None = None,
     on_written: Callable[[float], None] | None = None,
     *,
     changes: bool = False,
+    limited: bool = True,
 ) -> Library:
     """Return the mechanism's terms, from the cache or compiled now.
 
     Parameters
     ----------
     mechanism : Mechanism
-    most : int
-        Coordinates, above which terms are not written out.
     which : mapping, optional
         Which numbers are arguments (`arguments.present`), where that is more than those that are not zero: what is
         varied from zero.
@@ -90,17 +101,17 @@ def compiled(
         Called once before the compiler, with the seconds that it may take.
     changes : bool
         With how the acceleration changes along any direction (`code.functions`), a longer text.
+    limited : bool
+        Whether a tree that is `too_large` is refused; the compiler has no other limit than its patience.
 
     Raises
     ------
     InputError
-        A tree with too many coordinates, no CasADi, no C compiler or one that fails, no place to write, or code whose
+        A tree that is too large, no CasADi, no C compiler or one that fails, no place to write, or code whose
         results are not those of Pinocchio.
     """
-    if mechanism.n > most:
-        raise InputError(
-            f"{mechanism.name}: {mechanism.n} coordinates; terms are written out for trees of up to {most}"
-        )
+    if limited and (reason := too_large(mechanism)):
+        raise InputError(reason)
     subject = _Subject.of(mechanism, which, changes)
     found = _look(subject, cache_folder())
     if found is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.generated.library import MOST_COORDINATES
+from ckc_pin.generated.library import too_large
 from ckc_pin.mechanism.card import Card, Row, quantities
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.mechanism import Mechanism, efforts
@@ -175,8 +175,10 @@ def _work(stats: dict[str, Any], would_pay: str = "") -> list[Row]:
 
 def _would_pay(run: Run) -> str:
     """Say of a long run that compiled terms would have made it a short one."""
-    theirs = run.stats.get("terms", "pinocchio") != "pinocchio"
-    if theirs or len(run.coordinates) > MOST_COORDINATES or run.stats["wall_s"] < LONG:
+    if run.stats.get("terms", "pinocchio") != "pinocchio" or run.stats["wall_s"] < LONG:
+        return ""
+    mechanism = _mechanism(run)
+    if mechanism is None or too_large(mechanism):
         return ""
     return "; compiled ones are several times faster: ckc compile"
 

@@ -13,9 +13,10 @@ import pytest
 
 from ckc_pin import InputError, check, load, load_scene, simulate
 from ckc_pin.generated import library
-from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.prepare import prepare, scene_mechanism
 from ckc_pin.simulation.simulate import run_prepared
 from scripts.experiments.benchmark.growth import Case, written
+from scripts.experiments.generated_sizes import ring
 from tests.contract.helpers.command import ckc
 
 NAME = "slider_crank"
@@ -170,10 +171,11 @@ def test_the_command_tells_what_it_did(folder: Path, tmp_path: Path) -> None:
     first, again = ckc("compile", NAME, "--json"), ckc("compile", NAME, "--json")
     assert (first.code, first.json["compiled"], again.json["compiled"]) == (0, True, False)
     assert first.json["file"] == again.json["file"]
-    written(Case(20, 20), tmp_path)
+    written(Case(80, 80), tmp_path)
     too_large = ckc("compile", str(tmp_path / "mechanism.toml"))
     assert too_large.code == 2
-    assert "41 coordinates; terms are written out for trees of up to 40" in too_large.err
+    assert "161 coordinates, which move 241 joints" in too_large.err
+    assert "terms are written out for trees of up to 130 coordinates that move up to 820" in too_large.err
 
 
 def test_the_command_tells_what_it_could_not_keep(folder: Path) -> None:
@@ -187,10 +189,18 @@ def test_the_command_tells_what_it_could_not_keep(folder: Path) -> None:
     assert f"not kept: {folder} cannot be written to" in answer.err
 
 
-def test_a_caller_says_another_limit(folder: Path) -> None:
-    mechanism = load(NAME)
-    with pytest.raises(InputError, match="3 coordinates; terms are written out for trees of up to 2"):
-        library.compiled(mechanism, most=2)
-    made = library.compiled(mechanism, most=3)
+def test_one_long_branch_is_too_large_where_many_short_ones_are_not(folder: Path, tmp_path: Path) -> None:
+    """Joints of one branch have all to do with each other: so does the text that the compiler gets."""
+    ring_41 = load(ring(41, tmp_path).parent / "mechanism.toml")
+    with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
+        library.compiled(ring_41)
+    squares = load_scene("n_four_bar", {"mechanism.N": 64})
+    assert not library.too_large(scene_mechanism(squares))  # 129 coordinates
+    with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
+        simulate(tmp_path / "ring.scene.toml", {"solver.terms": "generated", "t_end": 0.01})
+
+
+def test_a_library_that_is_given_is_taken(folder: Path) -> None:
+    made = library.compiled(load(NAME))
     ready = prepare(load_scene(NAME, {"solver.terms": "pinocchio"}), library=made)
     assert run_prepared(ready).stats["terms"] == "generated"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.generated.library import MOST_COORDINATES, Library, compiled, find
+from ckc_pin.generated.library import Library, compiled, find, too_large
 from ckc_pin.generated.varied import Varied
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.tree import Array, IntArray
@@ -279,13 +279,15 @@ class Members:
     def _terms(self, count: int) -> Library | None:
         """Compiled terms where they are asked for, are there, or repay compiling."""
         wanted, which = self.scene.spec.solver.terms, self._varied.which
-        if wanted == "pinocchio" or self.mechanism.n > MOST_COORDINATES:
+        if wanted == "pinocchio":
             return None
         if wanted == "generated":
             return compiled(self.mechanism, which=which)
         library = find(self.mechanism, which)
-        if library is not None or count < 2 or count * self.work() < WORTH * self.mechanism.n:
+        if library is not None or count < 2 or too_large(self.mechanism):
             return library
+        if count * self.work() < WORTH * self.mechanism.n:
+            return None
         try:
             return compiled(self.mechanism, which=which)
         except InputError:  # no compiler, no CasADi: the general terms do
