@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Mechanism, load
+from ckc_pin import Mechanism, load, load_scene
 from ckc_pin.dynamics import Terms
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.arguments import numbers, present, values
@@ -17,6 +17,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.native.plant import Plant
 from ckc_pin.simulation.linear_model import linear_model
+from ckc_pin.simulation.prepare import prepare, scene_mechanism
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 
 EQUAL = 1e-11  # relative
@@ -67,6 +68,22 @@ def test_linear_models_by_compiled_terms_are_those_by_pinocchios(name: str, tmp_
         for matrix in "ABCD":
             one, other = getattr(ours, matrix), getattr(theirs, matrix)
             close(one, other, 10 * max(1.0, np.abs(other).max(initial=0.0)))
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3])
+def test_what_baumgarte_adds_is_there_where_nothing_has_drifted(speed: float) -> None:
+    """The right-hand side is eq. 1's there, but not how it changes."""
+    changes = {"formulation": "dae", "solver.baumgarte": [5.0, 0.0], "solver.projection": False}
+    scene = load_scene("five_bar/swing", {**changes, "solver.terms": "pinocchio"})
+    found = []
+    for library in (compiled(scene_mechanism(scene)), None):
+        ready = prepare(scene, library=library)
+        ready.begin()
+        y = ready.loop.y.copy()
+        y[ready.mechanism.n :] = speed
+        found.append(ready.loop.jacobian(0.0, y))
+    assert np.abs(found[1][4:, 4:]).max() > 1.0  # 2 alpha, of what the rows' rates are
+    close(found[0], found[1], np.abs(found[1]).max())
 
 
 def somewhere(mechanism: Mechanism, locked: np.ndarray, random: np.random.Generator) -> Terms:

@@ -100,7 +100,8 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   }
   if (!slopes(q_tree_, v, residual_, by_q_, by_v_)) return System::jacobian(t, y, jacobian, evaluations);
   if (stabilised() && core.rows.closure.rows) {
-    const Derivatives& by = core.derivatives;
+    Derivatives& by = core.derivatives;
+    by.compute(q_tree_, v, a_, uncorrected_);  // of the rows alone; terms written out have left none
     const Matrix none = Matrix::Zero(n, n);
     if (!core.respond(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, more_)) return false;
     by_q_ += more_;

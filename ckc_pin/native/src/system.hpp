@@ -143,10 +143,11 @@ class System {
 
  private:
   std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_, rate_here_, acting_, drift_, back_, a_, force_;
+  Vector moved_, rate_, rate_here_, acting_, drift_, back_, force_;
   Matrix u_by_q_, u_by_v_, none_;
 
  protected:
+  Vector a_;
   Matrix responses_;
 };
 
