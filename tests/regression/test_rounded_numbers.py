@@ -1,4 +1,4 @@
-"""Loops whose numbers are rounded: rows contradict each other a little, and the mechanism is where its guess says."""
+"""Numbers that are rounded, in files or by a machine: what a mechanism is does not hang on their last digits."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
+from ckc_pin.mechanism.rank import choose_dependent, redundant_rows
 
 # Bennett's linkage: opposite links alike, a / sin(alpha) = b / sin(beta); of its five rows two are independent
 A, ALPHA, BETA = 0.6, 0.4, 1.1
@@ -53,3 +54,15 @@ def test_assembled_where_the_exact_one_is(digits: int, tmp_path: Path) -> None:
     assert 1e-11 < np.abs(found.assembled.phi).max() < 10.0**-digits
     assert any("numbers in the files are rounded" in warning for warning in found.warnings)
     assert np.abs(found.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
+
+
+def test_of_coordinates_as_good_as_each_other_rounding_chooses_none() -> None:
+    """Two legs alike, each with a rod that spins between two joints, in axes turned at random."""
+    random = np.random.default_rng(1)
+    leg = random.normal(size=(3, 4))
+    leg[:, 3] = -leg[:, 2]  # the rod's other end spins the other way
+    jacobian = np.kron(np.eye(2), np.vstack([leg, leg]))
+    turned = [np.linalg.qr(random.normal(size=(12, 12)))[0] @ jacobian for _ in range(30)]
+    assert {tuple(choose_dependent(J, 6)) for J in turned} == {(0, 1, 2, 4, 5, 6)}
+    mixed = [np.linalg.qr(random.normal(size=(8, 8)))[0] for _ in range(30)]
+    assert {tuple(redundant_rows(jacobian @ Q, 6)) for Q in mixed} == {tuple(redundant_rows(jacobian, 6))}
