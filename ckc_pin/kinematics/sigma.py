@@ -24,6 +24,8 @@ Verdict = Literal["converged", "out of reach", "singular"]
 
 MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
 MAX_ITERATIONS = 12
+LOOSE = 1e-10  # of the mechanism's size: a tolerance beyond that is what contradicting rows leave open, not rounding
+GAINS = 0.1  # with such a one, Newton's method goes on while a step leaves no more
 FAR = 500  # Newton steps, a hundred radians or more: no step of a motion is so long, but a trial of one may be
 FARTHEST = 5000  # the same for a q that somebody asks for; what is further is looked for without the way there
 SMALLEST_PIECE = 1e-9  # of the straight line in q
@@ -118,7 +120,8 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
     w : (rows,) array or 0.0
         The level set.
     tolerance : float
-        Largest |phi - w| that counts as closed.
+        Largest |phi - w| that counts as closed. Where it is that large because rows contradict each other, what z can
+        close is closed to rounding: of how far a start was off, nothing stays.
 
     Returns
     -------
@@ -128,11 +131,13 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
     at = start
     residual = at.phi - w
     size = _unclosed(at, residual)
+    polish = tolerance > LOOSE * at.tree.size and size > 0.0
     for iteration in range(MAX_ITERATIONS):
-        if size <= tolerance:
+        closed = size <= tolerance
+        if closed and not polish:
             return Newton(at, iteration, True)
         if not np.isfinite(size) or at.phi_z_factor.singular:
-            return Newton(at, iteration, False)
+            return Newton(at, iteration, closed)
         step = np.zeros(at.tree.n)
         step[at.partition.z] = -at.phi_z_factor.solve(residual)
         if not np.abs(step / at.tree.reach).max() <= MAX_STEP:
@@ -142,7 +147,8 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
         previous, size = size, _unclosed(at, residual)
         if not size <= max(0.5 * previous, tolerance):
             return Newton(at, iteration + 1, False)
-    return Newton(at, MAX_ITERATIONS, False)
+        polish = polish and size < GAINS * previous
+    return Newton(at, MAX_ITERATIONS, size <= tolerance)
 
 
 def _unclosed(at: Kinematics, residual: Array) -> float:

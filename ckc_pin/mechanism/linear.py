@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
+TIED = 1e-8  # of a pivot: less than that apart, rounding would choose, on each machine another
 SCIPY = "scipy.linalg"  # loaded by who needs it, with a BLAS of its own
 
 
@@ -174,6 +175,8 @@ def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Arra
 def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
     """Order columns as a pivoted QR does: next is the one of which most is left beside those before it.
 
+    Of several that are as large, but for rounding, the first.
+
     Parameters
     ----------
     matrix : (m, n) array
@@ -182,16 +185,17 @@ def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
     -------
     order : (n,) int array
     pivots : (min(m, n),) array
-        What is left of each, falling: the sizes of R's diagonal.
+        What is left of each, falling but for rounding: the sizes of R's diagonal.
     """
     left = matrix.copy()
     order = np.arange(matrix.shape[1])
     pivots = np.zeros(min(matrix.shape))
     for k in range(len(pivots)):
         sizes = np.linalg.norm(left[:, order[k:]], axis=0)
-        best = int(np.argmax(sizes))
-        if not sizes[best] > 0:
+        largest = sizes.max()
+        if not largest > 0:
             break
+        best = int(np.argmax(sizes > (1 - TIED) * largest))
         order[[k, k + best]] = order[[k + best, k]]
         pivots[k] = sizes[best]
         direction = left[:, order[k]] / sizes[best]

@@ -250,7 +250,7 @@ def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the c
 
 @app.command(epilog=examples("robots ~/robots"))
 def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="of checkouts")]) -> None:
-    """Import and check of published robots.
+    """Import, check and motion of published robots.
 
     Prints the tables of docs/published_robots.md.
     """

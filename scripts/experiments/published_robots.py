@@ -1,4 +1,4 @@
-"""The tables of docs/published_robots.md: `ckc import` and `ckc check` on published robots.
+"""The tables of docs/published_robots.md: `ckc import`, `ckc check` and a motion of published robots.
 
     ./scripts/experiment robots FOLDER
 
@@ -8,6 +8,7 @@ example-robot-data come from its package (pip install example-robot-data). A rob
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from pathlib import Path
 import ckc_pin
 from ckc_pin.formats.importing import read, write
 from ckc_pin.mechanism.sources import resolve
+from scripts.experiments.published_robots_motion import given_back
 
 PACKAGE = "package://example-robot-data/robots"
 
@@ -103,21 +105,26 @@ ORIGINS = (
 
 
 def row(name: str, path: Path) -> str:
-    """Import and check one robot."""
+    """Import, check and move one robot."""
     draft = read(path)
     motors = str(len(draft.actuated)) if draft.actuated else ""
     joints = [spec for spec, _ in draft.joints]
     counts = {"rotor": sum(spec.armature is not None for spec in joints), "stop": sum(spec.stops for spec in joints)}
     counted = [f"{count} {what}{'s' * (count > 1)}" for what, count in counts.items() if count]
-    remarks = counted + _remarks(draft.guessed) + _remarks(draft.left_out)
+    remarks = counted + _remarks([*draft.guessed, *draft.left_out])
     with tempfile.TemporaryDirectory() as folder:
         file, _ = write(draft, Path(folder))
         try:
             found = ckc_pin.check(file)
         except ckc_pin.MechanismError as error:
             what = str(error).partition("mechanism.toml: ")[2].partition(". Check")[0]
-            return _line(name, "yes", "no", motors, "", "", "", "", "; ".join([*remarks, what]))
-    numbers = (str(x) for x in (found.n, found.rows, found.rank, found.d))
+            return _line(name, "yes", "no", motors, *[""] * 6, "; ".join([*remarks, what]))
+    try:
+        back = f"{given_back(draft):.0e}"
+    except ckc_pin.CkcError as error:
+        print(f"{path}: {error}", file=sys.stderr)
+        back = "none"
+    numbers = (*(str(x) for x in (found.n, found.rows, found.rank, found.d)), f"{found.mass:.4g}", back)
     return _line(name, "yes", "yes", motors, *numbers, "; ".join([*remarks, *_remarks(found.warnings)]))
 
 
@@ -129,7 +136,6 @@ SHORT = {
     "joints called spherical": "joints called spherical stay hinges",
     "ball joint": "ball joints as three hinges",
     "the three slides": "slides and a ball as a free root",
-    "armature of ": "armature left out",
     "masses of shapes": "masses of meshes left out",
     "actuator ": "actuator on a tendon left out",
     "coupling ": "coupling of three joints left out",
@@ -162,8 +168,8 @@ def main(root: Path) -> None:
     """Print the tables of all robots under a folder."""
     for origin in ORIGINS:
         print(f"\n## {origin.title} ({origin.commit})\n")
-        print(_line("robot", "imported", "closed", "motors", "n", "rows", "rank", "d", "remarks"))
-        print(_line(*["---"] * 9))
+        print(_line("robot", "imported", "closed", "motors", "n", "rows", "rank", "d", "kg", "back", "remarks"))
+        print(_line(*["---"] * 11))
         for file in origin.files:
             named = origin.title == "example-robot-data"
             path = resolve(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file

@@ -11,12 +11,19 @@ import pytest
 from ckc_pin import InputError, MechanismError, inverse_dynamics, load, simulate
 from ckc_pin.formats.importing import Draft, read, write
 from ckc_pin.mechanism.sources import resolve
+from scripts.experiments.published_robots_motion import given_back
 from tests.contract.helpers.models import TWO_ARMS, model
 from tests.contract.test_import_urdf import FOUR_BAR, PIN, YAML, imported, legs, spatial, two_legs
 from tests.regression.test_inverse_forward import assert_gives_back, assert_integrates_back, waves
 
 SCENE = 'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n'
 HINGE = "<equality><connect site1='s1' site2='t1'/><connect site1='s2' site2='t2'/></equality>"
+# floats, with two arms that motors turn
+ARM = "<body><joint name='{0}' axis='0 1 0'/><geom type='capsule' fromto='{1} 0 0 {2} 0 .3' size='.03'/></body>"
+FLOATING = (
+    "<body><freejoint/><geom type='box' size='.2 .1 .1'/>"
+    f"{ARM.format('left', -0.2, -0.4)}{ARM.format('right', 0.2, 0.4)}</body>"
+)
 # a crank that rubs, has a rotor and a gear; a rod on a spring
 RUBBING = TWO_ARMS.replace('<joint name="a"', '<joint name="a" frictionloss=".3" damping=".2" armature=".05"').replace(
     '<joint name="b"', '<joint name="b" stiffness="4" springref=".3"'
@@ -77,6 +84,15 @@ def test_imported_models_swing_as_they_should(name: str, tmp_path: Path) -> None
 @pytest.mark.parametrize("name", ROBOTS)
 def test_robots_of_a_package_swing_as_they_should(name: str, tmp_path: Path) -> None:
     assert_swings_as_it_should(robot(ROBOTS[name]), tmp_path)
+
+
+def test_what_published_robots_are_measured_by(tmp_path: Path) -> None:
+    """Their motion: of all freedoms, or on a free root of motors. Where nothing tells it, an error says so."""
+    assert given_back(MODELS["connects, friction, rotor and gear"](tmp_path)) < 1e-9
+    pushed = model(tmp_path, FLOATING, "<actuator><motor joint='left'/><motor joint='right'/></actuator>")
+    assert given_back(pushed) < 1e-9
+    with pytest.raises(InputError, match="mass"):
+        given_back(robot("romeo_description/urdf/romeo.urdf"))
 
 
 def test_what_no_motor_holds_is_named(tmp_path: Path) -> None:

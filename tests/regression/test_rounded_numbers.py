@@ -1,4 +1,4 @@
-"""Loops whose numbers are rounded: rows contradict each other a little, and the mechanism is where its guess says."""
+"""Numbers that are rounded, in files or by a machine: what a mechanism is does not hang on their last digits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import load
+from ckc_pin import inverse_dynamics, load
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.rank import choose_dependent, redundant_rows
+from tests.conftest import assert_close
+from tests.regression.test_inverse_forward import assert_integrates_back, waves
 
 # Bennett's linkage: opposite links alike, a / sin(alpha) = b / sin(beta); of its five rows two are independent
 A, ALPHA, BETA = 0.6, 0.4, 1.1
@@ -53,3 +57,32 @@ def test_assembled_where_the_exact_one_is(digits: int, tmp_path: Path) -> None:
     assert 1e-11 < np.abs(found.assembled.phi).max() < 10.0**-digits
     assert any("numbers in the files are rounded" in warning for warning in found.warnings)
     assert np.abs(found.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
+
+
+def test_the_way_to_a_configuration_leaves_no_trace(tmp_path: Path) -> None:
+    """Within what is open, which is what counts as closed, z is the same from everywhere."""
+    mechanism = load(bennett(tmp_path / "rounded", 6))
+    assert np.abs(mechanism.assembled.phi).max() > 1e-9
+    q = mechanism.q_tree[mechanism.partition.q]
+    ends = [sigma(mechanism, q + 0.1, sigma(mechanism, q + away).at).at.q_tree for away in (0.0, 0.099999, 0.3, -0.4)]
+    assert_close(np.ptp(ends, axis=0), 0.0, 1e-13)
+
+
+def test_torques_of_a_motion_give_it_back(tmp_path: Path) -> None:
+    """To rounding too, with loops that close to six digits."""
+    scene = bennett(tmp_path / "rounded", 6) / "default.scene.toml"
+    scene.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n')
+    changes = waves(load(scene.parent), 0.1)
+    assert_integrates_back(scene, changes, inverse_dynamics(scene, changes))
+
+
+def test_of_coordinates_as_good_as_each_other_rounding_chooses_none() -> None:
+    """Two legs alike, each with a rod that spins between two joints, in axes turned at random."""
+    random = np.random.default_rng(1)
+    leg = random.normal(size=(3, 4))
+    leg[:, 3] = -leg[:, 2]  # the rod's other end spins the other way
+    jacobian = np.kron(np.eye(2), np.vstack([leg, leg]))
+    turned = [np.linalg.qr(random.normal(size=(12, 12)))[0] @ jacobian for _ in range(30)]
+    assert {tuple(choose_dependent(J, 6)) for J in turned} == {(0, 1, 2, 4, 5, 6)}
+    mixed = [np.linalg.qr(random.normal(size=(8, 8)))[0] for _ in range(30)]
+    assert {tuple(redundant_rows(jacobian @ Q, 6)) for Q in mixed} == {tuple(redundant_rows(jacobian, 6))}

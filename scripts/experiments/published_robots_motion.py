@@ -1,0 +1,104 @@
+"""Published robots in motion: torques by inverse dynamics, fed back, make the motion that they are for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+import numpy as np
+
+import ckc_pin
+from ckc_pin import Mechanism, NumericalError, Terms
+from ckc_pin.control.desired import Table
+from ckc_pin.formats.importing import Draft, write
+from ckc_pin.mechanism.tree import Array
+
+__all__ = ["given_back"]
+
+T_END = 0.005  # s; open loop, light rods under large forces leave their motion within ms, by rounding alone
+RATE = 1 / T_END  # rad/s: what swings does not turn round
+SIZE = 0.01  # rad, or of the mechanism's size
+AWAY = 0.3  # rad, or of the mechanism's size: from a singular configuration
+STEPS = 100
+SCENE = f"""mechanism = "mechanism.toml"
+formulation = "dae"
+t_end = {T_END}
+initial.at = "assembled"
+solver = {{output_dt = {T_END / STEPS}, rtol = 1e-12, atol = 1e-14}}
+"""
+
+
+@dataclass(frozen=True)
+class _Torques:
+    """Torques over time, whatever the state."""
+
+    table: Table
+
+    def tau(self, t: float, terms: Terms) -> Array:
+        return self.table(t)[0]
+
+
+def given_back(draft: Draft) -> float:
+    """Find how far the torques of a motion give it back.
+
+    Every independent coordinate swings and has a motor; on a free root, which none drives, motors push as they
+    would for that. Ranges are no walls.
+
+    Returns
+    -------
+    float
+        Largest difference of coordinates, in units of the largest or of 1, and of rates.
+
+    Raises
+    ------
+    CkcError
+        It has no motion, or not to the end.
+    """
+    drawn = draft.mechanism()
+    numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.reach * drawn.freedoms.singular
+    draft = replace(
+        draft,
+        joints=[(msgspec.structs.replace(spec, stops=False), comment) for spec, comment in draft.joints],
+        independent=list(drawn.independent),
+        actuated=None,
+        motors=[],
+        q_guess=drawn.tree.named(numbers),
+    )
+    with TemporaryDirectory() as folder:
+        write(draft, Path(folder))
+        scene = Path(folder) / "default.scene.toml"
+        scene.write_text(SCENE, encoding="utf-8")
+        mechanism = ckc_pin.load(Path(folder))
+        changes = {} if mechanism.rooted else _swing(mechanism)
+        pushed = ckc_pin.simulate(scene, controller=_push(mechanism)) if mechanism.rooted else None
+        motion = ckc_pin.inverse_dynamics(pushed or scene, None if pushed else changes)
+        run = ckc_pin.simulate(scene, changes, controller=_Torques(Table(motion.t, motion.tau)))
+    for part in (motion, run):
+        if part.status != "done":
+            raise NumericalError(part.message)
+    pairs = ((run.q_tree, motion.q_tree), (run.v_tree, motion.v_tree))
+    return max(float(np.abs(ours - theirs).max() / max(1.0, np.abs(theirs).max())) for ours, theirs in pairs)
+
+
+def _swing(mechanism: Mechanism) -> dict[str, Any]:
+    """Changes of the scene: what the independent coordinates shall do, and how they start."""
+    tree, names = mechanism.tree, mechanism.independent
+    offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.reach)
+    desired = {name: {"offset": offset[name], "harmonics": [[amplitude[name], RATE, 0.0]]} for name in names}
+    return {
+        "controller": {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": desired},
+        "initial": {"at": "assembled", "q_dot": {name: RATE * amplitude[name] for name in names}},
+    }
+
+
+def _push(mechanism: Mechanism) -> _Torques:
+    """What would make each motor swing alone, all else free to move."""
+    at = mechanism.assembled
+    inertia = at.rho.T @ Terms(mechanism, at, np.zeros(mechanism.n)).D_tree @ at.rho
+    moved = mechanism.motors.turns @ at.rho
+    force = SIZE * RATE**2 / np.diag(moved @ np.linalg.solve(inertia, moved.T))
+    t = np.linspace(0.0, T_END, STEPS + 1)
+    return _Torques(Table(t, np.outer(np.cos(RATE * t), force)))
