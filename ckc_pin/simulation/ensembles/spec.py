@@ -120,7 +120,7 @@ class OutputSpec(_Spec, frozen=True):
         ``event.NAME`` or ``event.K`` (when that was met first).
         ``of = "error"``
     reduce
-        What is kept of it over the output instants; of those named after ``t`` nothing but themselves.
+        What is kept of it over the member's output instants; of those named after ``t`` nothing but themselves.
         ``reduce = "max_abs"``
     tolerance : rad, of the size
         Of ``settled``: of each coordinate and its rate.
