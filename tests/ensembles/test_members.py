@@ -179,6 +179,15 @@ def test_members_that_stop_or_cannot_begin_stay_with_their_reason() -> None:
     assert np.isfinite(found.outputs["end"]).all(axis=1).tolist() == [True, False, False, True, False]
 
 
+def test_a_member_that_stops_at_its_start_has_no_mean() -> None:
+    """NaN has a sign, which a chunk that is left out, as it is all NaN, does not keep: the same bits in any chunk."""
+    kept = {how: OutputSpec(of="theta_1", reduce=how) for how in ("mean", "rms")}
+    found = Members("five_bar/swing", SWING, ("solver.max_rhs",), kept, 1, 1).run(0, np.array([[1.0]]))
+    assert found.status.tolist() == [STOPPED]
+    for name in kept:
+        assert found.outputs[name].tobytes() == np.array([np.nan]).tobytes()
+
+
 def test_an_unphysical_member_of_a_batch_is_failed_and_the_others_are_not() -> None:
     members = Members("five_bar/swing", SWING, ("link.link_2.mass", "joint.theta_2.xyz.x"), OUTPUTS, 3, 2)
     assert members.batched

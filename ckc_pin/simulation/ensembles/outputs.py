@@ -242,6 +242,7 @@ def _reduce(x: Array, how: Reduction, instants: Array) -> Array:
     integral = np.where(np.isnan(x[:, :, 0]), np.nan, integral)
     if how == "integral":
         return integral
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = integral / np.ascontiguousarray(lasted).sum(axis=2)
-        return np.sqrt(mean) if how == "rms" else mean
+    seconds = np.ascontiguousarray(lasted).sum(axis=2)
+    # no 0 / 0, whose NaN has another sign where it is computed several at a time
+    mean = np.divide(integral, seconds, out=np.full_like(integral, np.nan), where=seconds > 0)
+    return np.sqrt(mean) if how == "rms" else mean
