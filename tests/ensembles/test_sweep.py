@@ -131,6 +131,36 @@ def test_a_full_disk_is_said_and_what_is_there_stays(tmp_path: Path) -> None:
     assert ckc("sweep", str(path), "--out", str(out), "--json", "--no-figures").json["done"] == 4000
 
 
+def test_a_store_that_could_not_be_begun_is_no_obstacle(tmp_path: Path) -> None:
+    path, out = written(tmp_path, 3), tmp_path / "o"
+
+    def small() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, 3_000))
+
+    command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--json"]
+    process = subprocess.run(command, preexec_fn=small, capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert process.stderr.splitlines() == [f"error: {out / 'results.zarr'}: cannot be written: File too large"]
+    assert not list(out.iterdir())
+    assert ckc("sweep", str(path), "--out", str(out), "--no-figures").code == 0
+
+
+def test_a_kill_while_a_store_is_begun_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: Any = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
+    rest: dict[str, Any] = {"changes": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False, "out": tmp_path}
+
+    def killed(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("zarr.Group.create_array", killed)
+        with pytest.raises(KeyboardInterrupt):
+            ckc_pin.ensemble(*given, **rest)
+    assert np.all(np.isfinite(ckc_pin.ensemble(*given, **rest)["end"].to_numpy()))
+    assert [path.name for path in tmp_path.iterdir()] == ["results.zarr"]
+
+
 def test_names_may_have_slashes(tmp_path: Path) -> None:
     """As joints of a robot description in a namespace have."""
     path = written(tmp_path, 4, more='"a/b" = "energy"\n')
