@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -216,6 +220,50 @@ def test_a_scheduler_that_does_not_answer_is_asked_for_nothing_else() -> None:
         with pytest.raises(InputError, match="does not answer within"):
             ckc_pin.ensemble(*given, **rest, scheduler=address)
     assert np.all(np.isfinite(ckc_pin.ensemble(*given, **rest)["end"].to_numpy()))
+
+
+def test_workers_say_nothing_of_ports(tmp_path: Path) -> None:
+    with socket.socket() as taken, contextlib.suppress(OSError):  # where it fails, another program has it
+        taken.bind(("127.0.0.1", 8787))
+        taken.listen()
+        done = ckc("sweep", str(written(tmp_path, 4)), "--out", str(tmp_path / "o"), "--workers", "1", "--no-figures")
+        assert (done.code, done.err) == (0, "")
+
+
+def test_a_scheduler_that_is_lost_costs_nothing_that_is_finished(tmp_path: Path) -> None:
+    python = [sys.executable, "-m"]
+    place, out = tmp_path / "scheduler.json", tmp_path / "o"
+    where = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)]
+    processes = [subprocess.Popen([*python, "distributed.cli.dask_scheduler", *where], stderr=subprocess.DEVNULL)]
+    try:
+        worker = ["distributed.cli.dask_worker", "--scheduler-file", str(place), "--no-nanny", "--no-dashboard"]
+        processes.append(subprocess.Popen([*python, *worker, "--nthreads", "1"], stderr=subprocess.DEVNULL))
+        wait_for(place.exists)
+        address = json.loads(place.read_text())["address"]
+        path = written(tmp_path, members=2000, t_end=2.0)
+        options = ["--out", str(out), "--chunk", "5", "--no-figures", "--json", "--scheduler", address]
+        ends: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        processes.append(subprocess.Popen([*python, "ckc_pin.cli", "sweep", str(path), *options], **ends))
+        wait_for(lambda: len(list(out.glob("results.zarr/status/c/*"))) > 1)
+        processes[0].kill()
+        said, errors = processes[2].communicate(timeout=120)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    found = json.loads(said)
+    assert processes[2].returncode == 3
+    assert errors.splitlines() == [found["message"]]
+    assert found["message"].startswith("the scheduler is lost, or was restarted (")
+    assert found["message"].endswith("the same command goes on from it")
+    assert 10 <= found["done"] == int((results(out)["status"] == 1).sum()) < 2000
+
+
+def wait_for(there: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not there():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_workers_that_die_cost_nothing_that_is_finished(tmp_path: Path) -> None:

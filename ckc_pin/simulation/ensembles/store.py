@@ -15,12 +15,13 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
 
-__all__ = ["RESULTS", "Store", "array_name", "require_libraries"]
+__all__ = ["RESULTS", "STAYS", "Store", "array_name", "require_libraries"]
 
 RESULTS = "results.zarr"
 FORMAT = 1
 BLOCK = 2**20  # members whose status is read at once
 STATUS_NAME, MESSAGE_NAME = "status", "message"
+STAYS = "what is there stays, and the same command goes on from it"
 UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 
@@ -116,8 +117,7 @@ class Store:
                 group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
             group[STATUS_NAME][at] = chunk.status
         except OSError as error:
-            says = f"{self.path}: cannot be written: {error.strerror or error}"
-            raise InputError(f"{says}; what is there stays, and the same command goes on from it") from None
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}; {STAYS}") from None
 
     def _begin(self, path: Path | None, sweep: Mapping[str, Any], members: Members, chunk: int) -> Any:
         """Make a store beside where it will be, so that it is there whole or not at all."""
