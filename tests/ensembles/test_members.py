@@ -13,6 +13,7 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.simulation.ensembles.members import DONE, FAILED, STOPPED, Members
 from ckc_pin.simulation.ensembles.outputs import SHORT
 from ckc_pin.simulation.ensembles.spec import OutputSpec
+from scripts.experiments.generated_sizes import ring
 from tests.contract.test_parameters import folder
 
 CLOSE = 1e-7  # rtol is 1e-9; a start that is closed to rounding in another way moves the steps
@@ -243,3 +244,12 @@ def test_an_output_that_raises_fails_its_member_only() -> None:
     assert found.status.tolist() == [FAILED, DONE]
     assert found.message[0] == "output 'late' raised RuntimeError: too far"
     assert np.isfinite(found.outputs["end"]).all()
+
+
+def test_terms_of_a_tree_that_is_too_large_are_compiled_nowhere(tmp_path: Path) -> None:
+    scene, names = ring(41, tmp_path), ("link.link_0.mass",)
+    with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
+        Members(scene, {"t_end": 1e-4, "solver.terms": "generated"}, names, {"end": "q_tree"}, 3, 1)
+    members = Members(scene, {"t_end": 1e-4}, names, {"end": "q_tree"}, 10**9, 1)  # as many as would repay it
+    assert members.terms == "pinocchio"
+    assert members.run(0, np.array([[0.9], [1.1]])).status.tolist() == [DONE] * 2
