@@ -65,6 +65,10 @@ def sweep(
     unknown = [name for name in worst if name not in task.spec.outputs]
     if unknown:
         raise InputError(f"--worst {unknown[0]}: no such output; there are {', '.join(task.spec.outputs)}")
+    if indices is not None:
+        from ckc_pin.simulation.ensembles.importance import laws_of
+
+        laws_of(task, indices)  # before anything is run
     found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
     if found.status == "done":
         _afterwards(found, out, worst, figures)

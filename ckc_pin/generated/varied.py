@@ -81,7 +81,8 @@ class Varied:
             found["gravity"] = now["gravity"]
         self._of_tables(now, found, sound)
         if any(name.partition(".")[0] in ("link", "joint", "loop", "spring") for name in now):
-            _Geometry(self.mechanism, self._present, now, found, sound, self._own).add(len(given))
+            with np.errstate(all="ignore"):  # of members that cannot be: no mass, or one that is not finite
+                _Geometry(self.mechanism, self._present, now, found, sound, self._own).add(len(given))
         return found, sound
 
     def arguments(self, found: Mapping[str, Array], members: int) -> Array:

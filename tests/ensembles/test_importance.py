@@ -60,3 +60,21 @@ def test_the_command_writes_them(tmp_path: Path) -> None:
 def test_what_has_no_variance_is_refused(tmp_path: Path, epsilon: str, count: int, says: str) -> None:
     with pytest.raises(InputError, match=says):
         importance(sweep_task(written(tmp_path, epsilon)), count, 1)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "count", "says"),
+    [
+        ('"gravity', "4", "epsilon alone makes all of the variance; vary something beside it"),
+        ("none", "6", "6 is no power of 2, which Saltelli's design needs"),
+    ],
+)
+def test_what_has_no_indices_is_refused_before_anything_is_run(
+    tmp_path: Path, left_out: str, count: str, says: str
+) -> None:
+    path, out = written(tmp_path), tmp_path / "o"
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if not line.startswith(left_out)))
+    done = ckc("sweep", str(path), "--out", str(out), "--indices", count, "--json")
+    assert done.code == 2
+    assert done.json["message"] == f"indices: {says}"
+    assert not out.exists()

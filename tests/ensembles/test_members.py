@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.errors import CkcError
+from ckc_pin.errors import CkcError, InputError
 from ckc_pin.simulation.ensembles.members import DONE, FAILED, STOPPED, Members
 from ckc_pin.simulation.ensembles.outputs import SHORT
+from ckc_pin.simulation.ensembles.spec import OutputSpec
+from scripts.experiments.generated_sizes import ring
 from tests.contract.test_parameters import folder
 
 CLOSE = 1e-7  # rtol is 1e-9; a start that is closed to rounding in another way moves the steps
@@ -95,8 +97,6 @@ def test_reductions_are_those_of_the_run() -> None:
         for name, of, how in [("low", "theta_2", "min"), ("mean", "v_tree", "mean"), ("area", "error", "integral"),
                               ("rms", "error", "rms"), ("path", "u", "trajectory"), ("late", "error", "end")]
     }  # fmt: skip
-    from ckc_pin.simulation.ensembles.spec import OutputSpec
-
     specs = {name: OutputSpec(**spec) for name, spec in kept.items()}
     scene = "five_bar/tracking"
     members = Members(scene, {"t_end": 0.3, "solver.output_dt": 0.01}, ("initial.q_dot.theta_1",),
@@ -114,6 +114,52 @@ def test_reductions_are_those_of_the_run() -> None:
     assert np.allclose(found["max_abs_u"], np.abs(run.u).max(), atol=1e-5)
     assert np.allclose(found["drift"], np.abs(run.energy - run.energy[0]).max(), atol=1e-6)
     assert found["settled"].tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("scene", "changes", "name", "values"),
+    [
+        ("five_bar/set_point", {"t_end": 0.3}, "controller.q_d.theta_1", [0.6, 0.7]),
+        ("five_bar/tracking", {"t_end": 0.3}, "controller.desired.theta_3.offset", [0.7, 0.9]),
+        ("five_bar/set_point", {"solver.output_dt": None}, "t_end", [0.1, 0.3]),
+        ("five_bar/set_point", {"t_end": 0.3, "solver.output_dt": 0.02}, "solver.output_dt", [0.01, 0.05]),
+    ],
+)
+def test_reductions_are_over_the_members_own_instants_and_from_its_own_desired_motion(
+    scene: str, changes: dict[str, Any], name: str, values: list[float]
+) -> None:
+    kept: dict[str, Any] = {
+        how: OutputSpec(of="error", reduce=how) for how in ("integral", "max_abs", "mean", "rms", "end")
+    }
+    changes = {"solver.terms": "pinocchio", **changes}
+    members = Members(scene, changes, (name,), kept, 1, 1)
+    found = members.run(0, np.array(values)[:, None]).outputs
+    for k, value in enumerate(values):
+        run = ckc_pin.simulate(scene, {**changes, name: value})
+        q_d = run.scene["controller"].get("q_d") or {}
+        wanted = [[q_d[x] for x in run.independent] if q_d else desired(run, t) for t in run.t]
+        error = run.q_tree[:, members.mechanism.partition.q] - np.array(wanted)
+        area = np.trapezoid(error, run.t, axis=0)
+        assert np.allclose(found["integral"][k], area, atol=1e-9)
+        assert np.allclose(found["mean"][k], area / run.t[-1], atol=1e-9)
+        assert np.allclose(found["rms"][k] ** 2, np.trapezoid(error**2, run.t, axis=0) / run.t[-1], atol=1e-9)
+        assert np.allclose(found["max_abs"][k], np.abs(error).max(axis=0), atol=1e-9)
+        assert np.allclose(found["end"][k], error[-1], atol=1e-9)
+
+
+def test_settled_is_at_the_members_own_target() -> None:
+    name, gains = "controller.q_d.theta_1", {"controller.K_V": 4.0, "t_end": 20.0, "solver.output_dt": 1.0}
+    members = Members("five_bar/set_point", gains, (name,), {"settled": OutputSpec(of="settled")}, 1, 1)
+    run = ckc_pin.simulate("five_bar/set_point", {**gains, name: 0.7})
+    assert abs(run.q_tree[-1, run.column("theta_1")] - 0.7) < 1e-4
+    assert members.run(0, np.array([[0.7]])).outputs["settled"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize("name", ["t_end", "solver.output_dt"])
+def test_a_trajectory_needs_the_same_instants_of_all_members(name: str) -> None:
+    path = {"path": OutputSpec(of="theta_1", reduce="trajectory")}
+    with pytest.raises(InputError, match=f"path: a trajectory is kept at the same instants .* {name} makes others"):
+        Members("five_bar/swing", SWING, (name,), path, 1, 1)
 
 
 def desired(run: ckc_pin.Run, t: float) -> list[float]:
@@ -134,12 +180,24 @@ def test_members_that_stop_or_cannot_begin_stay_with_their_reason() -> None:
     assert np.isfinite(found.outputs["end"]).all(axis=1).tolist() == [True, False, False, True, False]
 
 
+def test_a_member_that_stops_at_its_start_has_no_mean() -> None:
+    """NaN has a sign, which a chunk that is left out, as it is all NaN, does not keep: the same bits in any chunk."""
+    kept = {how: OutputSpec(of="theta_1", reduce=how) for how in ("mean", "rms")}
+    found = Members("five_bar/swing", SWING, ("solver.max_rhs",), kept, 1, 1).run(0, np.array([[1.0]]))
+    assert found.status.tolist() == [STOPPED]
+    for name in kept:
+        assert found.outputs[name].tobytes() == np.array([np.nan]).tobytes()
+
+
 def test_an_unphysical_member_of_a_batch_is_failed_and_the_others_are_not() -> None:
     members = Members("five_bar/swing", SWING, ("link.link_2.mass", "joint.theta_2.xyz.x"), OUTPUTS, 3, 2)
     assert members.batched
-    found = members.run(0, np.array([[0.3, 0.26], [-1.0, 0.26], [0.3, 9.0]]))
-    assert found.status.tolist() == [DONE, FAILED, FAILED]
+    values = np.array([[0.3, 0.26], [-1.0, 0.26], [0.3, 9.0], [0.0, 0.26], [np.inf, 0.26]])
+    found = members.run(0, values)  # a warning of NumPy's would be an error here
+    assert found.status.tolist() == [DONE, FAILED, FAILED, found.status[3], FAILED]
     assert "negative mass" in found.message[1]
+    massless = ckc_pin.simulate("five_bar/swing", members.changes_of(values[3]))
+    assert np.array_equal(found.outputs["end"][3], massless.q_tree[-1])
 
 
 def test_events_end_members_and_give_their_times() -> None:
@@ -186,3 +244,12 @@ def test_an_output_that_raises_fails_its_member_only() -> None:
     assert found.status.tolist() == [FAILED, DONE]
     assert found.message[0] == "output 'late' raised RuntimeError: too far"
     assert np.isfinite(found.outputs["end"]).all()
+
+
+def test_terms_of_a_tree_that_is_too_large_are_compiled_nowhere(tmp_path: Path) -> None:
+    scene, names = ring(41, tmp_path), ("link.link_0.mass",)
+    with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
+        Members(scene, {"t_end": 1e-4, "solver.terms": "generated"}, names, {"end": "q_tree"}, 3, 1)
+    members = Members(scene, {"t_end": 1e-4}, names, {"end": "q_tree"}, 10**9, 1)  # as many as would repay it
+    assert members.terms == "pinocchio"
+    assert members.run(0, np.array([[0.9], [1.1]])).status.tolist() == [DONE] * 2

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +135,36 @@ def test_a_full_disk_is_said_and_what_is_there_stays(tmp_path: Path) -> None:
     assert ckc("sweep", str(path), "--out", str(out), "--json", "--no-figures").json["done"] == 4000
 
 
+def test_a_store_that_could_not_be_begun_is_no_obstacle(tmp_path: Path) -> None:
+    path, out = written(tmp_path, 3), tmp_path / "o"
+
+    def small() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, 3_000))
+
+    command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--json"]
+    process = subprocess.run(command, preexec_fn=small, capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert process.stderr.splitlines() == [f"error: {out / 'results.zarr'}: cannot be written: File too large"]
+    assert not list(out.iterdir())
+    assert ckc("sweep", str(path), "--out", str(out), "--no-figures").code == 0
+
+
+def test_a_kill_while_a_store_is_begun_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: Any = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
+    rest: dict[str, Any] = {"changes": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False, "out": tmp_path}
+
+    def killed(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("zarr.Group.create_array", killed)
+        with pytest.raises(KeyboardInterrupt):
+            ckc_pin.ensemble(*given, **rest)
+    assert np.all(np.isfinite(ckc_pin.ensemble(*given, **rest)["end"].to_numpy()))
+    assert [path.name for path in tmp_path.iterdir()] == ["results.zarr"]
+
+
 def test_names_may_have_slashes(tmp_path: Path) -> None:
     """As joints of a robot description in a namespace have."""
     path = written(tmp_path, 4, more='"a/b" = "energy"\n')
@@ -186,6 +220,50 @@ def test_a_scheduler_that_does_not_answer_is_asked_for_nothing_else() -> None:
         with pytest.raises(InputError, match="does not answer within"):
             ckc_pin.ensemble(*given, **rest, scheduler=address)
     assert np.all(np.isfinite(ckc_pin.ensemble(*given, **rest)["end"].to_numpy()))
+
+
+def test_workers_say_nothing_of_ports(tmp_path: Path) -> None:
+    with socket.socket() as taken, contextlib.suppress(OSError):  # where it fails, another program has it
+        taken.bind(("127.0.0.1", 8787))
+        taken.listen()
+        done = ckc("sweep", str(written(tmp_path, 4)), "--out", str(tmp_path / "o"), "--workers", "1", "--no-figures")
+        assert (done.code, done.err) == (0, "")
+
+
+def test_a_scheduler_that_is_lost_costs_nothing_that_is_finished(tmp_path: Path) -> None:
+    python = [sys.executable, "-m"]
+    place, out = tmp_path / "scheduler.json", tmp_path / "o"
+    where = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)]
+    processes = [subprocess.Popen([*python, "distributed.cli.dask_scheduler", *where], stderr=subprocess.DEVNULL)]
+    try:
+        worker = ["distributed.cli.dask_worker", "--scheduler-file", str(place), "--no-nanny", "--no-dashboard"]
+        processes.append(subprocess.Popen([*python, *worker, "--nthreads", "1"], stderr=subprocess.DEVNULL))
+        wait_for(place.exists)
+        address = json.loads(place.read_text())["address"]
+        path = written(tmp_path, members=2000, t_end=2.0)
+        options = ["--out", str(out), "--chunk", "5", "--no-figures", "--json", "--scheduler", address]
+        ends: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        processes.append(subprocess.Popen([*python, "ckc_pin.cli", "sweep", str(path), *options], **ends))
+        wait_for(lambda: len(list(out.glob("results.zarr/status/c/*"))) > 1)
+        processes[0].kill()
+        said, errors = processes[2].communicate(timeout=120)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    found = json.loads(said)
+    assert processes[2].returncode == 3
+    assert errors.splitlines() == [found["message"]]
+    assert found["message"].startswith("the scheduler is lost, or was restarted (")
+    assert found["message"].endswith("the same command goes on from it")
+    assert 10 <= found["done"] == int((results(out)["status"] == 1).sum()) < 2000
+
+
+def wait_for(there: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not there():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_workers_that_die_cost_nothing_that_is_finished(tmp_path: Path) -> None:

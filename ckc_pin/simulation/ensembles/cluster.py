@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -9,6 +10,7 @@ from typing import Any
 
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.members import Chunk, Members
+from ckc_pin.simulation.ensembles.store import STAYS
 from ckc_pin.simulation.ensembles.task import SweepTask
 
 __all__ = ["chunks_by", "client_of"]
@@ -46,7 +48,13 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     if scheduler is None:
         try:
             cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
+                silence_logs=logging.ERROR,  # of tasks that are cancelled, as by Ctrl-C
             )
         except (OSError, RuntimeError) as error:
             raise InputError(
@@ -64,8 +72,14 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
             "`dask scheduler` and `dask worker ADDRESS`, or leave it out for processes on this machine"
         ) from None
-    with client:
-        yield client
+    log = logging.getLogger("distributed.client")
+    before = log.level
+    log.setLevel(logging.CRITICAL)  # it logs tracebacks of a scheduler that is lost, of which a message tells
+    try:
+        with client:
+            yield client
+    finally:
+        log.setLevel(before)
 
 
 def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
@@ -77,6 +91,8 @@ def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], 
         A chunk that its workers cannot finish: those that died, or what it raised. Others that are under way are lost.
     """
     from dask.distributed import as_completed
+    from distributed.client import FutureCancelledError
+    from distributed.comm.core import CommClosedError
 
     todo = iter(pending)
 
@@ -90,8 +106,10 @@ def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], 
     for future in running:
         try:
             chunk = future.result()
+        except (FutureCancelledError, CommClosedError) as error:
+            raise InputError(f"the scheduler is lost, or was restarted ({type(error).__name__}); {STAYS}") from None
         except Exception as error:  # what a worker raised, or that workers died over it
-            raise InputError(f"a worker failed: {type(error).__name__}: {error}") from None
+            raise InputError(f"a worker failed: {type(error).__name__}: {error}; {STAYS}") from None
         for more in submit(1):
             running.add(more)  # type: ignore[no-untyped-call]
         yield chunk

@@ -17,7 +17,7 @@ from ckc_pin.simulation.ensembles.task import SweepTask
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["importance"]
+__all__ = ["importance", "laws_of"]
 
 CHUNK = 4096  # members at once
 
@@ -40,16 +40,14 @@ def importance(task: SweepTask, count: int, threads: int | None = None) -> xr.Da
     Raises
     ------
     InputError
-        A count that is no power of 2, variables that are no random ones, no output of one number, members that fail.
+        A count that is no power of 2, a single variable, variables that are no random ones, no output of one number,
+        members that fail.
     """
     require_libraries()
     import xarray as xr
     from scipy.stats import sobol_indices
 
-    if count < 2 or count & (count - 1):
-        raise InputError(f"indices: {count} is no power of 2, which Saltelli's design needs")
-    names = list(task.spec.variables)
-    laws = [_law(name, spec) for name, spec in task.spec.variables.items()]
+    names, laws = list(task.spec.variables), laws_of(task, count)
     members = task.members(threads or os.cpu_count() or 1)
     outputs = [name for name, (dims, _) in members.shapes.items() if not dims]
     if not outputs:
@@ -75,6 +73,16 @@ def importance(task: SweepTask, count: int, threads: int | None = None) -> xr.Da
         },
         coords={"output": outputs, "variable": names},
     )
+
+
+def laws_of(task: SweepTask, count: int) -> list[Any]:
+    """Return the variables' distributions, where all that is known without a run allows indices (InputError)."""
+    if count < 2 or count & (count - 1):
+        raise InputError(f"indices: {count} is no power of 2, which Saltelli's design needs")
+    names = list(task.spec.variables)
+    if len(names) < 2:
+        raise InputError(f"indices: {names[0]} alone makes all of the variance; vary something beside it")
+    return [_law(name, spec) for name, spec in task.spec.variables.items()]
 
 
 def _law(name: str, spec: VariableSpec) -> Any:

@@ -91,7 +91,9 @@ class Members:
         if self.scene.spec.initial.at is not None and any(name.startswith("initial.q.") for name in names):
             self._start_from_there()
         self._vectors = check_names(scene, self._changes, self.scene, self.mechanism, names)
+        self._outputs = outputs
         self.outputs = Outputs(outputs, self.ready)
+        self._require_one_time()
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
         self._varied = Varied(self.mechanism, [names[k] for k in self._parameters])
         self._library = self._terms(count)
@@ -120,12 +122,10 @@ class Members:
         )
         status, message = np.full(count, PENDING, np.uint8), [""] * count
         rhs = self._run_batch(values, recorded, status, message) if self.batched else 0
-        left = np.flatnonzero(status == PENDING)
-        found: dict[str, Array] = {
-            name: np.full((count, *self.shapes[name][1]), np.nan) for name in self.outputs.functions
-        }
-        rhs += self._run_singly(left, values, recorded, status, message, found)
-        outputs = {**self.outputs.compute(recorded), **found}
+        outputs = self.outputs.compute(recorded)
+        for name in self.outputs.functions:
+            outputs[name] = np.full((count, *self.shapes[name][1]), np.nan)
+        rhs += self._run_singly(np.flatnonzero(status == PENDING), values, status, message, outputs)
         return Chunk(first, values, status, message, outputs, rhs)
 
     def changes_of(self, values: Array) -> dict[str, Any]:
@@ -193,17 +193,16 @@ class Members:
         self,
         which: IntArray,
         values: Array,
-        recorded: Recorded,
         status: Statuses,
         message: list[str],
-        found: dict[str, Array],
+        outputs: dict[str, Array],
     ) -> int:
         """Run members as runs of their own; their loops still turn in threads."""
         if not len(which):
             return 0
 
         def one(k: int) -> int:
-            status[k], message[k], rhs = self._single(values[k], k, recorded, found)
+            status[k], message[k], rhs = self._single(values[k], k, outputs)
             return rhs
 
         if self._threads == 1 or len(which) == 1:
@@ -215,7 +214,8 @@ class Members:
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def _single(self, values: Array, k: int, recorded: Recorded, found: dict[str, Array]) -> tuple[int, str, int]:
+    def _single(self, values: Array, k: int, outputs: dict[str, Array]) -> tuple[int, str, int]:
+        """Run one member and enter its outputs: its output instants and its q_d may be its own."""
         try:
             ready = prepare(load_scene(self.scene_name, self.changes_of(values)))
             rows, ended, message = run_rows(ready)
@@ -223,7 +223,9 @@ class Members:
             return FAILED, str(error), 0
         if ended == "interrupted":
             raise KeyboardInterrupt
-        self._enter(ready, rows, k, recorded)
+        own = Outputs(self._outputs, ready)
+        for name, value in own.compute(own.recorded(rows)).items():
+            outputs[name][k] = value[0]
         rhs = ready.loop.stats()["rhs"]
         status, message = (
             (DONE, "" if message == "reached t_end" else message) if ended == "done" else (STOPPED, message)
@@ -232,21 +234,10 @@ class Members:
             run = run_of(ready, rows, ended, message, 0.0)
             for name, function in self.outputs.functions.items():
                 try:
-                    found[name][k] = function(run)
+                    outputs[name][k] = function(run)
                 except Exception as error:  # a caller's function may raise anything
                     status, message = FAILED, f"output {name!r} raised {type(error).__name__}: {error}"
         return status, message, rhs
-
-    def _enter(self, ready: Any, rows: Array, k: int, recorded: Recorded) -> None:
-        """Put what a run has recorded where the others' is."""
-        recorded.last[k] = rows[-1]
-        at = {float(t): i for i, t in enumerate(self.instants)}
-        for row in rows:
-            i = at.get(float(row[0]))
-            if i is not None:
-                recorded.kept[k, :, i] = row[self.outputs.columns]
-        for t, event, _ in ready.loop.met():
-            recorded.met[k, event] = np.fmin(recorded.met[k, event], t)
 
     # --- what is asked ---------------------------------------------------------------------------
 
@@ -258,6 +249,14 @@ class Members:
         self.scene = load_scene(self.scene_name, self._changes)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
+
+    def _require_one_time(self) -> None:
+        """Refuse trajectories at instants that are not the same of all members (InputError)."""
+        own = [name for name in self.names if name in ("t_end", "solver.output_dt")]
+        over_time = [name for name, output in self.outputs.outputs.items() if "time" in output.dims]
+        if own and over_time:
+            says = f"a trajectory is kept at the same instants of all members, which {own[0]} makes others"
+            raise InputError(f"{self.scene.name}: outputs: {over_time[0]}: {says}; keep a reduction")
 
     def _shapes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
         """Dimensions and shape of each output, a function's found by calling it on the scene itself."""

@@ -101,6 +101,20 @@ class Outputs:
         """Return the outputs of some members, (members, ...) each."""
         return {name: output.compute(recorded) for name, output in self.outputs.items()}
 
+    def recorded(self, rows: Array) -> Recorded:
+        """Return what a run of what was prepared has recorded, as of one member."""
+        instants, events = self._ready.instants, self._ready.events
+        kept = np.full((1, len(self.columns), len(instants)), np.nan)
+        at = {float(t): i for i, t in enumerate(instants)}
+        for row in rows:
+            i = at.get(float(row[0]))
+            if i is not None:
+                kept[0, :, i] = row[self.columns]
+        met = np.full((1, len(events)), np.nan)
+        for t, event, _ in self._ready.loop.met():
+            met[0, event] = np.fmin(met[0, event], t)
+        return Recorded(rows[-1:], kept, met)
+
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
         """What stands along each dimension."""
@@ -228,6 +242,7 @@ def _reduce(x: Array, how: Reduction, instants: Array) -> Array:
     integral = np.where(np.isnan(x[:, :, 0]), np.nan, integral)
     if how == "integral":
         return integral
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = integral / np.ascontiguousarray(lasted).sum(axis=2)
-        return np.sqrt(mean) if how == "rms" else mean
+    seconds = np.ascontiguousarray(lasted).sum(axis=2)
+    # no 0 / 0, whose NaN has another sign where it is computed several at a time
+    mean = np.divide(integral, seconds, out=np.full_like(integral, np.nan), where=seconds > 0)
+    return np.sqrt(mean) if how == "rms" else mean

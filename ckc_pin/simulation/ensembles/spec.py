@@ -116,11 +116,11 @@ class OutputSpec(_Spec, frozen=True):
     of
         a coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
         ``dissipated``, ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``, ``max_phi``, ``energy_drift`` (largest
-        change), ``settled`` (1 where everything rests at the end, at q_d if there is one, 0 where not),
-        ``event.NAME`` or ``event.K`` (when that was met first).
+        change), ``settled`` (1 where everything rests at the end, if only to turn round, at q_d if there is one,
+        0 where not), ``event.NAME`` or ``event.K`` (when that was met first).
         ``of = "error"``
     reduce
-        What is kept of it over the output instants; of those named after ``t`` nothing but themselves.
+        What is kept of it over the member's output instants; of those named after ``t`` nothing but themselves.
         ``reduce = "max_abs"``
     tolerance : rad, of the size
         Of ``settled``: of each coordinate and its rate.

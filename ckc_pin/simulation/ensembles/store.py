@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import msgspec
@@ -14,12 +15,13 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
 
-__all__ = ["RESULTS", "Store", "array_name", "require_libraries"]
+__all__ = ["RESULTS", "STAYS", "Store", "array_name", "require_libraries"]
 
 RESULTS = "results.zarr"
 FORMAT = 1
 BLOCK = 2**20  # members whose status is read at once
 STATUS_NAME, MESSAGE_NAME = "status", "message"
+STAYS = "what is there stays, and the same command goes on from it"
 UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 
@@ -59,9 +61,6 @@ class Store:
     """
 
     def __init__(self, path: Path | None, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
-        import zarr
-        from zarr.storage import MemoryStore
-
         self.path, self.count = path, count
         _require_free_names(members)
         sweep = json.loads(json.dumps(sweep))
@@ -69,12 +68,7 @@ class Store:
         if path is not None and path.exists():
             self._group = self._open(path, sweep)
         else:
-            where: Any = MemoryStore() if path is None else path
-            try:
-                self._group = zarr.open_group(where, mode="w", zarr_format=3)
-                self._make(sweep, members, min(chunk, count))
-            except OSError as error:
-                raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+            self._group = self._begin(path, sweep, members, min(chunk, count))
         self.chunk: int = self._group[STATUS_NAME].chunks[0]
 
     @property
@@ -123,8 +117,25 @@ class Store:
                 group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
             group[STATUS_NAME][at] = chunk.status
         except OSError as error:
-            says = f"{self.path}: cannot be written: {error.strerror or error}"
-            raise InputError(f"{says}; what is there stays, and the same command goes on from it") from None
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}; {STAYS}") from None
+
+    def _begin(self, path: Path | None, sweep: Mapping[str, Any], members: Members, chunk: int) -> Any:
+        """Make a store beside where it will be, so that it is there whole or not at all."""
+        import zarr
+        from zarr.storage import MemoryStore
+
+        if path is None:
+            group = zarr.open_group(MemoryStore(), mode="w", zarr_format=3)
+            self._make(group, sweep, members, chunk)
+            return group
+        begun = path.with_name(f"{path.name}.begun")
+        try:
+            self._make(zarr.open_group(begun, mode="w", zarr_format=3), sweep, members, chunk)
+            begun.replace(path)
+            return zarr.open_group(path, mode="r+", zarr_format=3)
+        except OSError as error:
+            rmtree(begun, ignore_errors=True)
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
     def _open(self, path: Path, sweep: Mapping[str, Any]) -> Any:
         import zarr
@@ -137,9 +148,7 @@ class Store:
                 f"{path}: no results of a sweep ({type(error).__name__}); remove it, or choose another DIR"
             ) from None
         if attributes.get("format") != FORMAT or "identity" not in attributes:
-            raise InputError(
-                f"{path}: not begun as results of a sweep, or not to its end; remove it, or choose another DIR"
-            )
+            raise InputError(f"{path}: not begun as results of a sweep; remove it, or choose another DIR")
         if attributes["identity"] != self._identity:
             other = json.loads(str(attributes["sweep"]))
             differs = [key for key in sweep if other.get(key) != sweep[key]]
@@ -149,8 +158,7 @@ class Store:
             )
         return group
 
-    def _make(self, sweep: Mapping[str, Any], members: Members, chunk: int) -> None:
-        group: Any = self._group
+    def _make(self, group: Any, sweep: Mapping[str, Any], members: Members, chunk: int) -> None:
         labels = {name: found for name, found in members.outputs.labels.items() if _is_used(name, members)}
         for name, found in labels.items():
             place = group.create_array(name, shape=(len(found),), dtype=str, dimension_names=(name,))
@@ -176,7 +184,7 @@ class Store:
         )  # fmt: skip
         group.attrs.update(
             {"format": FORMAT, "units": UNITS, "sweep": json.dumps(sweep), "identity": self._identity}
-        )  # last: a store without them was not begun to its end
+        )  # last: what has none is no store of a sweep's
 
 
 def _require_free_names(members: Members) -> None:
