@@ -1,6 +1,6 @@
 """Through a loss of rank.
 
-Four-bars in a row lie flat at t = 0.708 s, where the closure loses a rank for each. The projected DAE goes on along
+Four-bars in a row lie flat at t = 0.718 s, where the closure loses a rank for each. The projected DAE goes on along
 its own branch by a checked collocation step. All rods keep one angle θ with θ'' = -k cos θ, which SciPy integrates as
 a second opinion.
 """

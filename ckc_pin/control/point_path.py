@@ -99,7 +99,7 @@ class PointPathSpec(_Spec, frozen=True):
     Attributes
     ----------
     point
-        a ``[[point]]`` of the mechanism.
+        A ``[[point]]`` of the mechanism.
         ``point = "tip"``
     file
         CSV with the columns ``t, x, y, z``; one of ``file``, ``circle``, ``line``.

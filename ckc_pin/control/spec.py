@@ -177,7 +177,7 @@ class TrackingSpec(_Feedback, frozen=True, tag="tracking"):
         Symmetric positive definite.
         ``K_D = [[10.0, 0.0], [0.0, 10.0]]``
     desired
-        a table for each independent coordinate, or ``file``, or ``point`` with its path.
+        A table for each independent coordinate, or ``file``, or ``point`` with its path.
         ``desired = {theta_1 = {offset = -1.4}, theta_3 = {harmonics = [[0.2, 1.0, 0.0]]}}``
     """
 
@@ -213,10 +213,10 @@ class HarmonicsSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     Attributes
     ----------
     offset : rad, m
-        Q_d = offset + Σ amplitude sin(frequency t + phase).
+        What the waves swing about.
         ``offset = -1.4``
     harmonics : rad or m, rad/s, rad
-        Any number of waves.
+        Any number of waves, ``[amplitude, frequency, phase]`` each.
         ``harmonics = [[1.0472, 1.0, 0.0]]``
     """
 

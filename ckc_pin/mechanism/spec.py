@@ -115,7 +115,7 @@ class PointSpec(FileStruct, frozen=True):
         The key under ``points``.
         ``name = "tip"``
     frame
-        a link, ``joint:NAME``, or a table ``{link, xyz, rpy}``; the point is its origin.
+        A link, ``joint:NAME``, or a table ``{link, xyz, rpy}``; the point is its origin.
         ``frame = {link = "rod", xyz = [0.6, 0.0, 0.0]}``
     """
 

@@ -22,7 +22,7 @@ class FrameSpec(FileStruct, frozen=True):
     Attributes
     ----------
     link
-        a link, ``joint:NAME`` or ``world``.
+        A link, ``joint:NAME`` or ``world``.
         ``link = "rod"``
     xyz : m
         Position in it.

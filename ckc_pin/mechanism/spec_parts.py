@@ -52,7 +52,7 @@ class SpringSpec(FileStruct, frozen=True):
         Of the spring between two frames; absent: 0.
         ``rest_length = 0.25``
     joint
-        a joint of one freedom, in the place of two frames.
+        A joint of one freedom, in the place of two frames.
         ``joint = "hip"``
     rest : rad, m
         The joint's position without force; absent: 0.
@@ -82,7 +82,7 @@ class ForceSpec(FileStruct, frozen=True):
     Attributes
     ----------
     joint
-        a joint of one freedom.
+        A joint of one freedom.
         ``joint = "slider"``
     value : N, N m
         Along its coordinate; potential -value × coordinate.
@@ -99,7 +99,7 @@ class JointSpec(FileStruct, frozen=True):
     Attributes
     ----------
     name
-        a joint of one freedom.
+        A joint of one freedom.
         ``name = "hip"``
     armature : kg m², kg
         Inertia of a rotor, reflected through its gear; on the diagonal of D'; absent: none.
@@ -137,7 +137,7 @@ class MotorSpec(FileStruct, frozen=True):
         Its key wherever tau is given by name; absent: the joint's.
         ``name = "hip_motor"``
     joint
-        a joint of one freedom.
+        A joint of one freedom.
         ``joint = "hip"``
     joints
         What it turns with each of several joints, ``{a = 1.0, b = -1.0}``; needs a ``name``.

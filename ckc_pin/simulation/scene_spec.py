@@ -67,7 +67,7 @@ class SolverSpec(_Spec, frozen=True):
         No longer steps.
         ``max_step = 0.01``
     min_step : s
-        a step below it stops the run, exit code 3.
+        A step below it stops the run, exit code 3.
         ``min_step = 1e-9``
     max_rhs
         So many right-hand sides, then the run stops.
@@ -113,7 +113,7 @@ class EventSpec(_Spec, frozen=True):
         Whose; a margin has none, and a limit without it means every coordinate's.
         ``coordinate = "theta_1"``
     of
-        a coordinate, its rate, its limits in the URDF, or how near φ_z or J is to singular.
+        A coordinate, its rate, its limits in the URDF, or how near φ_z or J is to singular.
         ``of = "q_dot"``
     value : of what crosses
         Absent: 0; a margin needs one greater than 0, a limit has none.

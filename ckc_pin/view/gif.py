@@ -20,7 +20,7 @@ from ckc_pin.view.outline import Outline, base, outline
 from ckc_pin.view.player import file_in_folder, shown_runs
 from ckc_pin.view.skeleton import Projection, configurations, is_planar, placements, planes, viewpoint
 
-__all__ = ["save_gif"]
+__all__ = ["in_one_palette", "save_gif"]
 
 RATE = 20  # frames a second; a GIF counts in hundredths
 MOST = 1200  # frames
@@ -63,6 +63,20 @@ def save_gif(runs: Run | Sequence[Run], path: str | Path, *, speed: float = 1.0)
     with written_whole(file) as written:
         frames[0].save(written, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
     return file
+
+
+def in_one_palette(drawn: Sequence[Any]) -> list[Any]:
+    """Return images in few colours, which are the same in all: what stands still is the same in the next frame."""
+    from PIL import Image
+
+    some = [np.asarray(drawn[k]) for k in np.linspace(0, len(drawn) - 1, LOOKED_AT).astype(int)]
+    palette = Image.fromarray(np.vstack(some)).quantize(COLOURS)
+    made = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in drawn]
+    colours = np.array(palette.getpalette()).reshape(-1, 3)
+    colours[np.asarray(made[0])[-1, -1]] = 255  # the paper, which was averaged with what is nearly white
+    for image in made:
+        image.putpalette(colours.ravel().tolist())
+    return made
 
 
 class _Moving:
@@ -166,14 +180,7 @@ class _Frames:
             for artist in artists:
                 self.figure.draw_artist(artist)
             drawn.append(Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy()))
-        some = [np.asarray(drawn[k]) for k in np.linspace(0, len(drawn) - 1, LOOKED_AT).astype(int)]
-        palette = Image.fromarray(np.vstack(some)).quantize(COLOURS)
-        made = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in drawn]
-        colours = np.array(palette.getpalette()).reshape(-1, 3)
-        colours[np.asarray(made[0])[-1, -1]] = 255  # the paper, which was averaged with what is nearly white
-        for image in made:
-            image.putpalette(colours.ravel().tolist())
-        return made
+        return in_one_palette(drawn)
 
     def _says(self, t: float) -> str:
         """The time, and whether a run has stopped by then."""

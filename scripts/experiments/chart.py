@@ -1,4 +1,4 @@
-"""The studies' figures: one look, written as PNG without a display."""
+"""The studies' figures: one look, written as PNG without a display; every picture of docs/ as a small file."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["BLACK", "COLOURS", "chart", "save", "whole_decades"]
+__all__ = ["BLACK", "COLOURS", "chart", "save", "shrink", "whole_decades"]
 
 # Okabe and Ito's colours, told apart by every eye; yellow is left out, which is hard to see as a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BLACK = "#000000"
-PALETTE = 128  # colours of a file: lines and letters with their soft edges need no more
+SEEN = 16  # of 255: what a colour of a palette may be off
 
 
 def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6)) -> tuple[Any, Any]:
@@ -36,13 +36,31 @@ def whole_decades(ax: Any) -> None:
 
 
 def save(figure: Any, folder: Path, name: str) -> str:
-    """Write a figure into a folder, which is made if need be, with a palette; return its file name."""
+    """Write a figure into a folder, which is made if need be; return its file name."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
     folder.mkdir(parents=True, exist_ok=True)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(PALETTE, dither=Image.Dither.NONE).save(folder / name, optimize=True)  # a third of the size
+    _write(Image.fromarray(np.asarray(canvas.buffer_rgba())), folder / name)
     return name
+
+
+def shrink(path: Path) -> None:
+    """Write a PNG again as small as it can be without a difference that is seen; one with a palette is left."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        if image.mode != "P":
+            _write(image, path)
+
+
+def _write(image: Any, path: Path) -> None:
+    """Write a picture with a palette, which takes a third, or without where shades would turn into others."""
+    from PIL import Image
+
+    exact = image.convert("RGB")
+    few = exact.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE)
+    off = np.abs(np.asarray(few.convert("RGB"), dtype=int) - np.asarray(exact, dtype=int)).max()
+    (few if off <= SEEN else exact).save(path, optimize=True)

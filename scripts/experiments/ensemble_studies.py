@@ -16,6 +16,7 @@ from ckc_pin.simulation.ensembles.importance import importance
 from ckc_pin.simulation.ensembles.spec import sweep_of
 from ckc_pin.simulation.ensembles.task import SweepTask
 from ckc_pin.view.ensemble_figures import draw_basins, draw_fan, draw_importance
+from scripts.experiments.chart import shrink
 from scripts.experiments.paper.set_point_experiments import load_case
 
 LENGTHS = {
@@ -133,3 +134,5 @@ def main(out: Path, quick: bool = False) -> None:
     lengths = tolerances(out, *((16, 4) if quick else (512, 64)))
     print(f"Lengths wrong by {DEVIATION * 1e3:g} mm (standard deviation)\n\n{lengths}\n")
     print(f"Set-point control from everywhere\n\n{basin(out, 9 if quick else 41)}")
+    for figure in out.glob("*.png"):
+        shrink(figure)

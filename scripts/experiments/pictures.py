@@ -14,6 +14,7 @@ from ckc_pin.view.canvas import look
 from ckc_pin.view.map_figure import draw_map
 from ckc_pin.view.player import play
 from ckc_pin.view.sections_figure import draw_sections
+from scripts.experiments.chart import shrink
 from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
@@ -53,3 +54,5 @@ def main(chromium: Path) -> None:
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
         draw_friction(IMAGES / "five_bar_friction.png", DPI)
         draw_preload(IMAGES / "two_ur5_preload.png", DPI)
+    for picture in IMAGES.glob("*.png"):
+        shrink(picture)

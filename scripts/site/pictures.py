@@ -10,7 +10,9 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.view.canvas import look
+from ckc_pin.view.gif import in_one_palette
 from ckc_pin.view.style import COLOURS, GREY
+from scripts.experiments.chart import shrink
 
 __all__ = ["main"]
 
@@ -123,8 +125,9 @@ def pipeline() -> Any:
 @look()
 def moving(path: Path, count: int = 60) -> None:
     """The five-bar under tracking control, as it moves."""
-    from matplotlib.animation import FuncAnimation, PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from PIL import Image
 
     run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
     mechanism = run.mechanism
@@ -136,9 +139,7 @@ def moving(path: Path, count: int = 60) -> None:
         pins.append(np.vstack([pose.translation[[1, 2]], pose.p[:1], pose.translation[[4, 3]]])[:, :2])
     path_of_tip = run.points["tip"]
     figure = Figure(figsize=(6.0, 3.2), dpi=110)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     pose_ax, angles = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
     pose_ax.plot(path_of_tip[:, 0], path_of_tip[:, 1], color=GREY, lw=0.8)
     (left,) = pose_ax.plot([], [], "-o", color=BLUE, lw=4, ms=5)
@@ -155,13 +156,15 @@ def moving(path: Path, count: int = 60) -> None:
     angles.set(xlabel="t (s)", ylabel="angle (rad)", title="Tracking control")
     figure.legend(loc="outside lower right", ncols=3)
 
-    def draw(k: int) -> list[Any]:
-        left.set_data(*pins[k][:3].T)
-        right.set_data(*pins[k][2:].T)
-        now.set_xdata([run.t[instants[k]]] * 2)
-        return []
-
-    FuncAnimation(figure, draw, frames=count).save(path, PillowWriter(fps=12))
+    drawn = []
+    for pin, instant in zip(pins, instants, strict=True):
+        left.set_data(*pin[:3].T)
+        right.set_data(*pin[2:].T)
+        now.set_xdata([run.t[instant]] * 2)
+        canvas.draw()
+        drawn.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    first, *others = in_one_palette(drawn)
+    first.save(path, save_all=True, append_images=others, duration=80, loop=0)
 
 
 def main() -> None:
@@ -169,6 +172,7 @@ def main() -> None:
     for draw, place in ((rows, "guide/rows.png"), (frames, "guide/frames.png"), (pipeline, "theory/pipeline.png")):
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)
+        shrink(IMAGES / place)
         print(f"written: {IMAGES / place}")
     moving(IMAGES / "moving.gif")
     print(f"written: {IMAGES / 'moving.gif'}")

@@ -9,6 +9,7 @@ from importlib import import_module
 from io import BytesIO
 from typing import Any
 
+from scripts.experiments.chart import shrink
 from scripts.site.gallery import Example, examples
 
 __all__ = ["main", "picture", "run"]
@@ -51,6 +52,7 @@ def main() -> None:
         if not sys.argv[1:] or example.name in sys.argv[1:]:
             example.picture.parent.mkdir(parents=True, exist_ok=True)
             example.picture.write_bytes(picture(example))
+            shrink(example.picture)
             print(f"written: {example.picture}")
 
 

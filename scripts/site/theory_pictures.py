@@ -15,6 +15,7 @@ from ckc_pin.mechanism.library import library
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.view import style
 from ckc_pin.view.canvas import line, look, say
+from scripts.experiments.chart import shrink
 
 __all__ = ["error_control", "friction", "generated", "main"]
 
@@ -198,6 +199,7 @@ def main() -> None:
         path = DOCS / "images" / "theory" / f"{draw.__name__}.png"
         with look():
             draw().savefig(path)
+        shrink(path)
         print(f"written: {path}")
 
 

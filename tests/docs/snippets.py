@@ -1,8 +1,8 @@
 """Pieces of code in a page: commands and Python are run, files are written and read, keys are checked.
 
 In a page's order, in one folder and one namespace. A TOML or XML piece whose first line is a comment with a file's
-name is that file; a TOML piece without is checked as part of a scene or a mechanism. ``text`` and ``console`` are
-only shown.
+name is that file; a TOML piece without is checked as part of a scene or a mechanism. ``text`` is what the last command
+before it prints, ``...`` standing for the rest of a line or for lines. ``console`` is only shown.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.contract.helpers.command import ckc
 
 BLOCK = re.compile(r"^( *)(```+|~~~+)(\{?[\w-]+\}?)[^\n]*\n(.*?)^\1\2 *$", re.MULTILINE | re.DOTALL)
 FILE = re.compile(r"^(?:#|<!--) ([\w./-]+\.(?:toml|urdf|xml|csv))\b")
-SHOWN = {"text", "console", "csv", "bibtex", "json"}
+SHOWN = {"console", "csv", "bibtex", "json"}
 FOREIGN = ("ckc play", "ckc run five_bar/swing --meshcat")  # they open a server, and wait
 
 
@@ -56,7 +56,9 @@ def run(snippet: Snippet, space: dict[str, Any]) -> None:
         exec(compile(text, f"line {snippet.line}", "exec"), space)
     elif language == "sh":
         for line in text.replace("\\\n", " ").splitlines():
-            _line(line)
+            space["printed"] = _line(line) or space.get("printed", "")
+    elif language == "text":
+        check_printed(text, space["printed"])
     elif language in ("toml", "xml"):
         named = FILE.match(text)
         if named:
@@ -70,28 +72,39 @@ def run(snippet: Snippet, space: dict[str, Any]) -> None:
         assert language in SHOWN, f"line {snippet.line}: no language {language!r}"
 
 
-def _line(line: str) -> None:
-    """Run commands joined by &&, in the folders that they change to."""
+def check_printed(shown: str, printed: str) -> None:
+    """Check that what is shown was printed, in that order."""
+    lines = [re.escape(line).replace(r"\.\.\.", "[^\n]*") for line in shown.splitlines()]
+    wanted = "\n".join(".*" if line.strip(r"\ ") == "[^\n]*" else line for line in lines)
+    assert re.search(wanted, printed, re.DOTALL), f"shown:\n{shown}\nprinted:\n{printed}"
+
+
+def _line(line: str) -> str:
+    """Run commands joined by &&, in the folders that they change to; return what the last one prints."""
+    printed = ""
     parts = line.split(" && ")
     with chdir("."):
         for part in parts:
             if part.startswith("cd ") and len(parts) > 1:
                 os.chdir(part.removeprefix("cd "))
             else:
-                _command(part)
+                printed = _command(part)
+    return printed
 
 
-def _command(line: str) -> None:
+def _command(line: str) -> str:
+    """Run a command, and return what it prints."""
     words = shlex.split(line, comments=True)
     if not words or words[0].startswith("./scripts/") or words[0] in ("pip", "git", "cd"):
-        return
+        return ""
     assert words[0] == "ckc", f"not a command of the program: {line}"
     if line.startswith(FOREIGN) and "--html" not in words:
         assert ckc(words[1], "--help").code == 0
-        return
+        return ""
     wanted = re.search(r"# exit code (\d)", line)
     found = ckc(*words[1:])
     assert found.code == int(wanted[1] if wanted else 0), f"{line}\n{found.err}"
+    return found.out
 
 
 def check_part(text: str) -> None:

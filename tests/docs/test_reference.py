@@ -117,6 +117,13 @@ def test_every_json_key_array_and_error_is_named() -> None:
     assert [name for name in errors.__all__ if f"| `{name}`" not in page("reference/errors.md")] == []
 
 
+def test_every_extra_is_described() -> None:
+    """But for those that the project's own work alone needs."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    said = re.findall(r"^\| `(\w+)` \|", page("install.md"), re.MULTILINE)
+    assert set(said) == set(extras) - {"dev", "lab", "peers", "sundials"}
+
+
 def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> None:
     """Texts of the sources, pieces of one string joined."""
     source = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "ckc_pin").rglob("*.py")))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from scripts.site.gallery import ROOT
-from tests.docs.snippets import run, snippets
+from tests.docs.snippets import check_printed, run, snippets
 
 MADE = {
     "paper.md",
@@ -48,3 +48,14 @@ def test_a_wrong_piece_is_found(text: str, wrong: str) -> None:
     (snippet,) = snippets(text)
     with pytest.raises(Exception, match=wrong):
         run(snippet, {})
+
+
+@pytest.mark.parametrize("shown", ["a 1\n...\nd 4", "b ...\nc 3"])
+def test_what_is_printed_may_be_shown_in_part(shown: str) -> None:
+    check_printed(shown, "a 1\nb 2\nc 3\nd 4\n")
+
+
+@pytest.mark.parametrize("shown", ["a 1\nd 4", "d 4\n...\na 1", "b ...\nd 4", "a 2"])
+def test_what_is_not_printed_is_found(shown: str) -> None:
+    with pytest.raises(AssertionError, match="shown"):
+        check_printed(shown, "a 1\nb 2\nc 3\nd 4\n")

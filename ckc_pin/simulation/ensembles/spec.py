@@ -80,7 +80,7 @@ class VariableSpec(_Spec, frozen=True):
         Values.
         ``list = [0.2, 0.3, 0.5]``
     file
-        a CSV file beside this one, whose first row names variables; those of one file go together, a row each.
+        A CSV file beside this one, whose first row names variables; those of one file go together, a row each.
         ``file = "starts.csv"``
     """
 
@@ -114,7 +114,7 @@ class OutputSpec(_Spec, frozen=True):
     Attributes
     ----------
     of
-        a coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
+        A coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
         ``dissipated``, ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``, ``max_phi``, ``energy_drift`` (largest
         change), ``settled`` (1 where everything rests at the end, if only to turn round, at q_d if there is one,
         0 where not), ``event.NAME`` or ``event.K`` (when that was met first).
@@ -138,7 +138,7 @@ class SweepSpec(_Spec, frozen=True):
     Attributes
     ----------
     scene
-        a scene's shipped name, or its path beside this file.
+        A scene's shipped name, or its path beside this file.
         ``scene = "five_bar/swing"``
     variables
         By a parameter's name (see "parameters") or a scene's key: how it differs; a plain list is short for

@@ -10,6 +10,7 @@ from pathlib import Path
 import pandas as pd
 from joblib import Parallel, delayed, parallel_config
 
+from scripts.experiments.chart import shrink
 from scripts.experiments.pages import render, versions
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.contents import KEYS, SECTIONS, STUDIES
@@ -102,4 +103,6 @@ def write(out: Path) -> list[Path]:
     for figure in figures.glob("*.png"):
         if figure.name not in shown:
             figure.unlink()
+        else:
+            shrink(figure)
     return [out / name for name in pages]
