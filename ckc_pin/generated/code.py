@@ -30,6 +30,7 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
+TOGETHER, ALL = 4, -1  # directions; their group of lanes, which is no branches'
 LARGEST_JACOBIAN = 3e4  # operations of the acceleration times n, about twice those of its derivatives: above, none
 
 
@@ -40,7 +41,8 @@ def functions(
 
     With `changes` also how the acceleration changes along any direction of q', v', u' and of what may be varied:
     `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it is
-    sound; `change` takes the first of these, and changes of q', v', u' and of what may be varied.
+    sound; `change` takes the first of these, and `TOGETHER` directions at a time, each number's side by side as in its
+    result: changes of q', v', u' and of what may be varied.
 
     Left out are `coriolis` of a tree with a free root, whose twist has several C', and `jacobian` where it would be too
     long to be compiled.
@@ -85,9 +87,20 @@ def functions(
         given_by = cs.substitute(known, cs.vertcat(columns, *taken), given_by)
         whole = cs.cse(cs.vertcat(given_by, part["acceleration_of_u"], part["sound"]))
         sizes = [known.numel(), mechanism.n, 1]
-        found["state"] = cs.Function("state", state, _split(whole, sizes))
-        found["change"] = cs.Function("change", [known, *along.values()], [cs.cse(change)])
+        found["state"] = cs.Function(
+            "state", state, _split(whole, sizes), ["q", "trig", "v", "u", "numbers"], ["known", "acceleration", "sound"]
+        )
+        found["change"] = _of_several(known, cs.vertcat(*along.values()), cs.cse(change))
     return found
+
+
+def _of_several(known: Any, direction: Any, change: Any) -> Any:
+    import casadi as cs
+
+    one = cs.Function("one", [known, direction], [change])
+    directions = cs.SX.sym("directions", TOGETHER, direction.numel())
+    changes = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
+    return cs.Function("change", [known, cs.vec(directions)], [cs.vec(changes)], ["known", "directions"], ["changes"])
 
 
 def _symbols_of(x: Any, among: list[Any]) -> list[Any]:
@@ -143,4 +156,8 @@ def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] 
 
 def source(found: Mapping[str, Any], tree: Tree) -> str:
     """Return the C text of a mechanism's functions."""
-    return text(list(found.values()), alike_branches(tree))
+    alike = dict(alike_branches(tree))
+    if "change" in found:
+        places = range(found["change"].numel_in(1))
+        alike["directions"] = {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in places}
+    return text(list(found.values()), alike)

@@ -10,6 +10,7 @@ import numpy as np
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.generated.code import TOGETHER
 from ckc_pin.generated.expressions import kept_rows
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.sigma import sigma
@@ -175,24 +176,24 @@ def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, 
 
 
 def _compare_change(terms: Terms, code: Calls, own: Array, random: np.random.Generator) -> None:
-    """Along a direction of everything at once."""
+    """Along directions of everything at once."""
     mechanism, tree, q, v = terms.mechanism, terms.mechanism.tree, terms.q_tree, terms.v_tree
-    u, step, faster, more = random.uniform(-1, 1, (4, tree.n)) * tree.reach
-    varied = random.uniform(-1, 1, len(own)) * np.where(own == 0.0, FROM_ZERO, own)
-    none = np.zeros(mechanism.closure.rows)
+    none, u = np.zeros(mechanism.closure.rows), random.uniform(-1, 1, tree.n) * tree.reach
+    steps, faster, more = random.uniform(-1, 1, (3, TOGETHER, tree.n)) * tree.reach
+    varied = random.uniform(-1, 1, (TOGETHER, len(own))) * np.where(own == 0.0, FROM_ZERO, own)
     state, acceleration, _ = code.call("state", q, v, u)
     _compare(mechanism, "acceleration with its change", acceleration, code.call("acceleration", q, v, u, none)[0])
-    (found,) = code.call("change", state, tree.configuration_rate(q, step), faster, more, varied)
+    moves = np.array([tree.configuration_rate(q, step) for step in steps])
+    (found,) = code.call("change", state, np.ravel(np.hstack([moves, faster, more, varied]), order="F"))
 
-    def at(h: float) -> Array:
-        numbers = code.of_numbers(own + h * varied)
-        return code.call(
-            "acceleration", tree.integrate(q, h * step), v + h * faster, u + h * more, none, numbers=numbers
-        )[0]
+    def at(k: int, h: float) -> Array:
+        there = tree.integrate(q, h * steps[k]), v + h * faster[k], u + h * more[k]
+        return code.call("acceleration", *there, none, numbers=code.of_numbers(own + h * varied[k]))[0]
 
     h = DIFFERENCE
-    wanted = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
-    _compare(mechanism, "the acceleration's change", found, wanted, 0.0, ALIKE)
+    for k, change in enumerate(found.reshape(TOGETHER, -1, order="F")):
+        wanted = (8 * (at(k, h) - at(k, -h)) - (at(k, 2 * h) - at(k, -2 * h))) / (12 * h)
+        _compare(mechanism, "the acceleration's change", change, wanted, 0.0, ALIKE)
 
 
 def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:

@@ -196,7 +196,7 @@ def variation_table(
 ) -> dict[str, Any]:
     """Describe what varies.
 
-    `directions`: as of `directions_of`, where there is a library that takes them. `at_equilibrium`: the start is where
+    `directions`: as of `directions_of`, where compiled terms can take them. `at_equilibrium`: the start is where
     the mechanism rests, which moves with it. `target`: q' where a controller compensates what this mechanism needs
     there; none where it compensates another one's.
     """

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 from ckc_pin.generated.library import Library, compiled, find
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.native.variation import Varying, directions_of
+from ckc_pin.mechanism.tree import BoolArray
 from ckc_pin.simulation.scene_spec import TermsOf
 
 __all__ = ["changing_library", "library_of"]
@@ -20,16 +19,11 @@ def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
     return compiled(mechanism) if terms == "generated" else find(mechanism)
 
 
-def changing_library(
-    mechanism: Mechanism, terms: str, varying: Sequence[Varying]
-) -> tuple[Library | None, Array | None]:
-    """Return terms that say how they change with what varies, and the parameters in their numbers; or neither.
+def changing_library(mechanism: Mechanism, terms: TermsOf, which: Mapping[str, BoolArray] | None) -> Library | None:
+    """Return terms that say how they change with numbers; None where there are none, or those are no arguments.
 
-    What varies from zero has to be an argument too: that is a library of its own. Of angles there is none.
+    What varies from zero has to be an argument too: that is a library of its own.
     """
-    found = None if terms == "pinocchio" else directions_of(mechanism, varying)
-    if found is None:
-        return None, None
-    which, directions = found
-    library = (compiled if terms == "generated" else find)(mechanism, which=which, changes=True)
-    return library, None if library is None else directions
+    if which is None or terms == "pinocchio":
+        return None
+    return (compiled if terms == "generated" else find)(mechanism, which, changes=True)

@@ -156,6 +156,13 @@ def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
         raise InputError(
             f"at: the loops do not close there (|phi| = {miss:.3g}); give {', '.join(mechanism.independent)} alone"
         )
+    if not whole and state.at.margin() <= NO_CHART:  # a fold, where Newton's method finds half of the digits
+        where = ", ".join(f"{name} = {x:.6g}" for name, x in given.items())
+        raise NumericalError(
+            f"at: {where} is singular: the other coordinates do not follow from that; take another configuration, or "
+            f"give {', '.join(mechanism.coordinates)}",
+            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(state.q_tree)),
+        )
     return _operating(subject, state)
 
 

@@ -34,11 +34,11 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.parameters import Changes
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
-from ckc_pin.native.variation import variation_table
+from ckc_pin.native.variation import directions_of, variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.libraries import changing_library, library_of
@@ -128,6 +128,8 @@ class Prepared:
     loop : native Loop
     varying : tuple of str
         Numbers that the motion's changes with are integrated beside it.
+    changing : dict of str to bool arrays, or None
+        Numbers that compiled terms would have to take to say how the motion changes; None where they do or cannot.
     """
 
     scene: Scene
@@ -141,6 +143,7 @@ class Prepared:
     tables: tuple[Any, ...]
     loop: Any
     varying: tuple[str, ...] = ()
+    changing: dict[str, BoolArray] | None = None
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Put the loop to a start, as if nothing had been before."""
@@ -215,12 +218,15 @@ def prepare(
     if law is not None and not gives_tau(law):
         actuation.require_transmission(start.at)
     formulation, labels = _formulation(mechanism, scene.spec, np.diagonal(D_tree)), tuple[str, ...]()
+    changing: dict[str, BoolArray] | None = None
     terms = scene.spec.solver.terms
     if parameters:
         varying = varying_of(mechanism, scene, controller, actuation, parameters)
         require_known_motion(mechanism, scene, controller, varying)
         require_movable(mechanism, scene.spec.parameters, varying, partial(_built, scene))
-        library, directions = changing_library(mechanism, terms, varying)
+        changing, directions = directions_of(mechanism, varying) or (None, None)
+        library = changing_library(mechanism, terms, changing)
+        changing = changing if library is None else None
         formulation["variation"] = variation_table(
             mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=compensated_at(mechanism, controller),
@@ -235,7 +241,9 @@ def prepare(
     )
     loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
-    return Prepared(scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop, labels)
+    return Prepared(
+        scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop, labels, changing
+    )
 
 
 def output_instants(scene: Scene) -> Array:

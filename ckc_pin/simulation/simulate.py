@@ -147,7 +147,7 @@ def _drive(
     loop, solver, t_end = ready.loop, ready.scene.spec.solver, ready.scene.spec.t_end
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
     n, shown, filled = ready.mechanism.n, 0, 0
-    may_compile = solver.terms == "auto" and loop.stats()["terms"] == "pinocchio"
+    may_compile = solver.terms == "auto" and (loop.stats()["terms"] == "pinocchio" or ready.changing is not None)
     loop.pause_at(REPAYS if may_compile else NEVER)
     try:
         while True:
@@ -187,7 +187,7 @@ def _drive(
 def _compile(ready: Prepared) -> None:
     """Give the loop terms that are written out, where they can be."""
     with suppress(InputError):  # too many coordinates, no CasADi, no compiler: it goes on as it is
-        library = compiled(ready.mechanism)
+        library = compiled(ready.mechanism, ready.changing, changes=ready.changing is not None)
         ready.loop.write((library.path, library.parameters))
 
 

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from ckc_pin import InputError, LinearModel, Mechanism, NumericalError, linearize, load, simulate, terms
 from ckc_pin.dynamics import Terms, dae_acceleration, multipliers, reduced_acceleration
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.library import shipped
+from ckc_pin.mechanism.library import mechanism_file, shipped
 from ckc_pin.native.plant import Plant
 from ckc_pin.simulation.linear_model import linear_model
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
@@ -316,6 +316,19 @@ def test_a_singular_configuration_is_refused() -> None:
     state = Terms(mechanism, mechanism.kinematics(np.zeros(mechanism.n)), np.zeros(mechanism.n))
     with pytest.raises(NumericalError, match="J has lost rank"):
         linear_model(state, np.zeros(1), at="there")
+
+
+def test_a_fold_that_is_only_met_to_half_of_its_digits_is_refused(tmp_path: Path) -> None:
+    """At a dead centre the slider does not say how crank and rod stand."""
+    there = mechanism_file("slider_crank").parent
+    for file in there.iterdir():
+        text = file.read_text(encoding="utf-8").replace('independent = ["crank"]', 'independent = ["slider"]')
+        (tmp_path / file.name).write_text(text, encoding="utf-8")
+    mechanism = load(tmp_path / "mechanism.toml")
+    for off in (0.0, 1e-13):
+        with pytest.raises(NumericalError, match=r"slider = 0\.4 is singular.*crank, rod, slider"):
+            linearize(mechanism, {"slider": 0.4 - off})
+    assert linearize(mechanism, {"slider": 0.39}).states == ("slider", "slider_dot")
 
 
 def test_an_instant_of_a_run_is_its_state() -> None:

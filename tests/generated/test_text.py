@@ -14,7 +14,7 @@ import pytest
 
 from ckc_pin import load
 from ckc_pin.generated.branches import alike_branches
-from ckc_pin.generated.code import functions
+from ckc_pin.generated.code import TOGETHER, functions, source
 from ckc_pin.generated.graph import Graph, lanes
 from ckc_pin.generated.library import FLAGS
 from ckc_pin.generated.text import text
@@ -93,3 +93,21 @@ def test_the_deltas_arms_are_done_together() -> None:
     acceleration = functions(mechanism)["acceleration"]
     written = text([acceleration], alike_branches(mechanism.tree))
     assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.7 * acceleration.n_instructions()
+
+
+def test_changes_along_several_directions_are_done_together() -> None:
+    """All of it: what does not depend on the direction is known from the state."""
+    mechanism = load("five_bar")
+    found = functions(mechanism, changes=True)
+    change = {name: found[name] for name in ("change",)}
+    packed = re.findall(r"\bp\d+=", source(change, mechanism.tree))
+    kept = {cs.OP_INPUT, cs.OP_OUTPUT, cs.OP_CONST}
+    done = [k for k in range(found["change"].n_instructions()) if found["change"].instruction_id(k) not in kept]
+    assert len(packed) * TOGETHER == len(done)
+
+
+def test_of_a_state_the_deltas_arms_are_done_together() -> None:
+    mechanism = load("delta")
+    state = functions(mechanism, changes=True)["state"]
+    written = source({"state": state}, mechanism.tree)
+    assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.6 * state.n_instructions()

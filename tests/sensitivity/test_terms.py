@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ckc_pin import simulate
+from ckc_pin import load, simulate
+from ckc_pin.generated.library import compiled
 from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import TIGHT, written
 from tests.sensitivity.spatial import arms, tethered
@@ -60,6 +62,21 @@ def test_of_every_kind_of_number(formulation: str, tmp_path: Path) -> None:
     counts = other.run.stats["changes_by_terms"]
     assert counts["generated"] == 0
     assert 0 < counts["pinocchio"] <= other.run.stats["rhs"]
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_terms_that_are_compiled_on_the_way(there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Say from there on how the motion changes, also where those of the motion alone were compiled before."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(sys.modules["ckc_pin.simulation.simulate"], "REPAYS", 300)
+    scene, names = written(tmp_path), ["link.crank.mass", "joint.b.armature", "initial.q.a"]
+    if there:
+        compiled(load(tmp_path / "bars.toml"))
+    found = sensitivities(scene, names, {**TIGHT, "solver.terms": "auto"})
+    same(found, sensitivities(scene, names, {**TIGHT, "solver.terms": "pinocchio"}))
+    counts = found.run.stats["changes_by_terms"]
+    assert 300 <= counts["pinocchio"] < 330  # up to the end of a step
+    assert counts["generated"] > counts["pinocchio"]
 
 
 def test_in_space_and_of_gears(tmp_path: Path) -> None:

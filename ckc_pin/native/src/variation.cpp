@@ -25,6 +25,13 @@ Variation::Variation(System& system, VariationTable table)
   q_.setZero(tree_.nq), v_.setZero(tree_.n), a_.setZero(tree_.n), of_tree_.setZero(tree_.n);
   back_.setZero(n), delay_.setZero(count), acting_.setZero(n), lacking_.setZero(n), lambda_.setZero(m);
   move_.setZero(core_.tree.nq), force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
+  changed_.setZero(Written::lanes, n);
+  for (int first = 0; first < count; first += Written::lanes) {
+    const int here = std::min(count - first, Written::lanes);
+    Matrix& along = directions_.emplace_back(Matrix::Zero(Written::lanes, core_.tree.nq + 2 * n + table_.directions.rows()));
+    along.block(0, along.cols() - table_.directions.rows(), here, table_.directions.rows()) =
+        table_.directions.middleCols(first, here).transpose();
+  }
   for (const Parameter& of : table_.parameters)
     acting_varies_ |= std::any_of(of.effects.begin(), of.effects.end(), is_acting);
 }
@@ -101,7 +108,12 @@ bool Variation::start(In v, Matrix& s) {
 
 bool Variation::what_acts(In v) {
   Joints& joints = core_.joints;
-  if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_)) return false;
+  const Control& control = system_.control;
+  answers_ = control.feedback() || joints.acts();
+  if (!answers_ && !control.acts())
+    acting_ = control.u_tree;
+  else if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_))
+    return false;
   if (joints.acts()) {
     joints.add_friction(v, acting_);
     back_.setZero(), joints.add_slopes(v, back_);
@@ -109,6 +121,12 @@ bool Variation::what_acts(In v) {
   }
   for (size_t i = 0; i < joints.locked.size(); ++i) acting_(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
   return true;
+}
+
+// What acts, where it answers to the state.
+void Variation::add_answer(const Matrix& s) {
+  force_.noalias() += u_by_q_ * s.topRows(n);
+  force_.noalias() += u_by_v_ * s.bottomRows(n);
 }
 
 void Variation::add_back(Matrix& change) {
@@ -129,8 +147,7 @@ bool Variation::rates(In v, In a, const Matrix& s, Matrix& s_dot) {
   add_acting(core_.q_tree, v, force_);
   add_state(s);
   force_ = -force_;
-  force_.noalias() += u_by_q_ * s.topRows(n);
-  force_.noalias() += u_by_v_ * s.bottomRows(n);
+  if (answers_) add_answer(s);
   if (!core_.respond(force_, row_, change_)) return false;
   if (locked) {
     if (!core_.responses(core_.joints.locked, responses_)) return false;
@@ -150,18 +167,21 @@ bool Variation::written_rates(In q_tree, In v, const Matrix& s, Matrix& s_dot) {
   if (!what_acts(v) || !core_.written->state(q_tree, v, acting_)) return false;
   ++written;
   force_.setZero();
-  if (acting_varies_ || compensated_.size()) add_acting(q_tree, v, force_);
-  if (system_.control.feedback() || core_.joints.acts()) {
-    force_ = -force_;
-    force_.noalias() += u_by_q_ * s.topRows(n);
-    force_.noalias() += u_by_v_ * s.bottomRows(n);
-  } else if (acting_varies_) {
-    force_ = -force_;
-  }
+  if (answers_ || acting_varies_) add_acting(q_tree, v, force_), force_ = -force_;
+  if (answers_) add_answer(s);
   move(v, s, s_dot);
-  for (int p = 0; p < count; ++p) {
-    core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
-    core_.written->change(move_, s.col(p).tail(n), force_.col(p), table_.directions.col(p), s_dot.col(p).tail(n));
+  const int nq = core_.tree.nq;
+  for (size_t i = 0; i < directions_.size(); ++i) {
+    Matrix& along = directions_[i];
+    const int first = static_cast<int>(i) * Written::lanes, last = std::min(count, first + Written::lanes);
+    for (int p = first; p < last; ++p) {
+      core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
+      for (int k = 0; k < nq; ++k) along(p - first, k) = move_(k);
+      for (int k = 0; k < n; ++k) along(p - first, nq + k) = s(n + k, p), along(p - first, nq + n + k) = force_(k, p);
+    }
+    core_.written->change(along, changed_);
+    for (int p = first; p < last; ++p)
+      for (int k = 0; k < n; ++k) s_dot(n + k, p) = changed_(p - first, k);
   }
   if (locked) {
     if (!core_.responses(core_.joints.locked, responses_)) return false;

@@ -79,7 +79,8 @@ class Variation {
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
   void move(In v, const Matrix& s, Matrix& s_dot) const;  // the places' part of the rates
-  bool what_acts(In v);  // acting_, and its slopes
+  bool what_acts(In v);  // acting_, and its slopes where it answers_
+  void add_answer(const Matrix& s);  // to force_
   void add_back(Matrix& change);  // what holds the joints that are locked
   // What each parameter adds to the forces that are lacking, and to J a; `impulsive` as there.
   void add_parameters(In v, In a, In lambda, bool impulsive, Matrix& force, Matrix& row);
@@ -104,7 +105,10 @@ class Variation {
   Tree tree_;
   Derivatives derivatives_;
   bool acting_varies_ = false;  // some effect is of what acts
+  bool answers_ = false;        // what acts changes with the state
   Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_;
+  std::vector<Matrix> directions_;  // for the code that is written out, as many rows each as it takes at a time
+  Matrix changed_;
   Vector acting_, back_, move_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };

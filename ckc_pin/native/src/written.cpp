@@ -9,7 +9,8 @@ namespace ckc {
 Written::Written(const std::string& path, In parameters) : library_(dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL)) {
   if (!library_) throw std::runtime_error(dlerror());
   try {
-    if (size("numbers_sparsity_in") != parameters.size()) throw std::runtime_error(path + ": of another mechanism");
+    taken_ = size("numbers_sparsity_in");
+    if (taken_ != parameters.size()) throw std::runtime_error(path + ": of another mechanism");
     numbers_.setZero(size("numbers_sparsity_out"));
     given_ = code("numbers", 1);
     vary(parameters);
@@ -17,8 +18,8 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     jacobian_rate_ = code("jacobian_rate", 4), rest_ = code("rest", 3), coriolis_ = perhaps("coriolis", 5);
     potential_energy_ = code("potential_energy", 3), acceleration_ = code("acceleration", 6);
     closing_step_ = code("closing_step", 4), jacobian_ = perhaps("jacobian", 5);
-    state_ = perhaps("state", 5), change_ = perhaps("change", 5);
-    if (state_) at_.setZero(size("state_sparsity_out")), acceleration_at_.setZero(size("change_sparsity_out"));
+    state_ = perhaps("state", 5), change_ = perhaps("change", 2);
+    if (state_) at_.setZero(size("state_sparsity_out")), acceleration_at_.setZero(size("change_sparsity_out") / lanes);
   } catch (...) {
     dlclose(library_);
     throw;
@@ -108,8 +109,8 @@ bool Written::state(In q, In v, In u_tree) const {
   return sound_ = sound > 0.0;
 }
 
-void Written::change(In q, In v, In u_tree, In arguments, Out acceleration) const {
-  const double* from[] = {at_.data(), q.data(), v.data(), u_tree.data(), arguments.data()};
+void Written::change(const Matrix& directions, Matrix& acceleration) const {
+  const double* from[] = {at_.data(), directions.data()};
   double* to[] = {acceleration.data()};
   change_(from, to, nullptr, nullptr, 0);
 }

@@ -15,7 +15,7 @@ class Written {
   Written(const Written&) = delete;
 
   void vary(In parameters);  // other numbers
-  long long parameters() const { return size("numbers_sparsity_in"); }
+  long long parameters() const { return taken_; }
 
   void place(In q, Out phi, Matrix& J) const;
   void inertia(In q, Matrix& D_tree) const;
@@ -28,11 +28,12 @@ class Written {
   double potential_energy(In q) const;
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // How that changes: at a state, and then along any direction; `arguments`: of what the library takes. Only of a library
-  // that was made for it. False as above, and none of the changes after that are known.
+  // How that changes: at a state, and then along any directions, as many at a time as there are lanes, a row each: of q',
+  // v', u' and what the library takes. Only of a library made for it. False as above, and no changes there are known.
+  static constexpr int lanes = 4;
   bool has_changes() const { return state_; }
   bool state(In q, In v, In u_tree) const;
-  void change(In q, In v, In u_tree, In arguments, Out acceleration) const;
+  void change(const Matrix& directions, Matrix& acceleration) const;  // (lanes, ...), (lanes, n)
   // The x with J x = -residual that is smallest in the metric of D'; false as above.
   bool closing_step(In q, In residual, Out x) const;
   // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
@@ -49,6 +50,7 @@ class Written {
   const double* trig(In q) const { return trig_.of(q); }
 
   void* library_;
+  long long taken_ = 0;  // parameters: to look a function up takes longer than to call it
   Vector numbers_;  // the parameters, and what follows from them alone
   mutable Trig trig_;
   mutable Vector q_, v_, u_, at_, acceleration_at_;  // the last state that changes were asked for, and what is known there
