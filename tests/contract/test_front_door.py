@@ -120,6 +120,8 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
         answer = ckc("new", "--", name)
         assert answer.code == 2
         assert "a name is of letters, digits, - and _" in answer.err
+    answer = ckc("new", "")
+    assert (answer.code, answer.err) == (2, "error: NAME is empty; give a name, as in: ckc new mine\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
     inside = ckc("new", str(tmp_path / "robots" / "arm-2"), "--json")
     assert len(inside.json["written"]) == 3
