@@ -20,13 +20,10 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 @click.command(epilog=options.examples("ckc new mine", "cd mine", "ckc run . --out first", "ckc play first"))
-@click.argument("given", metavar="NAME", type=click.Path(), help="Of the mechanism: a new folder.")
+@click.argument("folder", metavar="NAME", type=options.PATH, help="Of the mechanism: a new folder.")
 @options.as_json
-def new(given: str, as_json: bool) -> None:
+def new(folder: Path, as_json: bool) -> None:
     """Make a folder with a mechanism of one loop that runs. Its three files are commented: change them into yours."""
-    if not given:
-        raise InputError("NAME is empty; give a name, as in: ckc new mine")
-    folder = Path(given)
     name = folder.resolve().name if folder.name in ("", ".", "..") else folder.name
     if not NAME.fullmatch(name):
         raise InputError(f"{name!r}: a name is of letters, digits, - and _, and begins with a letter or a digit")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.kinds import is_number, require_kind, require_table
@@ -106,11 +106,5 @@ def _build(text: str, sources: Sources, changes: Changes | None) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    try:
+    with sources.naming():
         return assembled(spec, sources, changes)
-    except (InputError, MechanismError) as error:
-        if str(error).startswith(sources.name):
-            raise
-        raise type(error)(
-            f"{sources.name}: {error}"
-        ) from None  # what builds a part of it knows its table, not its file
