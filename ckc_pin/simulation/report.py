@@ -156,7 +156,7 @@ def _rows_of_jacobian(found: Terms) -> zip[tuple[Array, Array]]:
 
 
 def _row(values: Array) -> str:
-    return " ".join(f"{x:>14.8g}" for x in values)
+    return " ".join(f"{x + 0.0:>14.8g}" for x in values)
 
 
 def _plain_table(*titles: str) -> Table:
