@@ -173,10 +173,11 @@ def _tracking(group: Group) -> Figure:
 
 
 def _motion(group: Group) -> Figure:
-    """Without control: coordinates, rates, energy drift, closure residual."""
+    """Without control: coordinates, rates, change of energy, closure residual."""
     every = group.runs[0].coordinates
     names = every if len(every) <= ALL_MAX else group.independent
-    slots = _page(group, ["coordinates", "velocities", "energy drift", "closure residual"])
+    damped = group.mechanism.springs.any_damping or group.runs[0].dissipated is not None
+    slots = _page(group, ["coordinates", "velocities", f"energy {'change' if damped else 'drift'}", "closure residual"])
     panels.coordinates(slots[0], group, names)
     panels.rates(slots[1], group, names)
     drift = max(float(np.abs(run.energy - run.energy[0]).max()) for run in group.runs)
