@@ -56,6 +56,14 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "simulate a run": (lambda: simulate(run()), "simulate: scene: a Run was given"),
     "changes as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: changes: 't_end=1' was given"),
     "changes by number": (lambda: simulate(SWING, {3: 4}), "changes, a key: 3 was given; it takes a table"),
+    "progress of nothing": (
+        lambda: simulate(SWING, SHORT, progress=lambda: None),
+        r"simulate: progress: a function of other arguments was given; it takes a function of \(t, t_end\)",
+    ),
+    "a trajectory of nothing": (
+        lambda: Tracking(1.0, 1.0, lambda: 0),
+        "Tracking: desired: a function of other arguments was given; it takes a function of t that returns q_d",
+    ),
     "a word for a state": (
         lambda: ckc_pin.as_ivp(SWING).f(0.0, "rest"),
         "as_ivp: y: 'rest' was given; it takes 8 numbers, as y0 has",
