@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.simulation.ensembles.store import units_beside
+from ckc_pin.simulation.ensembles.store import array_name, units_beside
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, say, write
 from ckc_pin.view.labels import plain, symbol, with_unit
@@ -34,7 +35,8 @@ def draw(results: xr.Dataset, out: Path) -> list[Path]:
         matplotlib is not installed.
     """
     paths = []
-    variables = [str(name) for name, x in results.data_vars.items() if x.attrs.get("is") == "variable"]
+    named = json.loads(results.attrs["sweep"])["variables"]  # in the order that they are given in; a store has none
+    variables = [array_name(name) for name in named]
     for name, x in results.data_vars.items():
         if x.attrs.get("is") != "output":
             continue

@@ -188,4 +188,7 @@ def test_figures_have_units_on_their_axes(scene: Path, tmp_path: Path, monkeypat
         "spring.0.stiffness (N/m)",
     ]
     assert over.axes[1].get_ylabel() == "way (m)"
+    turned = ckc_pin.ensemble(scene, dict(reversed(VARIABLES.items())), {"way": OUTPUTS["way"]}, progress=False)
+    ensemble_figures.draw(turned, tmp_path)
+    assert figures["way"].axes[0].get_xlabel() == "spring.0.stiffness (N/m)", "the variable that is named first"
     assert np.all(np.isfinite(over.axes[0].collections[0].get_array()))
