@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,7 +21,18 @@ __all__ = ["PATH", "as_json", "changes", "check_speed", "complete_scenes", "exam
            "open_browser", "out", "overwrite", "port", "require_folder", "runs"]  # fmt: skip
 
 
-PATH = click.Path(path_type=Path)
+class _Path(click.Path):
+    """A path; an empty one, as of a variable that is not set, is none, and not the folder where one is."""
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
+        """Return the path (InputError where it is empty)."""
+        if value == "" and parameter is not None:
+            name = parameter.opts[0] if isinstance(parameter, click.Option) else parameter.metavar
+            raise InputError(f"{name} is empty; give a name")
+        return super().convert(value, parameter, context)
+
+
+PATH = _Path(path_type=Path)
 
 
 def complete_mechanisms(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -25,7 +25,7 @@ EPILOG = options.examples(
 
 
 @click.command("sweep", epilog=EPILOG)
-@click.argument("file", metavar="FILE", type=Path, help="A *.sweep.toml: a scene, its variables, what is kept.")
+@click.argument("file", metavar="FILE", type=options.PATH, help="A *.sweep.toml: a scene, its variables, what is kept.")
 @click.option(
     "--out", type=Path, required=True, metavar="DIR", help="Gets results.zarr; what is there is gone on with."
 )

@@ -19,7 +19,7 @@ from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.kinds import a_kind, require_kind
+from ckc_pin.mechanism.kinds import a_kind, require_callable, require_kind, takes_arguments
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
@@ -79,23 +79,13 @@ def as_controller(given: Any) -> Controller | TorqueController:
     for name in own or [""]:
         law = getattr(given, name) if name else given
         called = name or getattr(given, "__name__", type(given).__name__)
-        if not _takes_two(law):
+        if not takes_arguments(law, 2):
             raise InputError(
                 f"controller: {called}({', '.join(signature(law).parameters)}) was given; it must take (t, terms)"
             )
     found: Controller | TorqueController = given if own else FunctionController(given)
     gives_tau(found)
     return found
-
-
-def _takes_two(law: Callable[..., Any]) -> bool:
-    try:
-        signature(law).bind(0.0, None)
-    except TypeError:
-        return False
-    except ValueError:  # of some builtins it is not known
-        pass
-    return True
 
 
 def gives_tau(controller: Controller | TorqueController) -> bool:
@@ -261,8 +251,9 @@ class Tracking:
 def _dimension(desired: Any) -> int:
     """Return how many coordinates a trajectory is of; refuse what is none."""
     takes = "a function of t that returns q_d, its rate and its acceleration, each of shape (d,)"
-    if not callable(desired) or isinstance(desired, type):
+    if desired is None or isinstance(desired, type):
         raise InputError(f"Tracking: desired: {a_kind(desired)} was given; it takes {takes}")
+    require_callable(desired, "Tracking: desired", takes, 1)
     at_start = desired(0.0)
     shapes = [np.shape(part) for part in at_start] if isinstance(at_start, tuple | list | np.ndarray) else []
     if len(shapes) != 3 or len(set(shapes)) != 1 or len(shapes[0]) != 1:

@@ -106,4 +106,5 @@ def _build(text: str, sources: Sources, changes: Changes | None) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    return assembled(spec, sources, changes)
+    with sources.naming():
+        return assembled(spec, sources, changes)

@@ -22,6 +22,10 @@ def findings(mechanism: Mechanism) -> list[str]:
     for k, spring in enumerate(mechanism.spec.spring):
         if not spring.stiffness and not spring.damping:
             says.append(f"spring {k + 1} does nothing: it has neither stiffness nor damping")
+        elif spring.frame_a is not None and spring.frame_b is not None:
+            ends = [mechanism.frames.find(frame, f"spring {k + 1}").joint for frame in (spring.frame_a, spring.frame_b)]
+            if ends[0] == ends[1]:
+                says.append(f"spring {k + 1} does nothing: its frames move together (the same rigid body)")
     if far := _far_from_guess(mechanism):
         says.append(
             f"assembled more than {FAR:g} rad, or {FAR:g} of the size {mechanism.size:.3g} m, from q_guess: "

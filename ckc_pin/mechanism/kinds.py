@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from inspect import signature
 from os import PathLike
 from typing import Any
 
@@ -10,7 +11,16 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 
-__all__ = ["a_kind", "is_number", "require_callable", "require_flag", "require_kind", "require_path", "require_table"]
+__all__ = [
+    "a_kind",
+    "is_number",
+    "require_callable",
+    "require_flag",
+    "require_kind",
+    "require_path",
+    "require_table",
+    "takes_arguments",
+]
 
 PLAIN = (int, float, complex, str, bytes, type(None), np.generic)  # shown as they are; of the rest their kind
 MOST = 80  # characters of a value that is shown
@@ -60,8 +70,19 @@ def require_table(given: Any, what: str, takes: str) -> None:
         require_kind(key, str, f"{what}, a key", takes)
 
 
-def require_callable(given: Any, what: str, takes: str) -> None:
-    """Refuse what cannot be called and is not absent.
+def takes_arguments(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function can be called with so many arguments."""
+    try:
+        signature(function).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:  # of some builtins it is not known
+        pass
+    return True
+
+
+def require_callable(given: Any, what: str, takes: str, count: int = 2) -> None:
+    """Refuse what cannot be called with so many arguments and is not absent.
 
     Raises
     ------
@@ -70,6 +91,8 @@ def require_callable(given: Any, what: str, takes: str) -> None:
     """
     if given is not None and not callable(given):
         raise InputError(f"{what}: {a_kind(given)} was given; it takes {takes}")
+    if given is not None and not takes_arguments(given, count):
+        raise InputError(f"{what}: a function of other arguments was given; it takes {takes}")
 
 
 def require_flag(given: Any, what: str) -> None:

@@ -16,17 +16,12 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["CONSTRAINED_IN_PART", "Mechanism", "efforts"]
+__all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
 CONSTRAINED_IN_PART = (
     "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
     '(at = "assembled"), runs as a DAE (formulation = "dae"), and has no controller'
 )
-
-
-def efforts(lengths: set[bool]) -> str:
-    """Return the unit of forces along lengths, angles, or both."""
-    return " or ".join(["N m"] * (False in lengths) + ["N"] * (True in lengths)) or "N m"
 
 
 class Mechanism(Shown):
@@ -127,12 +122,6 @@ class Mechanism(Shown):
     def driven_directly(self) -> bool:
         """Whether the motors turn the independent joints themselves, so that tau is u of eq. 6."""
         return np.array_equal(self.motors.turns, np.eye(self.n)[self.partition.q])
-
-    @property
-    def effort_unit(self) -> str:
-        """The unit of the motors' torques, forces, or both."""
-        lengths, turns = self.tree.in_metres, self.motors.turns != 0
-        return efforts({bool(np.all(lengths[row])) for row in turns})
 
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from os.path import lexists
 from pathlib import Path
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.toml import read_text
 from ckc_pin.mechanism.whole_file import write_whole
 
@@ -33,6 +34,16 @@ class Sources:
         self.name = name
         self.folder = folder
         self.texts = dict(texts or {})
+
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """Have messages begin with the file: what reads a part of it knows its table alone."""
+        try:
+            yield
+        except (InputError, MechanismError) as error:
+            if str(error).startswith(self.name):
+                raise
+            raise type(error)(f"{self.name}: {error}") from None
 
     def text(self, file: str) -> str:
         """Return a file's text.

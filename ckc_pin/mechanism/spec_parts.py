@@ -94,7 +94,7 @@ class ForceSpec(FileStruct, frozen=True):
 
 
 class JointSpec(FileStruct, frozen=True):
-    """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s (N s/m).
+    """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s/rad (N s/m).
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class JointSpec(FileStruct, frozen=True):
     armature : kg m², kg
         Inertia of a rotor, reflected through its gear; on the diagonal of D'; absent: none.
         ``armature = 0.02``
-    damping : N m s, N s/m
+    damping : N m s/rad, N s/m
         Viscous friction; absent: the URDF's.
         ``damping = 0.1``
     friction : N m, N

@@ -33,6 +33,8 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
     InputError
         It cannot be written.
     """
+    if not path.name:
+        raise InputError(f"{path}: a folder, not the name of a file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _clear(path)

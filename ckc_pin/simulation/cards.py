@@ -14,9 +14,11 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.generated.library import too_large
 from ckc_pin.mechanism.card import Card, Row, quantities
 from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.mechanism import Mechanism, efforts
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import joined
 from ckc_pin.simulation.linear_report import stability_text
+from ckc_pin.simulation.units import quantity_units
 
 if TYPE_CHECKING:
     from ckc_pin.simulation.check import Check
@@ -248,8 +250,8 @@ def _count(number: int, what: str) -> str:
 
 def _efforts(mechanism: Mechanism) -> tuple[str, str]:
     """Return the units of u and of tau."""
-    along = set(mechanism.tree.in_metres[mechanism.partition.q].tolist())
-    return f" {efforts(along)}", f" {mechanism.effort_unit}"
+    units = quantity_units(mechanism)
+    return f" {joined(units['u'])}", f" {joined(units['tau'])}"
 
 
 def _largest(values: Array) -> float:

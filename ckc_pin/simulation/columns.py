@@ -9,6 +9,8 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import joined
+from ckc_pin.simulation.units import quantity_units
 
 if TYPE_CHECKING:
     from ckc_pin.simulation.run import Run
@@ -85,16 +87,18 @@ def as_dataset(run: Run) -> Any:
         import xarray
     except ModuleNotFoundError:
         raise InputError("to_xarray needs xarray: pip install 'ckc_pin[data]'") from None
-    tree, q = run.mechanism.tree, run.mechanism.partition.q
+    units = quantity_units(run.mechanism)
     along = {
-        "q_tree": ("coordinate", run.q_tree, "rad or m"),
-        "v_tree": ("coordinate", run.v_tree, "rad/s or m/s"),
-        "u": ("independent", run.u, "N m or N"),
-        "tau": ("motor", run.tau, "N m or N"),
-        "phi": ("row", run.phi, "m or rad"),
-        "w": ("row", run.w, "m or rad"),
+        "q_tree": ("coordinate", run.q_tree),
+        "v_tree": ("coordinate", run.v_tree),
+        "u": ("independent", run.u),
+        "tau": ("motor", run.tau),
+        "phi": ("row", run.phi),
+        "w": ("row", run.w),
     }
-    data: dict[str, Any] = {name: (("t", by), values, {"units": unit}) for name, (by, values, unit) in along.items()}
+    data: dict[str, Any] = {
+        name: (("t", by), values, {"units": joined(units[name])}) for name, (by, values) in along.items()
+    }
     data |= {name: ("t", getattr(run, name), {"units": "J"}) for name in BY_TIME if getattr(run, name) is not None}
     places: dict[str, Any] = {
         "t": ("t", run.t, {"units": "s"}),
@@ -102,8 +106,10 @@ def as_dataset(run: Run) -> Any:
         "independent": list(run.independent),
         "motor": list(run.actuated),
         "row": _rows(run),
-        "unit": ("coordinate", tree.units()),
-        "independent_unit": ("independent", [tree.units()[k] for k in q]),
+        "unit": ("coordinate", units["q_tree"]),
+        "independent_unit": ("independent", units["error"]),
+        "motor_unit": ("motor", units["tau"]),
+        "row_unit": ("row", units["phi"]),
     }
     if run.points:
         data["points"] = (("point", "t", "axis"), np.array(list(run.points.values())), {"units": "m"})

@@ -14,6 +14,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene_spec import InitialSpec
 
 __all__ = ["Start", "branch", "find_start"]
 
@@ -41,7 +42,11 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
     NumericalError
         A start that is singular.
     """
-    initial = scene.spec.initial
+    with scene.sources.naming():
+        return _find(mechanism, scene.spec.initial)
+
+
+def _find(mechanism: Mechanism, initial: InitialSpec) -> Start:
     rows = mechanism.closure.rows
     w = np.zeros(rows)
     if initial.w is not None:
@@ -55,6 +60,13 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
         if mechanism.splits_root and not np.any(w):
             return Start(at, q_dot, w)
         return Start(_close(mechanism, mechanism.independent_part(at.q_tree), at, w), q_dot, w)
+    lacking = [name for name in mechanism.independent if name not in initial.q]
+    if lacking and mechanism.spec.independent is None:
+        needed, file = ", ".join(mechanism.independent), mechanism.sources.name
+        raise InputError(
+            f"initial.q: {', '.join(lacking)} missing; needed are {needed}, which were chosen because {file} does not: "
+            "independent = [...] there says which it is to be"
+        )
     q = mechanism.vector(
         {k: x for k, x in initial.q.items() if k not in mechanism.dependent},
         mechanism.independent,

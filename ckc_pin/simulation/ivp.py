@@ -38,6 +38,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.chart import Chart
 from ckc_pin.kinematics.sigma import move
 from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
@@ -182,16 +183,19 @@ class LevelSet:
         return found.at
 
     def terms(self, t: float, y: Array) -> Terms:
+        y = _state(t, y, self.y0)
         at, q_dot = self.close(t, y[: self._d]), y[self._d :]
         if self._off:
             return spf_terms(self.mechanism, at, q_dot, self.epsilon, self.w(t), self.convention)
         return Terms(self.mechanism, at, at.rho @ q_dot)
 
     def velocity(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
         terms = self.terms(t, y)
         return _spf_velocity(terms, y[self._d :], self.epsilon, self.w(t)) if self._off else terms.v_tree
 
     def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
         try:
             terms, q_dot = self.terms(t, y), y[self._d :]
             actual = self._off and self.convention == "actual"
@@ -221,17 +225,19 @@ class PrintedSpf:
         self.y0 = np.concatenate([self.initial.q_tree[self._q], self.q_dot, self.initial.q_tree[self._z]])
 
     def terms(self, t: float, y: Array) -> Terms:
-        d, q_tree = self._d, np.empty(self.mechanism.tree.nq)
+        y, d, q_tree = _state(t, y, self.y0), self._d, np.empty(self.mechanism.tree.nq)
         q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
         at = self.mechanism.kinematics(q_tree)
         return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
 
     def velocity(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
         # with the exact w: what a tolerance leaves phi off by would be divided by epsilon
         w = self.w0 * np.exp(-t / self.epsilon)
         return _spf_velocity(self.terms(t, y), y[self._d : 2 * self._d], self.epsilon, w)
 
     def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
         if not np.all(np.isfinite(y)):
             return np.full_like(y, np.nan)
         terms, q_dot = self.terms(t, y), y[self._d : 2 * self._d]
@@ -258,14 +264,15 @@ class Dae:
         self.y0 = np.concatenate([self.initial.q_tree, self.v_tree])
 
     def terms(self, t: float, y: Array) -> Terms:
-        tree = self.mechanism.tree
+        y, tree = _state(t, y, self.y0), self.mechanism.tree
         q_tree = y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])
         return Terms(self.mechanism, self.mechanism.kinematics(q_tree), y[tree.nq :])
 
     def velocity(self, t: float, y: Array) -> Array:
-        return y[self.mechanism.tree.nq :]
+        return _state(t, y, self.y0)[self.mechanism.tree.nq :]
 
     def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
         if not np.all(np.isfinite(y)):
             return np.full_like(y, np.nan)
         terms = self.terms(t, y)
@@ -274,6 +281,19 @@ class Dae:
         except NumericalError:
             return np.full_like(y, np.nan)
         return np.concatenate([self.mechanism.tree.configuration_rate(terms.q_tree, terms.v_tree), acceleration])
+
+
+def _state(t: Any, y: Any, y0: Array) -> Array:
+    """Return a state as numbers (InputError where it, or t, is none)."""
+    if not is_number(t):
+        raise InputError(f"as_ivp: t: {a_kind(t)} was given; it takes a number, s")
+    try:
+        found = np.asarray(y, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"as_ivp: y: {a_kind(y)} was given; it takes {len(y0)} numbers, as y0 has") from None
+    if found.shape != y0.shape:
+        raise InputError(f"as_ivp: y: shape {found.shape} was given; it takes {len(y0)} numbers, as y0 has")
+    return found
 
 
 def _spf_velocity(terms: Terms, q_dot: Array, epsilon: float, w: Array) -> Array:

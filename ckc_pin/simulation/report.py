@@ -11,6 +11,7 @@ import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import motor_units
 from ckc_pin.simulation.check import Check
 from ckc_pin.simulation.linear_report import stability_plain
 from ckc_pin.simulation.run import Run
@@ -117,9 +118,7 @@ def inverse_table(found: MotionForces) -> Group:
         table.add_column(title, justify="right")
     beyond = {entry["motor"]: entry for entry in found.exceeded}
     table.add_column("limit")
-    lengths, turns = found.mechanism.tree.in_metres, found.mechanism.motors.turns != 0
-    for k, motor in enumerate(found.actuated):
-        unit = "N" if np.all(lengths[turns[k]]) else "N m"
+    for k, (motor, unit) in enumerate(zip(found.actuated, motor_units(found.mechanism), strict=True)):
         limit = found.limit[k]
         says = f"{limit:.4g} {unit}" if np.isfinite(limit) else ""
         if motor in beyond:
@@ -157,7 +156,7 @@ def _rows_of_jacobian(found: Terms) -> zip[tuple[Array, Array]]:
 
 
 def _row(values: Array) -> str:
-    return " ".join(f"{x:>14.8g}" for x in values)
+    return " ".join(f"{x + 0.0:>14.8g}" for x in values)
 
 
 def _plain_table(*titles: str) -> Table:

@@ -128,11 +128,19 @@ def _sticks(
 
 
 def _hidden_ball(mechanism: Mechanism, joint: int, drawn: set[int]) -> bool:
-    """Whether a joint's ball is at the same place, in every pose, as that of the body it is on: they would flicker."""
-    model = mechanism.tree.model
-    parent = model.parents[joint]
-    there = np.linalg.norm(model.jointPlacements[joint].translation) < 1e-9 * mechanism.size
-    return bool(there and parent and parent not in drawn and model.joints[joint].shortname().startswith("JointModelR"))
+    """Whether a hinge's ball is always where that of the body it is on is, or of another hinge: they would flicker."""
+    model, least = mechanism.tree.model, 1e-9 * mechanism.size
+    parent, at = model.parents[joint], model.jointPlacements[joint].translation
+    if not _is_hinge(mechanism, joint):
+        return False
+    if parent and parent not in drawn and np.linalg.norm(at) < least:
+        return True
+    beside = [k for k in range(1, joint) if model.parents[k] == parent and k not in drawn and _is_hinge(mechanism, k)]
+    return any(np.linalg.norm(model.jointPlacements[k].translation - at) < least for k in beside)
+
+
+def _is_hinge(mechanism: Mechanism, joint: int) -> bool:
+    return bool(mechanism.tree.model.joints[joint].shortname().startswith("JointModelR"))
 
 
 def _rail(stick: Stick, moved: Placements) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.mechanism.tree import Array, BoolArray
+from ckc_pin.simulation.ensembles.store import array_name, units_beside
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, say, write
 from ckc_pin.view.labels import plain, symbol, with_unit
@@ -33,7 +35,8 @@ def draw(results: xr.Dataset, out: Path) -> list[Path]:
         matplotlib is not installed.
     """
     paths = []
-    variables = [str(name) for name, x in results.data_vars.items() if x.attrs.get("is") == "variable"]
+    named = json.loads(results.attrs["sweep"])["variables"]  # in the order that they are given in; a store has none
+    variables = [array_name(name) for name in named]
     for name, x in results.data_vars.items():
         if x.attrs.get("is") != "output":
             continue
@@ -45,9 +48,11 @@ def draw(results: xr.Dataset, out: Path) -> list[Path]:
 
 
 def draw_fan(x: xr.DataArray, path: Path) -> Path:
-    """Draw quantiles over time, of each component one below the other, in the unit of its attribute `units`."""
+    """Draw quantiles over time, of each component one below the other, each in its unit."""
     values = x.to_numpy().reshape(x.sizes["member"], -1, x.sizes["time"])[:, :MOST_FANS]
     labels = [symbol(str(label)) for label in x[x.dims[1]].to_numpy()] if len(x.dims) > 2 else [plain(str(x.name))]
+    beside = x.coords.get(units_beside(str(x.name)))
+    units = [x.attrs.get("units", "")] * values.shape[1] if beside is None else beside.to_numpy().tolist()
     with look():
         figure, axes = _page((style.WIDTH, 0.9 + 1.3 * values.shape[1]), values.shape[1])
         t, blue = x["time"].to_numpy(), style.COLOURS[0]
@@ -57,7 +62,7 @@ def draw_fan(x: xr.DataArray, path: Path) -> Path:
             at.fill_between(t, bands[0], bands[4], alpha=0.2, color=blue, lw=0, label="5 to 95 %")
             at.fill_between(t, bands[1], bands[3], alpha=0.4, color=blue, lw=0, label="25 to 75 %")
             at.plot(t, bands[2], color=blue, lw=1.2, label="median")
-            at.set_ylabel(with_unit(labels[k], x.attrs.get("units", "")))
+            at.set_ylabel(with_unit(labels[k], units[k]))
         say(axes[0], f"{plain(str(x.name))} of {x.sizes['member']} members")
         axes[-1].set_xlabel(with_unit("$t$", "s"))
         fit_legend(figure, axes[0].get_legend_handles_labels()[0])

@@ -15,13 +15,14 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.kinds import require_path
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import joined, motor_units, row_units
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import panels, poses, style
 from ckc_pin.view.canvas import Slot, fit_legend, line, look, page, write
 from ckc_pin.view.desired import desired_along
 from ckc_pin.view.given_runs import given_runs
 from ckc_pin.view.group import Group
-from ckc_pin.view.labels import effort_units, plain, residual_units, symbol, with_unit
+from ckc_pin.view.labels import plain, symbol, with_unit
 from ckc_pin.view.skeleton import planes
 
 if TYPE_CHECKING:
@@ -172,10 +173,11 @@ def _tracking(group: Group) -> Figure:
 
 
 def _motion(group: Group) -> Figure:
-    """Without control: coordinates, rates, energy drift, closure residual."""
+    """Without control: coordinates, rates, change of energy, closure residual."""
     every = group.runs[0].coordinates
     names = every if len(every) <= ALL_MAX else group.independent
-    slots = _page(group, ["coordinates", "velocities", "energy drift", "closure residual"])
+    damped = group.mechanism.springs.any_damping or group.runs[0].dissipated is not None
+    slots = _page(group, ["coordinates", "velocities", f"energy {'change' if damped else 'drift'}", "closure residual"])
     panels.coordinates(slots[0], group, names)
     panels.rates(slots[1], group, names)
     drift = max(float(np.abs(run.energy - run.energy[0]).max()) for run in group.runs)
@@ -286,15 +288,14 @@ def _thin(figure: Figure, columns: int) -> None:
 
 
 def _efforts_title(group: Group) -> str:
-    units = {effort_units(group.mechanism, k) for k in range(len(group.runs[0].actuated))}
+    units = set(motor_units(group.mechanism))
     return "torques and forces" if len(units) > 1 else "forces" if units == {"N"} else "torques"
 
 
 def _peaks(group: Group) -> str:
     """Name the largest efforts, beside the paper's where it gives some."""
     sizes: dict[str, float] = {}
-    for k in range(len(group.runs[0].actuated)):
-        unit = effort_units(group.mechanism, k)
+    for k, unit in enumerate(motor_units(group.mechanism)):
         sizes[unit] = max(sizes.get(unit, 0.0), *(float(np.abs(run.tau[:, k]).max()) for run in group.runs))
     name = panels.effort_symbol(group)
     said = f"max $|{name}|$ = {', '.join(f'{size:.3g} {unit}' for unit, size in sizes.items())}"
@@ -310,7 +311,7 @@ def _residual(slot: Slot, group: Group) -> None:
         size = np.abs(run.phi - run.w).max(axis=1, initial=0.0)
         return np.where(size > 0, size, np.nan)  # zero has no logarithm
 
-    name = with_unit(r"max $|\varphi - w|$", residual_units(group.mechanism))
+    name = with_unit(r"max $|\varphi - w|$", joined(row_units(group.mechanism)) or "m")
     _logarithmic(panels.scalar(slot, group, residual, name, dots=True, cut=False))
 
 

@@ -12,7 +12,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.desired import DesiredPath
-from ckc_pin.view.labels import is_length, plain, run_labels
+from ckc_pin.view.labels import plain, run_labels
 
 __all__ = ["Group", "columns"]
 
@@ -86,7 +86,7 @@ class Group:
         """How far a coordinate goes, in radians or in the mechanism's size, or how hard a motor pushes."""
         run = self.runs[0]
         if name in run.coordinates:
-            unit = self.mechanism.size if is_length(self.mechanism, name) else 1.0
+            unit = float(self.mechanism.tree.reach[run.column(name)])
             return float(max(np.ptp(run.q_tree[:, run.column(name)]) for run in self.runs)) / unit
         return float(max(np.abs(run.tau[:, run.actuated.index(name)]).max() for run in self.runs))
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.mechanism.units import motor_units
 from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, note_on, page, write
-from ckc_pin.view.labels import effort_units, plain, symbol, with_unit
+from ckc_pin.view.labels import plain, symbol, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +35,7 @@ def save_inverse(found: MotionForces, folder: Path) -> list[Path]:
 def draw_inverse(found: MotionForces) -> Figure:
     """Return the figure: efforts over time, the sizes of loop forces below (InputError where matplotlib is missing)."""
     with look():
-        unit = [effort_units(found.mechanism, k) for k in range(len(found.actuated))]
+        unit = motor_units(found.mechanism)
         kinds = list(dict.fromkeys(unit))
         titles = ["motors", "forces that the loops transmit"]
         efforts, loops = page(f"{plain(found.name)}: what the motion asks for", "", titles, 1, (style.WIDTH, 2.4))

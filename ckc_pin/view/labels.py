@@ -6,12 +6,9 @@ import math
 import re
 from collections.abc import Sequence
 
-import numpy as np
-
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.run import Run
 
-__all__ = ["effort_units", "is_length", "plain", "rate_symbol", "residual_units", "run_labels", "symbol", "with_unit"]
+__all__ = ["plain", "rate_symbol", "run_labels", "symbol", "with_unit"]
 
 GREEK = (
     "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
@@ -50,28 +47,9 @@ def plain(name: str) -> str:
     return rf"$\_${shown[1:]}" if shown.startswith("_") else shown
 
 
-def is_length(mechanism: Mechanism, coordinate: str) -> bool:
-    """Whether a coordinate is a length (a slide, a free root's position) and not an angle."""
-    if coordinate in mechanism.tree.free_coordinates:
-        return not coordinate.rpartition(".")[2].startswith("r")
-    _, jacobian = mechanism.tree.kinematics(mechanism.q_tree)
-    return not np.any(jacobian[3:, mechanism.tree.index[coordinate]])
-
-
 def with_unit(name: str, unit: str) -> str:
     """Return what an axis shows, and in what: θ (rad). One notation for every figure."""
     return f"{name} ({unit})" if unit else name
-
-
-def residual_units(mechanism: Mechanism) -> str:
-    """Return the unit of the rows of phi, or both."""
-    return " or ".join(["m"] * (True in (rows := set(mechanism.closure.in_metres(mechanism.tree).tolist())))
-                       + ["rad"] * (False in rows)) or "m"  # fmt: skip
-
-
-def effort_units(mechanism: Mechanism, motor: int) -> str:
-    """Return the unit of what a motor gives: "N" where it pushes slides alone, "N m" otherwise."""
-    return "N" if np.all(mechanism.tree.in_metres[mechanism.motors.turns[motor] != 0]) else "N m"
 
 
 def run_labels(runs: Sequence[Run]) -> list[str]:

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import motor_units
 from ckc_pin.simulation.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.canvas import Slot, fit_legend, limit, line, note_on, say
 from ckc_pin.view.desired import DesiredPath
 from ckc_pin.view.group import Group, columns
-from ckc_pin.view.labels import effort_units, is_length, plain, rate_symbol, symbol, with_unit
+from ckc_pin.view.labels import plain, rate_symbol, symbol, with_unit
 
 __all__ = ["coordinates", "effort_symbol", "efforts", "errors", "loop_forces", "rates", "scalar", "unit_of"]
 
@@ -85,7 +86,8 @@ def errors(slot: Slot, group: Group, names: Sequence[str]) -> None:
 def efforts(slot: Slot, group: Group, names: Sequence[str], note: str = "") -> None:
     """Draw the motors' efforts over time; a short peak at either end is marked instead of flattening the rest."""
     run = group.runs[0]
-    kinds = _by_unit(names, lambda name: effort_units(group.mechanism, run.actuated.index(name)))
+    units = motor_units(group.mechanism)
+    kinds = _by_unit(names, lambda name: units[run.actuated.index(name)])
     for (unit, own), ax in zip(kinds.items(), slot.axes(len(kinds)), strict=True):
         _curves(ax, group, own, lambda run, name: run.tau[:, run.actuated.index(name)])
         rows = [run.actuated.index(name) for name in own]
@@ -153,7 +155,7 @@ def scalar(
 
 def unit_of(group: Group, name: str) -> str:
     """Return the unit of a coordinate."""
-    return "m" if is_length(group.mechanism, name) else "rad"
+    return group.mechanism.tree.units()[group.mechanism.tree.index[name]]
 
 
 # --- parts ---------------------------------------------------------------------------------------

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ckc_pin.mechanism.units import joined
 from ckc_pin.simulation.sensitivities import Sensitivities
+from ckc_pin.simulation.units import key_unit
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, look, write
 from ckc_pin.view.labels import plain, symbol, with_unit
@@ -60,8 +62,14 @@ def draw_sensitivities(found: Sensitivities) -> Figure:
             for name, k in zip(run.independent, at, strict=True):
                 ax.plot(found.t, found.q_tree[:, k, p], color=colours[name], label=symbol(name))
             ax.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-            ax.set(title=f"by {plain(found.parameters[p])}", ylabel=r"$\partial q / \partial p$")
+            unit = joined(_by(run.mechanism.tree.units()[k], key_unit(run.mechanism, found.parameters[p])) for k in at)
+            ax.set(title=f"by {plain(found.parameters[p])}", ylabel=with_unit(r"$\partial q / \partial p$", unit))
         if len(run.independent) <= NAMED:
             fit_legend(figure, axes[0].get_legend_handles_labels()[0])
         axes[-1].set_xlabel(with_unit("$t$", "s"))
         return figure
+
+
+def _by(unit: str, other: str) -> str:
+    """Return the unit of a derivative."""
+    return f"{unit}/({other})" if "/" in other or " " in other else f"{unit}/{other}" if other else unit

@@ -18,7 +18,8 @@ FINITE = "a finite number is needed"
 
 
 def _edit(what: str, old: str, new: str, *says: str) -> Bad:
-    return Bad(what, CHECK, says, {"mechanism.toml": (old, new)})
+    """Whatever is wrong in the file, the message begins with the file."""
+    return Bad(what, CHECK, (f"error: {NAMED}", *says), {"mechanism.toml": (old, new)})
 
 
 def _add(what: str, entry: str, *says: str) -> Bad:

@@ -143,6 +143,18 @@ def test_springs_that_do_nothing_are_named(bar: Path) -> None:
     assert warnings("bar") == ["spring 2 does nothing: it has neither stiffness nor damping"]
 
 
+def test_springs_within_one_body_are_named(bar: Path) -> None:
+    """Between links that a fixed joint makes one, or a link and a place on it; between two bodies they act."""
+    add(
+        bar,
+        '[[spring]]\nframe_a = "link_2"\nframe_b = "tip_left"\nstiffness = 1.0\n'
+        '[[spring]]\nframe_a = "world"\nframe_b = {link = "base", xyz = [0.0, 1.0, 0.0]}\ndamping = 1.0\n'
+        '[[spring]]\nframe_a = "base"\nframe_b = "tip_left"\nstiffness = 1.0',
+    )
+    says = "does nothing: its frames move together (the same rigid body)"
+    assert warnings("bar") == [f"spring 1 {says}", f"spring 2 {says}"]
+
+
 @pytest.mark.parametrize(("off", "is_far"), [(0.45, False), (-0.45, False), (0.55, True), (-0.55, True)])
 def test_an_assembly_far_from_the_guess_is_named(off: float, is_far: bool, bar: Path) -> None:
     """More than half a radian; a coordinate that the guess does not name has none to be far from."""

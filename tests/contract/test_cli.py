@@ -158,6 +158,7 @@ def test_terms_for_people() -> None:
     assert answer.code == 0
     for words in ("theta_4", "D_tree", "rho_dot", "phi_q | phi_z", "energy"):
         assert words in answer.out
+    assert "-0" not in answer.out.split(), "a zero has no sign"
 
 
 # --- run -------------------------------------------------------------------------------------------

@@ -20,6 +20,14 @@ def stewart() -> ckc_pin.Run:
     return ckc_pin.simulate("stewart", {"t_end": 0.1})
 
 
+@pytest.mark.parametrize(("damping", "title"), [(0.0, "energy drift"), (0.1, "energy change")])
+def test_what_dampers_take_is_no_drift(damping, title):
+    """Drift is what an integrator does to an energy that should stay."""
+    run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, "joint.crank.damping": damping})
+    titles = [ax.get_title("left") for ax in draw(run)["motion"].axes]
+    assert [said for said in titles if "energy" in said] == [f"c)  {title}"]
+
+
 def test_six_coordinates_have_a_colour_of_their_own_and_each_a_panel(stewart):
     figures = draw(stewart)
     assert list(figures) == ["motion", "motion_snapshots", "motion_coordinates"]

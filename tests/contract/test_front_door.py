@@ -120,10 +120,55 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
         answer = ckc("new", "--", name)
         assert answer.code == 2
         assert "a name is of letters, digits, - and _" in answer.err
+    answer = ckc("new", "")
+    assert (answer.code, answer.err) == (2, "error: NAME is empty; give a name\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
     inside = ckc("new", str(tmp_path / "robots" / "arm-2"), "--json")
     assert len(inside.json["written"]) == 3
     assert load(tmp_path / "robots" / "arm-2").name == "arm-2"
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["run", "five_bar/swing", "--set", "t_end=0.01", "--out", ""], "--out"),
+        (["export", "five_bar", "--to", "mjcf", "--out", ""], "--out"),
+        (["play", ""], "RUN..."),
+        (["plot", ""], "RUN..."),
+        (["sweep", "", "--out", "o"], "FILE"),
+        (["import", ""], "FILE"),
+    ],
+)
+def test_an_empty_path_is_not_the_current_folder(
+    words: list[str], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = ckc(*words)
+    assert (answer.code, answer.err) == (2, f"error: {what} is empty; give a name\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    simulate("five_bar/swing", {"t_end": 0.01}).save("o")
+    answer = ckc("play", "o", "--html", ".")
+    assert (answer.code, answer.err) == (2, "error: .: a folder, not the name of a file\n")
+
+
+def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> None:
+    mechanism = mine / "mechanism.toml"
+    mechanism.write_text(mechanism.read_text().replace("independent =", "# independent ="))
+    (chosen,) = check(mechanism).independent
+    (mine / "own.scene.toml").write_text(
+        'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\n[initial.q]\n'
+    )
+    other = next(name for name in ("shoulder", "hip") if name != chosen)
+    answer = ckc("run", "mine/own", "--set", f"initial.q.{other}=1.2")
+    assert answer.code == 2
+    assert answer.err.startswith(
+        f"error: mine/own: initial.q: {chosen} missing; needed are {chosen}, which were chosen"
+    )
+    assert "because mine/mechanism.toml does not: independent = [...] there says" in answer.err
 
 
 def test_what_comes_next_can_be_typed_as_it_stands(tmp_path: Path) -> None:

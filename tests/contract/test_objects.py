@@ -188,6 +188,9 @@ def test_xarray_and_pandas_have_the_same_by_name(swing: Run) -> None:
     assert data.points.sel(point="tip", axis="y").to_numpy().tolist() == frame["tip.y"].tolist()
     assert data.attrs["scene"] == SWING
     slide = simulate("slider_crank", {"t_end": 0.01}).to_xarray()
+    assert slide.q_tree.attrs["units"] == "rad or m"
+    assert swing.to_xarray().q_tree.attrs["units"] == "rad"
+    assert slide.row_unit.to_numpy().tolist() == ["m", "m"]
     assert "m" in slide.unit.to_numpy().tolist()
     assert "rad" in slide.unit.to_numpy().tolist()
 

@@ -22,6 +22,7 @@ from tests.contract.sketches import (
     FACES,
     FOUR_BAR,
     FOUR_BAR_LOOP,
+    INERTIAL,
     START_OF_FOUR_BAR,
     TETRAHEDRON,
     tetrahedron,
@@ -241,3 +242,20 @@ def test_what_the_command_cannot_do_is_said_in_one_line(run, tmp_path, words, sa
     assert (found.code, found.out) == (2, "")
     assert found.err.startswith(f"error: {says}")
     assert found.err.count("\n") == 1
+
+
+def test_no_two_hinges_at_one_point_of_a_body_have_balls(tmp_path: Path) -> None:
+    """They would flicker: on the crank's end beside the coupler, and on the base beside the crank."""
+    more = "".join(
+        f'<link name="{name}_link">{INERTIAL}</link><joint name="{name}" type="continuous"><parent link="{on}"/>'
+        f'<child link="{name}_link"/><origin xyz="{x} 0 0"/><axis xyz="0 1 0"/></joint>'
+        for name, on, x in (("swing", "crank", 0.2), ("hang", "base", 0.0), ("apart", "crank", 0.1))
+    )
+    hanging = ("swing", "hang", "apart")
+    loop = FOUR_BAR_LOOP.replace('["alpha"]', str(["alpha", *hanging]))
+    start = START_OF_FOUR_BAR + "".join(f"{name} = 0.0\n" for name in hanging)
+    run = ckc_pin.simulate(
+        write_scene(tmp_path / "m", FOUR_BAR.replace("</robot>", f"{more}</robot>"), loop, start, 0.02)
+    )
+    balls = {path.split("joint:")[1].removesuffix("/ball") for path in objects(scene([run])) if path.endswith("/ball")}
+    assert balls == {"alpha", "beta", "gamma", "apart"}

@@ -56,6 +56,30 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "simulate a run": (lambda: simulate(run()), "simulate: scene: a Run was given"),
     "changes as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: changes: 't_end=1' was given"),
     "changes by number": (lambda: simulate(SWING, {3: 4}), "changes, a key: 3 was given; it takes a table"),
+    "progress of nothing": (
+        lambda: simulate(SWING, SHORT, progress=lambda: None),
+        r"simulate: progress: a function of other arguments was given; it takes a function of \(t, t_end\)",
+    ),
+    "a trajectory of nothing": (
+        lambda: Tracking(1.0, 1.0, lambda: 0),
+        "Tracking: desired: a function of other arguments was given; it takes a function of t that returns q_d",
+    ),
+    "a word for a state": (
+        lambda: ckc_pin.as_ivp(SWING).f(0.0, "rest"),
+        "as_ivp: y: 'rest' was given; it takes 8 numbers, as y0 has",
+    ),
+    "words for a state": (
+        lambda: ckc_pin.as_ivp(SWING, {"formulation": "dae"}).f(0.0, ["a"] * 8),
+        "as_ivp: y: a list was given; it takes 8 numbers",
+    ),
+    "a state that is too short": (
+        lambda: ckc_pin.as_ivp(SWING, {"formulation": "spf", "spf_coordinates": "z"}).velocity(0.0, [1.0, 2.0]),
+        r"as_ivp: y: shape \(2,\) was given; it takes 6 numbers",
+    ),
+    "a word for a time": (
+        lambda: ckc_pin.as_ivp(SWING).terms("now", np.zeros(8)),
+        "as_ivp: t: 'now' was given; it takes a number, s",
+    ),
     "a class as a controller": (of(Own), r"the class Own was given; give an object of it, as Own\(\) makes one"),
     "a function of one": (of(lambda t: t), r"controller: <lambda>\(t\) was given; it must take \(t, terms\)"),
     "a method of one": (of(OfOne()), r"controller: u\(t\) was given; it must take \(t, terms\)"),

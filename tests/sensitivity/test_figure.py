@@ -15,6 +15,8 @@ def test_a_panel_a_parameter_with_the_independent_coordinates(tmp_path: Path) ->
     found = sensitivities(written(tmp_path), ["link.crank.mass", "initial.q.a"])
     figure = draw_sensitivities(found)
     assert [ax.get_title("left") for ax in figure.axes] == ["by link.crank.mass", "by initial.q.a"]
+    of = r"$\partial q / \partial p$"
+    assert [ax.get_ylabel() for ax in figure.axes] == [f"{of} (rad/kg)", f"{of} (rad/rad)"]
     for k, ax in enumerate(figure.axes):
         assert np.array_equal(ax.lines[0].get_ydata(), found.q_tree[:, 0, k])
     (path,) = save_sensitivities(found, tmp_path)
@@ -24,6 +26,9 @@ def test_a_panel_a_parameter_with_the_independent_coordinates(tmp_path: Path) ->
 
 def test_only_the_six_that_matter_most(tmp_path: Path) -> None:
     found = sensitivities(written(tmp_path), ["gravity", "joint.c.xyz", "initial.q.a", "spring.0.stiffness"])
+    labels = {ax.get_title("left"): ax.get_ylabel() for ax in draw_sensitivities(found).axes}
+    assert labels["by gravity.y"].endswith(" (rad/(m/s²))")
+    assert all(label.endswith(")") for label in labels.values())
     titles = {ax.get_title("left").removeprefix("by ") for ax in draw_sensitivities(found).axes}
     most = np.abs(found.q_tree[:, 0]).max(axis=0)
     assert titles == {found.parameters[k] for k in np.argsort(-most)[:6]}

@@ -76,7 +76,7 @@ def singularity_map(
     require_kind(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
         raise InputError(f"singularity_map: over: {over!r} was given; it takes one or two names, as [{over!r}]")
-    require_callable(progress, "singularity_map: progress", "a function of the part that is done")
+    require_callable(progress, "singularity_map: progress", "a function of the part that is done", 1)
     named = mechanism if isinstance(mechanism, str | FilePath) else mechanism.name
     mechanism = found
     if mechanism.d == 0:

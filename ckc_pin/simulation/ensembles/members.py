@@ -30,6 +30,7 @@ from ckc_pin.simulation.initial import branch
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.simulate import run_of, run_rows
+from ckc_pin.simulation.units import key_unit
 
 __all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "Members"]
 
@@ -146,6 +147,12 @@ class Members:
     def instants(self) -> Array:
         """When members are looked at, s."""
         return self.ready.instants if self.outputs.whole else self.ready.instants[-1:]
+
+    @property
+    def units(self) -> dict[str, tuple[str, ...]]:
+        """The unit of each variable, and of each component of each output that is no function, by name."""
+        of_variables = {name: (key_unit(self.mechanism, name),) for name in self.names}
+        return of_variables | {name: output.units for name, output in self.outputs.outputs.items()}
 
     def _run_batch(self, values: Array, recorded: Recorded, status: Statuses, message: list[str]) -> int:
         if self._batch is None:

@@ -12,10 +12,12 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.units import joined
 from ckc_pin.simulation.ensembles.spec import OutputSpec, Reduction
 from ckc_pin.simulation.prepare import Prepared
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.simulate import columns_of
+from ckc_pin.simulation.units import by_time, quantity_units
 
 __all__ = ["Function", "Output", "Outputs", "Recorded"]
 
@@ -54,10 +56,11 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Output:
-    """One output: the dimensions after the member's, and its shape in them."""
+    """One output: the dimensions after the member's, its shape in them, and the unit of each component."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
+    units: tuple[str, ...]
     compute: Callable[[Recorded], Array]
 
 
@@ -87,6 +90,7 @@ class Outputs:
 
     def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
         self._ready, self._places = ready, columns_of(ready.mechanism)
+        self._units = quantity_units(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
         self.outputs: dict[str, Output] = {}
@@ -129,23 +133,25 @@ class Outputs:
         if isinstance(spec, str):
             if spec in SHORT:
                 inner = self._reduced(name, SHORT[spec])
-                return Output((), (), lambda recorded: np.fmax.reduce(inner.compute(recorded), axis=1))
+                unit = (joined(inner.units),)
+                return Output((), (), unit, lambda recorded: np.fmax.reduce(inner.compute(recorded), axis=1))
             spec = OutputSpec(of=spec)
         if spec.of == "settled":
-            return Output((), (), self._settled(name, spec.tolerance))
+            return Output((), (), ("",), self._settled(name, spec.tolerance))
         if spec.of == "energy_drift":
             at = self._keep([self._places["energy"].start])
-            return Output((), (), lambda recorded: _drift(recorded.kept[:, at[0]]))
+            return Output((), (), ("J",), lambda recorded: _drift(recorded.kept[:, at[0]]))
         if spec.of.startswith(EVENT):
             event = self._event(name, spec.of.removeprefix(EVENT))
-            return Output((), (), lambda recorded: recorded.met[:, event])
+            return Output((), (), ("s",), lambda recorded: recorded.met[:, event])
         return self._reduced(name, spec)
 
     def _reduced(self, name: str, spec: OutputSpec) -> Output:
         columns, dims, wanted = self._quantity(name, spec.of)
         shape = (len(columns),) if dims else ()
+        units = self._units_of(spec)
         if spec.reduce == "end" and wanted is None:
-            return Output(dims, shape, lambda recorded: _squeezed(recorded.last[:, columns], dims))
+            return Output(dims, shape, units, lambda recorded: _squeezed(recorded.last[:, columns], dims))
         at, reduce = self._keep(columns), spec.reduce
 
         def compute(recorded: Recorded) -> Array:
@@ -153,8 +159,8 @@ class Outputs:
             return _squeezed(_reduce(x if wanted is None else x - wanted, reduce, self._ready.instants), dims)
 
         if reduce == "trajectory":
-            return Output((*dims, "time"), (*shape, len(self._ready.instants)), compute)
-        return Output(dims, shape, compute)
+            return Output((*dims, "time"), (*shape, len(self._ready.instants)), units, compute)
+        return Output(dims, shape, units, compute)
 
     def _quantity(self, name: str, of: str) -> tuple[list[int], tuple[str, ...], Array | None]:
         """Where a quantity stands in a row, its dimension, and what is taken off it over time."""
@@ -168,6 +174,12 @@ class Outputs:
             return list(range(place.start, place.stop)), (VECTORS[of],) if of in VECTORS else (), None
         choices = ", ".join([*VECTORS, *SCALARS, *DERIVED, f"{EVENT}NAME", *SHORT, *mechanism.coordinates])
         raise InputError(f"outputs: {name}: no {of!r}; there are {choices}")
+
+    def _units_of(self, spec: OutputSpec) -> tuple[str, ...]:
+        """The unit of each component; an integral's is over time."""
+        index = self._ready.mechanism.tree.index
+        own = [self._units["q_tree"][index[spec.of]]] if spec.of in index else self._units[spec.of]
+        return tuple(by_time(unit) if spec.reduce == "integral" else unit for unit in own)
 
     def _wanted(self, name: str) -> Array:
         """q_d over time, (d, instants)."""

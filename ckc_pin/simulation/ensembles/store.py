@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from shutil import rmtree
@@ -13,9 +14,10 @@ import msgspec
 import numpy as np
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.units import joined
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
 
-__all__ = ["RESULTS", "STAYS", "Store", "array_name", "require_libraries"]
+__all__ = ["RESULTS", "STAYS", "Store", "array_name", "require_libraries", "units_beside"]
 
 RESULTS = "results.zarr"
 FORMAT = 1
@@ -67,6 +69,8 @@ class Store:
         self._identity = sha256(msgspec.json.encode(sweep, order="deterministic")).hexdigest()
         if path is not None and path.exists():
             self._group = self._open(path, sweep)
+            with suppress(OSError):  # begun before there were units; what cannot be written can still be read
+                _say_units(self._group, members)
         else:
             self._group = self._begin(path, sweep, members, min(chunk, count))
         self.chunk: int = self._group[STATUS_NAME].chunks[0]
@@ -177,6 +181,7 @@ class Store:
         group.create_array(
             MESSAGE_NAME, shape=(self.count,), chunks=(chunk,), dtype=str, dimension_names=("member",), fill_value=""
         )
+        _say_units(group, members)
         flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
         group.create_array(
             STATUS_NAME, shape=(self.count,), chunks=(chunk,), dtype="u1", dimension_names=("member",),
@@ -187,9 +192,27 @@ class Store:
         )  # last: what has none is no store of a sweep's
 
 
+def _say_units(group: Any, members: Members) -> None:
+    """Give each array its unit; where components differ, a coordinate beside it has each one's."""
+    beside = []
+    for name, units in members.units.items():
+        array = group[array_name(name)]
+        if joined(units) and "units" not in array.attrs:
+            array.attrs["units"] = joined(units)
+        if len(set(units)) > 1:
+            beside.append(units_beside(name))
+            if beside[-1] not in group:
+                dimension = members.shapes[name][0][0]
+                place = group.create_array(beside[-1], shape=(len(units),), dtype=str, dimension_names=(dimension,))
+                place[:] = np.array(units, dtype=np.dtypes.StringDType())
+    if beside and "coordinates" not in group.attrs:
+        group.attrs["coordinates"] = " ".join(beside)  # what xarray takes for coordinates, not data
+
+
 def _require_free_names(members: Members) -> None:
     """Refuse outputs that are called like something else in the store."""
     taken = {STATUS_NAME, MESSAGE_NAME, "member", "time", *members.outputs.labels, *map(array_name, members.names)}
+    taken |= {units_beside(name) for name, units in members.units.items() if len(set(units)) > 1}
     for name in members.shapes:
         key = array_name(name)
         if key in taken:
@@ -206,3 +229,8 @@ def _is_used(dimension: str, members: Members) -> bool:
 def array_name(name: str) -> str:
     """Return what a variable or an output is called in the store: a slash would make groups of it."""
     return name.replace("/", "_")
+
+
+def units_beside(name: str) -> str:
+    """Return what the coordinate with the units of an output's components is called: one word."""
+    return f"{'_'.join(array_name(name).split())}_unit"

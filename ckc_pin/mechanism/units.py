@@ -1,0 +1,79 @@
+"""Units of a mechanism's quantities and of its numbers that have a name, "" where they have none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import split_component, split_name
+
+__all__ = ["effort", "joined", "motor_units", "parameter_unit", "row_units"]
+
+ROTOR = {"m": "kg", "rad": "kg m²"}  # what resists an acceleration, by the unit of what is accelerated
+STIFF = {"m": "N/m", "rad": "N m/rad"}
+VISCOUS = {"m": "N s/m", "rad": "N m s/rad"}
+OF_LINK = {"mass": "kg", "com": "m"}  # the rest are entries of an inertia
+OF_FRAME = {"xyz": "m", "rpy": "rad"}
+
+
+def joined(units: Iterable[str]) -> str:
+    """Return one unit for several quantities: theirs, or all there are, "rad or m"."""
+    return " or ".join(sorted({unit for unit in units if unit}, key=len, reverse=True))
+
+
+def effort(unit: str) -> str:
+    """Return the unit of what acts along a coordinate of unit "m" or "rad"."""
+    return "N" if unit == "m" else "N m"
+
+
+def motor_units(mechanism: Mechanism) -> list[str]:
+    """Return the unit of what each motor gives: "N" where it pushes slides alone, "N m" otherwise."""
+    return [effort(unit) for unit in _shafts(mechanism)]
+
+
+def row_units(mechanism: Mechanism) -> list[str]:
+    """Return the unit of each row of phi."""
+    return ["m" if metres else "rad" for metres in np.atleast_1d(mechanism.closure.in_metres(mechanism.tree))]
+
+
+def parameter_unit(mechanism: Mechanism, name: str) -> str:
+    """Return the unit of a number of the mechanism by its name, as `mechanism.parameters` has them."""
+    root, carrier, key = split_name(split_component(name)[0])
+    last = key.rpartition(".")[2]
+    if root == "gravity":
+        return "m/s²"
+    if root == "link":
+        return OF_LINK.get(key, "kg m²")
+    if last in OF_FRAME:
+        return OF_FRAME[last]
+    if root == "loop":
+        return "m"
+    if root == "motor":
+        unit = _shafts(mechanism)[mechanism.motors.names.index(carrier)]
+        of_motor = {"rotor_inertia": ROTOR[unit], "torque_limit": effort(unit), "speed_limit": f"{unit}/s"}
+        return of_motor.get(key, "")
+    return _of_coordinate(mechanism, root, carrier, key)
+
+
+def _of_coordinate(mechanism: Mechanism, root: str, carrier: str, key: str) -> str:
+    """Return the unit of a number whose unit is that of a coordinate, or follows from it."""
+    spec, units = mechanism.spec, dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
+    if root == "coupling":
+        coupling = spec.coupling[int(carrier)]
+        a, b = units[coupling.joint], units[coupling.other]
+        return a if key == "offset" else "" if a == b else f"{a}/{b}"
+    if root == "spring":
+        joint = spec.spring[int(carrier)].joint
+        unit = "m" if joint is None else units[joint]
+        return {"stiffness": STIFF[unit], "damping": VISCOUS[unit], "rest_length": "m"}.get(key, unit)
+    unit = units[spec.force[int(carrier)].joint if root == "force" else carrier]
+    own = {"armature": ROTOR[unit], "damping": VISCOUS[unit], "restitution": "", "lower": unit, "upper": unit}
+    return own.get(key, effort(unit))  # friction, and a force's value
+
+
+def _shafts(mechanism: Mechanism) -> list[str]:
+    """Return the unit of each motor's own angle, or way."""
+    lengths, turns = mechanism.tree.in_metres, mechanism.motors.turns != 0
+    return ["m" if np.all(lengths[row]) else "rad" for row in turns]
