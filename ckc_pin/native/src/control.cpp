@@ -102,7 +102,7 @@ Actuation::Actuation(const Core& core, std::vector<std::vector<Gear>> gears_, bo
   transmission_.setZero(static_cast<Eigen::Index>(gears.size()), core.d);  // u = transmission^T tau
 }
 
-void Actuation::push(const Vector& tau, Out u_tree) const {
+void Actuation::push(In tau, Out u_tree) const {
   u_tree.setZero();
   for (size_t k = 0; k < gears.size(); ++k)
     for (const Gear& gear : gears[k]) u_tree(gear.joint) += gear.turns * tau(static_cast<Eigen::Index>(k));

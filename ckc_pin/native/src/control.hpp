@@ -109,7 +109,7 @@ class Actuation {
   bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
 
  private:
-  void push(const Vector& tau, Out u_tree) const;
+  void push(In tau, Out u_tree) const;
   Allocation allocation_;
   Matrix transmission_;
 };

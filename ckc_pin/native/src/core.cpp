@@ -28,7 +28,8 @@ Core::Core(const std::string& model, Indices place, Closure closure, SpringTable
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
   C_tree_.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
-  turned_.setZero(m), negative_.setZero(m), tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
+  effort_.setZero(n), lambda_.setZero(m), turned_.setZero(m), negative_.setZero(m);
+  tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
   square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
   moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
   size_t entries = 0;

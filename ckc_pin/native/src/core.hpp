@@ -158,9 +158,9 @@ class Core {
   long inertia_at_ = -1;  // the same of square_factor_
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Eigen::CompleteOrthogonalDecomposition<Matrix> transposed_;
-  Matrix square_, by_state_, by_u_, responses_;
+  Matrix square_, by_state_, by_u_, change_, responses_;
   Definite square_factor_;
-  Vector turned_, negative_, moved_, small_, small_b_;
+  Vector turned_, negative_, moved_, small_, small_b_, effort_, lambda_;
 };
 
 }  // namespace ckc

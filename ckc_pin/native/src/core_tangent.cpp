@@ -194,11 +194,11 @@ void Core::multipliers(In force, Out lambda) {
 
 bool Core::differentiate(In u_tree, In acceleration) {
   bias(), tree_inertia();
-  Vector force(n), lambda = Vector::Zero(rows.closure.rows);
-  D_times(acceleration, force);
-  force += bias_tree - damping_tree - u_tree;
-  multipliers(force, lambda);
-  derivatives.compute(q_tree, v_tree, acceleration, lambda);
+  D_times(acceleration, effort_);
+  effort_ += bias_tree - damping_tree - u_tree;
+  lambda_.setZero();
+  multipliers(effort_, lambda_);
+  derivatives.compute(q_tree, v_tree, acceleration, lambda_);
   return derivatives.force_by_q.allFinite() && derivatives.row_by_q.allFinite();
 }
 
@@ -253,8 +253,10 @@ bool Core::slopes(In q_at, In v, In correction, Vector& force, Matrix& u_by_q, M
     if (!locked && !dae_acceleration(force, correction, a)) return false;
     if (!differentiate(force, a)) return false;
     const Derivatives& by = derivatives;
-    const auto changed = [](const Matrix& u_part, const Matrix& tree_part) {
-      return u_part.size() ? Matrix(u_part - tree_part) : Matrix(-tree_part);
+    const auto changed = [this](const Matrix& u_part, const Matrix& tree_part) -> const Matrix& {
+      change_ = -tree_part;
+      if (u_part.size()) change_ += u_part;
+      return change_;
     };
     if (!respond(changed(u_by_q, by.force_by_q), by.row_by_q, by_q) ||
         !respond(changed(u_by_v, by.force_by_v), by.row_by_v, by_v))

@@ -192,8 +192,9 @@ void Derivatives::add_springs() {
     const double pull = s.stiffness(k) * (length - s.rest_length(k)) + s.damping(k) * length_dot, weight = -pull / length;
     bend(a, weight * r), bend(b, -weight * r);
     product(a, a, weight), product(b, b, weight), product(a, b, -weight), product(b, a, -weight);
-    force_by_q += by * ((s.stiffness(k) - pull / length) * by + s.damping(k) * dot_by).transpose();
-    force_by_v += s.damping(k) * by * by.transpose();
+    dot_by *= s.damping(k), dot_by += (s.stiffness(k) - pull / length) * by;
+    force_by_q.noalias() += by * dot_by.transpose();
+    force_by_v.noalias() += s.damping(k) * by * by.transpose();
   }
 }
 
