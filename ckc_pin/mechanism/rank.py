@@ -74,6 +74,8 @@ def choose_dependent(
 ) -> IntArray | None:
     """Choose z so that phi_z is well conditioned, by a pivoted QR.
 
+    Of coordinates that are as good, the last is dependent: q is where the tree begins, as motors mostly are.
+
     Parameters
     ----------
     scaled_jacobian : (rows, n) array
@@ -89,10 +91,10 @@ def choose_dependent(
     """
     if rank == 0:
         return np.zeros(0, np.intp)
-    rest = np.arange(scaled_jacobian.shape[1])
+    rest = np.arange(scaled_jacobian.shape[1])[::-1]
     if len(blocks):
         inside = np.concatenate(blocks).astype(np.intp)
-        rest = np.setdiff1d(rest, inside)
+        rest = np.setdiff1d(rest, inside)[::-1]
         _, pivots = pivoted_columns(scaled_jacobian[:, inside])
         if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
             # take the blocks as dependent and choose the rest in what they leave over
