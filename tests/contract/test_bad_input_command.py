@@ -115,7 +115,7 @@ CASES = [
         [
             "singular: theta_1, theta_3 do not determine theta_2, theta_4",
             "start elsewhere",
-            "theta_2, theta_3 would do",
+            "theta_3, theta_4 would do",
         ],
         code=STOPPED,
     ),

@@ -221,4 +221,4 @@ def test_a_scene_without_a_start_is_no_error(bar: Path) -> None:
     add(bar, '[[joint]]\nname = "theta_2"\nstops = true')
     edit(bar / "swing.scene.toml", ("theta_1 = -0.934308508090164", "theta_1 = 3.0"))
     (said,) = warnings("bar/swing.scene.toml")
-    assert said.startswith("initial: the start theta_1 = 3, theta_3 = -1.20733 is out of reach")
+    assert said.startswith("bar/swing.scene.toml: initial: the start theta_1 = 3, theta_3 = -1.20733 is out of reach")
