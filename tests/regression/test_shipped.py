@@ -250,7 +250,9 @@ def test_redundant_rows_are_off_together_or_not_at_all() -> None:
     changes = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
     with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):
         simulate("bricard", {**changes, "initial.w": [1e-3] * 5})
-    off = mechanism("bricard").assembled.moved(np.array([1e-3, 0.0, 2e-3, 0.0, 0.0]))
+    bricard, moves = mechanism("bricard"), np.array([1e-3, 0.0, 2e-3, 1e-3, 0.0])
+    moves[bricard.partition.q] = 0.0  # the start's own
+    off = bricard.assembled.moved(moves)
     assert np.abs(off.phi).max() > 1e-4
     run = simulate("bricard", {**changes, "initial.w": off.phi.tolist()})
     assert run.status == "done"
