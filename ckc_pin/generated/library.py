@@ -30,8 +30,8 @@ __all__ = ["Library", "cache_folder", "compiled", "find", "too_large"]
 FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-ffp-contract=off", "-w")
 PATIENCE = 600.0  # s, for the compiler
 PER_LETTER = 4e-5  # s of the compiler for a letter of the text, as docs/theory/generated.md has them
-# Of a tree that is written out, with two minutes of the compiler at the most: its coordinates, and the joints that each of
-# them moves, all added up, as many as 40 in one branch do.
+# Of a tree that is written out, with two minutes of the compiler at the most: its coordinates, and the joints that each
+# of them moves, all added up, as many as 40 in one branch do.
 MOST_COORDINATES, MOST_MOVED = 130, 820
 
 
