@@ -50,7 +50,7 @@ __all__ = ["linearize"]
 @click.option(
     "--out",
     metavar="DIR",
-    type=Path,
+    type=options.PATH,
     help="Folder for linear.npz, figures, and the modes as runs to play; of a period floquet.npz and run.npz.",
 )
 @options.as_json

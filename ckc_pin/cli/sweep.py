@@ -27,7 +27,7 @@ EPILOG = options.examples(
 @click.command("sweep", epilog=EPILOG)
 @click.argument("file", metavar="FILE", type=options.PATH, help="A *.sweep.toml: a scene, its variables, what is kept.")
 @click.option(
-    "--out", type=Path, required=True, metavar="DIR", help="Gets results.zarr; what is there is gone on with."
+    "--out", type=options.PATH, required=True, metavar="DIR", help="Gets results.zarr; what is there is gone on with."
 )
 @click.option("--threads", type=click.IntRange(min=1), help="Threads of this process; absent: one a core.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine, by Dask, in place of threads.")

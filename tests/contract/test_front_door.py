@@ -133,6 +133,8 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
     [
         (["run", "five_bar/swing", "--set", "t_end=0.01", "--out", ""], "--out"),
         (["export", "five_bar", "--to", "mjcf", "--out", ""], "--out"),
+        (["linearize", "five_bar", "--at", "equilibrium", "--out", ""], "--out"),
+        (["sweep", "mine.sweep.toml", "--out", ""], "--out"),
         (["play", ""], "RUN..."),
         (["plot", ""], "RUN..."),
         (["sweep", "", "--out", "o"], "FILE"),
