@@ -30,8 +30,9 @@ __all__ = ["OnOutput", "Progress", "columns_of", "run_of", "run_prepared", "run_
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
-# Right-hand sides that cost what writing terms out and compiling them does, of whatever mechanism
-# (docs/theory/generated.md); a run with as many still ahead takes them then, wherever it runs.
+# Right-hand sides that cost what writing terms out and compiling them does, of whatever mechanism but one of a single
+# long branch, which is up to 2.5 times as many (docs/theory/generated.md); a run with as many still ahead takes them
+# then, wherever it runs.
 REPAYS, NEVER = 2_000_000, 2**62
 SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
 
