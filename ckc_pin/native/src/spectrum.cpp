@@ -9,6 +9,8 @@ namespace ckc {
 
 constexpr int small = 24;           // rows, up to which decomposing it whole is as cheap
 constexpr double exhausted = 1e-14;  // of the matrix' size: what the next direction is short of being one
+constexpr int first = 4;             // steps, after which it is looked whether they are enough; then after twice as many
+constexpr double exact = 1e-7;       // of the eigenvalue: what its vector may leave; its square is what the value is off by
 
 // A vector that no symmetry of a mechanism is orthogonal to.
 static void along_nothing(Out u) {
@@ -30,7 +32,7 @@ Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank) : patter
       if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
     }
   factor_.shape(m, m, whole_ ? full_pattern(m) : meets);
-  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
+  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), before_.setZero(m), along_.setZero(steps_);
   // Solvers cannot be copied before their first use.
   const int size = whole_ ? std::max(m, 1) : 1;
   eigen_.compute(Matrix::Identity(size, size), Eigen::EigenvaluesOnly);
@@ -55,41 +57,64 @@ void Spectrum::dense() {
 }
 
 void Spectrum::sparse() {
-  largest_ = top([this](In x, Vector& product) {
-    product.setZero();
-    for (const Pair& pair : pairs_) {
-      const double entry = gram_(pair.a, pair.b);
-      product(pair.a) += entry * x(pair.b);
-      if (pair.a != pair.b) product(pair.b) += entry * x(pair.a);
-    }
-  });
+  largest_ = most();
   factor_.compute(gram_);
-  least_ = factor_.singular() ? 0.0 : 1.0 / top([this](In x, Vector& product) { factor_.solve(x, product); });
+  least_ = factor_.singular() ? 0.0 : 1.0 / most_of_inverse();
 }
 
-// With full orthogonalization, twice, which a few steps can afford.
-template <class Apply>
-double Spectrum::top(const Apply& apply) {
-  Small diagonal = Small::Zero(), beside = Small::Zero();
+// Without orthogonalization: what it finds once more is no larger.
+double Spectrum::most() {
   along_nothing(u_);
   u_.normalize();
-  basis_.col(0) = u_;
-  for (int k = 0; k < steps_; ++k) {
-    apply(basis_.col(k), next_);
-    diagonal(k) = basis_.col(k).dot(next_);
+  for (int k = 0;; ++k) {
+    next_.setZero();
+    for (const Pair& pair : pairs_) {
+      const double entry = gram_(pair.a, pair.b);
+      next_(pair.a) += entry * u_(pair.b);
+      if (pair.a != pair.b) next_(pair.b) += entry * u_(pair.a);
+    }
+    diagonal_(k) = u_.dot(next_);
+    next_ -= diagonal_(k) * u_;
+    if (k) next_ -= beside_(k - 1) * before_;
+    beside_(k) = next_.norm();
+    if (ended(k)) {
+      ritz_.computeFromTridiagonal(diagonal_.head(k + 1), beside_.head(k), Eigen::EigenvaluesOnly);
+      return ritz_.eigenvalues()(k);
+    }
+    before_.swap(u_);
+    u_ = next_ / beside_(k);
+  }
+}
+
+// With full orthogonalization, twice, which a few steps can afford; its vector is u_.
+double Spectrum::most_of_inverse() {
+  along_nothing(u_);
+  basis_.col(0) = u_.normalized();
+  for (int k = 0, look = first;; ++k) {
+    factor_.solve(basis_.col(k), next_);
+    diagonal_(k) = basis_.col(k).dot(next_);
     const auto known = basis_.leftCols(k + 1);
     for (int twice = 0; twice < 2; ++twice) {
       along_.head(k + 1).noalias() = known.transpose() * next_;
       next_.noalias() -= known * along_.head(k + 1);
     }
-    const double rest = next_.norm();
-    if (k + 1 == steps_ || !(rest > exhausted * std::abs(diagonal(0)))) break;
-    beside(k) = rest;
-    basis_.col(k + 1) = next_ / rest;
+    beside_(k) = next_.norm();
+    if (ended(k) || k + 1 == look) {
+      look *= 2;
+      ritz_.computeFromTridiagonal(diagonal_.head(k + 1), beside_.head(k));
+      const double value = ritz_.eigenvalues()(k);
+      const auto vector = ritz_.eigenvectors().col(k);
+      if (ended(k) || beside_(k) * std::abs(vector(k)) <= exact * value) {
+        u_.noalias() = known * vector;
+        return value;
+      }
+    }
+    basis_.col(k + 1) = next_ / beside_(k);
   }
-  ritz_.computeFromTridiagonal(diagonal, beside.head<steps_ - 1>());
-  u_.noalias() = basis_ * ritz_.eigenvectors().col(steps_ - 1);
-  return ritz_.eigenvalues()(steps_ - 1);
+}
+
+bool Spectrum::ended(int k) const {
+  return k + 1 == steps_ || !(beside_(k) > exhausted * std::abs(diagonal_(0)));
 }
 
 void Spectrum::vectors(Vector& u, Vector& v) {

@@ -27,13 +27,14 @@ class Spectrum {
   void vectors(Vector& u, Vector& v);
 
  private:
-  static constexpr int steps_ = 16;  // of Lanczos' method
-  using Small = Eigen::Matrix<double, steps_, 1>;
+  static constexpr int steps_ = 16;  // of Lanczos' method, at most
+  using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, steps_, steps_>;
 
   void dense();
   void sparse();
-  template <class Apply>
-  double top(const Apply& apply);  // the largest eigenvalue, its vector into u_
+  double most();             // the largest eigenvalue by Lanczos' method
+  double most_of_inverse();  // by as many steps as that takes
+  bool ended(int k) const;   // whether no step can follow the k-th
 
   struct Pair {  // of rows that meet common columns
     int a, b;
@@ -45,9 +46,10 @@ class Spectrum {
   bool whole_;
   double largest_ = 0.0, least_ = 0.0;
   Matrix scaled_, gram_, basis_;
-  Vector u_, next_, along_;
+  Vector u_, next_, before_, along_;
+  Eigen::Matrix<double, steps_, 1> diagonal_, beside_;  // of what Lanczos' method makes of the matrix
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;  // values only: vectors would allocate
-  Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, steps_, steps_>> ritz_;
+  Eigen::SelfAdjointEigenSolver<Small> ritz_;
   Factor factor_;
 };
 
