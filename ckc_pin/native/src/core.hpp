@@ -101,6 +101,8 @@ class Core {
   bool closing_step(In residual, Out x);
   // The same in the metric of the coordinates, along every direction that J determines at all.
   bool shortest_step(In residual, Out x);
+  // Either, the one that costs less: from a state that an iteration closes anyway.
+  bool step_onto_closure(In residual, Out x);
   // Basis of the velocities that the loops allow, (n, n - rank), and the coordinates that its columns are of; null where
   // J has lost rank.
   const Matrix* tangent();

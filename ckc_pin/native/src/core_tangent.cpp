@@ -123,6 +123,10 @@ void Core::z_step(In residual, Out x) {
   for (size_t k = 0; k < z.size(); ++k) x(z[k]) = -z_(k);
 }
 
+bool Core::step_onto_closure(In residual, Out x) {
+  return (written && written->closing_step(q_tree, residual, x)) || shortest_step(residual, x);
+}
+
 bool Core::closing_step(In residual, Out x) {
   if (written && written->closing_step(q_tree, residual, x)) return true;
   if (!tangent_basis(residual, weak)) return shortest_step(residual, x);

@@ -162,14 +162,14 @@ bool Dae::rate_on_closure(double t, In y, Out y_dot) {
   core.tree.normalize(q_tree_);
   set(q_tree_, false);
   for (int k = 0;; ++k) {
-    if (k == most_steps || !core.shortest_step(core.rows.phi, step_)) return false;
+    if (k == most_steps || !core.step_onto_closure(core.rows.phi, step_)) return false;
     ++counts.factorizations;
     core.tree.integrate(q_tree_, step_);
     set(q_tree_);
     if (largest(step_.cwiseQuotient(core.scales.columns)) <= negligible) break;  // what is left is its square
   }
   residual_.noalias() = core.rows.J * y.tail(n);
-  if (!core.shortest_step(residual_, step_)) return false;
+  if (!core.step_onto_closure(residual_, step_)) return false;
   ++counts.factorizations;
   velocity = y.tail(n) + step_;
   return rate(t, velocity, y_dot);
