@@ -102,7 +102,8 @@ bool PointMotion::knot_rate(Eigen::Index knot) {
   if (!(*path_)(times_(knot), x_, x_dot_, x_ddot_) || !place()) return false;
   fill(x_dot_, nullptr);
   factor_.solve(wanted_, rates_.col(knot));
-  return known_[knot] = rates_.col(knot).allFinite();
+  known_[knot] = rates_.col(knot).allFinite();
+  return known_[knot];
 }
 
 bool PointMotion::predict(double t, Eigen::Index first) {
