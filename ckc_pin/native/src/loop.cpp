@@ -155,7 +155,7 @@ std::optional<Stop> Loop::begin(double bound) {
   if (!f_known_) {
     f_known_ = (method_ ? *method_ : dop853_).evaluate_start();
     if (!f_known_) return trouble();
-    if (anew) events.begun();
+    events.begun();
     if (!method_) choose(bound);
   }
   return {};
