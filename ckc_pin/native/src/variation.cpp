@@ -177,12 +177,14 @@ bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s
   move(v, s, s_dot);
   const int nq = core_.tree.nq;
   for (Along& along : along_) {
+    const auto apart = along.directions.rows();
     for (int row = 0; row < along.count; ++row) {
       const int p = along.first + row;
       core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
-      for (int k = 0; k < nq; ++k) along.directions(row, k) = move_(k);
-      for (int k = 0; k < n; ++k)
-        along.directions(row, nq + k) = s(n + k, p), along.directions(row, nq + n + k) = force_(k, p);
+      double* to = along.directions.data() + row;
+      for (int k = 0; k < nq; ++k, to += apart) *to = move_(k);
+      for (int k = 0; k < n; ++k, to += apart) *to = s(n + k, p);
+      for (int k = 0; k < n; ++k, to += apart) *to = force_(k, p);
     }
     if (along.directions.rows() == 1)
       core_.written->change(along.directions.reshaped(), along.changes.reshaped());

@@ -21,7 +21,7 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     closing_step_ = code("closing_step", 4), jacobian_ = perhaps("jacobian", 5);
     state_ = perhaps("state", 5), change_ = perhaps("change", 2), changes_ = perhaps("changes", 2);
     if (state_) {
-      at_.setZero(size("state_sparsity_out")), acceleration_at_.setZero(size("state_sparsity_out", 1));
+      known_.resize(size("state_sparsity_out") / 8 + 1), acceleration_at_.setZero(size("state_sparsity_out", 1));
       lanes_ = static_cast<int>(size("changes_sparsity_out") / size("change_sparsity_out"));
     }
   } catch (...) {
@@ -112,19 +112,19 @@ bool Written::state(In q, In v, In u_tree) const {
   q_ = q, v_ = v, u_ = u_tree;
   double sound = 0.0;
   const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), numbers_.data()};
-  double* to[] = {at_.data(), acceleration_at_.data(), &sound};
+  double* to[] = {known_.data()->x, acceleration_at_.data(), &sound};
   state_(from, to, nullptr, nullptr, 0);
   return sound_ = sound > 0.0;
 }
 
 void Written::change(In direction, Out acceleration) const {
-  const double* from[] = {at_.data(), direction.data()};
+  const double* from[] = {known_.data()->x, direction.data()};
   double* to[] = {acceleration.data()};
   change_(from, to, nullptr, nullptr, 0);
 }
 
 void Written::changes(const Matrix& directions, Matrix& acceleration) const {
-  const double* from[] = {at_.data(), directions.data()};
+  const double* from[] = {known_.data()->x, directions.data()};
   double* to[] = {acceleration.data()};
   changes_(from, to, nullptr, nullptr, 0);
 }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <vector>
 
 #include "trig.hpp"
 
@@ -55,7 +56,11 @@ class Written {
   long long taken_ = 0;  // parameters: to look a function up takes longer than to call it
   Vector numbers_;  // the parameters, and what follows from them alone
   mutable Trig trig_;
-  mutable Vector q_, v_, u_, at_, acceleration_at_;  // the last state that changes were asked for, and what is known there
+  struct alignas(64) Line {  // of the processor's cache: what is read four at a time is in one
+    double x[8];
+  };
+  mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
+  mutable std::vector<Line> known_;             // and what is known there
   mutable bool sound_ = false;
   int lanes_ = 0;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
