@@ -89,7 +89,9 @@ class ConstrainedInertia:
 
         terms, n = self._terms, self._n
         kept = list(terms.kept)
-        by_state = self.columns(u, terms.v)
+        left, unknown = self._left()
+        by_state = cs.horzcat(terms.angles.jacobian(left), cs.jacobian(left, terms.v))
+        by_state = cs.substitute(by_state, unknown, self._solution(u))
         columns = [
             self.solve([-by_state[i, j] for i in range(n)], [-by_state[n + i, j] for i in range(len(kept))])[0]
             for j in range(by_state.shape[1])
@@ -100,7 +102,7 @@ class ConstrainedInertia:
         found = cs.vertcat(rates, cs.horzcat(*(cs.vertcat(*x) for x in columns)))
         return _across(found, terms), cs.horzcat(*(cs.vertcat(*x) for x in by_u))
 
-    def change(self, u: Any, q: Any, v: Any, force: Any, arguments: Any, columns: Any = None) -> Any:
+    def change(self, u: Any, q: Any, v: Any, force: Any, arguments: Any) -> Any:
         """Return how v'_dot changes with all that it depends on, along one direction, (n).
 
         As in `derivatives`: one more elimination.
@@ -111,42 +113,28 @@ class ConstrainedInertia:
             u'; nothing is corrected.
         q, v, force, arguments : casadi.SX
             Changes of q' (its quaternions' lengths stay one), v', u', and of the numbers that are arguments.
-        columns : casadi.SX, optional
-            What stands for `columns` of v' and the arguments, where many directions are wanted at one state.
         """
         import casadi as cs
 
-        n = self._n
-        if columns is None:
-            left, unknown = self._left()
-            change = self._terms.angles.along(left, q)
-            change += cs.jtimes(left, cs.vertcat(self._terms.v, self._terms.arguments.vector), cs.vertcat(v, arguments))
-            change = cs.substitute(change, unknown, self._solution(u))
-        else:
-            change = cs.mtimes(columns, cs.vertcat(q, v, arguments))
+        n, (left, unknown) = self._n, self._left()
+        change = self._terms.angles.along(left, q)
+        change += cs.jtimes(left, cs.vertcat(self._terms.v, self._terms.arguments.vector), cs.vertcat(v, arguments))
+        change = cs.substitute(change, unknown, self._solution(u))
         along = [-change[n + i] for i in range(len(self._terms.kept))]
         found, _ = self.solve([force[i] - change[i] for i in range(n)], along)
         return cs.vertcat(*found)
 
-    def columns(self, u: Any, others: Any) -> Any:
-        """Return how what eq. 1 says is u' and zero changes at its solution, with q' and other symbols."""
-        import casadi as cs
-
-        left, unknown = self._left()
-        by_q = self._terms.angles.jacobian(left)
-        return cs.substitute(cs.horzcat(by_q, cs.jacobian(left, others)), unknown, self._solution(u))
-
     def _left(self) -> tuple[Any, Any]:
-        """What eq. 1 says is u' and zero, in symbols for a and the kept rows' multipliers; those symbols."""
+        """What eq. 1 says is u' and zero, in `v_dot` and symbols for the kept rows' multipliers; those symbols."""
         import casadi as cs
 
         terms, kept = self._terms, list(self._terms.kept)
-        J, a, multipliers = terms.rows.J[kept, :], cs.SX.sym("a", self._n), cs.SX.sym("l", len(kept))
+        J, multipliers = terms.rows.J[kept, :], cs.SX.sym("l", len(kept))
         left = cs.vertcat(
-            cs.mtimes(terms.D_tree, a) + terms.bias_tree - terms.damping - cs.mtimes(J.T, multipliers),
-            cs.mtimes(J, a) + terms.rows.J_dot_v[kept],
+            terms.needed - terms.damping - cs.mtimes(J.T, multipliers),
+            cs.mtimes(J, terms.v_dot) + terms.rows.J_dot_v[kept],
         )
-        return left, cs.vertcat(a, multipliers)
+        return left, cs.vertcat(terms.v_dot, multipliers)
 
     def _solution(self, u: Any) -> Any:
         import casadi as cs

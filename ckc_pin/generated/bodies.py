@@ -34,7 +34,7 @@ class Column:
 
 @dataclass(frozen=True)
 class MovingBody:
-    """A joint's frame in its branch's axes: rotation, origin, and with dv'/dt = 0 its rates and accelerations.
+    """A joint's frame in its branch's axes: rotation, origin, its rates and its accelerations.
 
     `axes` is the rotation of those axes in the world, `own` the number of the last columns that are its joint's own.
     """
@@ -132,7 +132,7 @@ def times(a: Any, b: Any) -> Any:
     return cs.sparsify(cs.mtimes(a, b))
 
 
-def bodies(tree: Tree, angles: Angles, v: Any, arguments: Arguments) -> list[MovingBody]:
+def bodies(tree: Tree, angles: Angles, v: Any, v_dot: Any, arguments: Arguments) -> list[MovingBody]:
     """Return the body of each of Pinocchio's joints, the world first.
 
     Parameters
@@ -140,8 +140,8 @@ def bodies(tree: Tree, angles: Angles, v: Any, arguments: Arguments) -> list[Mov
     tree : Tree
     angles : Angles
         Pinocchio's q', a free root's quaternion of unit length.
-    v : casadi.SX of n
-        v'.
+    v, v_dot : casadi.SX of n
+        v', and its rate.
     arguments : Arguments
         Takes the offsets of the joints.
     """
@@ -159,33 +159,33 @@ def bodies(tree: Tree, angles: Angles, v: Any, arguments: Arguments) -> list[Mov
         d = times(parent.R, arguments.column("offset", k))
         at_q, at_v = joint.idx_q, joint.idx_v
         if joint.nq == 7:
-            found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], at_v))
+            found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], v_dot[at_v : at_v + 6], at_v))
             continue
         local, turns = tree.axis(k)
-        a = times(stands, constant(local))
+        axis = times(stands, constant(local))
         R = times(stands, _turn(local, *angles.turn(at_q))) if turns else stands
-        d = d if turns else d + a * q[at_q]
-        column = Column(at_v, turns, a, parent.origin + d, constant(local))
-        found.append(_moved(parent, R, d, a * v[at_v], column))
+        d = d if turns else d + axis * q[at_q]
+        column = Column(at_v, turns, axis, parent.origin + d, constant(local))
+        found.append(_moved(parent, R, d, axis * v[at_v], axis * v_dot[at_v], column))
     return found
 
 
-def _moved(parent: MovingBody, R: Any, d: Any, rate: Any, column: Column) -> MovingBody:
+def _moved(parent: MovingBody, R: Any, d: Any, rate: Any, more: Any, column: Column) -> MovingBody:
     omega, alpha = parent.omega, parent.alpha
     swept = cross(omega, d)
     speed = parent.speed + swept
     acceleration = parent.acceleration + cross(alpha, d) + cross(omega, swept)
     if column.turns:
-        alpha = alpha + cross(omega, rate)
+        alpha = alpha + cross(omega, rate) + more
         omega = omega + rate
     else:
         speed = speed + rate
-        acceleration = acceleration + 2 * cross(omega, rate)
+        acceleration = acceleration + 2 * cross(omega, rate) + more
     columns = (*parent.columns, column)
     return MovingBody(parent.axes, R, column.origin, omega, speed, alpha, acceleration, columns, 1)
 
 
-def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> MovingBody:
+def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, v_dot: Any, at: int) -> MovingBody:
     import casadi as cs
 
     d = d + times(stands, q[:3])
@@ -201,9 +201,13 @@ def _free(parent: MovingBody, stands: Any, d: Any, q: Any, v: Any, at: int) -> M
         origin,
         omega,
         parent.speed + swept + slide,
-        parent.alpha + cross(parent.omega, spin),
+        parent.alpha + cross(parent.omega, spin) + times(R, v_dot[3:]),
         cs.sparsify(
-            parent.acceleration + cross(parent.alpha, d) + cross(parent.omega, swept + slide) + cross(omega, slide)
+            parent.acceleration
+            + cross(parent.alpha, d)
+            + cross(parent.omega, swept + slide)
+            + cross(omega, slide)
+            + times(R, v_dot[:3])
         ),
         (*parent.columns, *columns),
         6,

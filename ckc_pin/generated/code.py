@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.branches import alike_branches
 from ckc_pin.generated.expressions import Expressions, expressions
-from ckc_pin.generated.text import text
+from ckc_pin.generated.graph import Graph, Lane
+from ckc_pin.generated.text import Alike, result_lanes, text
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import BoolArray, Tree
 
@@ -41,8 +43,8 @@ def functions(
 
     With `changes` also how the acceleration changes along any direction of q', v', u' and of what may be varied:
     `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it is
-    sound; `change` takes the first of these, and `TOGETHER` directions at a time, each number's side by side as in its
-    result: changes of q', v', u' and of what may be varied.
+    sound; `change` takes the first of these and a direction: changes of q', v', u' and of what may be varied. So does
+    `changes`, of `TOGETHER` directions, each number's side by side as in its result.
 
     Left out are `coriolis` of a tree with a free root, whose twist has several C', and `jacobian` where it would be too
     long to be compiled.
@@ -80,27 +82,63 @@ def functions(
         parts = _split(together, [results[x].numel() for x in gives])
         found[name] = cs.Function(name, [*(symbols[x] for x in takes), once], parts, [*takes, "numbers"], list(gives))
     if changes:
-        state, columns = [*(symbols[x] for x in ("q", "trig", "v", "u")), once], symbols.get("columns", cs.SX(0, 1))
-        change, taken, made_of = cs.extract_parametric(cs.cse(part["change"]), cs.vertcat(*state))
-        known = cs.vertcat(columns, *taken, *_symbols_of(change, state))
-        given_by = cs.vertcat(part.get("columns", cs.SX(0, 1)), *made_of)
-        given_by = cs.substitute(known, cs.vertcat(columns, *taken), given_by)
-        whole = cs.cse(cs.vertcat(given_by, part["acceleration_of_u"], part["sound"]))
-        sizes = [known.numel(), mechanism.n, 1]
-        found["state"] = cs.Function(
-            "state", state, _split(whole, sizes), ["q", "trig", "v", "u", "numbers"], ["known", "acceleration", "sound"]
-        )
-        found["change"] = _of_several(known, cs.vertcat(*along.values()), cs.cse(change))
+        state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": once}
+        found |= _changes(part, state, cs.vertcat(*along.values()), alike_branches(mechanism.tree))
     return found
 
 
-def _of_several(known: Any, direction: Any, change: Any) -> Any:
+def _changes(part: Mapping[str, Any], state: Mapping[str, Any], direction: Any, alike: Alike) -> dict[str, Any]:
+    """Return what tells how the acceleration changes: `state`, `change` and `changes`."""
     import casadi as cs
 
-    one = cs.Function("one", [known, direction], [change])
+    of = [*state.values()]
+    change, taken, made_of = cs.extract_parametric(cs.cse(part["change"]), cs.vertcat(*of))
+    change = cs.cse(change)
+    known = cs.vertcat(*taken, *_symbols_of(change, of))
+    given_by = cs.substitute(known, cs.vertcat(*taken), cs.vertcat(*made_of))
+    pivots = _divisors(cs.Function("change", [known, direction], [change]))
+    change = cs.substitute(change, known[pivots], 1 / known[pivots])  # they are inverted once a state
+    given_by[pivots] = 1 / given_by[pivots]
+
+    def of_state(given_by: Any) -> Any:
+        gives = (given_by, part["acceleration_of_u"], part["sound"])
+        parts = _split(cs.cse(cs.vertcat(*gives)), [x.numel() for x in gives])
+        return cs.Function("state", of, parts, [*state], ["known", "acceleration", "sound"])
+
+    order = _side_by_side(known.numel(), result_lanes(of_state(given_by), "known", alike))
+    known = cs.vertcat(*(cs.SX.sym("unread") if k is None else known[k] for k in order))
+    given_by = cs.vertcat(*(cs.SX(np.nan) if k is None else given_by[k] for k in order))
+    one = cs.Function("change", [known, direction], [change], ["known", "direction"], ["change"])
     directions = cs.SX.sym("directions", TOGETHER, direction.numel())
-    changes = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
-    return cs.Function("change", [known, cs.vec(directions)], [cs.vec(changes)], ["known", "directions"], ["changes"])
+    every = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
+    several = cs.Function(
+        "changes", [known, cs.vec(directions)], [cs.vec(every)], ["shared", "directions"], ["changes"]
+    )
+    return {"state": of_state(given_by), "change": one, "changes": several}
+
+
+def _divisors(function: Any) -> list[int]:
+    """Return what of a function's first argument is only divided by."""
+    import casadi as cs
+
+    graph, uses = Graph.of(function), defaultdict(set)
+    for node in graph.nodes:
+        for at, x in enumerate(node.of):
+            uses[x].add((node.operation, at))
+    inputs = {k: node.at[1] for k, node in enumerate(graph.nodes) if node.operation == cs.OP_INPUT and not node.at[0]}
+    return [at for k, at in inputs.items() if uses[k] and uses[k] <= {(cs.OP_DIV, 1), (cs.OP_INV, 0)}]
+
+
+def _side_by_side(count: int, whose: Mapping[int, tuple[Lane, int]]) -> list[int | None]:
+    """Order numbers so that those which alike branches have make vectors of two or four; None is a place left free."""
+    alike: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for k in sorted(whose, key=whose.__getitem__):
+        (group, _), number = whose[k]
+        alike[group, number].append(k)
+    order: list[int | None] = []
+    for together in alike.values():
+        order += [*together, *[None] * (len(together) % 2)]
+    return order + [k for k in range(count) if k not in whose]
 
 
 def _symbols_of(x: Any, among: list[Any]) -> list[Any]:
@@ -143,21 +181,23 @@ def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] 
         found["by_state"], found["by_u"] = inertia.derivatives(symbols["u"])
     if along is None:
         return {name: cs.densify(x) for name, x in found.items()}
-    columns = None
-    if "by_state" in found:  # short enough: what they are once a state, and a product a direction
-        columns = inertia.columns(symbols["u"], cs.vertcat(terms.v, terms.arguments.vector))
-        found["columns"] = cs.vertcat(*columns.nonzeros())
-        symbols["columns"] = cs.SX.sym("columns", columns.nnz())
-        columns = cs.SX(columns.sparsity(), symbols["columns"])
     found["acceleration_of_u"] = inertia.acceleration(symbols["u"], cs.SX(rows.phi.numel(), 1))[0]  # uncorrected
-    found["change"] = inertia.change(symbols["u"], **along, columns=columns)
+    found["change"] = inertia.change(symbols["u"], **along)
     return {name: cs.densify(x) for name, x in found.items()}
 
 
 def source(found: Mapping[str, Any], tree: Tree) -> str:
     """Return the C text of a mechanism's functions."""
+    return text(list(found.values()), _alike(found, tree))
+
+
+def _alike(found: Mapping[str, Any], tree: Tree) -> Alike:
+    """Which arguments of the functions alike branches have, and which several directions."""
     alike = dict(alike_branches(tree))
-    if "change" in found:
-        places = range(found["change"].numel_in(1))
-        alike["directions"] = {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in places}
-    return text(list(found.values()), alike)
+    if "changes" in found:
+        starts = {"q": 0, "v": tree.nq, "u": tree.nq + tree.n}
+        alike["direction"] = {start + k: x for name, start in starts.items() for k, x in alike[name].items()}
+        alike["known"] = result_lanes(found["state"], "known", alike)
+        several = range(found["changes"].numel_in(1))
+        alike["directions"] = {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in several}
+    return alike

@@ -10,7 +10,6 @@ import numpy as np
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.generated.code import TOGETHER
 from ckc_pin.generated.expressions import kept_rows
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.sigma import sigma
@@ -54,17 +53,21 @@ class Calls:
 
     def call(self, name: str, *arguments: Array, numbers: Array | None = None) -> list[Array]:
         """Return a function's results, vectors by columns of what they are, of other numbers too."""
-        sizes = getattr(self._library, f"{name}_sparsity_out")
-        sizes.restype = ctypes.POINTER(ctypes.c_longlong)
         count = getattr(self._library, f"{name}_n_out")
         count.restype = ctypes.c_longlong
-        results = [np.zeros(sizes(k)[0] * sizes(k)[1]) for k in range(count())]
+        results = [np.zeros(self.size(name, "out", k)) for k in range(count())]
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
-        if name not in ("numbers", "change"):
+        if name not in ("numbers", "change", "changes"):
             q, last = given[0], self._numbers if numbers is None else numbers
             given = [q, np.concatenate([np.cos(q), np.sin(q)]), *given[1:], last]
         getattr(self._library, name)(self._pointers(given), self._pointers(results), None, None, 0)
         return results
+
+    def size(self, name: str, which: str, k: int) -> int:
+        """How many numbers an argument ("in") of a function has, or a result ("out")."""
+        sizes = getattr(self._library, f"{name}_sparsity_{which}")
+        sizes.restype = ctypes.POINTER(ctypes.c_longlong)
+        return int(sizes(k)[0] * sizes(k)[1])
 
     def _pointers(self, arrays: list[Array]) -> ctypes.Array[ctypes._Pointer[ctypes.c_double]]:
         return (self._pointer * len(arrays))(*(x.ctypes.data_as(self._pointer) for x in arrays))
@@ -179,21 +182,25 @@ def _compare_change(terms: Terms, code: Calls, own: Array, random: np.random.Gen
     """Along directions of everything at once."""
     mechanism, tree, q, v = terms.mechanism, terms.mechanism.tree, terms.q_tree, terms.v_tree
     none, u = np.zeros(mechanism.closure.rows), random.uniform(-1, 1, tree.n) * tree.reach
-    steps, faster, more = random.uniform(-1, 1, (3, TOGETHER, tree.n)) * tree.reach
-    varied = random.uniform(-1, 1, (TOGETHER, len(own))) * np.where(own == 0.0, FROM_ZERO, own)
+    directions = code.size("changes", "in", 1) // code.size("change", "in", 1)
+    steps, faster, more = random.uniform(-1, 1, (3, directions, tree.n)) * tree.reach
+    varied = random.uniform(-1, 1, (directions, len(own))) * np.where(own == 0.0, FROM_ZERO, own)
     state, acceleration, _ = code.call("state", q, v, u)
     _compare(mechanism, "acceleration with its change", acceleration, code.call("acceleration", q, v, u, none)[0])
     moves = np.array([tree.configuration_rate(q, step) for step in steps])
-    (found,) = code.call("change", state, np.ravel(np.hstack([moves, faster, more, varied]), order="F"))
+    along = np.hstack([moves, faster, more, varied])
+    (together,) = code.call("changes", state, np.ravel(along, order="F"))
 
     def at(k: int, h: float) -> Array:
         there = tree.integrate(q, h * steps[k]), v + h * faster[k], u + h * more[k]
         return code.call("acceleration", *there, none, numbers=code.of_numbers(own + h * varied[k]))[0]
 
     h = DIFFERENCE
-    for k, change in enumerate(found.reshape(TOGETHER, -1, order="F")):
+    for k, change in enumerate(together.reshape(directions, -1, order="F")):
+        (alone,) = code.call("change", state, along[k])
         wanted = (8 * (at(k, h) - at(k, -h)) - (at(k, 2 * h) - at(k, -2 * h))) / (12 * h)
         _compare(mechanism, "the acceleration's change", change, wanted, 0.0, ALIKE)
+        _compare(mechanism, "the acceleration's change alone", alone, change)
 
 
 def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:

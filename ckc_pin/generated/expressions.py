@@ -39,6 +39,10 @@ class Expressions:
     damping : casadi.SX of n
         What dampers do.
     rows : RowTerms
+    v_dot : casadi.SX of n
+        dv'/dt, in what is next.
+    needed : casadi.SX of n
+        D' v_dot and `bias_tree`, by recursion: shorter than the sum, and so are its derivatives.
     kept : tuple of int
         Rows that follow from no others.
     order : tuple of int
@@ -56,6 +60,8 @@ class Expressions:
     bias_tree: Any
     damping: Any
     rows: RowTerms
+    v_dot: Any
+    needed: Any
     kept: tuple[int, ...]
     order: tuple[int, ...]
     kinetic: Any
@@ -73,10 +79,12 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
 
     tree, arguments = mechanism.tree, Arguments(which or present(numbers(mechanism)))
     angles, v = Angles(tree.nq), cs.SX.sym("v", tree.n)
-    q, found = angles.q, bodies(tree, angles, v, arguments)
+    q, v_dot, none = angles.q, cs.SX.sym("v_dot", tree.n), cs.SX(tree.n, 1)
+    found, driven = (bodies(tree, angles, v, x, arguments) for x in (none, v_dot))
     gravity = arguments.column("gravity")
     q_dot = _configuration_rate(mechanism, q, v)
     D_tree, bias, potential = _inertia(mechanism, found, gravity, arguments)
+    needed = _inertia(mechanism, driven, gravity, arguments)[1] + times(cs.diag(_armature(tree.n, arguments)), v_dot)
     elastic, damping, stored = _springs(mechanism, found, q, v, arguments)
     rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), arguments)
     kept = kept_rows(mechanism)
@@ -90,6 +98,8 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
         bias_tree=bias - elastic,
         damping=damping,
         rows=rows,
+        v_dot=v_dot,
+        needed=needed - elastic,
         kept=tuple(kept),
         order=elimination_order(mechanism, kept),
         kinetic=dot(v, times(D_tree, v)) / 2,
@@ -98,7 +108,7 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
 
 
 def _inertia(mechanism: Mechanism, found: list[MovingBody], gravity: Any, arguments: Arguments) -> tuple[Any, Any, Any]:
-    """D', C' v' + h', and the potential energy of gravity.
+    """D', C' v' + h' with D' times what bodies accelerate with, and the potential energy of gravity.
 
     Composite bodies, and what their bias accelerations ask for, from the leaves to the root: a force along each
     coordinate meets what its joint carries.
@@ -146,8 +156,13 @@ def _inertia(mechanism: Mechanism, found: list[MovingBody], gravity: Any, argume
             second[parent] = second[parent] + second[k] + _shift(d, first[k] + mass[k] / 2 * d)
             first[parent] = first[parent] + first[k] + mass[k] * d
             mass[parent] = mass[parent] + mass[k]
-    armature = cs.vertcat(*(arguments.number("armature", k) for k in range(n)))
-    return cs.sparsify(D + cs.diag(armature)), bias, potential
+    return cs.sparsify(D + cs.diag(_armature(n, arguments))), bias, potential
+
+
+def _armature(n: int, arguments: Arguments) -> Any:
+    import casadi as cs
+
+    return cs.vertcat(*(arguments.number("armature", k) for k in range(n)))
 
 
 def _turned(I: Any, R: Any) -> Any:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from typing import Any
 
-__all__ = ["Graph", "Node", "lanes"]
+__all__ = ["Graph", "Lane", "Node", "Packing"]
 
 Lane = tuple[int, int]  # a group of alike branches, and which of them
 
@@ -54,9 +54,39 @@ class Graph:
             nodes.append(node)
         return cls(nodes, results)
 
+    def divided_once(self) -> Graph:
+        """With one division by what several are divided by, whose inverse costs as much as ten products.
 
-def lanes(graph: Graph, places: Mapping[tuple[int, int], tuple[Lane, int]], vectorized: Set[int]) -> list[list[int]]:
-    """Return packs of nodes that do the same in alike branches, a node a branch.
+        CasADi makes a division of every product with an inverse.
+        """
+        import casadi as cs
+
+        often = Counter(node.of[-1] for node in self.nodes if node.operation in (cs.OP_DIV, cs.OP_INV))
+        nodes: list[Node] = []
+        place: list[int] = []
+        inverse: dict[int, int] = {}
+        for node in self.nodes:
+            of = tuple(place[x] for x in node.of)
+            if node.operation in (cs.OP_DIV, cs.OP_INV) and often[node.of[-1]] > 1:
+                if node.of[-1] not in inverse:
+                    inverse[node.of[-1]] = len(nodes)
+                    nodes.append(Node(cs.OP_INV, of[-1:]))
+                by = inverse[node.of[-1]]
+                if node.operation == cs.OP_INV:
+                    place.append(by)
+                    continue
+                node, of = replace(node, operation=cs.OP_MUL), (of[0], by)
+            place.append(len(nodes))
+            nodes.append(replace(node, of=of))
+        return Graph(nodes, [(to, place[k]) for to, k in self.results])
+
+
+class Packing:
+    """Packs of nodes that do the same in alike branches, a node a branch.
+
+    Nodes are gone through by whose they are, level after level. A node that is of one branch and of what all share is
+    the branch's, unless other branches have none like it. What is of several branches is shared, a stage later: nodes
+    of one stage in different branches do not depend on each other, and of those in one branch the later is deeper.
 
     Parameters
     ----------
@@ -65,16 +95,12 @@ def lanes(graph: Graph, places: Mapping[tuple[int, int], tuple[Lane, int]], vect
         Inputs that belong to a branch, and which of its numbers they are.
     vectorized : set of int
         Operations that may be done together.
-    """
-    return _Packing(graph, places, vectorized).packs
 
-
-class _Packing:
-    """Nodes by whose they are, level after level.
-
-    A node that is of one branch and of what all share is the branch's, unless other branches have none like it. What is
-    of several branches is shared, a stage later: nodes of one stage in different branches do not depend on each other,
-    and of those in one branch the later is deeper.
+    Attributes
+    ----------
+    packs : list of lists of int
+    pack : dict of int to (int, int)
+        The pack of a node, and its place in it.
     """
 
     def __init__(self, graph: Graph, places: Mapping[tuple[int, int], tuple[Lane, int]], vectorized: Set[int]) -> None:
@@ -86,6 +112,7 @@ class _Packing:
         self.key = [0] * size
         self.keys: dict[object, int] = {}
         self.packs: list[list[int]] = []
+        self.pack: dict[int, tuple[int, int]] = {}
         self._waiting: dict[tuple[int, int], list[int]] = {}
         self._levels: list[tuple[int, int]] = []
         self._missing = [len(node.of) for node in graph.nodes]
@@ -96,6 +123,16 @@ class _Packing:
         self._go_on([k for k in range(size) if not self._missing[k]])
         while self._levels:
             self._go_on(self._judge(self._waiting.pop(heappop(self._levels))))
+
+    def whose(self, k: int) -> tuple[Lane, int] | None:
+        """Whose a node is that other branches have alike, and which of theirs."""
+        lane = self.lane[k]
+        if lane is None:
+            return None
+        if k in self.pack:
+            return lane, self.pack[k][0]
+        node = self.graph.nodes[k]
+        return (lane, -1 - self.key[k]) if not node.of and node.at in self.places else None
 
     def _go_on(self, ready: list[int]) -> None:
         """Settle nodes and all that is only waiting for them."""
@@ -144,11 +181,29 @@ class _Packing:
             lane = self.lane[nodes[0]]
             assert lane is not None
             if len(found) == self.together[lane[0]] and {len(x) for x in found.values()} == {len(nodes)}:
-                self.packs += [list(x) for x in zip(*(found[at] for at in sorted(found)), strict=True)]
+                for x in zip(*self._in_one_order([found[at] for at in sorted(found)]), strict=True):
+                    self.pack |= {node: (len(self.packs), at) for at, node in enumerate(x)}
+                    self.packs.append(list(x))
             else:
                 for k in (k for part in found.values() for k in part):
                     self._share(k, self.level[k][0] + 1)
         return [x for k in level for x in self._freed(k)]
+
+    def _in_one_order(self, branches: list[list[int]]) -> list[list[int]]:
+        """Nodes that do the same within a branch, in an order that is the same in each: by what they are of."""
+        if len(branches[0]) == 1:
+            return branches
+        nodes = self.graph.nodes
+        common = set.intersection(*({x for k in branch for x in nodes[k].of} for branch in branches))
+
+        def place(x: int) -> tuple[int, ...]:
+            if x in self.pack:
+                return 0, self.pack[x][0]
+            if x in common:
+                return 1, x
+            return (3,) if nodes[x].of else (2, *nodes[x].at)  # what else a branch has of its own stands in its order
+
+        return [sorted(branch, key=lambda k: ([place(x) for x in nodes[k].of], k)) for branch in branches]
 
     def _share(self, k: int, stage: int) -> None:
         import casadi as cs

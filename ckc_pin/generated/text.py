@@ -1,17 +1,28 @@
-"""C text of CasADi functions: straight lines, in which alike branches are done several at a time."""
+"""C text of CasADi functions: straight lines, in which alike branches are done several at a time.
+
+A result that is NaN is a place that nobody reads: nothing of its own is written there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import isnan
 from typing import Any
 
-from ckc_pin.generated.graph import Graph, Lane, lanes
+from ckc_pin.generated.graph import Graph, Lane, Packing
 
-__all__ = ["text"]
+__all__ = ["result_lanes", "text"]
 
+Alike = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: whose, and which of theirs
+
+# Functions in which several quotients share one division. Others round as they always have: the steps of stiff runs are
+# other ones with the last digit of an acceleration.
+INVERTED = ("state",)
 HEAD = """#include <math.h>
 typedef double two __attribute__((vector_size(16)));
 typedef double four __attribute__((vector_size(32)));
+typedef double two_at __attribute__((vector_size(16),aligned(8),may_alias));
+typedef double four_at __attribute__((vector_size(32),aligned(8),may_alias));
 typedef long long int two_bits __attribute__((vector_size(16)));
 typedef long long int four_bits __attribute__((vector_size(32)));
 static const two two_ones={1.,1.};
@@ -37,27 +48,43 @@ def _formats() -> tuple[dict[int, str], dict[int, str]]:
     return either | one, {**either, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}
 
 
-def text(functions: Sequence[Any], alike: Mapping[str, Mapping[int, tuple[Lane, int]]]) -> str:
+def text(functions: Sequence[Any], alike: Alike) -> str:
     """Return the C text of functions, all of whose arguments and results are asked for when they are called."""
     return HEAD + "".join(_Function(function, alike).text() for function in functions)
+
+
+def result_lanes(function: Any, result: str, alike: Alike) -> dict[int, tuple[Lane, int]]:
+    """Return what `alike` is to a function that takes another one's result."""
+    graph, packing = _packed(function, alike)
+    at = function.index_out(result)
+    whose = {place: packing.whose(k) for (to, place), k in graph.results if to == at}
+    return {place: found for place, found in whose.items() if found is not None}
+
+
+def _packed(function: Any, alike: Alike) -> tuple[Graph, Packing]:
+    graph, names = Graph.of(function), [function.name_in(k) for k in range(function.n_in())]
+    places = {(k, at): x for k, name in enumerate(names) for at, x in alike.get(name, {}).items()}
+    if function.name() in INVERTED:
+        graph = graph.divided_once()
+    return graph, Packing(graph, places, _formats()[1].keys())
 
 
 class _Function:
     """One function's text, made as it is asked for."""
 
-    def __init__(self, function: Any, alike: Mapping[str, Mapping[int, tuple[Lane, int]]]) -> None:
+    def __init__(self, function: Any, alike: Alike) -> None:
         import casadi as cs
 
-        self.function, self.graph = function, Graph.of(function)
+        self.function = function
         self.formats, self.together = _formats()
         self.constant, self.input = cs.OP_CONST, cs.OP_INPUT
-        names = [function.name_in(k) for k in range(function.n_in())]
-        places = {(k, at): x for k, name in enumerate(names) for at, x in alike.get(name, {}).items()}
-        self.packs = lanes(self.graph, places, self.together.keys()) if places else []
-        self.pack = {node: (number, at) for number, nodes in enumerate(self.packs) for at, node in enumerate(nodes)}
+        self.graph, packing = _packed(function, alike)
+        self.packs, self.pack = packing.packs, packing.pack
         self.stored: dict[int, list[tuple[int, int]]] = {}
         for to, k in self.graph.results:
-            self.stored.setdefault(k, []).append(to)
+            if not self._is_nan(k):
+                self.stored.setdefault(k, []).append(to)
+        self.unread = {to for to, k in self.graph.results if self._is_nan(k)}
         self.lines: list[str] = []
         self.declared = ("", 0)  # the kind of variables that the last line is of, and how many lines there were then
         self.gathered: dict[tuple[int, ...], str] = {}
@@ -79,7 +106,7 @@ class _Function:
     def _put_all(self) -> None:
         """Write what results need, as late as possible."""
         done: set[int] = set()
-        for _, result in self.graph.results:
+        for _, result in (x for x in self.graph.results if not self._is_nan(x[1])):
             waiting = [result]
             while waiting:
                 k = waiting[-1]
@@ -105,6 +132,10 @@ class _Function:
                 vectors = [self._vector(operands) for operands in zip(*of, strict=True)]
                 kind = _kind(nodes)
                 self._declare(kind, f"p{self.pack[nodes[0]][0]}={what.format(*vectors, kind)}")
+        if len(nodes) > 1 and (end := self._end(nodes)) is not None:
+            result, at = end
+            self.lines.append(f"*({_kind(nodes)}_at*)(y{result}+{at})=p{self.pack[nodes[0]][0]};")
+            return
         for k in nodes:
             self.lines += [f"y{result}[{at}]={self._scalar(k)};" for result, at in self.stored.get(k, ())]
 
@@ -135,10 +166,34 @@ class _Function:
         if len(set(parts)) == 1:
             return parts[0]
         if nodes not in self.gathered:
+            if (start := self._start(nodes)) is not None:
+                return f"(*(const {_kind(nodes)}_at*)(x{start[0]}+{start[1]}))"
             self.gathered[nodes] = f"g{len(self.gathered)}"
             filled = [*parts, parts[0]] if len(parts) == 3 else parts  # an ordinary number where there is no branch
             self._declare(_kind(nodes), f"{self.gathered[nodes]}={{{','.join(filled)}}}")
         return self.gathered[nodes]
+
+    def _is_nan(self, k: int) -> bool:
+        return self.graph.nodes[k].operation == self.constant and isnan(self.graph.nodes[k].value)
+
+    def _end(self, nodes: Sequence[int]) -> tuple[int, int] | None:
+        """Where they stand one behind the other in a result, and nowhere else; three before a place nobody reads."""
+        places = [self.stored.get(k, []) for k in nodes]
+        if any(len(x) != 1 for x in places):
+            return None
+        ((result, start),) = places[0]
+        if any(x != [(result, start + k)] for k, x in enumerate(places)):
+            return None
+        return (result, start) if len(nodes) != 3 or (result, start + 3) in self.unread else None
+
+    def _start(self, nodes: Sequence[int]) -> tuple[int, int] | None:
+        """Where in an argument they stand one behind the other; three before any number."""
+        of = [self.graph.nodes[k] for k in nodes]
+        argument, start = of[0].at
+        if any(x.operation != self.input or x.at != (argument, start + k) for k, x in enumerate(of)):
+            return None
+        behind = start + len(nodes) + len(nodes) % 2
+        return (argument, start) if behind <= self.function.numel_in(argument) else None
 
 
 def _kind(nodes: Sequence[int]) -> str:

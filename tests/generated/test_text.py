@@ -15,7 +15,7 @@ import pytest
 from ckc_pin import load
 from ckc_pin.generated.branches import alike_branches
 from ckc_pin.generated.code import TOGETHER, functions, source
-from ckc_pin.generated.graph import Graph, lanes
+from ckc_pin.generated.graph import Graph, Packing
 from ckc_pin.generated.library import FLAGS
 from ckc_pin.generated.text import text
 
@@ -76,15 +76,15 @@ def test_what_branches_do_alike_is_found_up_to_where_they_meet_and_after() -> No
     q, p = cs.SX.sym("q", 6), cs.SX.sym("p", 3)
     graph = Graph.of(cs.Function("found", [q, p], met(q, p)))
     places = {(0, at): place for at, place in THREE["q"].items()}
-    packs = lanes(graph, places, {cs.OP_ADD, cs.OP_SUB, cs.OP_MUL, cs.OP_DIV, cs.OP_SQ, cs.OP_TWICE, cs.OP_NEG})
-    operations = [{graph.nodes[k].operation for k in pack} for pack in packs]
+    vectorized = {cs.OP_ADD, cs.OP_SUB, cs.OP_MUL, cs.OP_DIV, cs.OP_SQ, cs.OP_TWICE, cs.OP_NEG}
+    packs = Packing(graph, places, vectorized).packs
     assert all(len(pack) == 3 for pack in packs)
-    assert all(len(x) == 1 for x in operations)
-    packed = {k for pack in packs for k in pack}
-    assert len(packed) == sum(map(len, packs))
+    assert all(len({graph.nodes[k].operation for k in pack}) == 1 for pack in packs)
+    together = {k for pack in packs for k in pack}
+    assert len(together) == sum(map(len, packs))
     divisions = [k for k, node in enumerate(graph.nodes) if node.operation == cs.OP_DIV]
-    assert sum(k in packed for k in divisions) == len(divisions) == 9
-    adds = [k for k, node in enumerate(graph.nodes) if node.operation == cs.OP_ADD and k not in packed]
+    assert sum(k in together for k in divisions) == len(divisions) == 9
+    adds = [k for k, node in enumerate(graph.nodes) if node.operation == cs.OP_ADD and k not in together]
     assert len(adds) == 6  # the sum of what all three do, and 1 + its square, three times
 
 
@@ -95,19 +95,44 @@ def test_the_deltas_arms_are_done_together() -> None:
     assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.7 * acceleration.n_instructions()
 
 
+def operations(function: Any) -> int:
+    kept = {cs.OP_INPUT, cs.OP_OUTPUT, cs.OP_CONST}
+    return sum(function.instruction_id(k) not in kept for k in range(function.n_instructions()))
+
+
+def packed(function: Any, found: dict[str, Any], name: str) -> int:
+    """How many vectors a function's text has."""
+    text = source(found, load(name).tree).partition(f"int {function.name()}(const")[2].partition("return 0;")[0]
+    return len(re.findall(r"\bp\d+=", text))
+
+
 def test_changes_along_several_directions_are_done_together() -> None:
     """All of it: what does not depend on the direction is known from the state."""
-    mechanism = load("five_bar")
-    found = functions(mechanism, changes=True)
-    change = {name: found[name] for name in ("change",)}
-    packed = re.findall(r"\bp\d+=", source(change, mechanism.tree))
-    kept = {cs.OP_INPUT, cs.OP_OUTPUT, cs.OP_CONST}
-    done = [k for k in range(found["change"].n_instructions()) if found["change"].instruction_id(k) not in kept]
-    assert len(packed) * TOGETHER == len(done)
+    found = functions(load("five_bar"), changes=True)
+    assert packed(found["changes"], found, "five_bar") * TOGETHER == operations(found["changes"])
+
+
+def test_along_one_direction_alike_branches_are_done_together() -> None:
+    """With few operations: eq. 1 is differentiated as inverse dynamics, D' a is never taken apart."""
+    for name, most in (("five_bar", 500), ("delta", 9000)):
+        found = functions(load(name), changes=True)
+        change = found["change"]
+        together = 2 if name == "five_bar" else 3
+        assert operations(change) <= most
+        assert packed(change, found, name) * together > 0.7 * operations(change)
+
+
+def test_pivots_are_inverted_once_a_state() -> None:
+    """A division takes as long as ten products: one for each of the delta's 39 pivots, none along a direction."""
+    found = functions(load("delta"), changes=True)
+    divisions = {cs.OP_DIV, cs.OP_INV}
+    for name, most in (("state", 39), ("change", 0), ("changes", 0)):
+        graph = Graph.of(found[name])
+        graph = graph.divided_once() if name == "state" else graph
+        assert sum(node.operation in divisions for node in graph.nodes) <= most, name
 
 
 def test_of_a_state_the_deltas_arms_are_done_together() -> None:
     mechanism = load("delta")
-    state = functions(mechanism, changes=True)["state"]
-    written = source({"state": state}, mechanism.tree)
-    assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.6 * state.n_instructions()
+    found = functions(mechanism, changes=True)
+    assert packed(found["state"], found, "delta") * 3 > 0.6 * found["state"].n_instructions()

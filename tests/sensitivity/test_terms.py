@@ -64,6 +64,31 @@ def test_of_every_kind_of_number(formulation: str, tmp_path: Path) -> None:
     assert 0 < counts["pinocchio"] <= other.run.stats["rhs"]
 
 
+@pytest.mark.parametrize("terms", ["generated", "pinocchio"])
+def test_a_right_hand_side_asks_once_how_it_changes(terms: str) -> None:
+    """Whatever the number of parameters; to hold S to the tolerances takes a third more of them at the most."""
+    names = ["link.link_2.mass", "initial.q.theta_1", "link.link_3.mass", "gravity.y", "link.link_2.com.x"]
+    changes = {"solver.rtol": 1e-9, "solver.terms": terms}
+    plain = simulate("five_bar/swing", changes).stats["rhs"]
+    for count in (1, 2, 4, 5):  # along one direction, some of four, four, and four and one
+        run = sensitivities("five_bar/swing", names[:count], changes).run
+        asked = run.stats["changes_by_terms"]
+        assert sum(asked.values()) == asked[terms] == run.stats["rhs"]
+        assert run.stats["rhs"] <= 1.34 * plain
+
+
+def test_of_one_parameter_and_of_several_is_the_same() -> None:
+    """One direction's code against that of four."""
+    names = ["link.link_2.mass", "initial.q.theta_1", "link.link_3.mass", "gravity.y", "link.link_2.com.x"]
+    changes = {"solver.rtol": 1e-11, "solver.terms": "generated"}
+    together = sensitivities("five_bar/swing", names, changes)  # four, and one
+    for name in (names[0], names[-1]):
+        alone = sensitivities("five_bar/swing", [name], changes)
+        for coordinate in together.run.coordinates:
+            curve = together.of(coordinate, name)
+            assert np.abs(alone.of(coordinate, name) - curve).max() <= SAME * max(1e-3, np.abs(curve).max())
+
+
 @pytest.mark.parametrize("there", [False, True])
 def test_terms_that_are_compiled_on_the_way(there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Say from there on how the motion changes, also where those of the motion alone were compiled before."""

@@ -29,6 +29,9 @@ class Dae : public System {
   // `rhs` at y put on the closure to rounding, along every direction, however weakly J determines it.
   bool rate_on_closure(double t, In y, Out y_dot);
 
+ protected:
+  Vector q_tree_;  // where a right-hand side was evaluated last
+
  private:
   void set(In q_tree, bool with_inertia = true);  // the core at a configuration, with J
   void independent(In q_tree, In v);              // q, q_dot
@@ -43,7 +46,7 @@ class Dae : public System {
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
-  Vector q_tree_, step_, z_step_, residual_, unforced_;
+  Vector step_, z_step_, residual_, unforced_;
   Matrix by_q_, by_v_, more_;
 };
 

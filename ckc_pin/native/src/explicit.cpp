@@ -58,7 +58,8 @@ bool Explicit::stages(double h) {
     if (whole) system_.whole(K_.col(s), x_stage_, X_.col(s));
   }
   step_.y_new = step_.y;
-  for (int s = 0; s < stages_; ++s) step_.y_new += (h * B_(s)) * K_.col(s);
+  for (int s = 0; s < stages_; ++s)
+    if (B_(s) != 0.0) step_.y_new += (h * B_(s)) * K_.col(s);
   if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
   K_.col(stages_) = step_.f_new;
   if (step_.x.size()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
@@ -76,7 +77,8 @@ double Explicit::error(double h) {
   double square[2] = {0.0, 0.0};
   for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
     error_.setZero(from.size());
-    for (int s = 0; s <= stages_; ++s) error_ += E_[k](s) * rates.col(s);
+    for (int s = 0; s <= stages_; ++s)
+      if (E_[k](s) != 0.0) error_ += E_[k](s) * rates.col(s);
     square[k] = (error_.array() / scale_.array()).matrix().squaredNorm();
   }
   const double size = static_cast<double>(from.size()), of_five = h * std::sqrt(square[0] / size);
@@ -157,7 +159,8 @@ bool Explicit::between(double at, Out y_at) {
     F_.col(2) = 2 * F_.col(0) - h * (step_.f_new + step_.f);
     for (Eigen::Index k = 0; k < D_.rows(); ++k) {
       F_.col(3 + k).setZero();
-      for (Eigen::Index i = 0; i < K_.cols(); ++i) F_.col(3 + k) += (h * D_(k, i)) * K_.col(i);
+      for (Eigen::Index i = 0; i < K_.cols(); ++i)
+        if (D_(k, i) != 0.0) F_.col(3 + k) += (h * D_(k, i)) * K_.col(i);
     }
   }
   dense_ = true;

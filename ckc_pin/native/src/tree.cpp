@@ -199,13 +199,19 @@ Matrix Tree::rate_changes(In q, In v) const {
   return found;
 }
 
+void Tree::add_bracket(In v, In x, Out sum) const {
+  for (const Root& root : roots) {
+    const Vector3 slide = v.segment<3>(root.v), spin = v.segment<3>(root.v + 3);
+    const Vector3 moved = x.segment<3>(root.v), turned = x.segment<3>(root.v + 3);
+    sum.segment<3>(root.v) += spin.cross(moved) + slide.cross(turned);
+    sum.segment<3>(root.v + 3) += spin.cross(turned);
+  }
+}
+
 Matrix Tree::brackets(In v) const {
   Matrix found = Matrix::Zero(n, n);
-  for (const Root& root : roots) {
-    const Matrix3 turning = skew(v.segment<3>(root.v + 3));
-    found.block<3, 3>(root.v, root.v) = found.block<3, 3>(root.v + 3, root.v + 3) = turning;
-    found.block<3, 3>(root.v, root.v + 3) = skew(v.segment<3>(root.v));
-  }
+  for (const Root& root : roots)
+    for (int k = root.v; k < root.v + 6; ++k) add_bracket(v, Vector::Unit(n, k), found.col(k));
   return found;
 }
 

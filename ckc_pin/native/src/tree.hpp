@@ -68,6 +68,7 @@ class Tree {
   Matrix rate_changes(In q, In v) const;     // (nq, n): of `configuration_rate` by tangent steps
   // What a free root's twist adds to the rate of a tangent step x: x_dot = v_change - brackets(v) x.
   Matrix brackets(In v) const;               // (n, n)
+  void add_bracket(In v, In x, Out sum) const;  // brackets(v) x, which is - brackets(x) v
   void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
   Matrix3 orientation(In q, Root root) const;
   // The twist in a free root's axes that takes it to another place.

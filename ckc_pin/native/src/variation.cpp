@@ -25,13 +25,6 @@ Variation::Variation(System& system, VariationTable table)
   q_.setZero(tree_.nq), v_.setZero(tree_.n), a_.setZero(tree_.n), of_tree_.setZero(tree_.n);
   back_.setZero(n), delay_.setZero(count), acting_.setZero(n), lacking_.setZero(n), lambda_.setZero(m);
   move_.setZero(core_.tree.nq), force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
-  changed_.setZero(Written::lanes, n);
-  for (int first = 0; first < count; first += Written::lanes) {
-    const int here = std::min(count - first, Written::lanes);
-    Matrix& along = directions_.emplace_back(Matrix::Zero(Written::lanes, core_.tree.nq + 2 * n + table_.directions.rows()));
-    along.block(0, along.cols() - table_.directions.rows(), here, table_.directions.rows()) =
-        table_.directions.middleCols(first, here).transpose();
-  }
   for (const Parameter& of : table_.parameters)
     acting_varies_ |= std::any_of(of.effects.begin(), of.effects.end(), is_acting);
 }
@@ -124,7 +117,7 @@ bool Variation::what_acts(In v) {
 }
 
 // What acts, where it answers to the state.
-void Variation::add_answer(const Matrix& s) {
+void Variation::add_answer(const Eigen::Ref<const Matrix>& s) {
   force_.noalias() += u_by_q_ * s.topRows(n);
   force_.noalias() += u_by_v_ * s.bottomRows(n);
 }
@@ -153,7 +146,7 @@ bool Variation::rates(In v, In a, const Matrix& s, Matrix& s_dot) {
     if (!core_.responses(core_.joints.locked, responses_)) return false;
     add_back(change_);
   }
-  move(v, s, s_dot);
+  s_dot.resize(2 * n, count), move(v, s, s_dot);
   s_dot.bottomRows(n) = change_;
   return s_dot.allFinite();
 }
@@ -162,26 +155,43 @@ bool Variation::is_written() const {
   return core_.written && core_.written->has_changes() && table_.directions.rows() == core_.written->parameters();
 }
 
-bool Variation::written_rates(In q_tree, In v, const Matrix& s, Matrix& s_dot) {
+// The code may be there from some time of the run on.
+void Variation::begin_written() {
+  const Matrix& numbers = table_.directions;
+  for (int first = 0; first < count; first += core_.written->lanes()) {
+    const int here = std::min(count - first, core_.written->lanes()), rows = here == 1 ? 1 : core_.written->lanes();
+    Along& along = along_.emplace_back(Along{first, here, {}, {}});
+    along.changes.setZero(rows, n), along.directions.setZero(rows, core_.tree.nq + 2 * n + numbers.rows());
+    along.directions.block(0, core_.tree.nq + 2 * n, here, numbers.rows()) = numbers.middleCols(first, here).transpose();
+  }
+}
+
+bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) {
   const bool locked = !core_.joints.locked.empty();
   if (!what_acts(v) || !core_.written->state(q_tree, v, acting_)) return false;
+  if (along_.empty()) begin_written();
   ++written;
   force_.setZero();
   if (answers_ || acting_varies_) add_acting(q_tree, v, force_), force_ = -force_;
   if (answers_) add_answer(s);
   move(v, s, s_dot);
   const int nq = core_.tree.nq;
-  for (size_t i = 0; i < directions_.size(); ++i) {
-    Matrix& along = directions_[i];
-    const int first = static_cast<int>(i) * Written::lanes, last = std::min(count, first + Written::lanes);
-    for (int p = first; p < last; ++p) {
+  for (Along& along : along_) {
+    const auto apart = along.directions.rows();
+    for (int row = 0; row < along.count; ++row) {
+      const int p = along.first + row;
       core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
-      for (int k = 0; k < nq; ++k) along(p - first, k) = move_(k);
-      for (int k = 0; k < n; ++k) along(p - first, nq + k) = s(n + k, p), along(p - first, nq + n + k) = force_(k, p);
+      double* to = along.directions.data() + row;
+      for (int k = 0; k < nq; ++k, to += apart) *to = move_(k);
+      for (int k = 0; k < n; ++k, to += apart) *to = s(n + k, p);
+      for (int k = 0; k < n; ++k, to += apart) *to = force_(k, p);
     }
-    core_.written->change(along, changed_);
-    for (int p = first; p < last; ++p)
-      for (int k = 0; k < n; ++k) s_dot(n + k, p) = changed_(p - first, k);
+    if (along.directions.rows() == 1)
+      core_.written->change(along.directions.reshaped(), along.changes.reshaped());
+    else
+      core_.written->changes(along.directions, along.changes);
+    for (int row = 0; row < along.count; ++row)
+      for (int k = 0; k < n; ++k) s_dot(n + k, along.first + row) = along.changes(row, k);
   }
   if (locked) {
     if (!core_.responses(core_.joints.locked, responses_)) return false;
@@ -189,17 +199,17 @@ bool Variation::written_rates(In q_tree, In v, const Matrix& s, Matrix& s_dot) {
     add_back(change_);
     s_dot.bottomRows(n) = change_;
   }
-  return s_dot.allFinite();
+  return true;
 }
 
-void Variation::move(In v, const Matrix& s, Matrix& s_dot) const {
-  s_dot.resize(2 * n, count);
+void Variation::move(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const {
   s_dot.topRows(n) = s.bottomRows(n);
-  if (!core_.tree.roots.empty()) s_dot.topRows(n) -= core_.tree.brackets(v) * s.topRows(n);
+  if (!core_.tree.roots.empty())
+    for (int p = 0; p < count; ++p) core_.tree.add_bracket(s.col(p).head(n), v, s_dot.col(p).head(n));
 }
 
 void Variation::rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const {
-  move(v, s, s_dot);
+  s_dot.resize(2 * n, count), move(v, s, s_dot);
   s_dot.bottomRows(n).noalias() = by_q * s.topRows(n);
   s_dot.bottomRows(n).noalias() += by_v * s.bottomRows(n);
 }

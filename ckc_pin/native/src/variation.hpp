@@ -65,7 +65,7 @@ class Variation {
   bool rates(In v, In a, const Matrix& s, Matrix& s_dot);
   // The same at any state where the terms are written out with their changes; false where they are not, or lose digits.
   bool is_written() const;
-  bool written_rates(In q_tree, In v, const Matrix& s, Matrix& s_dot);
+  bool written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot);
   // The same where nothing varies but the start, by eq. 1's derivatives.
   void rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const;
   // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
@@ -78,9 +78,10 @@ class Variation {
 
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
-  void move(In v, const Matrix& s, Matrix& s_dot) const;  // the places' part of the rates
+  void move(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const;  // the places' part of the rates
+  void begin_written();
   bool what_acts(In v);  // acting_, and its slopes where it answers_
-  void add_answer(const Matrix& s);  // to force_
+  void add_answer(const Eigen::Ref<const Matrix>& s);  // to force_
   void add_back(Matrix& change);  // what holds the joints that are locked
   // What each parameter adds to the forces that are lacking, and to J a; `impulsive` as there.
   void add_parameters(In v, In a, In lambda, bool impulsive, Matrix& force, Matrix& row);
@@ -107,8 +108,11 @@ class Variation {
   bool acting_varies_ = false;  // some effect is of what acts
   bool answers_ = false;        // what acts changes with the state
   Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_;
-  std::vector<Matrix> directions_;  // for the code that is written out, as many rows each as it takes at a time
-  Matrix changed_;
+  struct Along {  // parameters that the code which is written out takes at a time, rows
+    int first, count;
+    Matrix directions, changes;
+  };
+  std::vector<Along> along_;
   Vector acting_, back_, move_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };

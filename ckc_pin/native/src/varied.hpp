@@ -45,9 +45,11 @@ class Varied : public Base, public WithVariation {
 
   bool rhs(double t, In y, Out y_dot) override {
     if (!Base::rhs(t, y.head(size_), y_dot.head(size_))) return false;
+    Eigen::Map<Matrix> s_dot(y_dot.data() + size_, rows(), variation_.count);
+    if (written_rates(y, s_dot) && finite(y_dot.tail(this->size - size_))) return true;
     take(y);
-    if (!written_rates(y) && !rates(t, y, y_dot)) return this->fails(Trouble::infinite);
-    Eigen::Map<Matrix>(y_dot.data() + size_, rows(), variation_.count) = s_dot_;
+    if (!rates(t, y, y_dot)) return this->fails(Trouble::infinite);
+    s_dot = s_dot_;
     return true;
   }
 
@@ -113,14 +115,13 @@ class Varied : public Base, public WithVariation {
   int rows() const { return 2 * variation_.n; }
   void take(In y) { s_ = Eigen::Map<const Matrix>(y.data() + size_, rows(), variation_.count); }
   // Where the right-hand side was evaluated last, by the code that is written out.
-  bool written_rates(In y) {
+  bool written_rates(In y, Eigen::Ref<Matrix> s_dot) {
     if (!variation_.is_written()) return false;
+    const Eigen::Map<const Matrix> s(y.data() + size_, rows(), variation_.count);
     if constexpr (std::is_same_v<Base, Dae>) {
-      q_tree_ = y.head(this->core.tree.nq);
-      this->core.tree.normalize(q_tree_);
-      return variation_.written_rates(q_tree_, y.segment(q_tree_.size(), variation_.n), s_, s_dot_);
+      return variation_.written_rates(this->q_tree_, y.segment(this->q_tree_.size(), variation_.n), s, s_dot);
     } else {
-      return variation_.written_rates(this->core.q_tree, this->v_tree, s_, s_dot_);
+      return variation_.written_rates(this->core.q_tree, this->v_tree, s, s_dot);
     }
   }
   bool rates(double t, In y, In y_dot) {
@@ -140,7 +141,7 @@ class Varied : public Base, public WithVariation {
   const bool of_start_;  // nothing varies but where it starts
   Variation variation_;
   Matrix s_, s_dot_, by_q_, by_v_, u_, tau_;
-  Vector v_, a_, q_tree_;
+  Vector v_, a_;
 };
 
 }  // namespace ckc

@@ -2,6 +2,7 @@
 
 #include <dlfcn.h>
 
+#include <cstring>
 #include <stdexcept>
 
 namespace ckc {
@@ -18,8 +19,11 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     jacobian_rate_ = code("jacobian_rate", 4), rest_ = code("rest", 3), coriolis_ = perhaps("coriolis", 5);
     potential_energy_ = code("potential_energy", 3), acceleration_ = code("acceleration", 6);
     closing_step_ = code("closing_step", 4), jacobian_ = perhaps("jacobian", 5);
-    state_ = perhaps("state", 5), change_ = perhaps("change", 2);
-    if (state_) at_.setZero(size("state_sparsity_out")), acceleration_at_.setZero(size("change_sparsity_out") / lanes);
+    state_ = perhaps("state", 5), change_ = perhaps("change", 2), changes_ = perhaps("changes", 2);
+    if (state_) {
+      known_.resize(size("state_sparsity_out") / 8 + 1), acceleration_at_.setZero(size("state_sparsity_out", 1));
+      lanes_ = static_cast<int>(size("changes_sparsity_out") / size("change_sparsity_out"));
+    }
   } catch (...) {
     dlclose(library_);
     throw;
@@ -51,8 +55,8 @@ Written::Code Written::perhaps(const char* name, int arguments) const {
   return dlsym(library_, name) ? code(name, arguments) : nullptr;
 }
 
-long long Written::size(const char* of) const {
-  return reinterpret_cast<const long long* (*)(long long)>(symbol(of))(0)[0];
+long long Written::size(const char* of, long long k) const {
+  return reinterpret_cast<const long long* (*)(long long)>(symbol(of))(k)[0];
 }
 
 void Written::place(In q, Out phi, Matrix& J) const {
@@ -99,20 +103,30 @@ double Written::potential_energy(In q) const {
   return value;
 }
 
+static bool same(In a, const Vector& b) {
+  return a.size() == b.size() && std::memcmp(a.data(), b.data(), sizeof(double) * static_cast<size_t>(a.size())) == 0;
+}
+
 bool Written::state(In q, In v, In u_tree) const {
-  if (q_.size() && q_ == q && v_ == v && u_ == u_tree) return sound_;
+  if (q_.size() && same(q, q_) && same(v, v_) && same(u_tree, u_)) return sound_;
   q_ = q, v_ = v, u_ = u_tree;
   double sound = 0.0;
   const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), numbers_.data()};
-  double* to[] = {at_.data(), acceleration_at_.data(), &sound};
+  double* to[] = {known_.data()->x, acceleration_at_.data(), &sound};
   state_(from, to, nullptr, nullptr, 0);
   return sound_ = sound > 0.0;
 }
 
-void Written::change(const Matrix& directions, Matrix& acceleration) const {
-  const double* from[] = {at_.data(), directions.data()};
+void Written::change(In direction, Out acceleration) const {
+  const double* from[] = {known_.data()->x, direction.data()};
   double* to[] = {acceleration.data()};
   change_(from, to, nullptr, nullptr, 0);
+}
+
+void Written::changes(const Matrix& directions, Matrix& acceleration) const {
+  const double* from[] = {known_.data()->x, directions.data()};
+  double* to[] = {acceleration.data()};
+  changes_(from, to, nullptr, nullptr, 0);
 }
 
 bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {

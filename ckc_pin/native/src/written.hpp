@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <vector>
 
 #include "trig.hpp"
 
@@ -28,12 +29,14 @@ class Written {
   double potential_energy(In q) const;
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // How that changes: at a state, and then along any directions, as many at a time as there are lanes, a row each: of q',
-  // v', u' and what the library takes. Only of a library made for it. False as above, and no changes there are known.
-  static constexpr int lanes = 4;
+  // How that changes: at a state, and then along a direction, a change of q', v', u' and what the library takes; or along
+  // as many at a time as there are lanes, a row each. Only of a library made for it. False as above, and no changes there
+  // are known.
   bool has_changes() const { return state_; }
+  int lanes() const { return lanes_; }
   bool state(In q, In v, In u_tree) const;
-  void change(const Matrix& directions, Matrix& acceleration) const;  // (lanes, ...), (lanes, n)
+  void change(In direction, Out acceleration) const;
+  void changes(const Matrix& directions, Matrix& acceleration) const;  // (lanes, ...), (lanes, n)
   // The x with J x = -residual that is smallest in the metric of D'; false as above.
   bool closing_step(In q, In residual, Out x) const;
   // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
@@ -44,7 +47,7 @@ class Written {
   void* symbol(const std::string& name) const;
   Code code(const char* name, int arguments) const;     // of so many
   Code perhaps(const char* name, int arguments) const;  // null where there is none
-  long long size(const char* of) const;
+  long long size(const char* of, long long k = 0) const;
 
   // Cosines and sines of q, which most functions of one state share.
   const double* trig(In q) const { return trig_.of(q); }
@@ -53,10 +56,15 @@ class Written {
   long long taken_ = 0;  // parameters: to look a function up takes longer than to call it
   Vector numbers_;  // the parameters, and what follows from them alone
   mutable Trig trig_;
-  mutable Vector q_, v_, u_, at_, acceleration_at_;  // the last state that changes were asked for, and what is known there
+  struct alignas(64) Line {  // of the processor's cache: what is read four at a time is in one
+    double x[8];
+  };
+  mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
+  mutable std::vector<Line> known_;             // and what is known there
   mutable bool sound_ = false;
+  int lanes_ = 0;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
-  Code state_, change_;
+  Code state_, change_, changes_;
 };
 
 }  // namespace ckc
