@@ -69,7 +69,7 @@ Dae& dae_of(Run& run) {
   return *dae;
 }
 
-// J's least singular value over the largest, scaled, and its rate, at a state of a DAE as it is.
+// What the rank monitor has of J, scaled: its least singular value, and its rate, at a state of a DAE as it is.
 nb::tuple rank(Run& run, Given y) {
   Dae& dae = dae_of(run);
   require(y, dae.size, "y");

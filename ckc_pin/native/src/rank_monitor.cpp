@@ -19,7 +19,7 @@ RankMonitor::RankMonitor(const Core& core) : spectrum_(core.rows.pattern, core.n
 double RankMonitor::value(Core& core) {
   core.jacobian();
   spectrum_.compute(core.rows.J, core.scales.rows, core.scales.columns);
-  return spectrum_.least() / spectrum_.largest();
+  return spectrum_.least() / spectrum_.mean();
 }
 
 RankMonitor::Rank RankMonitor::at(System& system) {
@@ -28,14 +28,14 @@ RankMonitor::Rank RankMonitor::at(System& system) {
   core.jacobian();
   spectrum_.compute(core.rows.J, core.scales.rows, core.scales.columns);
   spectrum_.vectors(u_, v_);
-  const double least = v_.norm(), largest = spectrum_.largest();
+  const double least = v_.norm(), mean = spectrum_.mean();
   core.jacobian_rate(system.velocity);
   v_.array() *= core.scales.columns.array();
   u_.array() *= core.scales.rows.array();
   double rate = 0.0;
   for (Eigen::Index i = 0; i < u_.size(); ++i)
     for (int j : core.rows.pattern[i]) rate += u_(i) * core.rows.J_dot(i, j) * v_(j);
-  return {least / largest, rate / std::max(least, 1e-300) / largest};
+  return {least / mean, rate / std::max(least, 1e-300) / mean};
 }
 
 bool RankMonitor::ahead(const Rank& end, double length) {

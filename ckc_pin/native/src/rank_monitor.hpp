@@ -18,7 +18,7 @@ class RankMonitor {
  public:
   explicit RankMonitor(const Core& core);
 
-  // J's least singular value that is not zero relative to the largest, scaled to be free of units, and its rate.
+  // J's least singular value that is not zero over the root mean square of all such, free of units, and its rate.
   struct Rank {
     double value = 1.0, rate = 0.0;
   };

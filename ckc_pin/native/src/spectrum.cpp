@@ -7,7 +7,7 @@
 
 namespace ckc {
 
-constexpr int small = 24;           // rows, up to which decomposing it whole is as cheap
+constexpr int small = 8;             // rows, up to which decomposing it whole is as cheap
 constexpr double exhausted = 1e-14;  // of the matrix' size: what the next direction is short of being one
 constexpr int first = 4;             // steps, after which it is looked whether they are enough; then after twice as many
 constexpr double exact = 1e-7;       // of the eigenvalue: what its vector may leave; its square is what the value is off by
@@ -32,7 +32,7 @@ Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank) : patter
       if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
     }
   factor_.shape(m, m, whole_ ? full_pattern(m) : meets);
-  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), before_.setZero(m), along_.setZero(steps_);
+  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
   // Solvers cannot be copied before their first use.
   const int size = whole_ ? std::max(m, 1) : 1;
   eigen_.compute(Matrix::Identity(size, size), Eigen::EigenvaluesOnly);
@@ -47,43 +47,18 @@ void Spectrum::compute(const Matrix& a, In row_scale, In column_scale) {
     for (int j : pair.columns) sum += scaled_(pair.a, j) * scaled_(pair.b, j);
     gram_(pair.a, pair.b) = gram_(pair.b, pair.a) = sum;
   }
+  mean_ = gram_.trace() / rank_;
   whole_ ? dense() : sparse();
 }
 
 void Spectrum::dense() {
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
-  const auto m = gram_.rows();
-  largest_ = eigen_.eigenvalues()(m - 1), least_ = eigen_.eigenvalues()(m - rank_);
+  least_ = eigen_.eigenvalues()(gram_.rows() - rank_);
 }
 
 void Spectrum::sparse() {
-  largest_ = most();
   factor_.compute(gram_);
   least_ = factor_.singular() ? 0.0 : 1.0 / most_of_inverse();
-}
-
-// Without orthogonalization: what it finds once more is no larger.
-double Spectrum::most() {
-  along_nothing(u_);
-  u_.normalize();
-  for (int k = 0;; ++k) {
-    next_.setZero();
-    for (const Pair& pair : pairs_) {
-      const double entry = gram_(pair.a, pair.b);
-      next_(pair.a) += entry * u_(pair.b);
-      if (pair.a != pair.b) next_(pair.b) += entry * u_(pair.a);
-    }
-    diagonal_(k) = u_.dot(next_);
-    next_ -= diagonal_(k) * u_;
-    if (k) next_ -= beside_(k - 1) * before_;
-    beside_(k) = next_.norm();
-    if (ended(k)) {
-      ritz_.computeFromTridiagonal(diagonal_.head(k + 1), beside_.head(k), Eigen::EigenvaluesOnly);
-      return ritz_.eigenvalues()(k);
-    }
-    before_.swap(u_);
-    u_ = next_ / beside_(k);
-  }
 }
 
 // With full orthogonalization, twice, which a few steps can afford; its vector is u_.
@@ -119,7 +94,7 @@ bool Spectrum::ended(int k) const {
 
 void Spectrum::vectors(Vector& u, Vector& v) {
   if (whole_) {  // inverse iteration: the shift is as good as the value
-    gram_.diagonal().array() -= least_ + 1e-12 * largest_;
+    gram_.diagonal().array() -= least_ + 1e-12 * mean_;
     factor_.compute(gram_);
     along_nothing(u_);
     for (int k = 0; k < 2; ++k) {
