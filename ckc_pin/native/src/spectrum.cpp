@@ -64,7 +64,8 @@ void Spectrum::sparse() {
 // With full orthogonalization, twice, which a few steps can afford; its vector is u_.
 double Spectrum::most_of_inverse() {
   along_nothing(u_);
-  basis_.col(0) = u_.normalized();
+  u_.normalize();
+  basis_.col(0) = u_;
   for (int k = 0, look = first;; ++k) {
     factor_.solve(basis_.col(k), next_);
     diagonal_(k) = basis_.col(k).dot(next_);
