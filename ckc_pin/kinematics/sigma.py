@@ -131,7 +131,8 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
     at = start
     residual = at.phi - w
     size = _unclosed(at, residual)
-    polish = tolerance > LOOSE * at.tree.size and size > 0.0
+    redundant = len(residual) > len(at.partition.z)
+    polish = redundant and tolerance > LOOSE * at.tree.size and size > 0.0
     for iteration in range(MAX_ITERATIONS):
         closed = size <= tolerance
         if closed and not polish:

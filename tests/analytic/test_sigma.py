@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ckc_pin.kinematics.sigma import move, sigma
+from ckc_pin.kinematics.sigma import move, newton, sigma
 from ckc_pin.mechanism import Psi
 from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
 from tests.conftest import Pair, assert_close
@@ -169,3 +169,16 @@ def coincident_elbows(reference: FiveBar) -> Array:
     cosine = (l1**2 + base**2 - l3**2) / (2 * l1 * base)
     apex = l1 * np.exp(1j * np.arccos(cosine))
     return np.angle([apex, apex - base])
+
+
+def test_loops_without_redundant_rows_are_closed_to_the_tolerance_and_no_further(pair: Pair) -> None:
+    """Rounding is for rows that contradict each other: what z leaves open here is the caller's choice."""
+    mechanism, by_hand = pair
+    stale = np.array(by_hand.equilibrium())
+    stale[Q] += [0.01, 0.005]
+    open_by = np.abs(by_hand.phi(stale)).max()
+    for tolerance in (2 * open_by, 0.5 * open_by):
+        found = newton(mechanism.kinematics(stale), 0.0, tolerance)
+        assert found.converged
+        assert found.iterations == (0 if open_by <= tolerance else 1)
+        assert 1e-8 < np.abs(by_hand.phi(found.at.q_tree)).max() <= tolerance
