@@ -65,7 +65,7 @@ def test_modules_are_seen_in_a_fresh_interpreter() -> None:
     assert all(row.reason for row in modules_of("no_such_scene"))
     big, no = module_costs(1, {"big": ("import numpy; x = numpy.ones(2**22)", ""), "no": ("1 / 0", "")})
     assert big.bytes is not None
-    assert 2**25 <= big.bytes < 2**26
+    assert 2**25 - 2**16 <= big.bytes < 2**26  # in pages, of which the interpreter gives some back meanwhile
     assert big.seconds is not None
     assert big.seconds > 0
     assert "ZeroDivisionError" in no.reason
