@@ -26,6 +26,13 @@ Matrix rows_of(const double* values, int rows, int columns, bool triangular) {
 
 Vector vector_of(const double* values, int size) { return Eigen::Map<const Vector>(values, size); }
 
+// What the first rates make of h by their coefficients, many of which are zero.
+template <class Coefficients>
+void add(const Matrix& rates, const Coefficients& of, Eigen::Index count, double h, Out sum) {
+  for (Eigen::Index i = 0; i < count; ++i)
+    if (of(i) != 0.0) sum += (h * of(i)) * rates.col(i);
+}
+
 }  // namespace
 
 Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tolerance& tolerance)
@@ -52,14 +59,12 @@ bool Explicit::stages(double h) {
   if (whole) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
   for (int s = 1; s < stages_; ++s) {
     y_stage_ = step_.y;
-    for (int i = 0; i < s; ++i)
-      if (A_(s, i) != 0.0) y_stage_ += (h * A_(s, i)) * K_.col(i);
+    add(K_, A_.row(s), s, h, y_stage_);
     if (!evaluate(step_.t + C_(s) * h, y_stage_, K_.col(s))) return false;
     if (whole) system_.whole(K_.col(s), x_stage_, X_.col(s));
   }
   step_.y_new = step_.y;
-  for (int s = 0; s < stages_; ++s)
-    if (B_(s) != 0.0) step_.y_new += (h * B_(s)) * K_.col(s);
+  add(K_, B_, stages_, h, step_.y_new);
   if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
   K_.col(stages_) = step_.f_new;
   if (step_.x.size()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
@@ -77,8 +82,7 @@ double Explicit::error(double h) {
   double square[2] = {0.0, 0.0};
   for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
     error_.setZero(from.size());
-    for (int s = 0; s <= stages_; ++s)
-      if (E_[k](s) != 0.0) error_ += E_[k](s) * rates.col(s);
+    add(rates, E_[k], stages_ + 1, 1.0, error_);
     square[k] = (error_.array() / scale_.array()).matrix().squaredNorm();
   }
   const double size = static_cast<double>(from.size()), of_five = h * std::sqrt(square[0] / size);
@@ -141,8 +145,7 @@ bool Explicit::extra_stages(double h) {
   for (Eigen::Index k = 0; k < C_extra_.size(); ++k) {
     const auto s = stages_ + 1 + k;
     y_stage_ = step_.y;
-    for (Eigen::Index i = 0; i < s; ++i)
-      if (A_extra_(k, i) != 0.0) y_stage_ += (h * A_extra_(k, i)) * K_.col(i);
+    add(K_, A_extra_.row(k), s, h, y_stage_);
     if (!evaluate(step_.t + C_extra_(k) * h, y_stage_, K_.col(s))) return false;
   }
   return true;
@@ -159,8 +162,7 @@ bool Explicit::between(double at, Out y_at) {
     F_.col(2) = 2 * F_.col(0) - h * (step_.f_new + step_.f);
     for (Eigen::Index k = 0; k < D_.rows(); ++k) {
       F_.col(3 + k).setZero();
-      for (Eigen::Index i = 0; i < K_.cols(); ++i)
-        if (D_(k, i) != 0.0) F_.col(3 + k) += (h * D_(k, i)) * K_.col(i);
+      add(K_, D_.row(k), K_.cols(), h, F_.col(3 + k));
     }
   }
   dense_ = true;
