@@ -102,8 +102,8 @@ class ConstrainedInertia:
         found = cs.vertcat(rates, cs.horzcat(*(cs.vertcat(*x) for x in columns)))
         return _across(found, terms), cs.horzcat(*(cs.vertcat(*x) for x in by_u))
 
-    def change(self, u: Any, q: Any, v: Any, force: Any, arguments: Any) -> Any:
-        """Return how v'_dot changes with all that it depends on, along one direction, (n).
+    def change(self, u: Any, q: Any, v: Any, more: Any) -> Any:
+        """Return how v'_dot changes along one direction, (n).
 
         As in `derivatives`: one more elimination.
 
@@ -111,18 +111,42 @@ class ConstrainedInertia:
         ----------
         u : casadi.SX of n
             u'; nothing is corrected.
-        q, v, force, arguments : casadi.SX
-            Changes of q' (its quaternions' lengths stay one), v', u', and of the numbers that are arguments.
+        q, v : casadi.SX
+            Changes of q' (its quaternions' lengths stay one) and v'.
+        more : casadi.SX of n and the kept rows
+            Changes of u' and of J v'_dot, among them what `by_arguments` gives.
         """
         import casadi as cs
 
         n, (left, unknown) = self._n, self._left()
-        change = self._terms.angles.along(left, q)
-        change += cs.jtimes(left, cs.vertcat(self._terms.v, self._terms.arguments.vector), cs.vertcat(v, arguments))
-        change = cs.substitute(change, unknown, self._solution(u))
-        along = [-change[n + i] for i in range(len(self._terms.kept))]
-        found, _ = self.solve([force[i] - change[i] for i in range(n)], along)
+        change = self._terms.angles.along(left, q) + cs.jtimes(left, self._terms.v, v)
+        more = more - cs.substitute(change, unknown, self._solution(u))
+        found, _ = self.solve([more[i] for i in range(n)], [more[i] for i in range(n, more.numel())])
         return cs.vertcat(*found)
+
+    def by_arguments(self, u: Any, arguments: Any) -> Any:
+        """Return what a change of the numbers that are arguments is like, a column for each of their groups.
+
+        Parameters
+        ----------
+        u : casadi.SX of n
+            u'.
+        arguments : casadi.SX
+            The change.
+
+        Returns
+        -------
+        casadi.SX, (n and the kept rows, groups)
+            The changes of u' and of J v'_dot that would do the same.
+        """
+        import casadi as cs
+
+        (left, unknown), groups = self._left(), self._terms.arguments.groups
+        each = cs.SX(arguments.numel(), len(groups))
+        for k, group in enumerate(groups):
+            each[group, k] = arguments[group]
+        change = -cs.jtimes(left, self._terms.arguments.vector, each)
+        return cs.substitute(change, unknown, self._solution(u))
 
     def _left(self) -> tuple[Any, Any]:
         """What eq. 1 says is u' and zero, in `v_dot` and symbols for the kept rows' multipliers; those symbols."""

@@ -100,6 +100,8 @@ class Arguments:
     Attributes
     ----------
     vector : casadi.SX
+    groups : list of lists of int
+        Places in it of what changes together: a body's mass, centre and inertia; of other numbers all of a kind.
     """
 
     def __init__(self, which: Mapping[str, BoolArray]) -> None:
@@ -110,6 +112,11 @@ class Arguments:
             at = [tuple(int(i) for i in index) for index in np.argwhere(there)]
             self._symbols[name] = {index: cs.SX.sym("_".join([name, *map(str, index)])) for index in at}
         self.vector = cs.vertcat(*(symbol for found in self._symbols.values() for symbol in found.values()))
+        groups: dict[object, list[int]] = {}
+        places = [(name, index) for name, found in self._symbols.items() for index in found]
+        for place, (name, (first, *_)) in enumerate(places):
+            groups.setdefault(first if name in ("mass", "centre", "inertia") else name, []).append(place)
+        self.groups = [*groups.values()]
 
     def number(self, name: str, *index: int) -> Any:
         """Return one of them, a structural zero where there is none."""

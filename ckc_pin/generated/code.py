@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from ckc_pin.generated.acceleration import ConstrainedInertia
 from ckc_pin.generated.branches import alike_branches
+from ckc_pin.generated.changes import change_functions
 from ckc_pin.generated.expressions import Expressions, expressions
-from ckc_pin.generated.graph import Graph, Lane
-from ckc_pin.generated.text import Alike, result_lanes, text
+from ckc_pin.generated.text import Alike, split, text
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import BoolArray, Tree
+from ckc_pin.mechanism.tree import BoolArray
 
-__all__ = ["FUNCTIONS", "functions", "source"]
+__all__ = ["FUNCTIONS", "Code"]
 
 # name: arguments and results of the C functions; matrices are dense, by columns. After q each takes the cosines and
 # sines of its numbers, at last what `numbers` gives.
@@ -32,127 +30,83 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
-TOGETHER, ALL = 4, -1  # directions; their group of lanes, which is no branches'
 LARGEST_JACOBIAN = 3e4  # operations of the acceleration times n, about twice those of its derivatives: above, none
 
 
-def functions(
-    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
-) -> dict[str, Any]:
-    """Return CasADi functions: `numbers`, from what may be varied to what the others take last, and `FUNCTIONS`.
+@dataclass(frozen=True)
+class Code:
+    """What is written out of a mechanism.
 
-    With `changes` also how the acceleration changes along any direction of q', v', u' and of what may be varied:
-    `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it is
-    sound; `change` takes the first of these and a direction: changes of q', v', u' and of what may be varied. So does
-    `changes`, of `TOGETHER` directions, each number's side by side as in its result.
+    `numbers`, from what may be varied to what the others take last, and `FUNCTIONS`. Left out are `coriolis` of a tree
+    with a free root, whose twist has several C', and `jacobian` where it would be too long to be compiled.
 
-    Left out are `coriolis` of a tree with a free root, whose twist has several C', and `jacobian` where it would be too
-    long to be compiled.
+    With changes also how the acceleration changes along any direction: `state` of (q, trig, v, u, numbers) gives what
+    does not depend on the direction, the acceleration, and whether it is sound; `change` takes the first of these and a
+    direction, changes of q', v' and `more`: of u', and of J v'_dot by the rows that are kept. So does `changes`, of
+    `TOGETHER` directions, each number's side by side as in its result. Of what may be varied, `more` is the sum of what
+    `varied_K` gives, for each group K that changes at all; `groups` of a change tells by how much.
+
+    Attributes
+    ----------
+    functions : dict of str to casadi.Function
+    alike : mapping
+        Whose their arguments are that alike branches have.
     """
+
+    functions: dict[str, Any]
+    alike: Alike
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False) -> Code:
+        """Write a mechanism out, of the numbers that are arguments (`arguments.present`)."""
+        import casadi as cs
+
+        alike = dict(alike_branches(mechanism.tree))
+        terms = expressions(mechanism, which)
+        symbols = {
+            "q": terms.angles.q,
+            "trig": terms.angles.trig,
+            "v": terms.v,
+            "u": cs.SX.sym("u", mechanism.n),
+            "correction": cs.SX.sym("correction", mechanism.closure.rows),
+            "residual": cs.SX.sym("residual", mechanism.closure.rows),
+            "x": cs.SX.sym("x", mechanism.n),
+        }
+        along = {
+            "q": cs.SX.sym("q_change", mechanism.tree.nq),
+            "v": cs.SX.sym("v_change", mechanism.n),
+            "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
+            "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
+        }
+        results = _results(terms, symbols, along if changes else None)
+        every, once, found = _once(terms, results)
+        part = dict(zip(results, split(every, [x.numel() for x in results.values()]), strict=True))
+        for name, (given, gives) in FUNCTIONS.items():
+            if not part.keys() >= {*gives}:
+                continue
+            takes = {x: symbols[x] for x in ("q", "trig", *given[1:])} | {"numbers": once}
+            together = cs.cse(cs.vertcat(*(part[x] for x in gives)))
+            parts = split(together, [results[x].numel() for x in gives])
+            found[name] = cs.Function(name, [*takes.values()], parts, [*takes], list(gives))
+        if changes:
+            state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": once}
+            more, whose = change_functions(part, state, along, terms.arguments.groups, alike)
+            found, alike = found | more, {**alike, **whose}
+        return cls(found, alike)
+
+    def text(self) -> str:
+        """The C text."""
+        return text([*self.functions.values()], self.alike)
+
+
+def _once(terms: Expressions, results: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+    """What does not change with the state is computed once: the other results, what they take, and what gives that."""
     import casadi as cs
 
-    terms = expressions(mechanism, which)
-    symbols = {
-        "q": terms.angles.q,
-        "trig": terms.angles.trig,
-        "v": terms.v,
-        "u": cs.SX.sym("u", mechanism.n),
-        "correction": cs.SX.sym("correction", mechanism.closure.rows),
-        "residual": cs.SX.sym("residual", mechanism.closure.rows),
-        "x": cs.SX.sym("x", mechanism.n),
-    }
     arguments = terms.arguments.vector
-    along = {
-        "q": cs.SX.sym("q_change", mechanism.tree.nq),
-        "v": cs.SX.sym("v_change", mechanism.n),
-        "force": cs.SX.sym("u_change", mechanism.n),
-        "arguments": cs.SX.sym("arguments_change", arguments.numel()),
-    }
-    results = _results(terms, symbols, along if changes else None)
-    # what does not change with the state is computed once
-    alike, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), arguments)
-    once = cs.vertcat(arguments, *alone)
-    found = {"numbers": cs.Function("numbers", [arguments], [cs.vertcat(arguments, *made_of)])}
-    part = dict(zip(results, _split(alike, [x.numel() for x in results.values()]), strict=True))
-    for name, (given, gives) in FUNCTIONS.items():
-        if not part.keys() >= {*gives}:
-            continue
-        takes = ("q", "trig", *given[1:])
-        together = cs.cse(cs.vertcat(*(part[x] for x in gives)))
-        parts = _split(together, [results[x].numel() for x in gives])
-        found[name] = cs.Function(name, [*(symbols[x] for x in takes), once], parts, [*takes, "numbers"], list(gives))
-    if changes:
-        state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": once}
-        found |= _changes(part, state, cs.vertcat(*along.values()), alike_branches(mechanism.tree))
-    return found
-
-
-def _changes(part: Mapping[str, Any], state: Mapping[str, Any], direction: Any, alike: Alike) -> dict[str, Any]:
-    """Return what tells how the acceleration changes: `state`, `change` and `changes`."""
-    import casadi as cs
-
-    of = [*state.values()]
-    change, taken, made_of = cs.extract_parametric(cs.cse(part["change"]), cs.vertcat(*of))
-    change = cs.cse(change)
-    known = cs.vertcat(*taken, *_symbols_of(change, of))
-    given_by = cs.substitute(known, cs.vertcat(*taken), cs.vertcat(*made_of))
-    pivots = _divisors(cs.Function("change", [known, direction], [change]))
-    change = cs.substitute(change, known[pivots], 1 / known[pivots])  # they are inverted once a state
-    given_by[pivots] = 1 / given_by[pivots]
-
-    def of_state(given_by: Any) -> Any:
-        gives = (given_by, part["acceleration_of_u"], part["sound"])
-        parts = _split(cs.cse(cs.vertcat(*gives)), [x.numel() for x in gives])
-        return cs.Function("state", of, parts, [*state], ["known", "acceleration", "sound"])
-
-    order = _side_by_side(known.numel(), result_lanes(of_state(given_by), "known", alike))
-    known = cs.vertcat(*(cs.SX.sym("unread") if k is None else known[k] for k in order))
-    given_by = cs.vertcat(*(cs.SX(np.nan) if k is None else given_by[k] for k in order))
-    one = cs.Function("change", [known, direction], [change], ["known", "direction"], ["change"])
-    directions = cs.SX.sym("directions", TOGETHER, direction.numel())
-    every = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
-    several = cs.Function(
-        "changes", [known, cs.vec(directions)], [cs.vec(every)], ["shared", "directions"], ["changes"]
-    )
-    return {"state": of_state(given_by), "change": one, "changes": several}
-
-
-def _divisors(function: Any) -> list[int]:
-    """Return what of a function's first argument is only divided by."""
-    import casadi as cs
-
-    graph, uses = Graph.of(function), defaultdict(set)
-    for node in graph.nodes:
-        for at, x in enumerate(node.of):
-            uses[x].add((node.operation, at))
-    inputs = {k: node.at[1] for k, node in enumerate(graph.nodes) if node.operation == cs.OP_INPUT and not node.at[0]}
-    return [at for k, at in inputs.items() if uses[k] and uses[k] <= {(cs.OP_DIV, 1), (cs.OP_INV, 0)}]
-
-
-def _side_by_side(count: int, whose: Mapping[int, tuple[Lane, int]]) -> list[int | None]:
-    """Order numbers so that those which alike branches have make vectors of two or four; None is a place left free."""
-    alike: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for k in sorted(whose, key=whose.__getitem__):
-        (group, _), number = whose[k]
-        alike[group, number].append(k)
-    order: list[int | None] = []
-    for together in alike.values():
-        order += [*together, *[None] * (len(together) % 2)]
-    return order + [k for k in range(count) if k not in whose]
-
-
-def _symbols_of(x: Any, among: list[Any]) -> list[Any]:
-    """Return those of the given symbols that an expression has in it."""
-    import casadi as cs
-
-    there = {symbol.element_hash() for symbol in cs.symvar(x)}
-    return [symbol for symbol in cs.symvar(cs.vertcat(*among)) if symbol.element_hash() in there]
-
-
-def _split(column: Any, sizes: list[int]) -> list[Any]:
-    import casadi as cs
-
-    return list(cs.vertsplit(column, [0, *np.cumsum(sizes).tolist()]))
+    every, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), arguments)
+    given = cs.vertcat(arguments, *made_of)
+    return every, cs.vertcat(arguments, *alone), {"numbers": cs.Function("numbers", [arguments], [given])}
 
 
 def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] | None) -> dict[str, Any]:
@@ -182,22 +136,7 @@ def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] 
     if along is None:
         return {name: cs.densify(x) for name, x in found.items()}
     found["acceleration_of_u"] = inertia.acceleration(symbols["u"], cs.SX(rows.phi.numel(), 1))[0]  # uncorrected
-    found["change"] = inertia.change(symbols["u"], **along)
+    *direction, varied = along.values()
+    found["change"] = inertia.change(symbols["u"], *direction)
+    found["by_arguments"] = inertia.by_arguments(symbols["u"], varied)
     return {name: cs.densify(x) for name, x in found.items()}
-
-
-def source(found: Mapping[str, Any], tree: Tree) -> str:
-    """Return the C text of a mechanism's functions."""
-    return text(list(found.values()), _alike(found, tree))
-
-
-def _alike(found: Mapping[str, Any], tree: Tree) -> Alike:
-    """Which arguments of the functions alike branches have, and which several directions."""
-    alike = dict(alike_branches(tree))
-    if "changes" in found:
-        starts = {"q": 0, "v": tree.nq, "u": tree.nq + tree.n}
-        alike["direction"] = {start + k: x for name, start in starts.items() for k, x in alike[name].items()}
-        alike["known"] = result_lanes(found["state"], "known", alike)
-        several = range(found["changes"].numel_in(1))
-        alike["directions"] = {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in several}
-    return alike

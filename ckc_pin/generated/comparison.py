@@ -57,7 +57,7 @@ class Calls:
         count.restype = ctypes.c_longlong
         results = [np.zeros(self.size(name, "out", k)) for k in range(count())]
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
-        if name not in ("numbers", "change", "changes"):
+        if not name.startswith(("numbers", "change", "varied", "groups")):
             q, last = given[0], self._numbers if numbers is None else numbers
             given = [q, np.concatenate([np.cos(q), np.sin(q)]), *given[1:], last]
         getattr(self._library, name)(self._pointers(given), self._pointers(results), None, None, 0)
@@ -188,7 +188,9 @@ def _compare_change(terms: Terms, code: Calls, own: Array, random: np.random.Gen
     state, acceleration, _ = code.call("state", q, v, u)
     _compare(mechanism, "acceleration with its change", acceleration, code.call("acceleration", q, v, u, none)[0])
     moves = np.array([tree.configuration_rate(q, step) for step in steps])
-    along = np.hstack([moves, faster, more, varied])
+    groups, rows = range(code.size("groups", "out", 0)), code.size("change", "in", 1) - tree.nq - 2 * tree.n
+    by_numbers = [sum(code.call(f"varied_{k}", state, x)[0] for k in groups) for x in varied]
+    along = np.hstack([moves, faster, np.pad(more, ((0, 0), (0, rows))) + by_numbers])
     (together,) = code.call("changes", state, np.ravel(along, order="F"))
 
     def at(k: int, h: float) -> Array:

@@ -273,9 +273,9 @@ def _compile(
     import subprocess
 
     try:
-        from ckc_pin.generated.code import functions, source
+        from ckc_pin.generated.code import Code
 
-        written = source(functions(mechanism, subject.which, changes=subject.changes), mechanism.tree)
+        written = Code.of(mechanism, subject.which, changes=subject.changes).text()
     except ModuleNotFoundError as error:
         says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(says) from error

@@ -6,12 +6,13 @@ A result that is NaN is a place that nobody reads: nothing of its own is written
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from math import isnan
 from typing import Any
 
 from ckc_pin.generated.graph import Graph, Lane, Packing
 
-__all__ = ["result_lanes", "text"]
+__all__ = ["result_lanes", "split", "text"]
 
 Alike = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: whose, and which of theirs
 
@@ -59,6 +60,13 @@ def result_lanes(function: Any, result: str, alike: Alike) -> dict[int, tuple[La
     at = function.index_out(result)
     whose = {place: packing.whose(k) for (to, place), k in graph.results if to == at}
     return {place: found for place, found in whose.items() if found is not None}
+
+
+def split(column: Any, sizes: Sequence[int]) -> list[Any]:
+    """Return a column's parts of these sizes."""
+    import casadi as cs
+
+    return list(cs.vertsplit(column, [0, *accumulate(sizes)]))
 
 
 def _packed(function: Any, alike: Alike) -> tuple[Graph, Packing]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ckc_pin.errors import InputError
-from ckc_pin.generated.code import functions, source
+from ckc_pin.generated.code import Code
 from ckc_pin.generated.library import Library, compiled
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.simulation.prepare import prepare, scene_mechanism
@@ -95,15 +95,21 @@ def measure(name: str) -> Size:
         scene = _scene(name, Path(folder))
         mechanism = scene_mechanism(load_scene(scene))
         began = _spent()
-        found = functions(mechanism)
-        text = source(found, mechanism.tree)
+        found = Code.of(mechanism)
+        text = found.text()
         expressions_s, began = _spent() - began, _spent()
         reason, library = "", None
         try:
             library = compiled(mechanism, limited=False)
         except InputError as error:
             reason = str(error)
-        about = (mechanism.n, found["acceleration"].n_instructions(), len(text), expressions_s, _spent() - began)
+        about = (
+            mechanism.n,
+            found.functions["acceleration"].n_instructions(),
+            len(text),
+            expressions_s,
+            _spent() - began,
+        )
         if library is None:
             return Size(name, *about, reason=reason)
         return Size(name, *about, _rhs_s(scene, library), _rhs_s(scene, None))

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
+from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.generated.branches import alike_branches
-from ckc_pin.generated.code import TOGETHER, functions, source
+from ckc_pin.generated.changes import TOGETHER
+from ckc_pin.generated.code import Code
 from ckc_pin.generated.graph import Graph, Packing
 from ckc_pin.generated.library import FLAGS
 from ckc_pin.generated.text import text
@@ -90,7 +92,7 @@ def test_what_branches_do_alike_is_found_up_to_where_they_meet_and_after() -> No
 
 def test_the_deltas_arms_are_done_together() -> None:
     mechanism = load("delta")
-    acceleration = functions(mechanism)["acceleration"]
+    acceleration = Code.of(mechanism).functions["acceleration"]
     written = text([acceleration], alike_branches(mechanism.tree))
     assert len(re.findall(r"\bp\d+=", written)) * 3 > 0.7 * acceleration.n_instructions()
 
@@ -100,31 +102,31 @@ def operations(function: Any) -> int:
     return sum(function.instruction_id(k) not in kept for k in range(function.n_instructions()))
 
 
-def packed(function: Any, found: dict[str, Any], name: str) -> int:
+def packed(code: Code, name: str) -> int:
     """How many vectors a function's text has."""
-    text = source(found, load(name).tree).partition(f"int {function.name()}(const")[2].partition("return 0;")[0]
+    text = code.text().partition(f"int {name}(const")[2].partition("return 0;")[0]
     return len(re.findall(r"\bp\d+=", text))
 
 
 def test_changes_along_several_directions_are_done_together() -> None:
     """All of it: what does not depend on the direction is known from the state."""
-    found = functions(load("five_bar"), changes=True)
-    assert packed(found["changes"], found, "five_bar") * TOGETHER == operations(found["changes"])
+    code = Code.of(load("five_bar"), changes=True)
+    assert packed(code, "changes") * TOGETHER == operations(code.functions["changes"])
 
 
 def test_along_one_direction_alike_branches_are_done_together() -> None:
     """With few operations: eq. 1 is differentiated as inverse dynamics, D' a is never taken apart."""
-    for name, most in (("five_bar", 500), ("delta", 9000)):
-        found = functions(load(name), changes=True)
-        change = found["change"]
+    for name, most in (("five_bar", 330), ("delta", 7300)):
+        code = Code.of(load(name), changes=True)
+        change = code.functions["change"]
         together = 2 if name == "five_bar" else 3
         assert operations(change) <= most
-        assert packed(change, found, name) * together > 0.7 * operations(change)
+        assert packed(code, "change") * together > 0.7 * operations(change)
 
 
 def test_pivots_are_inverted_once_a_state() -> None:
     """A division takes as long as ten products: one for each of the delta's 39 pivots, none along a direction."""
-    found = functions(load("delta"), changes=True)
+    found = Code.of(load("delta"), changes=True).functions
     divisions = {cs.OP_DIV, cs.OP_INV}
     for name, most in (("state", 39), ("change", 0), ("changes", 0)):
         graph = Graph.of(found[name])
@@ -132,7 +134,21 @@ def test_pivots_are_inverted_once_a_state() -> None:
         assert sum(node.operation in divisions for node in graph.nodes) <= most, name
 
 
-def test_of_a_state_the_deltas_arms_are_done_together() -> None:
-    mechanism = load("delta")
-    found = functions(mechanism, changes=True)
-    assert packed(found["state"], found, "delta") * 3 > 0.6 * found["state"].n_instructions()
+def test_numbers_of_a_body_are_one_group_and_no_others_are() -> None:
+    """And each group adds what all of them at once do, by a few operations for one body."""
+    mechanism = load("five_bar")
+    given = numbers(mechanism)
+    found = Code.of(mechanism, changes=True).functions
+    whole, random = values(given, present(given)), np.random.default_rng(0)
+    heavier = given | {
+        "mass": given["mass"] * [1, 1, 1.1, 1, 1],
+        "centre": given["centre"] * [[1], [1], [1.1], [1], [1]],
+    }
+    (touched,) = np.flatnonzero(found["groups"](values(heavier, present(given)) - whole).full())
+    known, along = random.uniform(-1, 1, found["change"].numel_in(0)), random.uniform(-1, 1, (2, len(whole)))
+    names = [name for name in found if name.startswith("varied_")]
+    assert len(names) == found["groups"].numel_out(0)
+    for name in names:
+        one, other, both = (found[name](known, x).full() for x in (*along, along.sum(axis=0)))
+        np.testing.assert_allclose(one + other, both, rtol=1e-13, atol=1e-13)
+    assert operations(found[f"varied_{touched}"]) < 0.2 * operations(found["change"])

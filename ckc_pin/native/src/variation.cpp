@@ -160,10 +160,11 @@ void Variation::begin_written() {
   const Matrix& numbers = table_.directions;
   for (int first = 0; first < count; first += core_.written->lanes()) {
     const int here = std::min(count - first, core_.written->lanes()), rows = here == 1 ? 1 : core_.written->lanes();
-    Along& along = along_.emplace_back(Along{first, here, {}, {}});
-    along.changes.setZero(rows, n), along.directions.setZero(rows, core_.tree.nq + 2 * n + numbers.rows());
-    along.directions.block(0, core_.tree.nq + 2 * n, here, numbers.rows()) = numbers.middleCols(first, here).transpose();
+    Along& along = along_.emplace_back(Along{first, here, {}, {}, {}});
+    along.changes.setZero(rows, n), along.directions.setZero(rows, core_.written->directions());
+    for (int p = first; p < first + here; ++p) along.groups.push_back(core_.written->groups(numbers.col(p)));
   }
+  more_.setZero(core_.written->directions() - core_.tree.nq - n), of_group_ = more_;
 }
 
 bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) {
@@ -180,11 +181,16 @@ bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s
     const auto apart = along.directions.rows();
     for (int row = 0; row < along.count; ++row) {
       const int p = along.first + row;
+      more_.head(n) = force_.col(p), more_.tail(more_.size() - n).setZero();
+      for (int group : along.groups[row]) {
+        core_.written->varied(group, table_.directions.col(p), of_group_);
+        more_ += of_group_;
+      }
       core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
       double* to = along.directions.data() + row;
       for (int k = 0; k < nq; ++k, to += apart) *to = move_(k);
       for (int k = 0; k < n; ++k, to += apart) *to = s(n + k, p);
-      for (int k = 0; k < n; ++k, to += apart) *to = force_(k, p);
+      for (Eigen::Index k = 0; k < more_.size(); ++k, to += apart) *to = more_(k);
     }
     if (along.directions.rows() == 1)
       core_.written->change(along.directions.reshaped(), along.changes.reshaped());

@@ -110,10 +110,11 @@ class Variation {
   Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_;
   struct Along {  // parameters that the code which is written out takes at a time, rows
     int first, count;
+    std::vector<Indices> groups;  // of the numbers that the code takes, by row
     Matrix directions, changes;
   };
   std::vector<Along> along_;
-  Vector acting_, back_, move_, of_tree_, lambda_, lacking_;
+  Vector acting_, back_, move_, more_, of_group_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };
 

@@ -20,9 +20,13 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     potential_energy_ = code("potential_energy", 3), acceleration_ = code("acceleration", 6);
     closing_step_ = code("closing_step", 4), jacobian_ = perhaps("jacobian", 5);
     state_ = perhaps("state", 5), change_ = perhaps("change", 2), changes_ = perhaps("changes", 2);
+    groups_ = perhaps("groups", 1);
     if (state_) {
       known_.resize(size("state_sparsity_out") / 8 + 1), acceleration_at_.setZero(size("state_sparsity_out", 1));
       lanes_ = static_cast<int>(size("changes_sparsity_out") / size("change_sparsity_out"));
+      directions_ = static_cast<int>(size("change_sparsity_in", 1));
+      for (long long k = 0; k < size("groups_sparsity_out"); ++k)
+        varied_.push_back(code(("varied_" + std::to_string(k)).c_str(), 2));
     }
   } catch (...) {
     dlclose(library_);
@@ -127,6 +131,23 @@ void Written::changes(const Matrix& directions, Matrix& acceleration) const {
   const double* from[] = {known_.data()->x, directions.data()};
   double* to[] = {acceleration.data()};
   changes_(from, to, nullptr, nullptr, 0);
+}
+
+Indices Written::groups(In varied) const {
+  Vector changed(varied_.size());
+  const double* from[] = {varied.data()};
+  double* to[] = {changed.data()};
+  groups_(from, to, nullptr, nullptr, 0);
+  Indices found;
+  for (Eigen::Index k = 0; k < changed.size(); ++k)
+    if (changed(k) != 0.0) found.push_back(static_cast<int>(k));
+  return found;
+}
+
+void Written::varied(int group, In varied, Out more) const {
+  const double* from[] = {known_.data()->x, varied.data()};
+  double* to[] = {more.data()};
+  varied_[static_cast<size_t>(group)](from, to, nullptr, nullptr, 0);
 }
 
 bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {

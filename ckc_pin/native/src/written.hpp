@@ -29,14 +29,18 @@ class Written {
   double potential_energy(In q) const;
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // How that changes: at a state, and then along a direction, a change of q', v', u' and what the library takes; or along
-  // as many at a time as there are lanes, a row each. Only of a library made for it. False as above, and no changes there
-  // are known.
+  // How that changes: at a state, and then along a direction, a change of q', v', and `more`: of u', and of J v'_dot by
+  // the rows that are kept; or along as many at a time as there are lanes, a row each. Only of a library made for it.
+  // False as above, and no changes there are known.
   bool has_changes() const { return state_; }
   int lanes() const { return lanes_; }
+  int directions() const { return directions_; }  // how many numbers one is
   bool state(In q, In v, In u_tree) const;
   void change(In direction, Out acceleration) const;
   void changes(const Matrix& directions, Matrix& acceleration) const;  // (lanes, ...), (lanes, n)
+  // The groups of parameters that a change of them is of, and what such a group adds to `more`.
+  Indices groups(In varied) const;
+  void varied(int group, In varied, Out more) const;
   // The x with J x = -residual that is smallest in the metric of D'; false as above.
   bool closing_step(In q, In residual, Out x) const;
   // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
@@ -62,9 +66,10 @@ class Written {
   mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
   mutable std::vector<Line> known_;             // and what is known there
   mutable bool sound_ = false;
-  int lanes_ = 0;
+  int lanes_ = 0, directions_ = 0;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
-  Code state_, change_, changes_;
+  Code state_, change_, changes_, groups_;
+  std::vector<Code> varied_;
 };
 
 }  // namespace ckc
