@@ -11,7 +11,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.tree import Array, BoolArray
 
-__all__ = ["Arguments", "constant", "labels", "numbers", "present", "values"]
+__all__ = ["Arguments", "constant", "labels", "near", "numbers", "present", "values"]
 
 NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
 
@@ -100,6 +100,8 @@ class Arguments:
     Attributes
     ----------
     vector : casadi.SX
+    places : list of (str, tuple of int)
+        What each of them is, and where in the array of that name.
     groups : list of lists of int
         Places in it of what changes together: a body's mass, centre and inertia; of other numbers all of a kind.
     """
@@ -113,8 +115,8 @@ class Arguments:
             self._symbols[name] = {index: cs.SX.sym("_".join([name, *map(str, index)])) for index in at}
         self.vector = cs.vertcat(*(symbol for found in self._symbols.values() for symbol in found.values()))
         groups: dict[object, list[int]] = {}
-        places = [(name, index) for name, found in self._symbols.items() for index in found]
-        for place, (name, (first, *_)) in enumerate(places):
+        self.places = [(name, index) for name, found in self._symbols.items() for index in found]
+        for place, (name, (first, *_)) in enumerate(self.places):
             groups.setdefault(first if name in ("mass", "centre", "inertia") else name, []).append(place)
         self.groups = [*groups.values()]
 
@@ -138,11 +140,16 @@ class Arguments:
         return cs.vertcat(*(cs.horzcat(*row) for row in rows))
 
 
+def near(given: Array) -> Array:
+    """Return plain numbers, of which those that are almost zero or one are."""
+    found = np.array(given, dtype=float)
+    for whole in (0.0, 1.0, -1.0):
+        found[np.abs(found - whole) <= NEGLIGIBLE] = whole
+    return found
+
+
 def constant(given: Array) -> Any:
     """Return a matrix of plain numbers, without what is zero and with ones that are ones."""
     import casadi as cs
 
-    near = np.array(given, dtype=float)
-    for whole in (0.0, 1.0, -1.0):
-        near[np.abs(near - whole) <= NEGLIGIBLE] = whole
-    return cs.sparsify(cs.SX(near))
+    return cs.sparsify(cs.SX(near(given)))

@@ -13,7 +13,8 @@ import numpy as np
 
 from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.arguments import Arguments, constant
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.generated.axes import Axes, Turns
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Column", "MovingBody", "bodies"]
 
@@ -36,10 +37,10 @@ class Column:
 class MovingBody:
     """A joint's frame in its branch's axes: rotation, origin, its rates and its accelerations.
 
-    `axes` is the rotation of those axes in the world, `own` the number of the last columns that are its joint's own.
+    `own` is the number of the last columns that are its joint's own.
     """
 
-    axes: Array
+    axes: Axes
     R: Any
     origin: Any
     omega: Any
@@ -48,14 +49,6 @@ class MovingBody:
     acceleration: Any
     columns: tuple[Column, ...]
     own: int
-
-    def into(self, axes: Array) -> Any:
-        """What turns its vectors into other axes."""
-        return constant(axes.T @ self.axes)
-
-    def in_branch(self, vector: Any) -> Any:
-        """A vector of the world in the branch's axes."""
-        return times(constant(self.axes.T), vector)
 
     def point(self, local: Any) -> tuple[Any, Any, Any]:
         """Position, velocity and acceleration of a point fixed in the body."""
@@ -132,12 +125,14 @@ def times(a: Any, b: Any) -> Any:
     return cs.sparsify(cs.mtimes(a, b))
 
 
-def bodies(tree: Tree, angles: Angles, v: Any, v_dot: Any, arguments: Arguments) -> list[MovingBody]:
+def bodies(tree: Tree, turns: Turns, angles: Angles, v: Any, v_dot: Any, arguments: Arguments) -> list[MovingBody]:
     """Return the body of each of Pinocchio's joints, the world first.
 
     Parameters
     ----------
     tree : Tree
+    turns : Turns
+        Of the axes of its joints.
     angles : Angles
         Pinocchio's q', a free root's quaternion of unit length.
     v, v_dot : casadi.SX of n
@@ -148,24 +143,24 @@ def bodies(tree: Tree, angles: Angles, v: Any, v_dot: Any, arguments: Arguments)
     import casadi as cs
 
     model, none, q = tree.model, cs.SX(3, 1), angles.q
-    world = MovingBody(np.eye(3), cs.SX.eye(3), none, none, none, none, none, (), 0)
+    world = MovingBody(Axes(turns, 0), cs.SX.eye(3), none, none, none, none, none, (), 0)
     found = [world]
     for k in range(1, model.njoints):
         joint, placement, parent = model.joints[k], model.jointPlacements[k], found[model.parents[k]]
         stands = times(parent.R, constant(placement.rotation))
         if parent is world:
-            parent = replace(world, axes=placement.rotation, R=constant(placement.rotation.T))
+            parent = replace(world, axes=Axes(turns, k), R=turns.between(0, k))
             stands = cs.SX.eye(3)
         d = times(parent.R, arguments.column("offset", k))
         at_q, at_v = joint.idx_q, joint.idx_v
         if joint.nq == 7:
             found.append(_free(parent, stands, d, q[at_q : at_q + 7], v[at_v : at_v + 6], v_dot[at_v : at_v + 6], at_v))
             continue
-        local, turns = tree.axis(k)
+        local, turning = tree.axis(k)
         axis = times(stands, constant(local))
-        R = times(stands, _turn(local, *angles.turn(at_q))) if turns else stands
-        d = d if turns else d + axis * q[at_q]
-        column = Column(at_v, turns, axis, parent.origin + d, constant(local))
+        R = times(stands, _turn(local, *angles.turn(at_q))) if turning else stands
+        d = d if turning else d + axis * q[at_q]
+        column = Column(at_v, turning, axis, parent.origin + d, constant(local))
         found.append(_moved(parent, R, d, axis * v[at_v], axis * v_dot[at_v], column))
     return found
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ckc_pin.generated.acceleration import ConstrainedInertia
-from ckc_pin.generated.branches import alike_branches
+from ckc_pin.generated.branches import Places, alike_branches, alike_numbers, alike_roots
 from ckc_pin.generated.changes import change_functions
 from ckc_pin.generated.expressions import Expressions, expressions
-from ckc_pin.generated.text import Alike, split, text
+from ckc_pin.generated.text import Alike, result_lanes, split, text
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import BoolArray
 
@@ -62,7 +62,7 @@ class Code:
         import casadi as cs
 
         alike = dict(alike_branches(mechanism.tree))
-        terms = expressions(mechanism, which)
+        terms = expressions(mechanism, which, alike_roots(mechanism.tree, alike))
         symbols = {
             "q": terms.angles.q,
             "trig": terms.angles.trig,
@@ -79,7 +79,7 @@ class Code:
             "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
         }
         results = _results(terms, symbols, along if changes else None)
-        every, once, found = _once(terms, results)
+        every, once, found, alike["numbers"] = _once(mechanism, terms, results, alike)
         part = dict(zip(results, split(every, [x.numel() for x in results.values()]), strict=True))
         for name, (given, gives) in FUNCTIONS.items():
             if not part.keys() >= {*gives}:
@@ -99,14 +99,20 @@ class Code:
         return text([*self.functions.values()], self.alike)
 
 
-def _once(terms: Expressions, results: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+def _once(
+    mechanism: Mechanism, terms: Expressions, results: Mapping[str, Any], alike: Mapping[str, Places]
+) -> tuple[Any, Any, dict[str, Any], Places]:
     """What does not change with the state is computed once: the other results, what they take, and what gives that."""
     import casadi as cs
 
-    arguments = terms.arguments.vector
-    every, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), arguments)
-    given = cs.vertcat(arguments, *made_of)
-    return every, cs.vertcat(arguments, *alone), {"numbers": cs.Function("numbers", [arguments], [given])}
+    arguments, turns = terms.arguments.vector, terms.turns
+    own = cs.vertcat(arguments, *turns.symbols)
+    every, alone, made_of = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), own)
+    given = cs.vertcat(own, *made_of)
+    numbers = cs.Function("numbers", [own], [given], ["own"], ["numbers"])
+    whose = result_lanes(numbers, "numbers", {"own": alike_numbers(mechanism, terms.arguments, turns, alike)})
+    given = cs.substitute(given, cs.vertcat(*turns.symbols), cs.DM(turns.values))
+    return every, cs.vertcat(own, *alone), {"numbers": cs.Function("numbers", [arguments], [given])}, whose
 
 
 def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] | None) -> dict[str, Any]:

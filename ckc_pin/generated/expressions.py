@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.arguments import Arguments, numbers, present
+from ckc_pin.generated.axes import Turns
 from ckc_pin.generated.bodies import MovingBody, bodies, cross, dot, times
 from ckc_pin.generated.order import elimination_order
 from ckc_pin.generated.rows import RowTerms, row_terms
@@ -29,6 +30,8 @@ class Expressions:
         v'.
     arguments : Arguments
         Masses, centres of mass, inertias, offsets, stiffnesses, lengths, gravity.
+    turns : Turns
+        Rotations of axes, whose symbols are numbers of alike branches.
     quaternions : tuple of int
         Where the quaternions of free roots begin in q'.
     q_dot : casadi.SX of nq
@@ -54,6 +57,7 @@ class Expressions:
     angles: Angles
     v: Any
     arguments: Arguments
+    turns: Turns
     quaternions: tuple[int, ...]
     q_dot: Any
     D_tree: Any
@@ -73,14 +77,20 @@ def kept_rows(mechanism: Mechanism) -> list[int]:
     return [k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant]
 
 
-def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None) -> Expressions:
-    """Write a mechanism's terms out, of the numbers that are arguments (`arguments.present`)."""
+def expressions(
+    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, alike: Sequence[Sequence[int]] = ()
+) -> Expressions:
+    """Write a mechanism's terms out, of the numbers that are arguments (`arguments.present`).
+
+    In the same way for all branches that are `alike`, each group of them by the joints that they begin with.
+    """
     import casadi as cs
 
     tree, arguments = mechanism.tree, Arguments(which or present(numbers(mechanism)))
     angles, v = Angles(tree.nq), cs.SX.sym("v", tree.n)
     q, v_dot, none = angles.q, cs.SX.sym("v_dot", tree.n), cs.SX(tree.n, 1)
-    found, driven = (bodies(tree, angles, v, x, arguments) for x in (none, v_dot))
+    turns = Turns([placement.rotation for placement in tree.model.jointPlacements], alike)
+    found, driven = (bodies(tree, turns, angles, v, x, arguments) for x in (none, v_dot))
     gravity = arguments.column("gravity")
     q_dot = _configuration_rate(mechanism, q, v)
     D_tree, bias, potential = _inertia(mechanism, found, gravity, arguments)
@@ -92,6 +102,7 @@ def expressions(mechanism: Mechanism, which: Mapping[str, BoolArray] | None = No
         angles=angles,
         v=v,
         arguments=arguments,
+        turns=turns,
         quaternions=tuple(at_q + 3 for at_q, _ in tree.free),
         q_dot=q_dot,
         D_tree=D_tree,
@@ -128,13 +139,14 @@ def _inertia(mechanism: Mechanism, found: list[MovingBody], gravity: Any, argume
         I = I + m * (dot(local, local) * cs.SX.eye(3) - times(local, local.T))
         mass[k], first[k] = m, times(body.R, m * local)
         second[k] = _turned(I, body.R)
-        falls = body.acceleration - body.in_branch(gravity)
+        falling = times(found[0].axes.into(body.axes), gravity)
+        falls = body.acceleration - falling
         swept = cross(body.omega, first[k])
         force[k] = cs.sparsify(m * falls + cross(body.alpha, first[k]) + cross(body.omega, swept))
         torque[k] = cs.sparsify(
             cross(first[k], falls) + times(second[k], body.alpha) + cross(body.omega, times(second[k], body.omega))
         )
-        potential = potential - dot(body.in_branch(gravity), m * body.origin + first[k])
+        potential = potential - dot(falling, m * body.origin + first[k])
     for k in range(model.njoints - 1, 0, -1):
         body, parent = found[k], model.parents[k]
         own = body.columns[len(found[parent].columns) :]
@@ -212,7 +224,7 @@ def _springs(
     for k, ((a, local_a), (b, local_b)) in enumerate(zip(ends[:count], ends[count:], strict=True)):
         at_a, rate_a, _ = a.point(local_a)
         at_b, rate_b, _ = b.point(local_b)
-        into = b.into(a.axes)
+        into = b.axes.into(a.axes)
         r = at_a - times(into, at_b)
         length = cs.sqrt(dot(r, r))
         along = r / cs.if_else(length > 0, length, 1)  # at length zero it pulls nowhere

@@ -9,10 +9,10 @@ from typing import Any
 
 from ckc_pin.generated.angles import Angles
 from ckc_pin.generated.arguments import Arguments, constant
+from ckc_pin.generated.axes import Axes
 from ckc_pin.generated.bodies import MovingBody, cross, dot, times
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["RowTerms", "row_terms"]
 
@@ -58,11 +58,11 @@ class _Point:
     local: Any
     moving: _Moving
 
-    def seen(self, axes: Array) -> _Moving:
+    def seen(self, axes: Axes) -> _Moving:
         """How it moves in other axes that stand still."""
-        return self.moving.turned(self.body.into(axes))
+        return self.moving.turned(self.body.axes.into(axes))
 
-    def less(self, other: _Point, axes: Array) -> _Moving:
+    def less(self, other: _Point, axes: Axes) -> _Moving:
         """How it moves against another, in axes that stand still."""
         return self.seen(axes) - other.seen(axes)
 
@@ -81,7 +81,7 @@ class _Point:
         acceleration = less(here.acceleration, body.acceleration) - cross(body.alpha, lever)
         acceleration = acceleration - cross(body.omega, swept + 2 * rate)
         value, rate, acceleration = (times(body.R.T, x) for x in (lever, rate, acceleration))
-        into = self.body.into(body.axes)
+        into = self.body.axes.into(body.axes)
         carried = times(into, self.body.carried_jacobian(self.moving.value, n))
         carried = times(body.R.T, less(carried, body.carried_jacobian(here.value, n)))
         own = self.body.own_jacobian(times(body.R.T, times(into, self.body.R)), self.local, n)
@@ -189,7 +189,7 @@ def _component(direction: tuple[MovingBody, Any], a: _Point, b: _Point, n: int) 
 def _dot(one: tuple[MovingBody, Any], other: tuple[MovingBody, Any], n: int) -> tuple[Any, Any, Any]:
     """The row of two directions, in the axes of the first one's branch."""
     (a, e_a), (b, e_b) = one, other
-    return _product(_direction(a, e_a, n), _direction(b, e_b, n).turned(b.into(a.axes)))
+    return _product(_direction(a, e_a, n), _direction(b, e_b, n).turned(b.axes.into(a.axes)))
 
 
 def _product(a: _Moving, b: _Moving) -> tuple[Any, Any, Any]:
@@ -213,7 +213,7 @@ def _parallel(a: MovingBody, b: MovingBody, rotation_a: Any, rotation_b: Any, n:
     """log(R_A^T R_B) and its Jacobian."""
     import casadi as cs
 
-    into = b.into(a.axes)
+    into = b.axes.into(a.axes)
     R_b = times(into, times(b.R, rotation_b))
     relative = times(times(a.R, rotation_a).T, R_b)
     sine = cs.vertcat(*(relative[j, i] - relative[i, j] for i, j in ((1, 2), (2, 0), (0, 1)))) / 2
