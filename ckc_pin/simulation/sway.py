@@ -80,7 +80,7 @@ def _closed(model: LinearModel, partition: Partition, q_tree: Array, step: Array
 def _run(model: LinearModel, number: int, mode: Mode, angles: Array, states: list[Terms]) -> Run:
     mechanism, m = model.mechanism, len(angles)
     rows = mechanism.closure.rows
-    name = f"{model.name}: mode {number}, {mode.frequency:.4g} Hz, damping ratio {mode.damping_ratio:.3g}"
+    name = f"{model.name}: mode {number}, {mode.says}"
     stats: dict[str, Any] = dict.fromkeys(
         ("rhs", "steps", "rejected", "newton", "factorizations", "jacobians", "switches"), 0
     )

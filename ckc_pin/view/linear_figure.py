@@ -68,6 +68,11 @@ def draw_modes(model: LinearModel) -> Figure:
             _shape(ax, model, mode, names, number)
         panels[0].set_yticks(range(len(names)), [symbol(model.coordinates[k]) for k in names])
         panels[0].invert_yaxis()
+        figure.supxlabel("how far a coordinate is from rest, the one that swings most as 1 "
+                         "(angles in rad, lengths in the mechanism's size)", fontsize="medium")  # fmt: skip
+        phases = {bars.get_label(): bars for ax in panels for bars in ax.containers}
+        if len(phases) > 1:
+            figure.legend(phases.values(), phases.keys(), loc="outside upper right", ncols=2)
         return figure
 
 
@@ -81,9 +86,11 @@ def _moving(model: LinearModel, modes: tuple[Mode, ...]) -> list[int]:
 
 def _shape(ax: Any, model: LinearModel, mode: Mode, names: list[int], number: int) -> None:
     shape = (mode.shape / model.mechanism.tree.reach)[names]
-    ax.barh(range(len(names)), shape.real, color=style.COLOURS[0], height=0.6)
-    if np.abs(shape.imag).max(initial=0.0) > LEAST:  # a quarter of a period later
-        ax.barh(range(len(names)), shape.imag, color=style.COLOURS[1], height=0.25)
+    ax.barh(range(len(names)), shape.real, color=style.COLOURS[0], height=0.6, label="at one instant")
+    if np.abs(shape.imag).max(initial=0.0) > LEAST:  # Re(shape exp(i pi / 2))
+        ax.barh(
+            range(len(names)), -shape.imag, color=style.COLOURS[1], height=0.25, label="a quarter of a period later"
+        )
     ax.axvline(0.0, color=style.GREY, linewidth=0.8)
     ax.set(title=f"{number}: {mode.says}".replace(", ", "\n"), xlim=(-1.1, 1.1))
 

@@ -220,6 +220,30 @@ def test_figures_show_poles_modes_and_the_locus() -> None:
     assert len(draw_locus(locus).axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
 
 
+def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_period_later() -> None:
+    model = linearize("stewart")
+    figure, sways_in_time = draw_modes(model), sways(model)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "at one instant",
+        "a quarter of a period later",
+    ]
+    slide = model.mechanism.coordinates.index("plate_place.x")
+    assert "plate_place.x" in figure.axes[0].get_yticklabels()[slide].get_text()
+    for number in (1, 2):  # two at one frequency: not all coordinates are in phase
+        bars = figure.axes[number - 1].containers
+        run = sways_in_time[number]
+        frames = [np.argmin(np.abs(run.t - part / model.modes[number - 1].frequency)) for part in (0.0, 0.25)]
+        parts = np.array([[bar.get_width() for bar in drawn][slide : slide + 2] for drawn in bars])
+        seen = (run.q_tree[frames] - model.q_tree)[:, slide : slide + 2]
+        k = np.argmax(np.abs(seen))
+        seen /= seen.flat[k] / parts.flat[k]  # as large as it is shown
+        assert np.abs(seen - parts).max() < 0.05
+
+
+def test_an_undamped_mode_has_no_damping_ratio_of_rounding() -> None:
+    assert sways(linearize("stewart"))[1].scene_name.endswith("mode 1, 1.503 Hz, damping ratio 0")
+
+
 def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
     model = linearize("stewart")
     runs = sways(model)
