@@ -96,14 +96,17 @@ def scene_controller(
     spec = scene.spec
     if spec.controller is None:
         return None
-    return make_controller(spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model)
+    of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model
+    with scene.sources.naming():
+        return make_controller(*of)
 
 
 def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
     """Return how a scene's controller, or who stands in for it, moves the motors."""
     spec = scene.spec.controller
     allocation = spec.allocation if isinstance(spec, FeedbackSpec) else None
-    return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
+    with scene.sources.naming():
+        return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
 
 
 @dataclass(frozen=True)
@@ -198,12 +201,14 @@ def prepare(
     if controller is None and not free:
         controller = scene_controller(scene, mechanism, texts)
         if controller is not None and isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-            controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
+            with scene.sources.naming():
+                controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
     elif controller is not None and not isinstance(controller, Sampled):
         controller = as_controller(controller)
     if isinstance(controller, Sampled):
-        controller.require_countable(scene.spec.t_end)
-        controller.require_sensible(mechanism)
+        with scene.sources.naming():
+            controller.require_countable(scene.spec.t_end)
+            controller.require_sensible(mechanism)
     actuation = scene_actuation(scene, mechanism)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
@@ -211,7 +216,8 @@ def prepare(
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     functions = event_functions(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
-    _require_within_stops(mechanism, start)
+    with scene.sources.naming():
+        _require_within_stops(mechanism, start)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     law = controller.controller if isinstance(controller, Sampled) else controller
@@ -232,10 +238,12 @@ def prepare(
             target=compensated_at(mechanism, controller),
         )  # fmt: skip
         labels = tuple(x.name for x in varying)
+    with scene.sources.naming():
+        control = control_table(controller, actuation, partial(controller_call, mechanism=mechanism))
     tables = (
         core_table(mechanism, library or library_of(mechanism, terms), scene.spec.friction_smoothing or 0.0),
         formulation,
-        control_table(controller, actuation, partial(controller_call, mechanism=mechanism)),
+        control,
         _solver(mechanism, scene.spec, profile),
         [event.row for event in functions],
     )
@@ -252,9 +260,8 @@ def output_instants(scene: Scene) -> Array:
     if output_dt is None:
         return np.unique(np.linspace(0.0, t_end, OUTPUTS + 1, dtype=float))  # fewer in a t_end of a few denormals
     if t_end / output_dt > MAX_OUTPUTS:
-        raise InputError(
-            f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
-        )
+        says = f"solver.output_dt = {output_dt:g} gives more than {MAX_OUTPUTS} output instants in {t_end:g} s"
+        raise InputError(f"{scene.sources.name}: {says}")
     times = np.arange(int(t_end / output_dt * (1 + 1e-12)) + 1, dtype=float) * output_dt
     if t_end - times[-1] > 1e-9 * min(output_dt, t_end):
         return np.append(times, t_end)

@@ -22,11 +22,13 @@ def _tracking(*changes: str) -> tuple[str, ...]:
 
 
 def _value(change: str, *says: str) -> Bad:
-    return Bad(change[:60], _tracking(change), says)
+    return Bad(change[:60], _tracking(change), (f"error: {NAMED}", *says))
 
 
 def _target(change: str, *says: str) -> Bad:
-    return Bad(change[:60], ("run", "bar/set_point.scene.toml", "--set", f"controller.{change}"), says)
+    """Whatever is wrong in a scene, the message begins with its file."""
+    scene = "bar/set_point.scene.toml"
+    return Bad(change[:60], ("run", scene, "--set", f"controller.{change}"), (f"error: {scene}: ", *says))
 
 
 def _csv(what: str, content: str | bytes, *says: str) -> Bad:
