@@ -120,19 +120,21 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
     w : (rows,) array or 0.0
         The level set.
     tolerance : float
-        Largest |phi - w| that counts as closed. Where it is that large because rows contradict each other, what z can
-        close is closed to rounding: of how far a start was off, nothing stays.
+        Largest |phi - w| that counts as closed, where coordinates are not large (`Tree.coarseness`). Where it is loose
+        because rows contradict each other, what z can close is closed to rounding: of how far a start was off, nothing
+        stays.
 
     Returns
     -------
     Newton
         Not converged when a step is not local, does not contract, or phi_z is singular.
     """
-    at = start
+    at, loose = start, tolerance > LOOSE * start.tree.size
+    tolerance *= start.tree.coarseness(start.q_tree)
     residual = at.phi - w
     size = _unclosed(at, residual)
     redundant = len(residual) > len(at.partition.z)
-    polish = redundant and tolerance > LOOSE * at.tree.size and size > 0.0
+    polish = redundant and loose and size > 0.0
     for iteration in range(MAX_ITERATIONS):
         closed = size <= tolerance
         if closed and not polish:
@@ -215,6 +217,7 @@ def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done
     """
     target = np.zeros(at.tree.n)
     target[at.partition.q] = dq
+    tolerance *= at.tree.coarseness(at.moved(target).q_tree)
     start, random = at.moved(target), np.random.default_rng(0)
     least, singular, other = np.inf, False, False
     for attempt in range(STARTS):

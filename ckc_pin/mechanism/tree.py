@@ -29,6 +29,7 @@ BoolArray = NDArray[np.bool_]
 
 MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
 
+MANY = 100.0  # rad, or the mechanism's size: where rounding of a coordinate begins to be seen in how loops close
 WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # what belongs to a tree's own data
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -84,6 +85,15 @@ class Tree:
         """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
         self.size = size
         self.reach = np.where(self.in_metres, size, 1.0)
+        self._units = np.ones(self.nq)
+        self._units[self.place] = self.reach
+
+    def coarseness(self, q_tree: Array) -> float:
+        """Return how much coarser loops close there than near zero, at least 1.
+
+        Coordinates are rounded as they are large: a crank's after many turns, all of what is far from the origin.
+        """
+        return max(1.0, float(np.abs(q_tree / self._units).max(initial=0.0)) / MANY)
 
     def _work_on(self, model: Any) -> None:
         self.model = model

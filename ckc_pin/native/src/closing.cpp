@@ -22,6 +22,7 @@ bool Closing::close(In q_tree, In w, double tolerance, bool to_rounding) {
     if (!q_tree_.allFinite()) return false;
     core_.set(q_tree_, iteration == expected);
     core_.factor();
+    if (!iteration) tolerance *= core_.coarseness();
     residual_ = core_.rows.phi - w;
     const double previous = size;
     size = unclosed();

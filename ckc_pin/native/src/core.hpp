@@ -59,6 +59,7 @@ class Core {
 
   // --- at a configuration ---
   void set(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
+  double coarseness() const { return tree.coarseness(q_tree, scales.columns); }
   long sets = 0;              // how often that was: who remembers it knows whether the core is where it was left
   void jacobian();            // J
   void factor();              // phi_z

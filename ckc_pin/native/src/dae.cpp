@@ -139,13 +139,14 @@ bool Dae::closing_step(In residual) {
 bool Dae::project(In y) {
   const int n = core.n;
   place(y);
-  for (int k = 0; largest(core.rows.phi) > tolerance_; ++k) {
+  const double tolerance = tolerance_ * core.coarseness();
+  for (int k = 0; largest(core.rows.phi) > tolerance; ++k) {
     if (k == most_steps || !core.rows.phi.allFinite() || !closing_step(core.rows.phi)) return false;
     ++counts.newton, counts.factorizations += 2;
     residual_.noalias() = core.rows.J * step_;
     core.tree.integrate(q_tree_, step_);
     set(q_tree_);
-    if (largest(residual_) <= tolerance_) break;  // what else remains, rows contradict
+    if (largest(residual_) <= tolerance) break;  // what else remains, rows contradict
   }
   velocity = y.tail(n);
   residual_.noalias() = core.rows.J * velocity;
@@ -238,7 +239,7 @@ Accepted Dae::accept(double, Out y, double) {
   place(y);
   residual_.noalias() = core.rows.J * y.tail(n);
   const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
-  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_) return Accepted::kept;
+  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_ * core.coarseness()) return Accepted::kept;
   if (!project(y)) return Accepted::refused;
   put_exact(y);
   return Accepted::changed;

@@ -58,7 +58,7 @@ PointMotion::PointMotion(const std::string& model, Indices place, Task task, std
       end_(end),
       past_end_(std::move(past_end)) {
   const int n = tree_.n;
-  q_tree_.setZero(tree_.nq), J_dot_v_.setZero(rows_.closure.rows), J_.setZero(n, n);
+  q_tree_.setZero(tree_.nq), J_dot_v_.setZero(rows_.closure.rows), J_.setZero(n, n), units_.setOnes(n);
   for (Vector* x : {&v_, &a_, &wanted_, &residual_, &step_}) x->setZero(n);
   for (Vector* x : {&x_, &x_dot_, &x_ddot_}) x->setZero(3);
   factor_.shape(n, n, full_pattern(n));
@@ -76,13 +76,14 @@ bool PointMotion::place() {
 
 // Newton's method from q_tree_; false where a step is not local or does not contract.
 bool PointMotion::close() {
+  const double tolerance = tolerance_ * tree_.coarseness(q_tree_, units_);
   double before = 0.0;
   for (int k = 0; k < most_steps; ++k) {
     const bool exists = place();
     for (int i = 0; i < tree_.n; ++i) residual_(i) = rows_.phi(task_.psi[i]) - wanted_(i);
     const double size = residual_.lpNorm<Eigen::Infinity>();
-    if (!exists || (k && !(size <= std::max(0.5 * before, tolerance_)))) return false;
-    if (size <= tolerance_) return true;
+    if (!exists || (k && !(size <= std::max(0.5 * before, tolerance)))) return false;
+    if (size <= tolerance) return true;
     factor_.solve(residual_, step_);
     if (!(step_.lpNorm<Eigen::Infinity>() <= longest)) return false;
     step_ = -step_;

@@ -73,7 +73,7 @@ class PointMotion : public Motion {
   std::string past_end_;
   Matrix rates_;             // (n, count): how fast it moves at the knots,
   std::vector<char> known_;  // of which that was found; some are asked for, and the last may be singular
-  Vector q_tree_, v_, a_, wanted_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
+  Vector q_tree_, units_, v_, a_, wanted_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
   Matrix J_;
   Factor factor_;
 };

@@ -9,6 +9,9 @@
 #include <pinocchio/serialization.hpp>
 #include <pinocchio/spatial.hpp>
 
+#include <algorithm>
+#include <cmath>
+
 #include "rotation.hpp"
 
 namespace ckc {
@@ -166,6 +169,15 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
     q_dot.segment<3>(root.q) = turn * Vector3(v.segment<3>(root.v));
     q_dot.segment<4>(root.q + 3) = (turn * spin).coeffs();
   }
+}
+
+// That of `ckc_pin.mechanism.tree`.
+double Tree::coarseness(In q, In units) const {
+  constexpr double many = 100.0;
+  double largest = 0.0;
+  for (int k : single) largest = std::max(largest, std::abs(q(place[k])) / units(k));
+  for (const Root& root : roots) largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
+  return std::max(1.0, largest / many);
 }
 
 Matrix Tree::tangents(In q) const {

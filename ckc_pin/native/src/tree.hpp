@@ -29,6 +29,9 @@ class Tree {
   enum class Number { gravity, offset, mass, centre, inertia, armature };
   void vary(Number what, In numbers);
 
+  // How much coarser loops close at q than near zero, at least one: coordinates are rounded as they are large.
+  double coarseness(In q, In units) const;
+
   // Placements of all joints, and the Jacobian in world axes.
   void set(In q);
   const Matrix6x& jacobian() const;
