@@ -10,6 +10,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin.errors import CkcError, InputError
+from ckc_pin.generated.library import compiled
 from ckc_pin.simulation.ensembles.members import DONE, FAILED, STOPPED, Members
 from ckc_pin.simulation.ensembles.outputs import SHORT
 from ckc_pin.simulation.ensembles.spec import OutputSpec
@@ -253,3 +254,18 @@ def test_terms_of_a_tree_that_is_too_large_are_compiled_nowhere(tmp_path: Path) 
     members = Members(scene, {"t_end": 1e-4}, names, {"end": "q_tree"}, 10**9, 1)  # as many as would repay it
     assert members.terms == "pinocchio"
     assert members.run(0, np.array([[0.9], [1.1]])).status.tolist() == [DONE] * 2
+
+
+def test_a_number_that_is_zero_varies_though_terms_without_it_are_in_the_cache() -> None:
+    """What a plain run compiled leaves out what is zero in the file: a member by it would be the scene itself."""
+    compiled(ckc_pin.load("five_bar"))
+    names = ("gravity.x", "link.link_2.com.y", "joint.theta_2.xyz.y")
+    values = np.array([[2.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]])
+    members = Members("five_bar/swing", {**SWING, "solver.terms": "auto"}, names, dict(OUTPUTS), 3, 1)
+    assert members.batched
+    found = members.run(0, values)
+    for k, value in enumerate(values):
+        changes = SWING | dict(zip(names, value.tolist(), strict=True))
+        np.testing.assert_allclose(
+            found.outputs["end"][k], ckc_pin.simulate("five_bar/swing", changes).q_tree[-1], atol=CLOSE
+        )

@@ -156,9 +156,8 @@ class Members:
 
     def _run_batch(self, values: Array, recorded: Recorded, status: Statuses, message: list[str]) -> int:
         if self._batch is None:
-            core, *others = self.ready.tables
-            if self._library is not None:
-                core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
+            _, *others = self.ready.tables  # the scene's own terms may be without the numbers that vary from zero
+            core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
             self._batch = _core.Batch(core, *others, self.mechanism.tolerance, self._threads)
         found, sound = self._varied.of(values[:, self._parameters])
         chosen = np.flatnonzero(sound)
