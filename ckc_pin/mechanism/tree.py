@@ -30,6 +30,7 @@ BoolArray = NDArray[np.bool_]
 MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
 
 MANY = 100.0  # rad, or the mechanism's size: where rounding of a coordinate begins to be seen in how loops close
+COARSEST = 1e4  # with loops closed to 1e-13 of the mechanism's size, 1e-9 of it: at a million radians
 WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # what belongs to a tree's own data
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -91,9 +92,10 @@ class Tree:
     def coarseness(self, q_tree: Array) -> float:
         """Return how much coarser loops close there than near zero, at least 1.
 
-        Coordinates are rounded as they are large: a crank's after many turns, all of what is far from the origin.
+        Coordinates are rounded as they are large: a crank's after many turns, all of what is far from the origin. What
+        is beyond `COARSEST` does not count as closed.
         """
-        return max(1.0, float(np.abs(q_tree / self._units).max(initial=0.0)) / MANY)
+        return min(max(1.0, float(np.abs(q_tree / self._units).max(initial=0.0)) / MANY), COARSEST)
 
     def _work_on(self, model: Any) -> None:
         self.model = model

@@ -173,11 +173,11 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
 
 // That of `ckc_pin.mechanism.tree`.
 double Tree::coarseness(In q, In units) const {
-  constexpr double many = 100.0;
+  constexpr double many = 100.0, most = 1e4;
   double largest = 0.0;
   for (int k : single) largest = std::max(largest, std::abs(q(place[k])) / units(k));
   for (const Root& root : roots) largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
-  return std::max(1.0, largest / many);
+  return std::clamp(largest / many, 1.0, most);
 }
 
 Matrix Tree::tangents(In q) const {
