@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.expressions import kept_rows
 from ckc_pin.generated.library import Library
+from ckc_pin.generated.order import elimination_order, eq_1, least_pivot
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -24,6 +25,7 @@ EQUAL = 1e-11  # relative to the largest entry
 SOUND = (
     1e-3  # of J D'^-1 J^T's scaled eigenvalues, from which solutions of eq. 1 are compared: with less digits are lost
 )
+MASSLESS = 1e-12  # of the scaled eigenvalues of D': below that a motion moves no mass
 DIFFERENCE = 1e-5  # rad, or of the mechanism's size, and of v' in their multiples a second
 ALIKE = 1e-6  # derivatives and differences, relative
 FROM_ZERO = 1e-2  # SI units: how far what is zero and may vary does
@@ -82,7 +84,7 @@ def require_equal(mechanism: Mechanism, library: Library) -> None:
         A term that differs by more than 1e-11.
     """
     code, random = Calls(library), np.random.default_rng(0)
-    compared = 0
+    compared, order = 0, elimination_order(mechanism, kept_rows(mechanism))
     for at, closed in _configurations(mechanism, random):
         v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.reach
         if closed and mechanism.closure.rows:
@@ -91,12 +93,15 @@ def require_equal(mechanism: Mechanism, library: Library) -> None:
         _compare_terms(terms, code, random.uniform(-1, 1, mechanism.n))
         if mechanism.redundant and not closed:
             continue  # redundant rows contradict each other there
-        found = _compare_solutions(terms, code, *random.uniform(-1, 1, (2, mechanism.n)))
+        found = _compare_solutions(terms, code, order, *random.uniform(-1, 1, (2, mechanism.n)))
         if found and "change" in code:
             _compare_change(terms, code, library.parameters, random)
         compared += found
     if not compared:
-        raise InputError(f"{mechanism.name}: its acceleration would have to be eliminated with pivoting everywhere")
+        raise InputError(
+            f"{mechanism.name}: its acceleration would have to be eliminated with pivoting everywhere, which compiled "
+            'terms do not do; take solver.terms = "pinocchio"'
+        )
 
 
 def _compare_terms(terms: Terms, code: Calls, x: Array) -> None:
@@ -124,10 +129,10 @@ def _compare_terms(terms: Terms, code: Calls, x: Array) -> None:
         _compare(mechanism, name, found[name], np.ravel(wanted, order="F"), scale.get(name, 0.0))
 
 
-def _compare_solutions(terms: Terms, code: Calls, u: Array, x: Array) -> bool:
+def _compare_solutions(terms: Terms, code: Calls, order: Sequence[int], u: Array, x: Array) -> bool:
     """Of eq. 1, its derivatives, and the step that closes the loops; False where that would lose digits."""
     mechanism, at, q, v = terms.mechanism, terms.at, terms.q_tree, terms.v_tree
-    if not _sound(terms):
+    if not _sound(terms, order):
         return False
     try:
         wanted = dae_acceleration(terms, u)
@@ -141,22 +146,40 @@ def _compare_solutions(terms: Terms, code: Calls, u: Array, x: Array) -> bool:
     return True
 
 
-def _constraint(terms: Terms) -> Array:
-    """J D'^-1 J^T of the rows that follow from no others."""
-    J = terms.at.J[kept_rows(terms.mechanism)]
-    return J @ np.linalg.solve(terms.D_tree, J.T)
+def _kept(terms: Terms) -> tuple[Array, Array]:
+    """D' and the J of the rows that follow from no others.
+
+    Where links without mass make D' singular, J^T W J is added, which changes no solution of eq. 1: they move with the
+    loops. W is what makes rows as heavy as what else moves with them.
+    """
+    D, J = terms.D_tree, terms.at.J[kept_rows(terms.mechanism)]
+    if not len(J) or _least(D) > MASSLESS:
+        return D, J
+    mobility = np.sum(J * (np.linalg.pinv(D, rcond=MASSLESS, hermitian=True) @ J.T).T, axis=1)
+    most = float(mobility.max()) or 1.0
+    return D + J.T @ (J / np.where(mobility > SOUND * most, mobility, most)[:, None]), J
 
 
-def _sound(terms: Terms) -> bool:
-    S = _constraint(terms)
-    units = 1 / np.sqrt(np.diag(S))
-    return not S.size or float(np.linalg.eigvalsh(S * np.outer(units, units))[0]) > SOUND
+def _least(symmetric: Array) -> float:
+    """The least eigenvalue in units in which the diagonal is 1."""
+    diagonal = np.diag(symmetric)
+    if not np.all(diagonal > 0):
+        return 0.0
+    units = 1 / np.sqrt(diagonal)
+    return float(np.linalg.eigvalsh(symmetric * np.outer(units, units))[0])
+
+
+def _sound(terms: Terms, order: Sequence[int]) -> bool:
+    D, J = _kept(terms)
+    if not _least(D) > MASSLESS or (len(J) and not _least(J @ np.linalg.solve(D, J.T)) > SOUND):
+        return False
+    return D is terms.D_tree or least_pivot(eq_1(terms.D_tree, J), terms.mechanism.n, order) > SOUND
 
 
 def _closing_step(terms: Terms, residual: Array) -> Array:
-    kept = kept_rows(terms.mechanism)
-    multipliers = np.linalg.solve(_constraint(terms), residual[kept])
-    return np.asarray(-np.linalg.solve(terms.D_tree, terms.at.J[kept].T @ multipliers))
+    D, J = _kept(terms)
+    multipliers = np.linalg.solve(J @ np.linalg.solve(D, J.T), residual[kept_rows(terms.mechanism)])
+    return np.asarray(-np.linalg.solve(D, J.T @ multipliers))
 
 
 def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, u: Array) -> None:

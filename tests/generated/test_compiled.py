@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ckc_pin import Mechanism, Simulator, load, simulate
+from ckc_pin import InputError, Mechanism, Simulator, load, simulate
 from ckc_pin.generated.library import compiled
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
@@ -144,3 +144,71 @@ def test_a_run_that_is_nearly_done_does_not_compile(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("ckc_pin.generated.library._compiler", lambda: None)  # and neither does one that cannot
     late = simulate("five_bar/set_point", changes)
     assert np.array_equal(late.q_tree, usual.q_tree)
+
+
+LINK = (
+    '<link name="{0}"><inertial><mass value="{1}"/>'
+    '<inertia ixx="{1}" iyy="{1}" izz="{1}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><origin xyz="{4} 0 0"/>{5}</joint>'
+SLIDE = '<axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="9" velocity="9"/>'
+HINGE = '<axis xyz="0 0 1"/>'
+CRANK, ROD, SPEED = 0.3, 1.0, 4.0  # m, m, rad/s
+SLIDER_CRANK = f"""
+name = "slider_crank"
+urdf = "slider_crank.urdf"
+gravity = [0.0, 0.0, 0.0]
+independent = ["crank"]
+[q_guess]
+crank = 0.4
+pin = -0.5
+slide = 1.27
+[[loop]]
+name = "piston"
+type = "point_2d"
+frame_a = {{ link = "rod", xyz = [{ROD}, 0.0, 0.0] }}
+frame_b = {{ link = "piston" }}
+axis_a = [0.0, 0.0, 1.0]
+"""
+
+
+def slider_crank(folder: Path, rod: float) -> Path:
+    """A crank of 2 kg m^2, a piston of 3 kg, and a rod without mass, or with some."""
+    links = '<link name="ground"/>' + LINK.format("crank", 2.0) + LINK.format("rod", rod) + LINK.format("piston", 3.0)
+    joints = JOINT.format("crank", "continuous", "ground", "crank", 0.0, HINGE)
+    joints += JOINT.format("pin", "continuous", "crank", "rod", CRANK, HINGE)
+    joints += JOINT.format("slide", "prismatic", "ground", "piston", 0.0, SLIDE)
+    (folder / "slider_crank.urdf").write_text(f'<robot name="slider_crank">{links}{joints}</robot>')
+    (folder / "mechanism.toml").write_text(SLIDER_CRANK)
+    (folder / "default.scene.toml").write_text(
+        f'mechanism = "mechanism.toml"\nt_end = 3.0\n[initial]\nq = {{ crank = 0.4 }}\n'
+        f"q_dot = {{ crank = {SPEED} }}\n[solver]\nrtol = 1e-10\n"
+    )
+    return folder
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+def test_a_rod_without_mass_moves_with_its_loop(tmp_path: Path, formulation: str) -> None:
+    """D' is singular, eq. 1 is not: the crank's speed is what the energy says."""
+    changes = {"formulation": formulation, "solver.terms": "generated"}
+    run = simulate(slider_crank(tmp_path, 0.0), changes)
+    assert run.status == "done"
+    assert set(run.stats["rhs_by_terms"]) == {"generated"}
+
+    def inertia(angle: Any) -> Any:
+        piston = CRANK * np.sin(angle) * (1 + CRANK * np.cos(angle) / np.sqrt(ROD**2 - (CRANK * np.sin(angle)) ** 2))
+        return 2.0 + 3.0 * piston**2
+
+    crank = run.mechanism.coordinates.index("crank")
+    angle, speed = run.q_tree[:, crank], run.v_tree[:, crank]
+    assert angle[-1] > 6.0
+    assert_close(speed, SPEED * np.sqrt(inertia(0.4) / inertia(angle)), 1e-8)
+    if formulation == "dae":
+        are_alike(run.mechanism)
+
+
+def test_what_is_never_eliminated_soundly_names_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("ckc_pin.generated.comparison._sound", lambda terms, order: False)
+    with pytest.raises(InputError, match=r'four_bar: .* with pivoting everywhere, .*; take solver.terms = "pinocchio"'):
+        compiled(load("four_bar"))
