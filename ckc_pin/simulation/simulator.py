@@ -68,6 +68,9 @@ class Simulator(Shown):
     While u stays as it is, a step of the method may reach beyond the caller's, and states within it are read off it, as
     accurate as the outputs of a run; a change of u goes on from the state that was read. Events keep steps from that.
 
+    It is not copied or pickled: after ``other.reset(this.state)`` another one of the scene goes on from where this one
+    is, as accurate, but not by the same steps.
+
     It takes one call at a time: an InputError refuses one from another thread, or from an event's function, while it is
     at work. Simulators of their own in several threads do not wait for each other.
 
@@ -96,6 +99,13 @@ class Simulator(Shown):
             gate.turn(f"{what}: {AT_WORK}") for what in ("step", "reset", "events", "stats")
         )
         self.reset()
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse copies, shallow, deep or pickled: steps beyond the present state are known to one loop alone."""
+        raise InputError(
+            "Simulator: one cannot be copied or pickled; make another of the same scene, and take it to where this one "
+            "is with other.reset(simulator.state)"
+        )
 
     def card(self) -> Card:
         """Return what there is to see of it."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -315,6 +318,20 @@ def test_a_bad_step_is_refused_and_moves_nothing(u: Any, dt: Any, says: str) -> 
     with pytest.raises(InputError, match=says):
         simulator.step(u, dt)
     assert simulator.state is before
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_copy_is_refused_and_what_does_the_same_is_named(copied: Callable[[Simulator], Any]) -> None:
+    """A copy would share the loop: what one steps, the other would too."""
+    simulator, other = Simulator("five_bar/swing", TIGHT), Simulator("five_bar/swing", TIGHT)
+    _push_on(simulator, np.array([0.1, 0.2]), 10)
+    with pytest.raises(InputError, match=r"make another of the same scene, .* other\.reset\(simulator\.state\)"):
+        copied(simulator)
+    other.reset(simulator.state)
+    _push_on(other, np.array([3.0, -3.0]), 3)
+    assert simulator.state.t == pytest.approx(0.1)
+    other.reset(pickle.loads(pickle.dumps(simulator.state)))
+    assert_same(other.step([0.2, 0.1], 0.01), simulator.step([0.2, 0.1], 0.01), 1e-8)
 
 
 def test_limits_of_torque_hold() -> None:
