@@ -47,6 +47,8 @@ def require_tau(tau: Any, mechanism: Mechanism, what: str = "the controller's ta
 
 
 def _vector(given: Any, names: Sequence[str], what: str) -> Array:
+    if given is None:
+        raise InputError(f"{what} is None; {len(names)} numbers are needed: {', '.join(names)}; is a return missing?")
     try:
         array = np.asarray(given)
         if array.dtype.kind in NO_NUMBERS:

@@ -7,7 +7,6 @@ Errors are q - q_d everywhere. A controller sees the plant's measured state thro
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from inspect import signature
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +18,7 @@ from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.kinds import a_kind, require_callable, require_kind, takes_arguments
+from ckc_pin.mechanism.kinds import a_kind, require_arguments, require_callable, require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
@@ -79,10 +78,7 @@ def as_controller(given: Any) -> Controller | TorqueController:
     for name in own or [""]:
         law = getattr(given, name) if name else given
         called = name or getattr(given, "__name__", type(given).__name__)
-        if not takes_arguments(law, 2):
-            raise InputError(
-                f"controller: {called}({', '.join(signature(law).parameters)}) was given; it must take (t, terms)"
-            )
+        require_arguments(law, called, "controller")
     found: Controller | TorqueController = given if own else FunctionController(given)
     gives_tau(found)
     return found

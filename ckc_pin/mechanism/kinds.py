@@ -14,6 +14,7 @@ from ckc_pin.errors import InputError
 __all__ = [
     "a_kind",
     "is_number",
+    "require_arguments",
     "require_callable",
     "require_flag",
     "require_kind",
@@ -79,6 +80,20 @@ def takes_arguments(function: Callable[..., Any], count: int) -> bool:
     except ValueError:  # of some builtins it is not known
         pass
     return True
+
+
+def require_arguments(function: Callable[..., Any], called: str, what: str) -> None:
+    """Refuse a function that cannot be called with (t, terms).
+
+    Raises
+    ------
+    InputError
+        What it takes.
+    """
+    if not takes_arguments(function, 2):
+        raise InputError(
+            f"{what}: {called}({', '.join(signature(function).parameters)}) was given; it must take (t, terms)"
+        )
 
 
 def require_callable(given: Any, what: str, takes: str, count: int = 2) -> None:

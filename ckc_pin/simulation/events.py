@@ -14,7 +14,7 @@ import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import require_kind
+from ckc_pin.mechanism.kinds import require_arguments, require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.loop_terms import event_call
 from ckc_pin.simulation.scene_spec import EventSpec
@@ -54,6 +54,7 @@ class Event:
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise InputError(f"Event: {self.function!r:.80} is no function of (t, terms)")
+        require_arguments(self.function, getattr(self.function, "__name__", type(self.function).__name__), "Event")
         if self.direction not in (-1, 0, 1) or isinstance(self.direction, bool):
             raise InputError(f"Event: direction = {self.direction!r:.80}; valid: -1, 0, 1")
         if not isinstance(self.stop, bool):

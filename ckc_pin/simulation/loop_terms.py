@@ -117,6 +117,9 @@ def event_call(function: Callable[[float, Terms], Any], name: str, mechanism: Me
         except NumericalError as error:
             return str(error)
         number = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
+        if isinstance(number, bool):
+            says = "a number that changes sign where it happens is needed, as t - 0.5 is one for t > 0.5"
+            raise InputError(f"the event {name!r} gave {number}; {says}")
         if not isinstance(number, int | float):
             raise InputError(f"the event {name!r} gave {value!r:.80}; a number is needed")
         try:

@@ -16,10 +16,11 @@ from tests.contract.helpers.bad import Bad, expect
     ("arguments", "says"),
     [
         ((3,), "Event: 3 is no function"),
-        ((abs, 2), "direction = 2; valid: -1, 0, 1"),
-        ((abs, True), "direction = True"),
-        ((abs, 0, 1), "stop = 1: True or False is needed"),
-        ((abs, 0, True, 5), "name = 5: a string is needed"),
+        ((max, 2), "direction = 2; valid: -1, 0, 1"),
+        ((max, True), "direction = True"),
+        ((max, 0, 1), "stop = 1: True or False is needed"),
+        ((max, 0, True, 5), "name = 5: a string is needed"),
+        ((lambda t: t - 0.5,), r"Event: <lambda>\(t\) was given; it must take \(t, terms\)"),
     ],
 )
 def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
@@ -31,6 +32,13 @@ def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
 def test_a_function_that_gives_no_number_is_refused(value: Any) -> None:
     with pytest.raises(InputError, match=r"the event 'odd' gave .*; a number is needed"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: value, name="odd")])
+
+
+@pytest.mark.parametrize("kind", [bool, np.bool_], ids=["Python's", "NumPy's"])
+def test_a_truth_value_is_refused_at_once(kind: Any) -> None:
+    """From False to True no sign changes: it would never be met."""
+    with pytest.raises(InputError, match=r"the event 'late' gave False; a number that changes sign .* t - 0\.5"):
+        simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: kind(t > 0.5), name="late")])
 
 
 def test_a_function_alone_is_refused() -> None:

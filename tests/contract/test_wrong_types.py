@@ -83,6 +83,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a class as a controller": (of(Own), r"the class Own was given; give an object of it, as Own\(\) makes one"),
     "a function of one": (of(lambda t: t), r"controller: <lambda>\(t\) was given; it must take \(t, terms\)"),
     "a method of one": (of(OfOne()), r"controller: u\(t\) was given; it must take \(t, terms\)"),
+    "a forgotten return": (of(lambda t, terms: None), "controller's u is None; 2 numbers are .*is a return missing"),
     "a string as a controller": (of("pd"), r"controller: 'pd' was given; it takes an object with one of the methods"),
     "an object as a controller": (of(object()), r"controller: an object was given; .*or a function u\(t, terms\)"),
     "a class that is sampled": (lambda: Sampled(Own, 0.1), "the class Own was given"),
