@@ -160,7 +160,7 @@ def _unclosed(at: Kinematics, residual: Array) -> float:
     With redundant rows some of it may be out of z's reach: where the numbers of a file are rounded the
     rows contradict each other slightly, and no configuration closes them all.
     """
-    if len(residual) > len(at.partition.z) and np.all(np.isfinite(residual)):
+    if len(residual) > len(at.partition.z) and np.all(np.isfinite(residual)) and not at.phi_z_factor.singular:
         residual = at.phi_z @ at.phi_z_factor.solve(residual)
     return float(np.abs(residual).max(initial=0.0))
 
@@ -184,7 +184,7 @@ def move(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, an
 
     def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
         nonlocal iterations
-        if iterations > most:
+        if iterations > most or at.phi_z_factor.singular:
             return None
         level = w - (1.0 - done - part) * dw if between_levels else w
         trial = newton(predict(at, part * dq, part * dw if between_levels else None), level, tolerance)

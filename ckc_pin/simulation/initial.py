@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import newton, sigma
@@ -14,9 +15,11 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_spec import InitialSpec
+from ckc_pin.simulation.scene_spec import SceneSpec
 
-__all__ = ["Start", "branch", "find_start"]
+__all__ = ["Start", "branch", "find_start", "require_chart"]
+
+ROUNDED = 1e-4  # rad, or of the mechanism's size: how far a configuration that is given whole may be from a closed one
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,11 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
         A start that is singular.
     """
     with scene.sources.naming():
-        return _find(mechanism, scene.spec.initial)
+        return _find(mechanism, scene.spec)
 
 
-def _find(mechanism: Mechanism, initial: InitialSpec) -> Start:
-    rows = mechanism.closure.rows
+def _find(mechanism: Mechanism, spec: SceneSpec) -> Start:
+    initial, rows = spec.initial, mechanism.closure.rows
     w = np.zeros(rows)
     if initial.w is not None:
         if len(initial.w) != rows:
@@ -67,12 +70,38 @@ def _find(mechanism: Mechanism, initial: InitialSpec) -> Start:
             f"initial.q: {', '.join(lacking)} missing; needed are {needed}, which were chosen because {file} does not: "
             "independent = [...] there says which it is to be"
         )
+    needs_q = isinstance(spec.controller, FeedbackSpec) or np.any(q_dot)
+    if spec.formulation == "dae" and not np.any(w) and not needs_q:
+        given = _off_chart(mechanism, initial.q)
+        if given is not None:
+            return Start(given, q_dot, w)
     q = mechanism.vector(
         {k: x for k, x in initial.q.items() if k not in mechanism.dependent},
         mechanism.independent,
         "initial.q",
     )
     return Start(_close(mechanism, q, branch(mechanism, initial.q), w), q_dot, w)
+
+
+def _off_chart(mechanism: Mechanism, given: dict[str, float]) -> Kinematics | None:
+    """Return a configuration that is given whole, where q is no chart but J keeps its rank.
+
+    What the DAE starts from at rest: it needs no q. In other coordinates it is closed by what the numbers are rounded
+    to. None where q is a chart, or not all is given.
+    """
+    if not all(name in given for name in mechanism.coordinates):
+        return None
+    numbers = mechanism.vector(given, mechanism.coordinates, "initial.q")
+    at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
+    best = None if _is_chart(at) else mechanism.best_partition(at)
+    if best is None:
+        return None
+    at = Kinematics(at.tree, at.closure, best, at.q_tree)
+    if not _is_chart(at):
+        return None
+    closed = newton(at, 0.0, mechanism.tolerance)
+    moved = mechanism.tree.difference(at.q_tree, closed.at.q_tree) / mechanism.tree.reach
+    return closed.at if closed.converged and np.abs(moved).max() <= ROUNDED else None
 
 
 def branch(mechanism: Mechanism, given: dict[str, float]) -> Kinematics:
@@ -99,15 +128,35 @@ def _close(mechanism: Mechanism, q: Array, start: Kinematics, w: Array) -> Kinem
     if found.verdict == "converged":
         _refuse_contradiction(mechanism, found.at, w)
         return found.at
-    where = ", ".join(f"{name} = {x:.6g}" for name, x in zip(mechanism.independent, q, strict=True))
+    where = _place(mechanism, q)
     level = f" on phi = w = {w.tolist()}" if np.any(w) else ""
     if found.verdict == "singular":
-        raise NumericalError(
-            f"the start {where}{level} is singular: {_what_would_help(mechanism, found.at)}",
-            t=0.0,
-            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(found.at.q_tree)),
-        )
+        raise _singular(mechanism, f"{where}{level}", found.at)
     raise InputError(f"initial: the start {where}{level} is out of reach: {found.reason}")
+
+
+def require_chart(mechanism: Mechanism, start: Start) -> None:
+    """Refuse a start where q is no chart, for who needs q.
+
+    Raises
+    ------
+    NumericalError
+    """
+    at = start.at
+    if not np.array_equal(at.partition.z, mechanism.partition.z):
+        raise _singular(mechanism, _place(mechanism, mechanism.independent_part(at.q_tree)), at)
+
+
+def _place(mechanism: Mechanism, q: Array) -> str:
+    return ", ".join(f"{name} = {x:.6g}" for name, x in zip(mechanism.independent, q, strict=True))
+
+
+def _singular(mechanism: Mechanism, where: str, at: Kinematics) -> NumericalError:
+    return NumericalError(
+        f"the start {where} is singular: {_what_would_help(mechanism, at)}",
+        t=0.0,
+        q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
+    )
 
 
 def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:

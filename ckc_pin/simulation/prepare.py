@@ -40,7 +40,7 @@ from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
 from ckc_pin.native.variation import directions_of, variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
-from ckc_pin.simulation.initial import Start, find_start
+from ckc_pin.simulation.initial import Start, find_start, require_chart
 from ckc_pin.simulation.libraries import changing_library, library_of
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
@@ -222,6 +222,7 @@ def prepare(
     _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not gives_tau(law):
+        require_chart(mechanism, start)
         actuation.require_transmission(start.at)
     formulation, labels = _formulation(mechanism, scene.spec, np.diagonal(D_tree)), tuple[str, ...]()
     changing: dict[str, BoolArray] | None = None

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from sksundae.ida import IDA
 
-from ckc_pin import Run, simulate
-from ckc_pin.errors import InputError
+from ckc_pin import Run, load, simulate
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.simulation.initial import Start
 from ckc_pin.simulation.ivp import Dae, as_ivp
 from ckc_pin.simulation.prepare import prepare
@@ -133,3 +134,53 @@ def test_a_constant_u_does_the_work_that_is_gained_where_q_is_no_chart(
     work = moved[:, [run.column(name) for name in run.independent]] @ run.u[0]
     gained = run.energy - run.energy[0]
     assert np.abs(gained - work).max() < 100 * 1e-4 * np.abs(run.energy).max()
+
+
+# --- starts where q is no chart ---------------------------------------------------------------------
+
+
+IN_LINE = {"crank": 0.0, "rod": 0.0, "slider": 0.4}
+
+
+def by_slider(folder: Path, pin: str = 'type = "point_2d"\n') -> str:
+    """The slider-crank with the slider as q, which does not determine the crank where crank and rod are in line."""
+    for name, text in load("slider_crank").sources.texts.items():
+        by_slider = text.replace('["crank"]', '["slider"]')
+        (folder / name).write_text(by_slider.replace('type = "point_2d"\n', pin))
+    (folder / "s.scene.toml").write_text('mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 0.5\n')
+    return str(folder / "s.scene.toml")
+
+
+@pytest.mark.parametrize("off", [0.0, 3e-6])
+@pytest.mark.parametrize(
+    "pin", ['type = "point_2d"\n', 'type = "hinge"\naxis_a = [0.0, 0.0, 1.0]\n'], ids=["point", "hinge"]
+)
+def test_a_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) -> None:
+    """From every coordinate, with redundant rows too; as the one whose q is the crank does."""
+    scene = by_slider(tmp_path, pin)
+    changes = {"initial": {"q": {**IN_LINE, "rod": off}}, "solver.rtol": 1e-10, "t_end": 0.5, "solver.output_dt": 0.05}
+    ours, theirs = simulate(scene, changes), simulate("slider_crank", {**changes, "formulation": "dae"})
+    assert ours.status == "done"
+    assert np.ptp(ours["crank"]) > 0.5
+    for name in IN_LINE:
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=max(1e-8, 10 * off))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"formulation": "reduced"},
+        {"initial.q_dot": {"slider": 1.0}},
+        {"controller": {"type": "set_point", "K_P": 4.0, "K_V": 1.0, "q_d": {"slider": 0.28}}},
+    ],
+)
+def test_who_needs_q_does_not_start_there(tmp_path: Path, more: dict[str, Any]) -> None:
+    scene = by_slider(tmp_path)
+    with pytest.raises(NumericalError, match="singular: slider do not determine crank, rod there"):
+        simulate(scene, {"initial": {"q": IN_LINE}, **more})
+
+
+def test_neither_does_a_controller_of_ones_own(tmp_path: Path) -> None:
+    scene = by_slider(tmp_path)
+    with pytest.raises(NumericalError, match="singular: slider do not determine crank, rod there"):
+        simulate(scene, {"initial": {"q": IN_LINE}}, controller=lambda t, terms: np.zeros(1))
