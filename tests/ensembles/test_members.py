@@ -92,6 +92,25 @@ def test_springs_forces_and_lengths_are_varied_too(tmp_path: Path) -> None:
         assert np.abs(found.outputs["end"][k] - run.q_tree[-1]).max() < CLOSE
 
 
+def test_a_table_among_the_changes_takes_the_place_of_the_scenes() -> None:
+    """As in a single run: nothing stays of the table that was there, which says another start."""
+    scene = "five_bar/tracking"
+    changes = {"t_end": 0.1, "initial": {"q": {"theta_1": -1.0, "theta_3": -2.0}}}
+    assert ckc_pin.load_scene(scene).spec.initial.at == "equilibrium"
+    found = ckc_pin.ensemble(
+        scene, {"link.link_2.mass": [0.2, 0.3]}, {"end": "q_tree"}, changes=changes, progress=False
+    )
+    for k, mass in enumerate((0.2, 0.3)):
+        run = ckc_pin.simulate(scene, {**changes, "link.link_2.mass": mass})
+        assert np.abs(found["end"][k] - run.q_tree[-1]).max() < CLOSE
+
+
+@pytest.mark.parametrize("name", ["gravity.x", "link.link_2.mass", "initial.q.theta_1"])
+def test_a_distribution_that_is_none_names_those_there_are(name: str) -> None:
+    with pytest.raises(ckc_pin.InputError, match=rf"{name}: unknown key 'gauss'; valid: uniform, loguniform, normal"):
+        ckc_pin.ensemble("five_bar/swing", {name: {"gauss": [0, 1]}}, {"end": "q_tree"}, members=2)
+
+
 def test_reductions_are_those_of_the_run() -> None:
     kept: dict[str, Any] = {
         name: {"of": of, "reduce": how}

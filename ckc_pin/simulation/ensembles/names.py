@@ -8,7 +8,8 @@ from typing import Any
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import AXES, is_parameter, require_known, values_of, with_components
+from ckc_pin.mechanism.parameters import AXES, Value, is_parameter, require_known, values_of, with_components
+from ckc_pin.simulation.ensembles.spec import KINDS
 from ckc_pin.simulation.scene import Scene, load_scene
 
 __all__ = ["check_names"]
@@ -19,6 +20,8 @@ def check_names(
 ) -> dict[str, tuple[str, int]]:
     """Refuse variables that are none; return those that are components of what the scene gives whole."""
     present = values_of(mechanism.spec, mechanism.urdf)
+    for name in names:
+        _refuse_distribution(scene, mechanism, present, name)
     asked = [name for name in names if is_parameter(name)]
     require_known(asked, with_components(present), f"{scene.name}: variables")
     vectors: dict[str, tuple[str, int]] = {}
@@ -32,6 +35,16 @@ def check_names(
         if not is_parameter(name):
             _try_key(scene_name, changes, scene, mechanism, name)
     return vectors
+
+
+def _refuse_distribution(scene: Scene, mechanism: Mechanism, present: Mapping[str, Value], name: str) -> None:
+    """A name that goes on behind a number's: a distribution that there is none of has been read as a table."""
+    of, _, kind = name.rpartition(".")
+    vector, _, axis = of.rpartition(".")
+    is_number = not isinstance(present[of], tuple) if of in present else vector in present and axis in AXES
+    start = next((of.removeprefix(x) for x in ("initial.q.", "initial.q_dot.") if of.startswith(x)), "")
+    if is_number or start in mechanism.coordinates:
+        raise InputError(f"{scene.name}: variables: {of}: unknown key {kind!r}; valid: {', '.join(KINDS)}")
 
 
 def _try_key(scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, mechanism: Mechanism, name: str) -> None:

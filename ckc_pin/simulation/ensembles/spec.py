@@ -13,7 +13,17 @@ from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import by_coordinate, convert, read_text, read_toml
 
-__all__ = ["SUFFIX", "GridSpec", "OutputSpec", "Reduction", "SweepSpec", "VariableSpec", "read_sweep", "sweep_of"]
+__all__ = [
+    "KINDS",
+    "SUFFIX",
+    "GridSpec",
+    "OutputSpec",
+    "Reduction",
+    "SweepSpec",
+    "VariableSpec",
+    "read_sweep",
+    "sweep_of",
+]
 
 SUFFIX = ".sweep.toml"
 MOST = 10**9  # members
@@ -176,12 +186,12 @@ def read_sweep(path: str | Path) -> tuple[SweepSpec, Sources]:
     """
     path = Path(path)
     data = read_toml(read_text(path, "sweep"), str(path))
+    by_coordinate(data, "changes")
     return sweep_of(data, Sources(str(path), path.parent)), Sources(str(path), path.parent)
 
 
 def sweep_of(data: dict[str, Any], sources: Sources) -> SweepSpec:
     """Check parsed data (InputError)."""
-    by_coordinate(data, "changes")
     if isinstance(data.get("variables"), dict):
         data["variables"] = dict(_variables("", data["variables"]))
     spec = convert(data, SweepSpec, sources.name)
