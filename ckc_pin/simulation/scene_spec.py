@@ -36,7 +36,7 @@ class InitialSpec(_Spec, frozen=True):
         The independent coordinates; dependent ones may be added to pick the branch.
         ``q = {theta_1 = -1.2, theta_3 = -1.9}``
     q_dot : rad/s, m/s
-        The independent rates; 0 for what is not named.
+        The independent rates; 0 for what is not named. Of a free root velocity and angular velocity in its own axes.
         ``q_dot = {theta_1 = 0.4}``
     w : m, rad
         φ at the start, of the SPF alone; absent: 0.

@@ -41,7 +41,10 @@ class State(Shown):
 
     @cached_property
     def v_tree(self) -> Array:
-        """Rates by coordinate, shape (n,); off its manifold the SPF's z_dot differs from what q_dot implies."""
+        """Rates by coordinate, shape (n,); of a free root velocity and angular velocity in its own axes.
+
+        Off its manifold the SPF's z_dot differs from what q_dot implies.
+        """
         return self._part(0)
 
     @cached_property
@@ -76,5 +79,5 @@ class State(Shown):
 
     @property
     def q_dot(self) -> Array:
-        """Their rates, shape (d,)."""
+        """Their rates, shape (d,); of a free root in its own axes."""
         return self.v_tree[self.mechanism.partition.q]

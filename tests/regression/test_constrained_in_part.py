@@ -53,11 +53,7 @@ def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical
     inertia = np.diag([0.01, 0.03, 0.04])
     vertical = []
     for row, v in zip(run.q_tree, run.v_tree, strict=True):
-        rotvec = row[3:]
-        angle = float(np.linalg.norm(rotvec))
-        axis = rotvec / angle if angle else np.zeros(3)
-        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        rotation = _rotation(row[3:])
         vertical.append(float((rotation @ inertia @ v[3:])[2]))
     assert np.ptp(vertical) < 1e-7
     assert np.ptp(run.v_tree[:, 3]) > 1e-3  # it does not just spin
@@ -75,3 +71,22 @@ def test_check_says_so(top: Path) -> None:
     assert any("hold a free root in part" in warning for warning in found.warnings)
     with pytest.raises(InputError, match="hold a free root in part"):
         terms(load(top / "mechanism.toml"), {"root.rx": 0.1, "root.ry": 0.0, "root.rz": 0.0})
+
+
+def test_rates_of_a_free_root_are_in_its_own_axes(top: Path) -> None:
+    """A quarter turn about z, thrown along its x and spun about its y: along the world's y, nose down."""
+    (top / "mechanism.toml").write_text(MECHANISM.partition("[[loop]]")[0])
+    turned, thrown = {"root.rz": np.pi / 2}, {"root.x": 2.0, "root.ry": 0.3}
+    start = {"q": {f"root.{k}": 0.0 for k in ("x", "y", "z", "rx", "ry", "rz")} | turned, "q_dot": thrown}
+    run = simulate(top / "default.scene.toml", {"initial": start, "t_end": 1e-6, "solver.output_dt": 1e-6})
+    moved = run.q_tree[-1] - run.q_tree[0]
+    assert_close(moved[:3] / 1e-6, [0, 2, 0], 1e-4)
+    first = _rotation(run.q_tree[-1][3:])[:, 0]
+    assert_close(first, [0, 1, -0.3e-6], 1e-10)
+
+
+def _rotation(rotvec: np.ndarray) -> np.ndarray:
+    angle = float(np.linalg.norm(rotvec))
+    x, y, z = rotvec / angle if angle else np.zeros(3)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
