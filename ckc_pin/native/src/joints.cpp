@@ -81,23 +81,26 @@ void Joints::factor(const Matrix& responses) {
 }
 
 // The least forces, each measured in what it takes to move its own joint, that make the rows x.
-void Joints::back(const Matrix& responses, In x, Out step) {
+void Joints::least_forces(const Matrix& responses, In x, Vector& force) {
   factor(responses);
   const auto m = static_cast<Eigen::Index>(locked.size());
-  wanted_.resize(m), force_.resize(m);
+  wanted_.resize(m);
   for (Eigen::Index i = 0; i < m; ++i) wanted_(i) = -scale_(i) * x(locked[i]);
   const Eigen::Index rank = root_.cols();
   const auto vectors = eigen_.eigenvectors().rightCols(rank);
   const Vector along = (vectors.transpose() * wanted_).cwiseQuotient(eigen_.eigenvalues().tail(rank));
-  force_.noalias() = vectors * along;
-  for (Eigen::Index i = 0; i < m; ++i) force_(i) *= scale_(i);
-  step.noalias() = responses.leftCols(m) * force_;
+  force.noalias() = vectors * along;
+  for (Eigen::Index i = 0; i < m; ++i) force(i) *= scale_(i);
+}
+
+void Joints::back(const Matrix& responses, In x, Out step) {
+  least_forces(responses, x, back_);
+  step.noalias() = responses.leftCols(back_.size()) * back_;
 }
 
 void Joints::hold(const Matrix& responses, Out a) {
-  Vector added(a.size());
-  back(responses, a, added);
-  a += added;
+  least_forces(responses, a, force_);
+  a.noalias() += responses.leftCols(force_.size()) * force_;
   for (int k : locked) a(k) = 0.0;  // what is left is rounding
 }
 

@@ -78,6 +78,7 @@ class Joints {
  private:
   static constexpr double infinite = std::numeric_limits<double>::infinity();
   void factor(const Matrix& responses);
+  void least_forces(const Matrix& responses, In x, Vector& force);
   double slack(In direction) const;  // along a motion that the forces allow
   const bool smooth_;
   double rubbed_ = 0.0;
@@ -85,7 +86,7 @@ class Joints {
   // Of the scaled matrix A = G D^-1 G^T of the locked rows: its root, (locked, rank), and the least forces that hold.
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;
   Matrix A_, root_;
-  Vector scale_, force_, wanted_;
+  Vector scale_, force_, wanted_, back_;
 };
 
 }  // namespace ckc
