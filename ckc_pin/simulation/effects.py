@@ -6,7 +6,7 @@ of a joint that is locked where that stands; one that places a fixed joint moves
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -17,7 +17,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import split_component, split_name
+from ckc_pin.mechanism.parameters import Changes, split_component, split_name
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.spec import FrameSpec
 from ckc_pin.mechanism.tree import Array
@@ -33,7 +33,9 @@ Thing = tuple[Place, int]
 Twist = tuple[Array, Array]  # angular, linear: of the frame at a joint's origin, in its axes
 
 
-def effects_of(mechanism: Mechanism, actuation: Actuation, name: str) -> tuple[Effect, ...]:
+def effects_of(
+    mechanism: Mechanism, actuation: Actuation, name: str, given: Changes, changed: Callable[[Changes], Mechanism]
+) -> tuple[Effect, ...]:
     """Return what a number does; nothing where the motion does not depend on it.
 
     Parameters
@@ -42,6 +44,10 @@ def effects_of(mechanism: Mechanism, actuation: Actuation, name: str) -> tuple[E
     actuation : Actuation
     name : str
         Of a single number: of a vector's, with its component.
+    given : mapping
+        The scene's own changes of its numbers.
+    changed : callable
+        Makes the mechanism of other changes.
 
     Raises
     ------
@@ -54,7 +60,7 @@ def effects_of(mechanism: Mechanism, actuation: Actuation, name: str) -> tuple[E
         case "gravity":
             found = iter([Effect("gravity", numbers=np.eye(3)[k])])
         case "link":
-            found = _of_link(mechanism, carrier, key, k)
+            found = _of_link(mechanism, carrier, key, k, given, changed)
         case "joint":
             found = _of_joint(mechanism, carrier, key, k)
         case "loop":
@@ -74,14 +80,19 @@ def effects_of(mechanism: Mechanism, actuation: Actuation, name: str) -> tuple[E
 # --- bodies ------------------------------------------------------------------------------------------
 
 
-def _of_link(mechanism: Mechanism, name: str, key: str, k: int) -> Iterator[Effect]:
+def _of_link(
+    mechanism: Mechanism, name: str, key: str, k: int, given: Changes, changed: Callable[[Changes], Mechanism]
+) -> Iterator[Effect]:
     """A new mass is the same body of another density; a new centre takes the inertia along."""
     body = _Body(mechanism, name)
     if body.placed.joint == 0:
         return
     if key == "mass":
-        per_mass = body.about / body.mass if body.mass > 0 else np.zeros((3, 3))
-        yield body.changed(1.0, body.centre, per_mass + _about(body.centre, body.centre))
+        of_file = body
+        if body.mass == 0 and f"link.{name}.mass" in given:  # what it has none of any more, its file says
+            of_file = _Body(changed({x: value for x, value in given.items() if x != f"link.{name}.mass"}), name)
+        kept = [entry for entry in ENTRIES if f"link.{name}.inertia.{entry}" in given]
+        yield body.changed(1.0, body.centre, of_file.per_mass(kept) + _about(body.centre, body.centre))
     elif key == "com":
         yield body.moved(np.zeros(3), body.placed.rotation[:, k])
     else:
@@ -98,16 +109,23 @@ class _Body:
         self.placed = _link(mechanism, link)
         element = next(x for x in mechanism.urdf.findall("link") if x.attrib["name"] == link)
         inertial = element.find("inertial")
-        self.mass, centre, self.turn, tensor = 0.0, np.zeros(3), self.placed.rotation, np.zeros((3, 3))
+        self.mass, centre, self.turn, self.tensor = 0.0, np.zeros(3), self.placed.rotation, np.zeros((3, 3))
         if inertial is not None:
             origin = inertial.find("origin")
             self.mass = float(_numbers(inertial.find("mass"), "value", 1)[0])
             centre = _numbers(origin, "xyz", 3)
             self.turn = self.placed.rotation @ pin.rpy.rpyToMatrix(*_numbers(origin, "rpy", 3))
             for entry, (i, j) in ENTRIES.items():
-                tensor[i, j] = tensor[j, i] = float(_numbers(inertial.find("inertia"), entry, 1)[0])
+                self.tensor[i, j] = self.tensor[j, i] = float(_numbers(inertial.find("inertia"), entry, 1)[0])
         self.centre = self.placed.translation + self.placed.rotation @ centre
-        self.about = self.turn @ tensor @ self.turn.T
+        self.about = self.turn @ self.tensor @ self.turn.T
+
+    def per_mass(self, kept: Sequence[str]) -> Array:
+        """Return how the inertia goes with the mass, but for entries that are kept; without mass it does not."""
+        scaled = np.zeros((3, 3)) if self.mass == 0 else self.tensor / self.mass
+        for i, j in (ENTRIES[entry] for entry in kept):
+            scaled[i, j] = scaled[j, i] = 0.0
+        return np.asarray(self.turn @ scaled @ self.turn.T)
 
     def changed(self, mass: float, moment: Array, inertia: Array) -> Effect:
         return Effect("inertia", self.placed.joint, np.concatenate([[mass], moment, inertia[np.triu_indices(3)]]))

@@ -228,9 +228,10 @@ def prepare(
     changing: dict[str, BoolArray] | None = None
     terms = scene.spec.solver.terms
     if parameters:
-        varying = varying_of(mechanism, scene, controller, actuation, parameters)
+        changed = partial(_built, scene)
+        varying = varying_of(mechanism, scene, controller, actuation, parameters, changed)
         require_known_motion(mechanism, scene, controller, varying)
-        require_movable(mechanism, scene.spec.parameters, varying, partial(_built, scene))
+        require_movable(mechanism, scene.spec.parameters, varying, changed)
         changing, directions = directions_of(mechanism, varying) or (None, None)
         library = changing_library(mechanism, terms, changing)
         changing = changing if library is None else None

@@ -70,6 +70,14 @@ def require_known_motion(mechanism: Mechanism, scene: Scene, controller: object,
                 f'sensitivities: {shaping}: a start that is "assembled" follows from where things are placed in a way '
                 "of its own; give initial.q"
             )
+    if not spec.friction_smoothing:
+        rubs = mechanism.joints.friction
+        for x in varying:
+            if any(effect.kind == "friction" and rubs[effect.index] == 0 for effect in x.effects):
+                raise InputError(
+                    f"sensitivities: {x.name}: it is 0, and where the joint turns round is not looked for then; give a "
+                    f"small one, {x.name} = 1e-6 in [parameters], or friction_smoothing"
+                )
     plant = [x.name for x in varying if any(effect.is_term for effect in x.effects)]
     if type(controller) is Tracking and controller.model is None and plant:
         raise InputError(
@@ -126,9 +134,14 @@ def _moved(value: tuple[float, float, float], k: int, step: float) -> Value:
 
 
 def varying_of(
-    mechanism: Mechanism, scene: Scene, controller: object, actuation: Actuation, names: Sequence[str]
+    mechanism: Mechanism,
+    scene: Scene,
+    controller: object,
+    actuation: Actuation,
+    names: Sequence[str],
+    changed: Callable[[Changes], Mechanism],
 ) -> list[Varying]:
-    """Look names up; a vector's stands for its three components.
+    """Look names up; a vector's stands for its three components. `changed` makes the mechanism of other changes.
 
     Raises
     ------
@@ -142,7 +155,9 @@ def varying_of(
     if len(set(labels)) < len(labels):
         raise InputError(f"sensitivities: a parameter is named twice in {', '.join(names)}")
     return [
-        Varying(name, effects_of(mechanism, actuation, name)) if is_parameter(name) else of_scene[name]
+        Varying(name, effects_of(mechanism, actuation, name, scene.spec.parameters, changed))
+        if is_parameter(name)
+        else of_scene[name]
         for name in labels
     ]
 

@@ -132,10 +132,11 @@ void Variation::add_force(const Effect& of, In v, Out force) {
 // What each parameter does by way of friction, of motors and of a controller, with the sign of what is lacking.
 void Variation::add_acting(In q_tree, In v, Matrix& force) const {
   const Joints& joints = core_.joints;
+  const double smoothing = joints.table.smoothing;
   for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects)
       if (of.kind == Effect::friction)
-        force(of.index, p) += joints.smooth() ? std::tanh(v(of.index) / joints.table.smoothing) : joints.sign[of.index];
+        force(of.index, p) += smoothing > 0.0 ? std::tanh(v(of.index) / smoothing) : joints.sign[of.index];
   add_control(q_tree, v, force);
 }
 
