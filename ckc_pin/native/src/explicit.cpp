@@ -72,20 +72,22 @@ bool Explicit::stages(double h) {
   return true;
 }
 
-// Of the whole motion, so that it does not matter which coordinates y has.
+// Of the whole motion, so that it does not matter which coordinates y has, and of what y has beside it.
 double Explicit::error(double h) {
   const bool whole = this->whole(h);
-  const Vector& from = whole ? step_.x : step_.y;
-  const Vector& to = whole ? step_.x_new : step_.y_new;
-  const Matrix& rates = whole ? X_ : K_;
-  scale_ = tolerance_.between(from, to);
+  const Eigen::Index moves = whole ? step_.x.size() : 0, rest = whole ? system_.beside() : step_.y.size();
   double square[2] = {0.0, 0.0};
-  for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
-    error_.setZero(from.size());
-    add(rates, E_[k], stages_ + 1, 1.0, error_);
-    square[k] = (error_.array() / scale_.array()).matrix().squaredNorm();
-  }
-  const double size = static_cast<double>(from.size()), of_five = h * std::sqrt(square[0] / size);
+  const auto look = [&](const Matrix& rates, const Vector& from, const Vector& to, Eigen::Index last) {
+    scale_ = tolerance_.between(from, to);
+    for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
+      error_.setZero(from.size());
+      add(rates, E_[k], stages_ + 1, 1.0, error_);
+      square[k] += (error_.tail(last).array() / scale_.tail(last).array()).matrix().squaredNorm();
+    }
+  };
+  if (moves) look(X_, step_.x, step_.x_new, moves);
+  if (rest) look(K_, step_.y, step_.y_new, rest);
+  const double size = static_cast<double>(moves + rest), of_five = h * std::sqrt(square[0] / size);
   if (kind_ == rk45) return of_five;
   reach_ = 0.5 * h * std::pow(std::max(of_five, 1e-10), -1.0 / 6.0);  // of RK45, whose error estimate is of order four
   if (square[0] == 0.0 && square[1] == 0.0) return 0.0;

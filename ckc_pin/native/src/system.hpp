@@ -81,6 +81,8 @@ class System {
   virtual bool return_to_accepted() { return true; }
   // How many numbers the whole motion (q', v') is where y is only a part that determines it, else zero.
   virtual int whole_size() const { return 0; }
+  // How many numbers of y, its last ones, are no part of the motion.
+  virtual int beside() const { return 0; }
   // The longest step over which its rates add up to anything, s.
   virtual double whole_within() const { return std::numeric_limits<double>::infinity(); }
   // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).

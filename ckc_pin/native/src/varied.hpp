@@ -65,6 +65,7 @@ class Varied : public Base, public WithVariation {
   }
   bool tree_acceleration(In f, Out a) const override { return Base::tree_acceleration(f.head(size_), a); }
   void whole(In f, Out x, Out x_dot) const override { Base::whole(f.head(size_), x, x_dot); }
+  int beside() const override { return this->size - size_; }
   void push(Out y, In v) const override { Base::push(y.head(size_), v); }
   void shift(Out y, In step) const override { Base::shift(y.head(size_), step); }
   void go_on(double t, Out y) override { Base::go_on(t, y.head(size_)); }
