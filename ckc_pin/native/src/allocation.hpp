@@ -17,6 +17,8 @@ class Allocation {
   void share(const Matrix& transmission, In u, Out tau);  // transmission: (motors, d)
   void clip(Out tau) const { tau = tau.cwiseMin(limit).cwiseMax(-limit); }
 
+  bool redundant() const { return redundant_; }
+
   const Vector limit;  // infinite where there is none
 
  private:

@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include <Eigen/LU>
+
 namespace ckc {
 
 constexpr double realised = 1e-9;  // of u: what motors make of it is it
@@ -197,23 +199,48 @@ bool SetPoint::slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) {
 }
 
 // Where an actuator is at its limit, it does not answer. Motors that are not q's own share u: as long as they amount to
-// it, it does not matter which.
+// it, it does not matter which; where they do not, those within their limits do as they would without any.
 bool Control::slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force) {
   const auto n = u_tree.size();
   by_q.setZero(n, n), by_v.setZero(n, n);
   force = u_tree;
   slope_.setZero(u.size(), n), slope_dot_.setZero(u.size(), n);
+  clipped.any = false;
   if (!acts() || of_motors()) return !feedback() || law->slopes(core, own_, slope_, slope_dot_);
+  clipped.any = !actuation_.direct && !((u - wanted_).norm() <= realised * wanted_.norm());
+  if (clipped.any && actuation_.redundant()) return false;
+  if (feedback() && !law->slopes(core, own_, slope_, slope_dot_)) return false;
+  if (clipped.any) return clip(core, by_q, by_v);
   if (!actuation_.direct) {
-    if (!((u - wanted_).norm() <= realised * wanted_.norm())) return false;
     force.setZero();
     for (size_t i = 0; i < own_.size(); ++i) force(own_[i]) = u(static_cast<Eigen::Index>(i));
   }
-  if (!feedback()) return true;
-  if (!law->slopes(core, own_, slope_, slope_dot_)) return false;
   for (Eigen::Index i = 0; i < u.size(); ++i)
     if (answers(i)) by_q.row(own_[i]) = slope_.row(i), by_v.row(own_[i]) = slope_dot_.row(i);
   return true;
+}
+
+// With f what the motors would do without limits, f + J^T lambda = u on q: dtau follows from du = rho^T (df + d(J^T) lambda).
+bool Control::clip(Core& core, Matrix& by_q, Matrix& by_v) {
+  core.reduce();
+  const auto n = u_tree.size();
+  Matrix turns = Matrix::Zero(tau.size(), n);
+  for (size_t k = 0; k < actuation_.gears.size(); ++k)
+    for (const Actuation::Gear& gear : actuation_.gears[k]) turns(static_cast<Eigen::Index>(k), gear.joint) += gear.turns;
+  const Eigen::PartialPivLU<Matrix> transmission(core.rho.transpose() * turns.transpose());
+  clipped.tau = transmission.solve(wanted_), clipped.answer = transmission.inverse();
+  for (Eigen::Index k = 0; k < tau.size(); ++k)
+    if (limited(k)) clipped.answer.row(k).setZero();
+  Vector lacking = -turns.transpose() * clipped.tau;
+  for (size_t i = 0; i < own_.size(); ++i) lacking(own_[i]) += wanted_(static_cast<Eigen::Index>(i));
+  clipped.lambda.setZero(core.rows.closure.rows), core.multipliers(lacking, clipped.lambda);
+  const Vector none = Vector::Zero(n), v = core.v_tree;
+  core.derivatives.compute(core.q_tree, none, none, clipped.lambda, true);
+  clipped.by_q = clipped.answer * (slope_ + core.rho.transpose() * core.derivatives.force_by_q);
+  clipped.by_v = clipped.answer * slope_dot_;
+  by_q = turns.transpose() * clipped.by_q, by_v = turns.transpose() * clipped.by_v;
+  core.set_velocity(v);
+  return by_q.allFinite() && by_v.allFinite();
 }
 
 bool Control::ask(const Measured& at, Out u) { return law->u(in_own_q(at), u, problem) && known(u); }

@@ -106,6 +106,7 @@ class Actuation {
   void clip(Out tau) const { allocation_.clip(tau); }
   const std::vector<std::vector<Gear>> gears;
   const bool direct;  // u is what the motors do
+  bool redundant() const { return allocation_.redundant(); }
   bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
 
  private:
@@ -154,6 +155,14 @@ class Control {
   bool needs_terms() const {
     return acts() && ((feedback() && law->needs_terms()) || !(actuation_.direct || of_motors()));
   }
+  // Where motors that are not q's own are at limits, as the last `slopes` found them: they do not make u any more.
+  struct Clipped {
+    bool any = false;
+    Matrix answer;       // (motors, d): what those within their limits do to a change of what is wanted of them all
+    Vector tau, lambda;  // what they would do without limits, and what holds against that with u on q
+    Matrix by_q, by_v;   // (motors, n): how their torques change with the state
+  };
+  Clipped clipped;
   // d u' / d q' and d u' / d v' where u' was found last; false where that is not known.
   // `force`: what acts, where eq. 6's force is meant as that alone on q.
   bool slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
@@ -174,6 +183,7 @@ class Control {
   bool answer(const Measured& at);  // to a sample: sampled_
   bool known(In u);                 // finite
   Measured in_own_q(const Measured& at);
+  bool clip(Core& core, Matrix& by_q, Matrix& by_v);  // those slopes
   Actuation actuation_;
   const Indices own_;  // q, whatever the coordinates of the motion are
   Vector sampled_, asked_, pushed_, q_, q_dot_, wanted_;

@@ -103,10 +103,13 @@ bool Variation::what_acts(In v) {
   Joints& joints = core_.joints;
   const Control& control = system_.control;
   answers_ = control.feedback() || joints.acts();
-  if (!answers_ && !control.acts())
+  clipped_.resize(0, 0);
+  if (!answers_ && !control.acts()) {
     acting_ = control.u_tree;
-  else if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_))
-    return false;
+  } else {
+    if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_)) return false;
+    if (control.acts() && control.clipped.any) answers_ = true, clipped_efforts(v);
+  }
   if (joints.acts()) {
     joints.add_friction(v, acting_);
     back_.setZero(), joints.add_slopes(v, back_);

@@ -95,6 +95,9 @@ class Variation {
   void closure_changes(In v, Matrix& place, Matrix& rate) const;
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
+  // How a controller's u changes with the parameters, with that sign, in the rows of q.
+  void add_wanted(In q_tree, In v, Matrix& force) const;
+  void clipped_efforts(In v);  // clipped_: how torques change with the parameters where motors are at limits
   void add_gain(const Effect& of, In q_tree, In v, Out force) const;
   void add_state(const Matrix& s);
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
@@ -107,7 +110,7 @@ class Variation {
   Derivatives derivatives_;
   bool acting_varies_ = false;  // some effect is of what acts
   bool answers_ = false;        // what acts changes with the state
-  Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_;
+  Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_, clipped_;
   struct Along {  // parameters that the code which is written out takes at a time, rows
     int first, count;
     std::vector<Indices> groups;  // of the numbers that the code takes, by row

@@ -142,19 +142,27 @@ void Variation::add_acting(In q_tree, In v, Matrix& force) const {
 
 void Variation::add_control(In q_tree, In v, Matrix& force) const {
   const Control& control = system_.control;
-  for (int p = 0; p < count; ++p) {
+  const bool clipped = clipped_.size() > 0;
+  for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
       const int k = of.index;
-      if (of.kind == Effect::gear && (control.of_motors() || control.limited(k)))
+      if (of.kind == Effect::gear && (control.of_motors() || clipped || control.limited(k)))
         force.col(p) -= control.tau(k) * of.numbers;
       else if (of.kind == Effect::torque_limit && control.limited(k))
         force.col(p) -= (control.tau(k) > 0.0 ? 1.0 : -1.0) * of.numbers;
-      else if ((of.kind == Effect::gain_q || of.kind == Effect::gain_q_dot) && control.feedback())
-        add_gain(of, q_tree, v, force.col(p));
     }
-    if (!control.feedback()) continue;
+  if (clipped)
+    force.noalias() -= table_.turns.transpose() * clipped_;
+  else if (control.feedback())
+    add_wanted(q_tree, v, force);
+}
+
+void Variation::add_wanted(In q_tree, In v, Matrix& force) const {
+  for (int p = 0; p < count; ++p) {
+    for (const Effect& of : table_.parameters[p].effects)
+      if (of.kind == Effect::gain_q || of.kind == Effect::gain_q_dot) add_gain(of, q_tree, v, force.col(p));
     for (Eigen::Index i = 0; i < compensated_.rows(); ++i)
-      if (control.answers(i)) force(table_.own[i], p) -= compensated_(i, p);
+      if (system_.control.answers(i)) force(table_.own[i], p) -= compensated_(i, p);
   }
 }
 

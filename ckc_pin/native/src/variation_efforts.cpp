@@ -12,7 +12,7 @@ namespace ckc {
 void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   const Control& control = system_.control;
   const auto d = static_cast<Eigen::Index>(table_.own.size()), motors = table_.turns.rows();
-  const bool torques = control.of_motors();
+  bool torques = control.of_motors();
   u.setZero(d, count), tau.setZero(motors, count);
   if (!control.acts()) return;
   Matrix geared = Matrix::Zero(n, count);  // of f with the gears alone
@@ -27,7 +27,14 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
       u.setConstant(std::numeric_limits<double>::quiet_NaN()), tau = Matrix::Constant(motors, count, u(0, 0));
       return;
     }
-    force_.setZero();
+    if (control.clipped.any) {
+      clipped_efforts(v);
+      tau += clipped_ + control.clipped.by_q * s.topRows(n) + control.clipped.by_v * s.bottomRows(n);
+      torques = true;
+    }
+  }
+  if (!torques) {
+    clipped_.resize(0, 0), force_.setZero();
     add_control(core_.q_tree, v, force_);
     force_ = u_by_q_ * s.topRows(n) + u_by_v_ * s.bottomRows(n) - force_;
     for (Eigen::Index i = 0; i < d; ++i) u.row(i) = force_.row(table_.own[i]);
@@ -57,6 +64,22 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
     tau = transmission.partialPivLu().solve(u - turned);
   else
     tau.setConstant(std::numeric_limits<double>::quiet_NaN());  // which of them, when they share u, is not known
+}
+
+// du of what is wanted, less what the parameters make of what the motors would do without limits (control.cpp).
+void Variation::clipped_efforts(In v) {
+  const Control& control = system_.control;
+  const Vector none = Vector::Zero(n);
+  compute(none, none, control.clipped.lambda, true);
+  force_.setZero(n, count), row_.setZero(core_.rows.closure.rows, count);
+  add_parameters(none, none, control.clipped.lambda, true, force_, row_);
+  for (int p = 0; p < count; ++p)
+    for (const Effect& of : table_.parameters[p].effects)
+      if (of.kind == Effect::gear) force_.col(p) -= control.clipped.tau(of.index) * of.numbers;
+  Matrix wanted = Matrix::Zero(n, count), u = core_.rho.transpose() * force_;
+  if (control.feedback()) add_wanted(core_.q_tree, v, wanted);
+  for (Eigen::Index i = 0; i < u.rows(); ++i) u.row(i) -= wanted.row(table_.own[i]);
+  clipped_ = control.clipped.answer * u;
 }
 
 }  // namespace ckc

@@ -1,0 +1,69 @@
+"""Where motors that are not q's own are at their limits."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import simulate
+from ckc_pin.mechanism.parameters import values_of
+from ckc_pin.simulation.sensitivities import sensitivities
+from tests.sensitivity.changed import TIGHT
+
+CLOSE = 1e-6  # of the largest: of a fast motion, whose differences have 1e-7
+PARTS = ("q_tree", "v_tree", "u", "tau")
+MOTORS = """
+[[motor]]
+joint = "theta_1"
+ratio = 2.0
+[[motor]]
+joint = "theta_2"
+ratio = 3.0
+torque_limit = 1.0
+"""
+
+
+def driven_elbow(folder: Path) -> str:
+    """Write the five-bar with a motor on an elbow, which is dependent, and a limit that it is at from the start."""
+    shutil.copytree("urdf/five_bar", folder)
+    path = folder / "mechanism.toml"
+    text = path.read_text(encoding="utf-8").replace('actuated = ["theta_1", "theta_3"]\n', "")
+    path.write_text(text + MOTORS, encoding="utf-8")
+    return str(folder / "set_point.scene.toml")
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+@pytest.mark.parametrize("terms", ["pinocchio", "generated"])
+def test_of_a_dependent_joints_motor_at_its_limit(formulation: str, terms: str, tmp_path: Path) -> None:
+    """The other one does what it would do without that limit."""
+    scene = driven_elbow(tmp_path / "x")
+    mechanism = ckc_pin.load(tmp_path / "x" / "mechanism.toml")
+    values: dict[str, Any] = dict(values_of(mechanism.spec, mechanism.urdf))
+    values |= {"gravity.y": -9.81, "joint.theta_2.xyz.x": values["joint.theta_2.xyz"][0], "controller.K_P": 10.0}
+    values |= {"controller.K_V": 1.0, "initial.q_dot.theta_1": 0.0}
+    names = ["link.link_2.mass", "gravity.y", "joint.theta_2.xyz.x", "controller.K_P", "controller.K_V"]
+    names += ["motor.theta_1.ratio", "motor.theta_2.ratio", "motor.theta_2.torque_limit", "initial.q_dot.theta_1"]
+    changes = {**TIGHT, "formulation": formulation, "solver.terms": terms, "t_end": 0.05, "solver.output_dt": 0.01}
+    found = sensitivities(scene, names, changes)
+    assert found.run.status == "done"
+    assert np.all(np.abs(found.run.tau[:, 1]) == 1.0)  # all the time
+
+    def read(run: Any) -> Any:
+        return np.concatenate([getattr(run, part) for part in PARTS], axis=1)
+
+    ours = read(found)
+    for k, name in enumerate(names):
+        h = 1e-3 * max(0.3, abs(values[name]))
+        one, two, four = (
+            (read(simulate(scene, {**changes, name: values[name] + x}))
+             - read(simulate(scene, {**changes, name: values[name] - x}))) / (2 * x)
+            for x in (h, h / 2, h / 4)
+        )  # fmt: skip
+        wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
+        assert np.abs(wanted).max() > 1e-4, name
+        assert np.abs(ours[:, :, k] - wanted).max() <= CLOSE * np.abs(wanted).max(), name
