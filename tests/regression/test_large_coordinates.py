@@ -96,7 +96,7 @@ def test_it_falls_from_the_origin_as_from_afar(falling: str, formulation: str) -
     assert long["root.y"][-1] < -4000
 
 
-def test_an_angle_that_is_rounded_too_coarsely_is_told() -> None:
+def test_an_angle_that_is_rounded_too_coarsely_stops_the_run() -> None:
     """One of 6e9 rad is known to 1e-6: no loop closes as it should."""
     given = {"initial": {"q": {"crank": 2e9 * np.pi + np.pi / 2}, "q_dot": {"crank": 12.0}}, "t_end": 0.1}
     run = ckc_pin.simulate("four_bar/turning", given)

@@ -41,7 +41,7 @@ solver.output_dt = 0.5
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-11])
-def test_a_joint_is_held_whatever_the_changes_are(formulation: str, rtol: float, tmp_path: Path) -> None:
+def test_a_joint_rests_whatever_the_changes_are(formulation: str, rtol: float, tmp_path: Path) -> None:
     """The loop has one freedom: at rest its place follows from the stop's, and from nothing else."""
     links = [LINK.format(name=name, x=x, m=m, i=i) for name, x, m, i in
              (("crank", 0.1, 0.5, 2e-3), ("rod", 0.3, 1.0, 3e-2), ("rocker", 0.2, 1.0, 1e-2))]  # fmt: skip
