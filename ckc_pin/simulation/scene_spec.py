@@ -70,7 +70,7 @@ class SolverSpec(_Spec, frozen=True):
         A step below it stops the run, exit code 3.
         ``min_step = 1e-9``
     max_rhs
-        So many right-hand sides, then the run stops.
+        So many right-hand sides, then the run stops; absent: where the rest would take more than 1e9.
         ``max_rhs = 100000``
     max_wall_s : s
         So much time of the clock, then the run stops.

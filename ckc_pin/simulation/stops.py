@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.events import EventFunction
@@ -45,6 +47,8 @@ def explain(
             return NumericalError(f"the budget of max_rhs = {solver.max_rhs} right-hand sides is used up", t=loop.t)
         case "wall_budget":
             return NumericalError(f"the budget of max_wall_s = {solver.max_wall_s:g} s is used up", t=loop.t)
+        case "pace":
+            return NumericalError(f"{_fastest(loop, mechanism)}; {_rest(stop.value)}", t=loop.t)
         case "rank":
             return NumericalError(
                 f"J loses rank at t = {stop.t:.6g} s (least singular value {stop.value:.1g}): branches of the motion "
@@ -78,6 +82,22 @@ def explain(
     if not margin <= NEARLY:
         return NumericalError(reason, t=loop.t)
     return NumericalError(f"{why_not_q(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
+
+
+def _rest(rhs: float) -> str:
+    much = f"{rhs:.0e}" if math.isfinite(rhs) else "far more than 1e9"
+    return f"the rest would take {much} right-hand sides: the motion runs away or is stiff (solver.max_rhs = N goes on)"
+
+
+def _fastest(loop: Any, mechanism: Mechanism) -> str:
+    """Say which coordinate moves fastest, radians and the mechanism's size being alike."""
+    tree = mechanism.tree
+    at = loop.state()
+    if at is None:
+        return "steps are very short"
+    v = at[1][tree.nq : tree.nq + tree.n]
+    k = int(np.argmax(np.abs(v) / tree.reach))
+    return f"steps are very short ({mechanism.coordinates[k]} moves at {v[k]:.2g} {tree.units('/s')[k]})"
 
 
 def why_not_q(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:

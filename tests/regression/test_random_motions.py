@@ -129,3 +129,4 @@ def test_a_motion_that_runs_away_is_no_singular_chart() -> None:
     assert run.status == "stopped"
     assert "runs away" in run.message
     assert "nan" not in run.message
+    assert run.stats["rhs"] < 10_000_000  # what is left of the run would take 1e9 and more

@@ -14,7 +14,7 @@ namespace ckc {
 
 using namespace nb::literals;
 
-const char* const reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "min_step", "step",
+const char* const reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "pace", "min_step", "step",
                                "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
 
 namespace {

@@ -46,7 +46,7 @@ void Loop::start(double t, In q_tree, In v_tree, In w) {
   begin_joints();
   system->start(t, q_tree, v_tree, w, now.y);
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
-  steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0;
+  steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0, paced_ = 0, paced_at_ = t;
   method_ = nullptr, radau_.reset(), segment_ = t;
   begun_ = f_known_ = jumped_ = false;
   beyond_.reset(), unchanged_ = 0;
@@ -107,11 +107,24 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
         continue;
       }
       if (beyond_) return within(until);
+      if (const auto stop = keep_pace(until)) return *stop;
       const double seconds = spent();
       if (seconds > budget) return {Stop::wall_budget, now.t};
       if (seconds > pause || work.rhs >= pause_at) return {Stop::pause, now.t};
     }
   }
+}
+
+// Where no budget is given, what would take hours is told in seconds: a motion that runs away turns ever faster.
+std::optional<Stop> Loop::keep_pace(double until) {
+  constexpr long many = 1'000'000;
+  constexpr double longest = 1e9;
+  const long done = work.rhs - paced_;
+  if (options_.max_rhs < unlimited || done < many) return std::nullopt;
+  const double rest = static_cast<double>(done) * (until - now.t) / (now.t - paced_at_);
+  if (!(rest <= longest)) return Stop{Stop::pace, now.t, rest};
+  paced_ = work.rhs, paced_at_ = now.t;
+  return std::nullopt;
 }
 
 Stop Loop::within(double until) {

@@ -13,10 +13,12 @@
 
 namespace ckc {
 
+constexpr long unlimited = 1L << 62;
+
 struct Options {
   std::string method;  // "auto", or one by name
   double rtol, atol, max_step, min_step;
-  long max_rhs;
+  long max_rhs;        // `unlimited` where none is given
   double closed;       // rad or m: how far the loops may be open along a collocation step
 };
 
@@ -27,6 +29,7 @@ struct Stop {
     pause,        // the interpreter is to be let in
     rhs_budget,
     wall_budget,
+    pace,         // the rest would take more right-hand sides than anyone waits for
     min_step,
     step,         // no step can be made: see `trouble`
     rank,         // J loses rank and that cannot be passed
@@ -38,7 +41,7 @@ struct Stop {
     joints,       // which joints slide, stick or touch cannot be told
     raised,       // a caller's function did
   } why;
-  double t = 0.0, value = 0.0;  // when; least singular value, or what a function gave
+  double t = 0.0, value = 0.0;  // when; least singular value, right-hand sides, or what a function gave
   int which = -1;               // whose function
 };
 
@@ -93,6 +96,7 @@ class Loop {
   std::optional<Stop> finish(const Made& step, double bound, bool last);
   std::optional<Stop> keep(const Made& step, bool last);
   std::optional<Stop> check_stiffness(double bound);
+  std::optional<Stop> keep_pace(double until);
   Stop within(double until);  // the step that goes beyond
   void back();                // from it to the present state
   std::optional<Stop> look(Interpolant& motion, bool last, double& halt);
@@ -134,6 +138,8 @@ class Loop {
   bool jumped_ = false;       // something has changed since the start that a second try would not know
   bool silent_ = false;       // nothing is recorded, no event is looked for
   long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never
+  long paced_ = 0;            // right-hand sides when the pace was looked at last,
+  double paced_at_ = 0.0;     // and where that was
   long restarts_ = 0;         // times that joints have changed since the start
   double last_instant_ = 0.0; // outputs up to there are of the present segment,
   double segment_ = 0.0;      // which ends there; the start, before the first one
