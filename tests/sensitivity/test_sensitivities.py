@@ -137,12 +137,14 @@ def test_of_the_start_under_tracking_control(terms: str) -> None:
 
     def ended(h: float) -> Any:
         run = simulate("five_bar/tracking", {**changes, "initial.q_dot.theta_1": h})
-        return np.stack([run.q_tree, run.v_tree])
+        return np.hstack([run.q_tree, run.v_tree, run.u])
 
     one, two, four = ((ended(h) - ended(-h)) / (2 * h) for h in (4e-3, 2e-3, 1e-3))
     wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
-    ours = np.stack([found.q_tree[:, :, 0], found.v_tree[:, :, 0]])
-    assert np.abs(ours - wanted).max() <= CLOSE * np.abs(wanted).max()
+    ours = np.hstack([found.q_tree[:, :, 0], found.v_tree[:, :, 0], found.u[:, :, 0]])
+    for part in (slice(8), slice(8, 10)):  # the motion, and what moves it
+        assert np.abs(ours - wanted)[:, part].max() <= CLOSE * np.abs(wanted[:, part]).max()
+    assert np.array_equal(found.tau, found.u)
 
 
 def test_of_a_start_at_the_equilibrium(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ Tracking::Tracking(Matrix Lambda, Matrix K_D, std::unique_ptr<Motion> desired, s
       desired_(std::move(desired)),
       model_(std::move(model)),
       actual_(actual) {
-  for (Vector* x : {&e_, &e_dot_, &v_, &a_, &r_, &product_}) x->setZero(Lambda_.rows());
+  for (Vector* x : {&e_, &e_dot_, &v_, &a_, &r_, &product_, &turned_}) x->setZero(Lambda_.rows());
   if (model_) v_model_.setZero(model_->n);
 }
 
@@ -83,9 +83,10 @@ double Tracking::lyapunov(const Measured& at, double, In w) {
   if (!errors(at)) return std::numeric_limits<double>::quiet_NaN();
   at.core.inertia();
   product_.noalias() = at.core.D * r_;
-  v_.noalias() = K_D_ * e_;
-  a_.noalias() = Lambda_ * e_;
-  return 0.5 * r_.dot(product_) + a_.dot(v_) + 0.5 * w.squaredNorm();
+  const double kinetic = 0.5 * r_.dot(product_);
+  product_.noalias() = K_D_ * e_;
+  turned_.noalias() = Lambda_ * e_;
+  return kinetic + turned_.dot(product_) + 0.5 * w.squaredNorm();
 }
 
 bool Torques::u(const Measured& at, Out tau, Problem&) {

@@ -75,7 +75,8 @@ class Tracking : public Controller {
   std::unique_ptr<Core> model_;
   bool actual_;
   bool errors(const Measured& at);
-  Vector e_, e_dot_, v_, a_, r_, product_, v_model_;
+  Vector e_, e_dot_, v_, a_, r_;  // there: `slopes` reads them
+  Vector product_, turned_, v_model_;
 };
 
 // Torques that were measured, by time: each until the next one, or lines between them.
