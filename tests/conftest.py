@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("ckc_pin")
+
+# Whoever started the tests may have it ignored, as a shell does for a background job, and commands inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}

@@ -81,7 +81,7 @@ def test_a_run_that_no_file_could_hold_is_refused() -> None:
 @pytest.fixture
 def interrupts() -> Iterator[Interrupts]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started the tests may have it ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     taken = Interrupts()
     taken.install()
@@ -121,9 +121,8 @@ def test_what_was_ignored_stays_ignored(interrupts: Interrupts) -> None:
 
 # The command, in a process of its own, which says when it is under way, when it is saving, and waits there.
 CKC = """
-import os, signal, sys, time
+import os, sys, time
 import ckc_pin, ckc_pin.cli
-signal.signal(signal.SIGINT, signal.default_int_handler)
 simulate, fsync, said = ckc_pin.simulate, os.fsync, []
 
 def say(what):

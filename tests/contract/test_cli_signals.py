@@ -16,9 +16,8 @@ from tests.contract.helpers.under_way import under_way
 
 # The command, in a process of its own, which says on standard error when it is under way.
 CKC = """
-import signal, sys
+import sys
 import ckc_pin, ckc_pin.cli
-signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started the tests may have it ignored
 simulate = ckc_pin.simulate
 
 def watched(scene, **options):

@@ -153,10 +153,7 @@ def test_stop_does_not_wait_for_a_viewer_that_hangs(swing):
 
 def test_play_prints_the_address_and_waits_for_ctrl_c(swing, tmp_path):
     saved = swing.save(tmp_path / "run.npz")
-    code = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background job has it ignored
-        f"import ckc_pin; ckc_pin.play(ckc_pin.Run.load({str(saved)!r}))"
-    )
+    code = f"import ckc_pin; ckc_pin.play(ckc_pin.Run.load({str(saved)!r}))"
     command = [sys.executable, "-W", "error", "-c", code]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -172,10 +172,9 @@ def test_what_is_wrong_is_said_before_anything_is_run(
 
 # The command, in a process of its own, which says on standard error when it has ten rows.
 CKC = """
-import signal, sys
+import sys
 import ckc_pin.cli
 from ckc_pin.analysis.precision import compute
-signal.signal(signal.SIGINT, signal.default_int_handler)
 apart, compared = compute.apart, []
 
 def announced(*arguments):
