@@ -134,18 +134,33 @@ def sensitivities(
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, parameters=tuple(parameters))
     started = perf_counter()
-    rows, status, message = run_rows(ready, progress)
+    try:
+        rows, status, message = run_rows(ready, progress)
+    except NumericalError as error:
+        if (apart := _apart(ready)) is None:
+            raise
+        raise NumericalError(f"sensitivities: {apart}", t=0.0) from error
+    message = _apart(ready) or message
     run = run_of(ready, rows, status, message, perf_counter() - started)
-    if not ready.loop.together():
-        t = float(ready.loop.t)
-        raise NumericalError(
-            f"sensitivities: at t = {t:.6g} s two joints come to a stop or to rest at once, and with these parameters "
-            "one of them before the other: there the motion has no derivative",
-            t=t,
-        )
     run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
     q_tree, v_tree, u, tau = _parts(ready, rows)
     return Sensitivities(run, ready.varying, q_tree, v_tree, u, tau, _end_time(ready))
+
+
+def _apart(ready: Prepared) -> str | None:
+    """Say where a joint has no one time to change what it does."""
+    found = ready.loop.apart()
+    if found is None:
+        return None
+    coordinate, of_rate, parameter = found
+    joint, name, t = ready.mechanism.coordinates[coordinate], ready.varying[parameter], float(ready.loop.t)
+    where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
+    what = f"{joint} begins to move from rest" if of_rate else f"{joint} comes to its stop"
+    there = "at rest" if of_rate else "there"
+    return (
+        f"stopped {where}: {what}, and with another {name} it is not {there} just then: either way the motion goes on "
+        "differently, so that it has no derivative"
+    )
 
 
 def _parts(ready: Prepared, rows: Array) -> list[Array]:

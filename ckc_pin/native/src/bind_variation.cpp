@@ -45,9 +45,15 @@ nb::object delays(Run& run, int coordinate, bool of_rate) {
   require_indices({coordinate}, run.core->n, "coordinate");
   Vector a(run.core->n);
   if (!loop.settle_core() || !loop.system->acceleration(loop.t(), a)) return nb::none();
-  const Matrix s = system.changes(loop.y());
-  if (!system.variation().delays(loop.system->velocity, a, {{coordinate, of_rate}}, s)) return nb::none();
-  return nb::cast(Vector(system.variation().delay()));
+  const Vector found = system.variation().delay({coordinate, of_rate}, loop.system->velocity, a, system.changes(loop.y()));
+  return found.allFinite() ? nb::cast(found) : nb::none();
+}
+
+// Where a joint has no one time to change what it does: (coordinate, whether it is at rest there, parameter); else none.
+nb::object apart(Run& run) {
+  const auto& found = varied(run).apart;
+  if (!found) return nb::none();
+  return nb::make_tuple(found->met.coordinate, found->met.of_rate, found->parameter);
 }
 
 // The same states' velocity and acceleration of the tree, (2 n).
@@ -86,7 +92,7 @@ void bind_variation(nb::class_<Run>& loop) {
       .def("motion", &motion)
       .def("rates_found",  // by the code that is written out, and by the tree
            [](Run& run) { return nb::make_tuple(varied(run).variation().written, varied(run).variation().general); })
-      .def("together", [](Run& run) { return varied(run).together; });
+      .def("apart", &apart);
 }
 
 }  // namespace ckc

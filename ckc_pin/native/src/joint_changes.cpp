@@ -17,8 +17,8 @@ constexpr double moves = 1e-12;     // of a joint's response without loops: they
 constexpr double negligible = 1e-6, rounded = 1e-8;  // of what friction alone would accelerate
 constexpr double exactly = 1e-9;    // of the largest acceleration: none
 
-JointChanges::JointChanges(System& system, double rise)
-    : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise) {
+JointChanges::JointChanges(System& system, double rise, const Tolerance& tolerance)
+    : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise), tolerance_(tolerance) {
   const int n = core_.n;
   for (Vector* x : {&coordinates, &v_, &a_, &rest_, &step_, &unit_}) x->setZero(n);
   near_.assign(n, 0);
@@ -37,8 +37,6 @@ bool JointChanges::take_state(double t, Out y) {
 bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
   if (!take_state(t, y)) return false;
   const Vector& reach = joints_.table.reach;
-  const bool known = known_ && !met.empty();
-  if (known && !system_.before_change(t, y, timed(met))) return false;
   joints_.account(coordinates);
   // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
   rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
@@ -61,17 +59,33 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   }
   for (int k : joints_.locked) rest_(k) = infinity;
   const Indices held = joints_.locked;
+  arrived_.clear();
+  const Indices sign = joints_.sign;
+  if (!known_)
+    for (int k = 0; k < core_.n; ++k)
+      if (joints_.rubs_at(k) && !rests(k)) joints_.sign[k] = v_(k) > 0.0 ? 1 : -1;
+  if (!system_.before_change(t, y, arriving(met))) return false;
+  joints_.sign = sign;
   if (!impact(t, y) || !grip(t, y, held)) return false;
   known_ = true;
-  return !known || system_.after_change(t, y);
+  return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
 }
 
-// Of what was met, what comes at a time of its own: what holds gives way where nothing changes yet.
-std::vector<System::Met> JointChanges::timed(const std::vector<Event>& met) {
+// What holds gives way where nothing changes yet: at no time of its own.
+std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) const {
   std::vector<System::Met> found;
-  for (const Event& event : met)
-    if (event.of != Event::holding) found.push_back({event.coordinate, event.of == Event::q_dot});
+  for (int k = 0; k < core_.n; ++k)
+    if (is_into(k)) found.push_back({k, false, near_[k]});
+  for (const Event& event : met) {
+    const int k = event.coordinate;
+    if (event.of == Event::q_dot) found.push_back({k, true});
+    if (event.of == Event::q && !is_into(k)) found.push_back({k, false, near_[k]});
+  }
   return found;
+}
+
+bool JointChanges::hits(int k) const {
+  return std::any_of(arrived_.begin(), arrived_.end(), [&](const auto& of) { return of.coordinate == k && of.stop; });
 }
 
 bool JointChanges::movable(Indices& at) {
@@ -106,7 +120,8 @@ bool JointChanges::impact(double t, Out y) {
   for (int k = 0; k < core_.n; ++k)
     if (near_[k]) {
       at.push_back(k);
-      into |= near_[k] * v_(k) > 0.0 && !rests(k);
+      into |= is_into(k);
+      if (is_into(k)) arrived_.push_back({k, false, near_[k]});
     }
   if (!into) return true;
   joints_.locked.clear();
@@ -215,6 +230,7 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
         locked.push_back(k);
         continue;
       }
+      if (!hits(k)) arrived_.push_back({k, true});
       joints_.touch[k] = 0;
       if (joints_.rubs_at(k)) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
     }
@@ -224,6 +240,7 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
   const auto among = [](const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); };
   for (int k = 0; k < core_.n; ++k) {
     const bool holds = among(locked, k);
+    if (joints_.touch[k] && !touch[k]) arrived_.push_back({k, false, joints_.touch[k]});
     if (joints_.touch[k] && !touch[k]) note(t, k, JointChange::touches, joints_.touch[k]);
     if (!joints_.touch[k] && touch[k]) note(t, k, JointChange::leaves, touch[k]);
     if (joints_.sign[k] && joints_.sign[k] != sign[k]) note(t, k, JointChange::slides, joints_.sign[k]);

@@ -9,7 +9,7 @@ namespace ckc {
 class JointChanges {
  public:
   // `rise`: rad, or of the mechanism's size: a bounce that would rise no further is none.
-  JointChanges(System& system, double rise);
+  JointChanges(System& system, double rise, const Tolerance& tolerance);
 
   void begin();  // a motion begins
   // Decide, at the core's exact state, that of y, from what was met there; `within`: s, how closely events are located.
@@ -20,13 +20,16 @@ class JointChanges {
 
  private:
   bool take_state(double t, Out y);  // and close it in y
-  static std::vector<System::Met> timed(const std::vector<Event>& met);
+  // What comes to a stop, or to rest, where that was met.
+  std::vector<System::Met> arriving(const std::vector<Event>& met) const;
   bool impact(double t, Out y);
   bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
   bool movable(Indices& at);
   void scale(const Indices& at);  // A_, free of units: what unit forces make of the coordinates that they are on
   bool rests(int k) const { return std::abs(v_(k)) <= rest_(k); }
+  bool is_into(int k) const { return near_[k] * v_(k) > 0.0 && !rests(k); }  // its stop
+  bool hits(int k) const;  // has just been thrown back by its stop, with a speed that follows from a restitution
   void note(double t, int k, JointChange::What what, int direction) {
     joints_.changes.push_back({t, k, what, direction});
   }
@@ -35,9 +38,11 @@ class JointChanges {
   Core& core_;
   Joints& joints_;
   const double rise_;
+  const Tolerance& tolerance_;
   bool known_ = false;  // whether a decision was made since the begin
   Vector v_, a_, rest_, step_, unit_;
   Indices near_;        // (n): the stop that a joint is at, as `touch`
+  std::vector<System::Met> arrived_;  // what is as it is now because it has come there now
   bool slips_ = false;  // what holds has given way
   Matrix responses_, A_;
   Vector b_, low_, high_, scale_, x_;

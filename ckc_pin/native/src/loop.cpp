@@ -32,7 +32,7 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       monitor_(system->core),
       energy_(system->core),
       crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed),
-      joint_changes_(*system, std::max(options_.atol, least_rise)) {
+      joint_changes_(*system, std::max(options_.atol, least_rise), tolerance_) {
   for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
 

@@ -99,12 +99,14 @@ class System {
   // false where that cannot be.
   bool keep_locked(Out y, double tolerance, bool& changed);
   // --- parameters (varied.hpp) ---
-  // What was met at y where joints change what they do, the core being there; and what becomes of y: an impact adds
-  // `step` to the velocities, by impulses `x` on the coordinates `at`, whose speeds it turns round by `back`.
-  struct Met { int coordinate; bool of_rate; };
+  // Of a coordinate, or of its rate: it comes to what it is; to a stop, -1 for the lower one, that moves with parameters.
+  struct Met { int coordinate; bool of_rate; int stop = 0; };
+  // Where joints change what they do, at y where the core is: what comes there at a time of its own; an impact, that adds
+  // `step` to the velocities, by impulses `x` on the coordinates `at`, whose speeds it turns round by `back`; and what has
+  // come to be as it is at that time, to a tolerance. False where that time is not one for all of them.
   virtual bool before_change(double, In, const std::vector<Met>&) { return true; }
   virtual bool at_impact(In, const Indices&, const Matrix&, In, In) { return true; }
-  virtual bool after_change(double, Out) { return true; }
+  virtual bool after_change(double, Out, const std::vector<Met>&, double, double) { return true; }
   // Numbers that are recorded behind those of the state.
   virtual int extra() const { return 0; }
   virtual void put_extra(In, Out) {}  // at the core's state, that of y, with what acts there

@@ -241,6 +241,16 @@ void Tree::to_coordinates(In q, Out numbers) const {
   }
 }
 
+double Tree::coordinate_step(In q, int k, In step) const {
+  for (const Root& root : roots) {
+    if (k < root.v || k >= root.v + 6) continue;
+    const Matrix3 turn = turned(q, root).toRotationMatrix();
+    const int row = k - root.v;
+    return row < 3 ? turn.row(row).dot(step.segment<3>(root.v)) : Jlog3(turn).row(row - 3).dot(step.segment<3>(root.v + 3));
+  }
+  return step(k);
+}
+
 Vector3 log3(const Matrix3& rotation) { return pin::log3(rotation); }
 
 Matrix3 exp3(const Vector3& vector) { return pin::exp3(vector); }

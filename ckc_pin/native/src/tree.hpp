@@ -73,6 +73,7 @@ class Tree {
   Matrix brackets(In v) const;               // (n, n)
   void add_bracket(In v, In x, Out sum) const;  // brackets(v) x, which is - brackets(x) v
   void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
+  double coordinate_step(In q, int k, In step) const;  // of one of those, for a step of the tangent coordinates
   Matrix3 orientation(In q, Root root) const;
   // The twist in a free root's axes that takes it to another place.
   Vector6 twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const;

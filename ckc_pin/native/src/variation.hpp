@@ -6,6 +6,8 @@
 // parameter is a direction in the space of the numbers that the code takes.
 #pragma once
 
+#include <optional>
+
 #include "system.hpp"
 
 namespace ckc {
@@ -49,15 +51,20 @@ struct VariationTable {
   Matrix directions;  // (numbers that the written-out code takes, parameters); none where it does not take them
 };
 
+// A joint that with a parameter comes to what it does at another time than others, or not at all.
+struct Apart {
+  System::Met met;
+  int parameter;
+};
+
 class Variation {
  public:
   Variation(System& system, VariationTable table);
 
   const int n, count;
   long written = 0, general = 0;  // how often rates were found by the code that is written out, and by the tree
-  // How much later with each parameter what is met there comes; false where two things come that do not come together.
-  bool delays(In v, In a, const std::vector<System::Met>& met, const Matrix& s);
-  const Vector& delay() const { return delay_; }
+  // How much later with each parameter what is met comes, where the core moves with v and accelerates with a.
+  Vector delay(const System::Met& met, In v, In a, const Matrix& s) const;
   // From a start in the independent coordinates; false where it is singular.
   bool start(In v, Matrix& s);
   // Of s at the core's state, where it moves with v and accelerates with a under what acts; false where what acts has no
@@ -71,10 +78,12 @@ class Variation {
   // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
   // what acts there; NaN where that is not known.
   void efforts(In v, const Matrix& s, Matrix& u, Matrix& tau);
-  // Where joints change what they do.
+  // Where joints change what they do: as the system's. In between s is of the instant that comes with the parameters.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
-  bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
-  void after_change(In v, In a, Matrix& s);
+  bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
+  bool after_change(In v, In a, Matrix& s);
+  // Of what has come to be as it is, the first with which parameter it has not, if there is one.
+  std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol) const;
 
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
@@ -93,6 +102,7 @@ class Variation {
   void add_gravity(const Effect& of, Out force);
   void add_spring(const Effect& of, Out force);
   void closure_changes(In v, Matrix& place, Matrix& rate) const;
+  bool tidy(In v, Matrix& s);
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
   // How a controller's u changes with the parameters, with that sign, in the rows of q.
@@ -101,7 +111,7 @@ class Variation {
   void add_gain(const Effect& of, In q_tree, In v, Out force) const;
   void add_state(const Matrix& s);
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
-  bool is_of_stop(const Parameter& of, int coordinate, double v) const;
+  Vector from_stop(const System::Met& met, const Matrix& s) const;  // how far with each parameter a joint is
 
   System& system_;
   Core& core_;

@@ -198,10 +198,15 @@ void Variation::closure_changes(In v, Matrix& place, Matrix& rate) const {
     }
 }
 
-bool Variation::is_of_stop(const Parameter& of, int coordinate, double v) const {
-  for (const Effect& effect : of.effects)
-    if (effect.index == coordinate && effect.kind == (v < 0.0 ? Effect::lower : Effect::upper)) return true;
-  return false;
+Vector Variation::from_stop(const System::Met& met, const Matrix& s) const {
+  Vector found(count);
+  for (int p = 0; p < count; ++p) {
+    found(p) = core_.tree.coordinate_step(core_.q_tree, met.coordinate, s.col(p));
+    for (const Effect& of : table_.parameters[p].effects)
+      if (met.stop && of.index == met.coordinate && of.kind == (met.stop < 0 ? Effect::lower : Effect::upper))
+        found(p) -= 1.0;
+  }
+  return found;
 }
 
 }  // namespace ckc

@@ -1,4 +1,5 @@
 // How the change of a motion jumps where the motion, or its rate, does: saltation.
+#include <algorithm>
 #include <cmath>
 
 #include <Eigen/QR>
@@ -7,38 +8,76 @@
 
 namespace ckc {
 
-constexpr double same = 1e-6;  // relative: two events at once that come at the same time whatever the parameters are
+constexpr double least = 1e-7, most = 1e-2, times = 100.0;  // relative, at least, at most, and of the tolerances: none
 
-// When what was met comes with another parameter: its function stays at zero.
-bool Variation::delays(In v, In a, const std::vector<System::Met>& met, const Matrix& s) {
-  bool known = false;
-  delay_.setZero();
-  for (const auto& [k, of_rate] : met) {
-    Vector found(count);
-    for (int p = 0; p < count; ++p) {
-      const bool stop = !of_rate && is_of_stop(table_.parameters[p], k, v(k));
-      found(p) = of_rate ? -s(n + k, p) / a(k) : -(s(k, p) - (stop ? 1.0 : 0.0)) / v(k);
-    }
-    if (known && !((found - delay_).norm() <= same * delay_.norm())) return false;
-    delay_ = found, known = true;
-  }
-  return delay_.allFinite();
+Vector Variation::delay(const System::Met& met, In v, In a, const Matrix& s) const {
+  const int k = met.coordinate;
+  if (met.of_rate) return -s.row(n + k) / a(k);
+  return -from_stop(met, s) / core_.tree.coordinate_step(core_.q_tree, k, v);
 }
 
-bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s) {
-  if (!delays(v, a, met, s)) return false;
-  s.topRows(n) += v * delay_.transpose();
-  s.bottomRows(n) += a * delay_.transpose();
+// Bring the changes back to what the loops allow, by what is least in the metric of D': they drift within the tolerances,
+// and joints that move only together would come to rest at times of their own.
+bool Variation::tidy(In v, Matrix& s) {
+  const int m = core_.rows.closure.rows;
+  const Vector none = Vector::Zero(n), no_force = Vector::Zero(m);
+  Matrix rate;
+  compute(v, none, no_force, false);
+  closure_changes(v, row_, rate);
+  core_.tree_inertia();
+  force_.setZero();
+  row_ += core_.rows.J * s.topRows(n);
+  if (!core_.respond(force_, row_, change_)) return false;
+  s.topRows(n) += change_;
+  for (int k = 0; k < n; ++k) rate += derivatives_.rate_by_q.col(table_.real_v[k]) * s.row(k);
+  row_ = rate + core_.rows.J * s.bottomRows(n);
+  if (!core_.respond(force_, row_, change_)) return false;
+  s.bottomRows(n) += change_;
   return true;
 }
 
-void Variation::after_change(In v, In a, Matrix& s) {
+// What is met stays met. Of several the one that comes fastest tells when, a stop before what comes to rest.
+bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s) {
+  const Vector& reach = core_.joints.table.reach;
+  const auto speed = [&](const System::Met& of) { return std::abs((of.of_rate ? a : v)(of.coordinate)) / reach(of.coordinate); };
+  const auto later = [&](const System::Met& x, const System::Met& y) {
+    return x.of_rate == y.of_rate ? speed(x) < speed(y) : x.of_rate;
+  };
+  delay_.setZero();
+  if (!tidy(v, s)) return false;
+  if (!met.empty()) delay_ = delay(*std::max_element(met.begin(), met.end(), later), v, a, s);
+  s.topRows(n) += v * delay_.transpose();
+  s.bottomRows(n) += a * delay_.transpose();
+  return s.allFinite();
+}
+
+std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol,
+                                      double atol) const {
+  const double relative = std::clamp(times * rtol, least, most);
+  for (const System::Met& met : arrived) {
+    const Vector off = met.of_rate ? Vector(s.row(n + met.coordinate)) : from_stop(met, s);
+    for (int p = 0; p < count; ++p)
+      if (!(std::abs(off(p)) <= relative * s.col(p).lpNorm<Eigen::Infinity>() + times * atol)) return Apart{met, p};
+  }
+  return {};
+}
+
+// What sticks or touches from here on is brought to rest by what holds it, whenever it comes: a friction that could hold
+// more, or the last of ever smaller bounces, takes a time and a way that vanish with the rate it comes with.
+bool Variation::after_change(In v, In a, Matrix& s) {
+  if (!core_.joints.locked.empty()) {
+    if (!core_.responses(core_.joints.locked, responses_)) return false;
+    change_ = s.bottomRows(n);
+    add_back(change_);
+    s.bottomRows(n) = change_;
+  }
   s.topRows(n) -= v * delay_.transpose();
   s.bottomRows(n) -= a * delay_.transpose();
+  return true;
 }
 
 // D' step = J^T mu + x, J step = 0, and the speeds that x turns round go on in that proportion.
-bool Variation::at_impact(In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s) {
+bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s) {
   const int m = core_.rows.closure.rows;
   const Vector none = Vector::Zero(n);
   Vector lambda = Vector::Zero(m), lacking(n);
@@ -65,13 +104,11 @@ bool Variation::at_impact(In step, const Indices& at, const Matrix& responses, I
     columns.col(i) = responses.col(pushed[i]);
     for (Eigen::Index j = 0; j < few; ++j) A(i, j) = responses(k, pushed[j]);
     const double again = back(pushed[i]) > 0.0 ? core_.joints.table.restitution(k) : 0.0;
+    const double side = x(pushed[i]) > 0.0 ? 1.0 : -1.0;  // off the stop
     wanted.row(i) = -(1.0 + again) * s.row(n + k) - change_.row(k);
-    for (int p = 0; p < count; ++p) {
-      const double speed = again > 0.0 ? back(pushed[i]) / again : 0.0;  // off the stop
-      const double side = x(pushed[i]) > 0.0 ? 1.0 : -1.0;
+    for (int p = 0; p < count; ++p)
       for (const Effect& of : table_.parameters[p].effects)
-        if (of.kind == Effect::restitution && of.index == k) wanted(i, p) += side * speed;
-    }
+        if (of.kind == Effect::restitution && of.index == k) wanted(i, p) += side * std::max(-side * v(k), 0.0);
   }
   s.bottomRows(n) += change_ + columns * A.completeOrthogonalDecomposition().solve(wanted);
   return s.allFinite();

@@ -15,7 +15,7 @@ class WithVariation {
   virtual ~WithVariation() = default;
   virtual Variation& variation() = 0;
   virtual Matrix changes(In y) const = 0;  // (2 n, parameters)
-  bool together = true;  // false: what was met at once has different delays
+  std::optional<Apart> apart;  // why the motion has no derivative from here on
 };
 
 template <class Base>
@@ -37,7 +37,7 @@ class Varied : public Base, public WithVariation {
 
   void start(double t, In q_tree, In v, In w, Out y) override {
     Base::start(t, q_tree, v, w, y.head(size_));
-    together = true;
+    apart.reset();
     this->core.set(q_tree);
     if (!variation_.start(v, s_)) s_.setConstant(2 * variation_.n, variation_.count, std::nan(""));
     put(y);
@@ -91,16 +91,14 @@ class Varied : public Base, public WithVariation {
 
   bool before_change(double t, In y, const std::vector<System::Met>& met) override {
     take(y), a_.resize(variation_.n), v_ = this->velocity;
-    if (!this->acceleration(t, a_)) return false;
-    together = variation_.before_change(v_, a_, met, s_);
-    return together;
+    return this->acceleration(t, a_) && variation_.before_change(v_, a_, met, s_);
   }
   bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back) override {
-    return variation_.at_impact(step, at, responses, x, back, s_);
+    return variation_.at_impact(v_, step, at, responses, x, back, s_);
   }
-  bool after_change(double t, Out y) override {
-    if (!this->acceleration(t, a_)) return false;
-    variation_.after_change(this->velocity, a_, s_);
+  bool after_change(double t, Out y, const std::vector<System::Met>& arrived, double rtol, double atol) override {
+    apart = variation_.apart(arrived, s_, rtol, atol);
+    if (apart || !this->acceleration(t, a_) || !variation_.after_change(this->velocity, a_, s_)) return false;
     put(y);
     return true;
   }

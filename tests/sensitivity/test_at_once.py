@@ -1,0 +1,143 @@
+"""Where joints change what they do at the start, or several of them at one instant, in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import simulate
+from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from tests.sensitivity.changed import NUMBERS, differentiated, written
+from tests.sensitivity.sliders import force, joint, sliders
+
+TIGHT = {"solver.rtol": 1e-11, "solver.atol": 1e-13}
+FORMULATIONS = pytest.mark.parametrize("formulation", ["dae", "reduced"])
+
+
+def last(found: Sensitivities, parameter: str) -> Any:
+    """How x, y and their rates have changed in the end."""
+    assert found.run.status == "done"
+    return np.stack([found.q_tree, found.v_tree])[:, -1, :, found.parameters.index(parameter)].ravel()
+
+
+@FORMULATIONS
+def test_an_impact_at_the_start(formulation: str, tmp_path: Path) -> None:
+    """Of one joint, thrown back with 0.6 of its speed: x = upper - 0.6 (v t - (upper - x_0)) from there on."""
+    scene = sliders(tmp_path, joint("x", restitution=0.6), q=(0.3, 0.0), q_dot=(1.5, 0.2), upper=0.3)
+    names = ["joint.x.restitution", "joint.x.upper", "initial.q.x", "initial.q_dot.x", "link.one.mass"]
+    found = sensitivities(scene, names, {**TIGHT, "formulation": formulation})
+    for name, x, v in zip(names, (-1.5, 1.6, -0.6, -0.6, 0.0), (-1.5, 0.0, 0.0, -0.6, 0.0), strict=True):
+        assert last(found, name) == pytest.approx([x, 0.0, v, 0.0], abs=1e-9), name
+
+
+def test_an_impact_at_the_start_in_a_loop(tmp_path: Path) -> None:
+    changes = {"joint.c.restitution": 0.4, "initial.q_dot.a": 1.5}
+    start = simulate(written(tmp_path / "x", changes), {"t_end": 1e-9}).q_tree[0]
+    changes["joint.c.upper"] = float(start[2])
+    names = ["link.crank.mass", "spring.0.stiffness", "initial.q_dot.a", "joint.c.restitution"]
+    found = sensitivities(written(tmp_path / "x", changes, stop=True, t_end=0.3), names, TIGHT)
+    assert found.run.events[0]["name"] == "c bounces"
+    for k, name in enumerate(names):
+        h = 1e-3 * max(0.3, {**NUMBERS, **changes}[name])
+        wanted = differentiated(tmp_path / "y", name, h, changes=changes, stop=True, t_end=0.3)
+        ours = np.stack([found.q_tree[:, :, k], found.v_tree[:, :, k]])
+        assert np.abs(ours - wanted)[:, 1:].max() <= 1e-7 * np.abs(wanted).max(), name
+
+
+@FORMULATIONS
+@pytest.mark.parametrize("on", ["ground", "one"])
+def test_two_joints_that_come_to_rest_at_once_and_stick(formulation: str, on: str, tmp_path: Path) -> None:
+    """With another start one comes to rest before the other; both stay where they stick, which changes smoothly."""
+    friction, masses, time = np.array([2.0, 1.5]), (1.3, 0.7), 0.5
+    M = np.diag(masses) if on == "ground" else np.array([[2.0, 0.7], [0.7, 0.7]])
+    v = time * np.linalg.solve(M, friction)
+    rubs = joint("x", friction=2.0) + joint("y", friction=1.5)
+    found = sensitivities(
+        sliders(tmp_path, rubs, q_dot=(v[0], v[1]), on=on), ["initial.q_dot.x", "initial.q_dot.y", "joint.x.friction"],
+        {**TIGHT, "formulation": formulation},
+    )  # fmt: skip
+    assert last(found, "initial.q_dot.x") == pytest.approx([time, 0.0, 0.0, 0.0], abs=1e-9)
+    assert last(found, "initial.q_dot.y") == pytest.approx([0.0, time, 0.0, 0.0], abs=1e-9)
+    shorter = -0.5 * time**2 * np.linalg.solve(M, [1.0, 0.0])
+    assert last(found, "joint.x.friction") == pytest.approx([*shorter, 0.0, 0.0], abs=1e-9)
+
+
+@FORMULATIONS
+def test_a_joint_that_sticks_from_the_start(formulation: str, tmp_path: Path) -> None:
+    """Pushed a little it comes to rest at once, and gives its momentum to nothing but the ground."""
+    rubs = joint("x", friction=2.0) + joint("y", friction=0.1)
+    scene = sliders(tmp_path, rubs, q_dot=(0.0, 1.0), on="one")
+    found = sensitivities(scene, ["initial.q_dot.x", "initial.q.x"], {**TIGHT, "formulation": formulation})
+    assert last(found, "initial.q.x") == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-9)
+    assert last(found, "initial.q_dot.x") == pytest.approx([0.0, 1.0, 0.0, 1.0], abs=1e-9)
+    h = 1e-6
+    one, other = (simulate(sliders(tmp_path, rubs, q_dot=(x, 1.0), on="one"), TIGHT) for x in (h, -h))
+    assert ((one.q_tree - other.q_tree) / (2 * h))[-1] == pytest.approx([0.0, 1.0], abs=1e-5)
+
+
+def test_a_stop_without_restitution_that_lets_go_at_once(tmp_path: Path) -> None:
+    """A force of 1.3 on 1.3 kg pulls back: with a restitution e the joint leaves at e times the speed it came with."""
+    scene = sliders(tmp_path, joint("x", restitution=0.0) + force("x", -1.3), q_dot=(1.5, 0.0), upper=0.3)
+    speed = np.sqrt(1.5**2 - 2 * 0.3)
+    left = 1.0 - (1.5 - speed)
+    found = sensitivities(scene, ["joint.x.restitution"], TIGHT)
+    assert last(found, "joint.x.restitution") == pytest.approx([-speed * left, 0.0, -speed, 0.0], abs=1e-9)
+
+
+def test_an_event_at_a_place_does_not_move_with_the_stop(tmp_path: Path) -> None:
+    event = '[[event]]\ncoordinate = "x"\nof = "q"\nvalue = 0.1\nstop = true\n'
+    scene = sliders(tmp_path, joint("x", restitution=0.6), q_dot=(1.5, 0.0), upper=0.3, scene=event)
+    found = sensitivities(scene, ["initial.q_dot.x", "joint.x.upper"], TIGHT)
+    assert found.end_time == pytest.approx([-0.1 / 1.5**2, 0.0], abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("more", "q_dot", "upper", "name", "says"),
+    [
+        (joint("x", friction=0.5) + force("x", 2.0), 0.0, 9.0, "initial.q_dot.x", "x begins to move from rest"),
+        (joint("x", restitution=0.5) + force("x", 2.0), 0.0, 0.0, "initial.q.x", "x comes to its stop"),
+        (joint("x", restitution=0.5) + force("x", 2.0), 0.0, 0.0, "joint.x.upper", "x comes to its stop"),
+    ],
+)
+def test_a_start_without_a_derivative_is_named(
+    more: str, q_dot: float, upper: float, name: str, says: str, tmp_path: Path
+) -> None:
+    scene = sliders(tmp_path, more, q_dot=(q_dot, 0.0), upper=upper)
+    found = sensitivities(scene, [name])
+    assert found.run.status == "stopped"
+    assert f"at the start: {says}, and with another {name}" in found.run.message
+    assert sensitivities(scene, ["link.one.mass"]).run.status == "done"  # of which it has one
+
+
+def test_two_joints_that_turn_round_at_once(tmp_path: Path) -> None:
+    """With what moves both alike they still do; with what moves one, the other's friction turns at another time."""
+    more = "".join(joint(name, friction=0.5) + force(name, -3.0) for name in ("x", "y"))
+    scene = sliders(tmp_path, more, q_dot=(1.0, 1.0), masses=(1.0, 1.0))
+    alike = sensitivities(scene, ["initial.q.x"], TIGHT)
+    assert last(alike, "initial.q.x") == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-9)
+    found = sensitivities(scene, ["initial.q.x", "initial.q_dot.x"], TIGHT)
+    assert found.run.status == "stopped"
+    assert "begins to move from rest, and with another initial.q_dot.x" in found.run.message
+    assert found.run.t[-1] == pytest.approx(1.0 / 3.5, abs=1e-8)
+    assert found.q_tree[-1, :, 1] == pytest.approx([1.0 / 3.5, 0.0], abs=1e-8)  # what there is so far
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_joints_that_only_move_together_turn_round_together(seed: int) -> None:
+    """Whatever the tolerance is: a loop of one freedom that rubs in three of its joints has a derivative everywhere."""
+    rng = np.random.default_rng(seed)
+    changes: dict[str, Any] = {
+        f"joint.{name}.friction": rng.uniform(0.05, 0.5) for name in ("crank", "coupler", "rocker")
+    }
+    changes |= {"initial.q_dot.crank": rng.uniform(-5.0, 5.0), "t_end": 3.0, "formulation": "dae"}
+    names = ["link.coupler_link.mass", "initial.q_dot.crank", "joint.rocker.friction"]
+    wanted = sensitivities("four_bar/turning", names, {**changes, **TIGHT})
+    turns = [event for event in wanted.run.events if "slides" in event["name"] and event["t"] > 0.0]
+    assert len(turns) >= 3
+    for rtol in (1e-2, 1e-4, 1e-6, 1e-8):
+        found = sensitivities("four_bar/turning", names, {**changes, "solver.rtol": rtol})
+        assert found.run.status == "done", rtol
+        assert np.abs(found.q_tree - wanted.q_tree).max() <= 100 * rtol * np.abs(wanted.q_tree).max(), rtol
