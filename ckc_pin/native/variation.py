@@ -23,7 +23,17 @@ __all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "variation_tab
 
 Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b"]
 
-ACTING = ("friction", "gain_q", "gain_q_dot", "gear", "torque_limit", "restitution", "lower", "upper")  # not terms
+ACTING = (
+    "friction",
+    "gain_q",
+    "gain_q_dot",
+    "target",
+    "gear",
+    "torque_limit",
+    "restitution",
+    "lower",
+    "upper",
+)  # not terms
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,8 @@ def sensitivities(
     run = run_of(ready, rows, status, message, perf_counter() - started)
     run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
     q_tree, v_tree, u, tau = _parts(ready, rows)
+    if np.isnan(q_tree[0]).any():
+        raise NumericalError(f"sensitivities: {_start(ready)}", t=0.0)
     return Sensitivities(run, ready.varying, q_tree, v_tree, u, tau, _end_time(ready))
 
 
@@ -160,6 +162,20 @@ def _apart(ready: Prepared) -> str | None:
     return (
         f"stopped {where}: {what}, and with another {name} it is not {there} just then: either way the motion goes on "
         "differently, so that it has no derivative"
+    )
+
+
+def _start(ready: Prepared) -> str:
+    """Say why how the start changes is not known."""
+    mechanism = ready.mechanism
+    if ready.scene.spec.initial.at == "equilibrium":
+        return (
+            "the start is an equilibrium beside which there are others, or where "
+            f"{', '.join(mechanism.independent)} are no coordinates: which one it is with other parameters is not known"
+        )
+    return (
+        f"at the start phi_z is singular: {', '.join(mechanism.independent)} do not determine the others, so that how "
+        "they change is not known; other independent coordinates would"
     )
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.control.spec import SetPointSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -63,6 +63,13 @@ def require_known_motion(mechanism: Mechanism, scene: Scene, controller: object,
         raise InputError(
             "sensitivities: solver.baumgarte, solver.projection: the loops have to be closed; leave them out"
         )
+    if type(controller) is Tracking and isinstance(controller.desired, PointPath):
+        shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
+        if shaping is not None:
+            raise InputError(
+                f"sensitivities: {shaping}: q_d is where the mechanism's own lengths bring the point that is to follow "
+                "a path, and how it moves with them is not known; give controller.desired by joint"
+            )
     if spec.initial.at == "assembled":
         shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
         if shaping is not None:
@@ -84,8 +91,12 @@ def require_known_motion(mechanism: Mechanism, scene: Scene, controller: object,
             f"sensitivities: {plant[0]}: tracking compensates the mechanism's own terms, and how u changes with "
             "them is not known; give controller.model, or parameters of the start"
         )
-    if type(controller) is Tracking and mechanism.tree.free:
-        raise InputError(f"sensitivities: tracking of {mechanism.name}: with a free root it is not known how u changes")
+    free = [name for name in mechanism.independent if name in mechanism.tree.free_coordinates]
+    if type(controller) is Tracking and free:
+        raise InputError(
+            f"sensitivities: tracking of {free[0]}: it is a free root's, and how u changes with those is not known; "
+            "take joints as independent coordinates"
+        )
 
 
 def require_movable(
@@ -163,14 +174,18 @@ def varying_of(
 
 
 def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[Varying]:
-    spec, d = scene.spec.controller, mechanism.d
-    if type(controller) is not SetPoint or not isinstance(spec, SetPointSpec):
-        return
-    for key, kind in (("K_P", "gain_q"), ("K_V", "gain_q_dot")):
-        changes = {f"controller.{key}": np.eye(d)} if isinstance(getattr(spec, key), float | int) else {}
-        changes |= {f"controller.{key}.{name}": np.diag(np.eye(d)[k]) for k, name in enumerate(mechanism.independent)}
+    """Gains, a number for all or one of the diagonal, and where eq. 14 holds."""
+    spec, each = scene.spec.controller, np.eye(mechanism.d)
+    gains = {"K_P": "gain_q", "K_V": "gain_q_dot"} if type(controller) is SetPoint else {}
+    gains = {"Lambda": "gain_q", "K_D": "gain_q_dot"} if type(controller) is Tracking else gains
+    for key, kind in gains.items():
+        changes = {f"controller.{key}": each} if isinstance(getattr(spec, key), float | int) else {}
+        changes |= {f"controller.{key}.{name}": np.diag(each[k]) for k, name in enumerate(mechanism.independent)}
         for name, gain in changes.items():
-            yield Varying(name, (Effect(kind, 0, np.concatenate([gain.ravel(order="F"), controller.q_d])),))
+            yield Varying(name, (Effect(kind, 0, gain.ravel(order="F")),))
+    if type(controller) is SetPoint and compensated_at(mechanism, controller).size:
+        for k, name in enumerate(mechanism.independent):
+            yield Varying(f"controller.q_d.{name}", (Effect("target", k, controller.K_P[:, k]),))
 
 
 def _of_start(mechanism: Mechanism, scene: Scene) -> Iterator[Varying]:

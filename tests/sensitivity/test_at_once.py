@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ckc_pin
 from ckc_pin import simulate
 from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import NUMBERS, differentiated, written
@@ -141,3 +142,28 @@ def test_joints_that_only_move_together_turn_round_together(seed: int) -> None:
         found = sensitivities("four_bar/turning", names, {**changes, "solver.rtol": rtol})
         assert found.run.status == "done", rtol
         assert np.abs(found.q_tree - wanted.q_tree).max() <= 100 * rtol * np.abs(wanted.q_tree).max(), rtol
+
+
+def test_an_event_of_a_free_root_in_the_worlds_axes(tmp_path: Path) -> None:
+    """A body that is thrown, turned as it is: it comes to x = 0.4 after 0.4 / v, with v in the body's own axes."""
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    (tmp_path / "body.urdf").write_text(f"""<robot name="body"><link name="world"/><link name="thing">{inertial}</link>
+        <link name="arm">{inertial}</link>
+        <joint name="root" type="floating"><parent link="world"/><child link="thing"/></joint>
+        <joint name="swing" type="continuous"><parent link="thing"/><child link="arm"/><axis xyz="0 0 1"/></joint>
+        </robot>""")
+    (tmp_path / "body.toml").write_text('name = "body"\nurdf = "body.urdf"\ngravity = [0, 0, 0]\n')
+    mechanism = ckc_pin.load(tmp_path / "body.toml")
+    root = [name for name in mechanism.coordinates if name in mechanism.tree.free_coordinates]
+    turn, along = 0.9, np.array([0.8, 0.3, -0.2])
+    start = dict.fromkeys(mechanism.independent, 0.0) | {root[5]: turn}
+    rates = dict.fromkeys(mechanism.independent, 0.0) | dict(zip(root, along.tolist(), strict=False))
+    q, q_dot = ("{" + ", ".join(f"{name} = {x}" for name, x in table.items()) + "}" for table in (start, rates))
+    event = f'[[event]]\ncoordinate = "{root[0]}"\nof = "q"\nvalue = 0.4\nstop = true\n'
+    (tmp_path / "body.scene.toml").write_text(
+        f'mechanism = "body.toml"\nformulation = "dae"\nt_end = 5.0\ninitial.q = {q}\ninitial.q_dot = {q_dot}\n{event}'
+    )
+    found = sensitivities(tmp_path / "body.scene.toml", [f"initial.q_dot.{name}" for name in root[:3]], TIGHT)
+    row = np.array([np.cos(turn), -np.sin(turn), 0.0])
+    assert found.run.t[-1] == pytest.approx(0.4 / (row @ along))
+    assert found.end_time == pytest.approx(-0.4 / (row @ along) ** 2 * row, abs=1e-9)

@@ -13,7 +13,7 @@ namespace {
 constexpr const char* kinds[] = {
     "placement",   "inertia",    "gravity",       "stiffness", "rest_length", "damping",     "joint_stiffness",
     "joint_rest",  "joint_damping", "constant",   "friction",  "restitution", "lower",       "upper",
-    "armature",    "length",     "offset",        "ratio",     "gain_q",      "gain_q_dot",  "gear",
+    "armature",    "length",     "offset",        "ratio",     "gain_q",      "gain_q_dot",  "target", "gear",
     "torque_limit"};
 
 Effect effect_of(const nb::tuple& row) {

@@ -199,6 +199,10 @@ bool SetPoint::slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) {
   return true;
 }
 
+void SetPoint::by_gains(const Measured& at, const Matrix& K_P, const Matrix& K_V, Out more) {
+  more = -K_P * (at.q - q_d_) - K_V * at.q_dot;
+}
+
 // Where an actuator is at its limit, it does not answer. Motors that are not q's own share u: as long as they amount to
 // it, it does not matter which; where they do not, those within their limits do as they would without any.
 bool Control::slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force) {

@@ -43,6 +43,8 @@ class Controller {
   virtual bool needs_terms() const { return true; }
   // d u / d q' and d u / d v', tangent, of the last u, at the core's state; zero so far; `own`: q. False where unknown.
   virtual bool slopes(Core&, const Indices&, Matrix&, Matrix&) { return false; }
+  // What u would be more, where `slopes` has found how it changes, if gains were more by this: of positions, of rates.
+  virtual void by_gains(const Measured&, const Matrix&, const Matrix&, Out more) { more.setZero(); }
 };
 
 // Eq. 14.
@@ -53,6 +55,7 @@ class SetPoint : public Controller {
   double lyapunov(const Measured& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
   bool slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  void by_gains(const Measured& at, const Matrix& K_P, const Matrix& K_V, Out more) override;
 
  private:
   Matrix K_P_, K_V_;
@@ -68,6 +71,7 @@ class Tracking : public Controller {
   bool u(const Measured& at, Out u, Problem& problem) override;
   double lyapunov(const Measured& at, double potential_energy, In w) override;
   bool slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  void by_gains(const Measured& at, const Matrix& Lambda, const Matrix& K_D, Out more) override;
 
  private:
   Matrix Lambda_, K_D_;
@@ -171,6 +175,7 @@ class Control {
   bool answers(Eigen::Index k) const { return !(direct() && limited(k)); }
   bool limited(Eigen::Index k) const { return actuation_.limited(tau, k); }  // a motor
   bool direct() const { return actuation_.direct; }
+  bool redundant() const { return actuation_.redundant(); }
   bool of_motors() const { return feedback() ? law->of_motors() : constant_of_motors; }  // what acts is their torques
   // Whether u follows the state between samples.
   bool feedback() const { return law && !(sampling && sampling->holds); }

@@ -22,6 +22,7 @@ enum class Trouble {
   infinite,  // a number is not finite
   control,   // a controller has no u
   vague,     // z is not known to the tolerance
+  shares,    // how motors at their limits share what they do not reach has no known derivative
 };
 
 // What becomes of an accepted state.

@@ -85,8 +85,17 @@ bool Tracking::slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_
   }
   by_q = rho.transpose() * changed_q - K_D_ * Lambda_ * in_q;
   by_v = rho.transpose() * changed_v - K_D_ * in_q;
-  core.set_velocity(v1);
+  core.set_velocity(v1), core.jacobian_rate(v1);
   return by_q.allFinite() && by_v.allFinite();
+}
+
+// Lambda is in v, in a and in r = q_dot - v.
+void Tracking::by_gains(const Measured& at, const Matrix& Lambda, const Matrix& K_D, Out more) {
+  Core& core = model_ ? *model_ : at.core;
+  core.inertia(), core.coriolis();
+  const Vector of_v = Lambda * e_, of_a = Lambda * e_dot_;
+  core.C_times(of_v, product_);
+  more = -product_ - core.D * of_a - K_D_ * of_v - K_D * r_;
 }
 
 }  // namespace ckc

@@ -8,9 +8,11 @@
 
 namespace ckc {
 
+constexpr double neutral = 1e-12;  // of its largest: a stiffness that keeps nothing
+
 static bool is_acting(const Effect& of) {
   return of.kind == Effect::friction || of.kind == Effect::gain_q || of.kind == Effect::gain_q_dot ||
-         of.kind == Effect::gear || of.kind == Effect::torque_limit;
+         of.kind == Effect::target || of.kind == Effect::gear || of.kind == Effect::torque_limit;
 }
 
 Variation::Variation(System& system, VariationTable table)
@@ -76,24 +78,33 @@ bool Variation::start(In v, Matrix& s) {
   if (table_.target.size()) {
     core_.set(table_.target), core_.reduce();
     balance(q, compensated_, stiffness);
+    for (int p = 0; p < count; ++p)
+      for (const Effect& of : table_.parameters[p].effects)
+        if (of.kind == Effect::target) compensated_.col(p) += stiffness.col(of.index) + of.numbers;
     q.setZero(), core_.set(here);
   }
   core_.reduce();
-  if (core_.phi_z.singular()) return false;
-  for (int p = 0; p < count; ++p)
+  Matrix change = Matrix::Zero(n, count);
+  for (int p = 0; p < count; ++p) {
     for (int k : core_.q) q(k, p) = table_.parameters[p].q(k);
-  if (table_.at_equilibrium) {
-    balance(q, effort, stiffness);
-    q -= core_.rho * stiffness.partialPivLu().solve(effort);
+    for (int k = 0; k < core_.d; ++k) change(core_.q[k], p) = table_.parameters[p].q_dot(k);
   }
   compute(v, none, no_force, false);
   closure_changes(v, place, rate);
-  if (!table_.at_equilibrium) close(core_.rows.J * q + place, q);
+  if (!table_.at_equilibrium && q.isZero(0) && change.isZero(0) && place.isZero(0) && rate.isZero(0)) return true;
+  if (core_.phi_z.singular() || system_.phi_z_margin() < chart_margin) return false;
+  if (table_.at_equilibrium) {
+    balance(q, effort, stiffness);
+    Eigen::FullPivLU<Matrix> factored(stiffness);
+    factored.setThreshold(neutral);
+    if (!factored.isInvertible()) return false;
+    q -= core_.rho * factored.solve(effort);
+    compute(v, none, no_force, false);
+  } else {
+    close(core_.rows.J * q + place, q);
+  }
   s.topRows(n) = q;
   for (int k = 0; k < n; ++k) rate += derivatives_.rate_by_q.col(table_.real_v[k]) * q.row(k);
-  Matrix change = Matrix::Zero(n, count);
-  for (int p = 0; p < count; ++p)
-    for (int k = 0; k < core_.d; ++k) change(core_.q[k], p) = table_.parameters[p].q_dot(k);
   close(core_.rows.J * change + rate, change);
   s.bottomRows(n) = change;
   return s.allFinite();

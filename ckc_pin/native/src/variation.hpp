@@ -24,7 +24,8 @@ struct Effect {
     length,        // index: row
     offset,        // index: row
     ratio,         // index: row; numbers: the coordinate that it is of (1)
-    gain_q, gain_q_dot,  // numbers: a change of K_P, K_V, columns; then q_d
+    gain_q, gain_q_dot,  // numbers: a change of K_P or Lambda, of K_V or K_D, columns
+    target,        // index: of q_d; numbers: K_P's column
     gear,          // index: motor; numbers: of what it turns by coordinate (n)
     torque_limit,  // index: motor; numbers: what it turns by coordinate (n)
   };
@@ -108,7 +109,6 @@ class Variation {
   // How a controller's u changes with the parameters, with that sign, in the rows of q.
   void add_wanted(In q_tree, In v, Matrix& force) const;
   void clipped_efforts(In v);  // clipped_: how torques change with the parameters where motors are at limits
-  void add_gain(const Effect& of, In q_tree, In v, Out force) const;
   void add_state(const Matrix& s);
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
   Vector from_stop(const System::Met& met, const Matrix& s) const;  // how far with each parameter a joint is

@@ -146,7 +146,8 @@ void Variation::add_control(In q_tree, In v, Matrix& force) const {
   for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
       const int k = of.index;
-      if (of.kind == Effect::gear && (control.of_motors() || clipped || control.limited(k)))
+      if (!control.of_motors() && !clipped && !(control.direct() && control.limited(k))) continue;
+      if (of.kind == Effect::gear)
         force.col(p) -= control.tau(k) * of.numbers;
       else if (of.kind == Effect::torque_limit && control.limited(k))
         force.col(p) -= (control.tau(k) > 0.0 ? 1.0 : -1.0) * of.numbers;
@@ -158,23 +159,23 @@ void Variation::add_control(In q_tree, In v, Matrix& force) const {
 }
 
 void Variation::add_wanted(In q_tree, In v, Matrix& force) const {
-  for (int p = 0; p < count; ++p) {
-    for (const Effect& of : table_.parameters[p].effects)
-      if (of.kind == Effect::gain_q || of.kind == Effect::gain_q_dot) add_gain(of, q_tree, v, force.col(p));
-    for (Eigen::Index i = 0; i < compensated_.rows(); ++i)
-      if (system_.control.answers(i)) force(table_.own[i], p) -= compensated_(i, p);
-  }
-}
-
-void Variation::add_gain(const Effect& of, In q_tree, In v, Out force) const {
   const auto d = static_cast<Eigen::Index>(table_.own.size());
-  const Eigen::Map<const Matrix> gain(of.numbers.data(), d, d);
-  for (Eigen::Index i = 0; i < d; ++i) {
-    if (!system_.control.answers(i)) continue;
-    for (Eigen::Index k = 0; k < d; ++k)
-      force(table_.own[i]) += gain(i, k) * (of.kind == Effect::gain_q_dot
-                                                ? v(table_.own[k])
-                                                : q_tree(core_.tree.place[table_.own[k]]) - of.numbers(d * d + k));
+  const auto answer = [&](const Vector& u, int p) {
+    for (Eigen::Index i = 0; i < d; ++i)
+      if (system_.control.answers(i)) force(table_.own[i], p) -= u(i);
+  };
+  Vector q(d), q_dot(d), more(d);
+  for (Eigen::Index i = 0; i < d; ++i) q(i) = q_tree(core_.tree.place[table_.own[i]]), q_dot(i) = v(table_.own[i]);
+  const Matrix none = Matrix::Zero(d, d);
+  for (int p = 0; p < count; ++p) {
+    for (const Effect& of : table_.parameters[p].effects) {
+      if (of.kind != Effect::gain_q && of.kind != Effect::gain_q_dot) continue;
+      const Eigen::Map<const Matrix> gain(of.numbers.data(), d, d);
+      const bool of_q = of.kind == Effect::gain_q;
+      system_.control.law->by_gains({0.0, core_, q, q_dot, v, q_dot}, of_q ? Matrix(gain) : none, of_q ? none : Matrix(gain), more);
+      answer(more, p);
+    }
+    if (compensated_.size()) answer(compensated_.col(p), p);
   }
 }
 

@@ -48,7 +48,10 @@ class Varied : public Base, public WithVariation {
     Eigen::Map<Matrix> s_dot(y_dot.data() + size_, rows(), variation_.count);
     if (written_rates(y, s_dot) && finite(y_dot.tail(this->size - size_))) return true;
     take(y);
-    if (!rates(t, y, y_dot)) return this->fails(Trouble::infinite);
+    if (!rates(t, y, y_dot)) {
+      const Control& control = this->control;
+      return this->fails(control.clipped.any && control.redundant() ? Trouble::shares : Trouble::infinite);
+    }
     s_dot = s_dot_;
     return true;
   }

@@ -1,0 +1,134 @@
+"""Of controllers: gains, targets, starts with free roots; against extrapolated differences of tight runs."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from ckc_pin import InputError, simulate
+from ckc_pin.simulation.sensitivities import sensitivities
+from tests.sensitivity.changed import TIGHT
+
+CLOSE = 1e-8  # of the largest
+
+
+def agree(scene: str, values: dict[str, float], changes: dict[str, Any]) -> None:
+    """In the coordinates of joints, their rates, u and tau; `values`: of the parameters."""
+    found = sensitivities(scene, list(values), changes)
+    assert found.run.status == "done"
+    run = found.run
+    free = run.mechanism.tree.free_coordinates
+    kept = [k for k, name in enumerate(run.coordinates) if name not in free]
+    parts = {
+        "q": (found.q_tree[:, kept], lambda x: x.q_tree[:, kept]),
+        "v": (found.v_tree[:, kept], lambda x: x.v_tree[:, kept]),
+        "u": (found.u, lambda x: x.u),
+        "tau": (found.tau, lambda x: x.tau),
+    }
+    for k, (name, value) in enumerate(values.items()):
+        h = 1e-2 * max(1.0, abs(value))
+        runs = [[simulate(scene, {**changes, name: value + x}) for x in (h / s, -h / s)] for s in (1, 2, 4)]
+        for part, (ours, read) in parts.items():
+            if part == "tau" and len(run.actuated) > len(run.independent):  # motors that share u
+                assert np.isnan(ours).all()
+                continue
+            one, two, four = (
+                (read(more) - read(less)) / (2 * h / s) for (more, less), s in zip(runs, (1, 2, 4), strict=True)
+            )
+            wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
+            assert np.abs(wanted).max() > 1e-6, name  # it matters
+            assert np.abs(ours[:, :, k] - wanted).max() <= CLOSE * np.abs(wanted).max(), name
+
+
+@pytest.mark.parametrize(
+    ("terms", "formulation", "each"),
+    [("pinocchio", "dae", False), ("pinocchio", "reduced", True), ("generated", "dae", True)],
+)
+def test_of_tracking_controls_gains(terms: str, formulation: str, each: bool) -> None:
+    """Numbers for all, or by coordinate."""
+    gains = {"controller.Lambda": 1.0, "controller.K_D": 10.0}
+    spec = ckc_pin.load_scene("five_bar/tracking").spec.controller
+    assert (spec.Lambda, spec.K_D) == tuple(gains.values())
+    changes = {**TIGHT, "formulation": formulation, "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
+    if each:
+        changes |= {name: {"theta_1": gain, "theta_3": gain} for name, gain in gains.items()}
+        gains = {"controller.Lambda.theta_3": 1.0, "controller.K_D.theta_1": 10.0}
+    agree("five_bar/tracking", gains, changes)
+
+
+@pytest.mark.parametrize("terms", ["pinocchio", "generated"])
+def test_of_a_set_points_target(terms: str) -> None:
+    """Where what it compensates moves with it."""
+    q_d = dict(ckc_pin.load_scene("five_bar/set_point").spec.controller.q_d)
+    changes = {**TIGHT, "formulation": "reduced", "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
+    agree("five_bar/set_point", {f"controller.q_d.{name}": value for name, value in q_d.items()}, changes)
+
+
+@pytest.mark.parametrize("scene", ["delta/circle", "stewart/wave", "two_ur5/lift"])
+def test_of_tracking_with_a_free_root(scene: str) -> None:
+    ready = ckc_pin.load_scene(scene)
+    name = ckc_pin.load(scene.split("/")[0]).independent[1]
+    start = (ready.spec.initial.q_dot or {}).get(name, 0.0)
+    changes = {**TIGHT, "formulation": "reduced", "t_end": 0.1, "solver.output_dt": 0.05, "solver.terms": "pinocchio"}
+    gain = float(ready.spec.controller.K_D)
+    agree(scene, {f"initial.q_dot.{name}": start, "controller.K_D": gain}, changes)
+
+
+REDUNDANT = """
+[[motor]]
+joint = "theta_1"
+{limit}
+[[motor]]
+joint = "theta_2"
+torque_limit = 0.5
+[[motor]]
+joint = "theta_3"
+{limit}
+"""
+
+
+def with_three_motors(folder: Path, limit: str = "") -> str:
+    shutil.copytree("urdf/five_bar", folder)
+    path = folder / "mechanism.toml"
+    text = path.read_text(encoding="utf-8").replace('actuated = ["theta_1", "theta_3"]\n', "")
+    path.write_text(text + REDUNDANT.format(limit=limit), encoding="utf-8")
+    return str(folder / "set_point.scene.toml")
+
+
+def test_of_a_limit_that_other_motors_make_up_for(tmp_path: Path) -> None:
+    """They do the rest of u, so that the motion stays what it is."""
+    names = ["motor.theta_2.torque_limit", "motor.theta_2.ratio", "controller.K_P"]
+    found = sensitivities(with_three_motors(tmp_path / "x"), names, {"t_end": 0.3, "solver.output_dt": 0.05})
+    assert np.abs(found.run.tau[:, 1]).max() == 0.5
+    assert not found.q_tree[:, :, :2].any()
+    assert not found.u[:, :, :2].any()
+    assert np.abs(found.q_tree[-1, :, 2]).max() > 1e-3
+
+
+def test_redundant_motors_that_do_not_reach_u_stop_it(tmp_path: Path) -> None:
+    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], {"t_end": 0.3})
+    assert found.run.status == "stopped"
+    assert "motors at their limits do not reach what is wanted of them together" in found.run.message
+
+
+def test_lengths_are_refused_where_a_point_follows_a_path(tmp_path: Path) -> None:
+    """Even with a model: q_d is where the mechanism's own lengths bring the point."""
+    shutil.copytree("urdf/five_bar", tmp_path / "x")
+    scene = tmp_path / "x" / "tracking.scene.toml"
+    x, y, _ = simulate("five_bar/swing", {"t_end": 1e-3}).points["tip"][0]
+    text = (
+        scene.read_text(encoding="utf-8").partition("[controller]")[0].replace('at = "equilibrium"', 'at = "assembled"')
+    )
+    scene.write_text(
+        text + '[controller]\ntype = "tracking"\nLambda = 1.0\nK_D = 10.0\nmodel = "mechanism.toml"\n'
+        f'[controller.desired]\npoint = "tip"\nline = {{ start = [{x}, {y}, 0.0], end = [{x}, {y + 0.01}, 0.0], '
+        "frequency = 1.0 }\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(InputError, match=r"joint\.theta_2\.xyz\.x: q_d is where the mechanism's own lengths bring"):
+        sensitivities(str(scene), ["joint.theta_2.xyz.x"])
