@@ -320,11 +320,7 @@ def test_a_singular_configuration_is_refused() -> None:
 
 def test_a_fold_that_is_only_met_to_half_of_its_digits_is_refused(tmp_path: Path) -> None:
     """At a dead centre the slider does not say how crank and rod stand."""
-    there = mechanism_file("slider_crank").parent
-    for file in there.iterdir():
-        text = file.read_text(encoding="utf-8").replace('independent = ["crank"]', 'independent = ["slider"]')
-        (tmp_path / file.name).write_text(text, encoding="utf-8")
-    mechanism = load(tmp_path / "mechanism.toml")
+    mechanism = _by_slider(tmp_path)
     for off in (0.0, 1e-13):
         with pytest.raises(NumericalError, match=r"slider = 0\.4 is singular.*crank, rod, slider"):
             linearize(mechanism, {"slider": 0.4 - off})
@@ -339,3 +335,35 @@ def test_an_instant_of_a_run_is_its_state() -> None:
     assert isinstance(model, LinearModel)
     assert model.closed_loop is not None
     assert np.linalg.eigvals(model.closed_loop).real.max() < 0
+
+
+def test_rows_that_others_imply_stay_so_where_the_loops_are_slightly_open() -> None:
+    """Bricard's six rows of rank five: a step off the closure makes them independent, by rounding."""
+    mechanism, random = load("bricard"), np.random.default_rng(4)
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + 0.1).at
+    off = mechanism.kinematics(mechanism.tree.integrate(at.q_tree, 3e-9 * random.uniform(-1, 1, mechanism.n)))
+    v = at.rho @ random.uniform(-1, 1, mechanism.d)
+    closed, opened = (linear_model(Terms(mechanism, x, v), np.zeros(1), at="somewhere") for x in (at, off))
+    assert mechanism.redundant
+    agree(opened.C, closed.C, 1e-7)
+    agree(opened.D, closed.D, 1e-7)
+
+
+def _by_slider(folder: Path) -> Mechanism:
+    there = mechanism_file("slider_crank").parent
+    for file in there.iterdir():
+        text = file.read_text(encoding="utf-8").replace('independent = ["crank"]', 'independent = ["slider"]')
+        (folder / file.name).write_text(text, encoding="utf-8")
+    return load(folder / "mechanism.toml")
+
+
+def test_next_to_a_fold_of_one_freedom_another_coordinate_is_taken(tmp_path: Path) -> None:
+    """There a slider tells crank and rod by the square root of its digits: its A would be of size 1 / angle squared."""
+    by_crank, by_slider = load("slider_crank"), _by_slider(tmp_path)
+    for angle, chart in ((1e-3, "slider"), (1e-6, "rod")):
+        at = by_crank.kinematics(sigma(by_crank, np.array([angle])).at.q_tree)
+        other = Terms(by_slider, by_slider.kinematics(at.q_tree), np.zeros(by_slider.n))
+        model = linear_model(other, np.zeros(1), at="near the dead centre")
+        wanted = linear_model(Terms(by_crank, at, np.zeros(by_crank.n)), np.zeros(1), at="there")
+        assert model.states[0] == chart
+    agree(model.A, wanted.A, 1e-4)  # of the rod's angle, which is a multiple of the crank's there

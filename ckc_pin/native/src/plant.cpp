@@ -1,13 +1,13 @@
 #include "plant.hpp"
 
 #include <Eigen/LU>
+#include <Eigen/SVD>
 
 namespace ckc {
 
-constexpr double poor = 1e-6;      // 1 / condition of the coordinates' part of a tangent basis: beyond that they are no chart
+constexpr double poor = 1e-5;      // least of what a motion of size one moves the coordinates: below that they are no chart
 constexpr double sound = 1e-2;      // of phi_z's pivots: q is as good a chart as any
 constexpr double at_rest = 1e-9;   // of a tangent basis' largest entry: a coordinate that locked ones leave no motion
-constexpr double least_pivot = 1e-9;  // of the largest: rows that the others imply
 
 Plant::Plant(std::unique_ptr<Core> core_, Matrix turns_) : core(std::move(core_)), turns(std::move(turns_)) {
   a.setZero(core->n), residual_.setZero(core->rows.closure.rows);
@@ -79,11 +79,15 @@ void Plant::choose(const Indices& free) {
   if (at == free) return;
   const auto d = static_cast<Eigen::Index>(free.size());
   if (static_cast<Eigen::Index>(at.size()) == d) {
-    Matrix part(d, d);
-    for (Eigen::Index i = 0; i < d; ++i) part.row(i) = T.row(at[i]);
-    const Eigen::PartialPivLU<Matrix> lu(part);
-    if (lu.rcond() > poor) {
-      const Matrix turned = lu.transpose().solve(Matrix(T.transpose()));
+    const auto of_chart = [&](const Matrix& basis) {
+      Matrix part(d, d);
+      for (Eigen::Index i = 0; i < d; ++i) part.row(i) = basis.row(at[i]);
+      return part;
+    };
+    const Matrix free_of_units = core->scales.columns.cwiseInverse().asDiagonal() * T;
+    const Matrix motions = free_of_units.householderQr().householderQ() * Matrix::Identity(core->n, d);
+    if (of_chart(motions).jacobiSvd().singularValues()(d - 1) > poor) {
+      const Matrix turned = of_chart(T).partialPivLu().transpose().solve(Matrix(T.transpose()));
       T = turned.transpose();
       for (Eigen::Index i = 0; i < d; ++i) T.row(at[i]).setZero(), T(at[i], i) = 1.0;
       return;
@@ -162,10 +166,10 @@ void Plant::solve() {
   Matrix J = Matrix::Zero(m + static_cast<Eigen::Index>(locked.size()), n);
   J.topRows(m) = c.rows.J;
   for (size_t i = 0; i < locked.size(); ++i) J(m + static_cast<Eigen::Index>(i), locked[i]) = 1.0;
-  Eigen::CompleteOrthogonalDecomposition<Matrix> qr;
-  qr.setThreshold(least_pivot);
-  qr.compute(J);
-  const Matrix inverse = qr.pseudoInverse();
+  const Eigen::Index rank = n - T.cols();  // whatever rounding makes of rows that the others imply
+  const Eigen::BDCSVD<Matrix> svd(J, Eigen::ComputeThinU | Eigen::ComputeThinV);
+  const Matrix inverse = svd.matrixV().leftCols(rank) * svd.singularValues().head(rank).cwiseInverse().asDiagonal() *
+                         svd.matrixU().leftCols(rank).transpose();
   const auto D_times = [&](const Matrix& x) {
     Matrix product(n, x.cols());
     for (Eigen::Index k = 0; k < x.cols(); ++k) c.D_times(x.col(k), product.col(k));
@@ -182,7 +186,7 @@ void Plant::solve() {
   lambda_q = least * (of_q + c.derivatives.force_by_q);
   lambda_v = least * (of_v + c.derivatives.force_by_v - Matrix(slope.asDiagonal()));
   lambda_u = least * (of_u - Matrix::Identity(n, n));
-  if (qr.rank() == J.rows()) return;
+  if (rank == J.rows()) return;
   // what keeps them the least ones as the range of J turns
   c.closure_rate(inverse * all, opened_);
   Matrix turned = Matrix::Zero(J.rows(), n);
