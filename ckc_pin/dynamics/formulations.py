@@ -10,17 +10,18 @@ from typing import Literal
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import NumericalError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.linear import Factorization, null_space
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = [
     "CoriolisVelocity",
     "dae_acceleration",
     "multipliers",
     "reduced_acceleration",
+    "refuse_massless",
     "spf_terms",
     "spf_z_dot",
     "tangent_basis",
@@ -143,3 +144,35 @@ def tree_force(terms: Terms, acceleration: Array) -> Array:
     """What actuators and loops together must do to the tree, D' a + C' v' + h' less what dampers do: shape (n,)."""
     force = terms.D_tree @ acceleration + terms.bias_tree
     return force - terms.damping_force if terms.mechanism.springs.any_damping else force
+
+
+def refuse_massless(terms: Terms, tangent: Array, among: IntArray) -> None:
+    """Refuse motions that move no mass. Massless links are fine as long as every motion moves some.
+
+    Judged on the inertia with its diagonal scaled to one, so that neither units nor ratios of masses matter.
+
+    Parameters
+    ----------
+    terms : Terms
+    tangent : (n, d) array
+        Basis of the motions.
+    among : int array
+        Coordinates that the motion is named by.
+
+    Raises
+    ------
+    InputError
+    """
+    D = tangent.T @ terms.D_tree @ tangent
+    scale = np.sqrt(np.maximum(np.diagonal(D), 0.0))
+    motion = np.eye(len(D))[int(np.argmin(scale))]
+    if scale.min() > 1e-12 * scale.max():
+        values, directions = np.linalg.eigh(D / np.outer(scale, scale))
+        if values[0] > 1e-13:
+            return
+        motion = directions[:, 0] / scale
+    most = among[int(np.argmax(np.abs(tangent @ motion / terms.mechanism.tree.reach)[among]))]
+    raise InputError(
+        f"{terms.mechanism.name}: the motion along {terms.mechanism.coordinates[most]} moves no mass, so no force can "
+        "tell its acceleration; give the links it moves a mass and an inertia, or make the joint fixed"
+    )

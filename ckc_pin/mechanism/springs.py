@@ -35,6 +35,7 @@ class Springs:
     ) -> None:
         self.tree = tree
         ends_a, ends_b, lines = [], [], []
+        self.names = list[str]()  # of those between frames
         self._on_joint = set[int]()
         self.joint_stiffness, self.joint_rest = np.zeros(tree.n), np.zeros(tree.n)
         self.joint_damping = np.array(tree.model.damping, dtype=float)
@@ -48,6 +49,7 @@ class Springs:
                 ends_a.append(frames.find(spec.frame_a, f"{where}, frame_a"))
                 ends_b.append(frames.find(spec.frame_b, f"{where}, frame_b"))
                 lines.append((spec.stiffness, spec.rest_length or 0.0, spec.damping))
+                self.names.append(where)
             else:
                 raise InputError(f"{where}: give either joint, or frame_a and frame_b")
         self.constant = np.zeros(tree.n)
@@ -96,6 +98,16 @@ class Springs:
         for k, bent in enumerate(self._bending(q_tree)):
             gradient[:, k] += pull @ bent
         return gradient
+
+    def without_direction(self, q_tree: Array, least: float) -> list[str]:
+        """Name those whose ends are so near to each other that they have no direction to act along.
+
+        Springs without a length at rest have a force and derivatives there, too.
+        """
+        if not self.between_frames:
+            return []
+        acts = (self.damping != 0.0) | ((self.stiffness != 0.0) & (self.rest_length != 0.0))
+        return [self.names[k] for k in np.flatnonzero(acts & (self._lengths(q_tree)[0] <= least))]
 
     def damping_force(self, q_tree: Array, v_tree: Array) -> Array:
         """Generalized force of the dampers on the tree, shape (n,)."""

@@ -27,6 +27,7 @@ from ckc_pin.control.controllers import (
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
+from ckc_pin.dynamics.formulations import refuse_massless
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.generated.library import Library
@@ -43,6 +44,7 @@ from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start, require_chart
 from ckc_pin.simulation.libraries import changing_library, library_of
 from ckc_pin.simulation.loop_terms import controller_call
+from ckc_pin.simulation.resting import beyond_stops
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.scene_spec import SceneSpec
 from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
@@ -59,7 +61,6 @@ __all__ = [
 SLACK = 3e-3  # of rtol: how far a right-hand side may be off the closure, relative to the mechanism's size
 UNEVEN = 1e4  # ratio of inertias from which heavy links turn what that is into accelerations of light ones
 CLOSED = 1e-9  # of the mechanism's size: the loops stay closed along a collocation step, or the branches do not meet
-AT_STOP = 1e-11  # rad, or of the mechanism's size: a start so far beyond a stop is at it
 UNLIMITED = 2**62
 OUTPUTS = 500  # instants when a scene gives no output_dt
 MAX_OUTPUTS = 1_000_000
@@ -217,9 +218,10 @@ def prepare(
     functions = event_functions(scene.spec.event, events, mechanism)
     start = find_start(mechanism, scene)
     with scene.sources.naming():
-        _require_within_stops(mechanism, start)
+        if says := beyond_stops(mechanism, start.at.q_tree):
+            raise InputError(f"initial: {says}; give another initial.q, or a q_guess within them")
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
-    _refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)))
+    refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not gives_tau(law):
         require_chart(mechanism, start)
@@ -316,34 +318,3 @@ def _solver(mechanism: Mechanism, spec: SceneSpec, profile: bool) -> dict[str, A
         "closed": max(CLOSED * mechanism.size, 10 * mechanism.tolerance),
         "profile": profile,
     }
-
-
-def _require_within_stops(mechanism: Mechanism, start: Start) -> None:
-    joints = mechanism.joints
-    numbers = mechanism.tree.to_coordinates(start.at.q_tree)
-    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
-    worst = int(np.argmax(off))
-    if off[worst] > AT_STOP:
-        raise InputError(
-            f"initial: {mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
-            f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}; give another initial.q, or a q_guess within them"
-        )
-
-
-def _refuse_massless(terms: Terms) -> None:
-    """Massless links are fine as long as every motion that the loops allow moves some mass.
-
-    Judged on D with its diagonal scaled to one, so that neither units nor ratios of masses matter.
-    """
-    scale = np.sqrt(np.maximum(np.diagonal(terms.D), 0.0))
-    least = int(np.argmin(scale))
-    if scale[least] > 1e-12 * scale.max():
-        values, directions = np.linalg.eigh(terms.D / np.outer(scale, scale))
-        if values[0] > 1e-13:
-            return
-        least = int(np.argmax(np.abs(directions[:, 0])))
-    name = terms.mechanism.independent[least]
-    raise InputError(
-        f"{terms.mechanism.name}: the motion along {name} moves no mass, so no force can tell its acceleration; "
-        "give the links it moves a mass and an inertia, or make the joint fixed"
-    )

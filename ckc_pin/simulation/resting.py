@@ -1,0 +1,168 @@
+"""What holds a mechanism at rest: its motors, stops that joints rest on, dry friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.allocation import allocate
+from ckc_pin.dynamics.formulations import tangent_basis
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.linear import pivoted_columns
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.tree import Array, IntArray
+
+__all__ = ["Rest", "beyond_stops", "hold", "kernel", "unbalanced"]
+
+AT_STOP = 1e-11  # rad, or of the mechanism's size: a joint so far beyond a stop, or so near to it, is at it
+LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which nothing needs to hold
+ROUNDING = 1e-4  # of that along the others
+NOTHING = 1e-14  # of the largest force on any coordinate
+FLAT = 1e-9  # of the largest singular value: motions that joints at stops leave
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What holds a configuration.
+
+    Attributes
+    ----------
+    tau : (motors,) array
+        N m or N.
+    touching : int array
+        Coordinates at a stop that they are pushed into.
+    idle : int array
+        Those at a stop that nothing pushes into it.
+    rubs : bool
+        Whether the motors alone would not do, and dry friction holds the rest.
+    """
+
+    tau: Array
+    touching: IntArray
+    idle: IntArray
+    rubs: bool
+
+
+def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
+    """Hold a configuration by its stops and the least torques, shared as in a run, and by friction where these fail.
+
+    Parameters
+    ----------
+    state : Terms
+        At rest, on the closure.
+    rubs : bool
+        Whether dry friction holds joints at rest.
+
+    Raises
+    ------
+    InputError
+        Nothing holds it.
+    """
+    mechanism = state.mechanism
+    every, _ = tangent_basis(state, np.zeros(mechanism.closure.rows))
+    side = _side(mechanism, state.q_tree)
+    at_stop = touching = np.flatnonzero(side)
+    while True:
+        tangent = every @ kernel(every[touching] / mechanism.tree.reach[touching, None])
+        tau, friction = _share(state, tangent, actuation, rubs=rubs)
+        left = every.T @ (state.h_tree - mechanism.motors.force(tau) - friction)
+        push = -side[touching] * np.linalg.lstsq(every[touching].T, left, rcond=FLAT)[0]
+        scale = np.abs(every.T) @ (np.abs(state.h_tree) + np.abs(mechanism.motors.force(tau)))
+        if np.all(push > LEFT_OVER * scale.max(initial=0.0)):
+            return Rest(tau, touching, np.setdiff1d(at_stop, touching), bool(friction.any()))
+        touching = np.delete(touching, int(np.argmin(push)))  # a stop does not pull
+
+
+def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
+    """Whether more than rounding is left of what acts at rest, along a basis of motions."""
+    reach, sizes = state.mechanism.tree.reach, np.abs(state.h_tree) + np.abs(u_tree)
+    enough = LEFT_OVER * (np.abs(tangent.T) @ sizes)
+    enough += NOTHING * (reach * sizes).max() * np.abs(tangent / reach[:, None]).max(axis=0)
+    left = np.abs(tangent.T @ (state.h_tree - u_tree))
+    return bool(np.any(left > enough + ROUNDING * enough.max(initial=0.0)))
+
+
+def beyond_stops(mechanism: Mechanism, q_tree: Array) -> str:
+    """Say which joint is furthest beyond its stops; empty where none is."""
+    joints = mechanism.joints
+    numbers = mechanism.tree.to_coordinates(q_tree)
+    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
+    worst = int(np.argmax(off))
+    if off[worst] <= AT_STOP:
+        return ""
+    return (
+        f"{mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, {joints.lower[worst]:.6g} to "
+        f"{joints.upper[worst]:.6g}"
+    )
+
+
+def _side(mechanism: Mechanism, q_tree: Array) -> Array:
+    """Return -1 at a joint's lower stop, 1 at its upper one, else 0, by coordinate."""
+    joints, numbers = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
+    near = AT_STOP * mechanism.tree.reach
+    return np.where(numbers - joints.lower <= near, -1.0, np.where(joints.upper - numbers <= near, 1.0, 0.0))
+
+
+def kernel(rows: Array) -> Array:
+    """Basis of what rows leave over; the identity without rows."""
+    if not len(rows):
+        return np.eye(rows.shape[1])
+    _, values, directions = np.linalg.svd(rows)
+    return np.asarray(directions[int(np.sum(values > FLAT * values[0])) :].T)
+
+
+def _share(state: Terms, tangent: Array, actuation: Actuation, *, rubs: bool) -> tuple[Array, Array]:
+    """Torques of motors, and where these do not do it alone forces of friction, (n,), that hold along a basis."""
+    mechanism, none = state.mechanism, np.zeros(state.mechanism.n)
+    needed = tangent.T @ state.h_tree
+    tau = actuation.share(tangent, needed)
+    if not unbalanced(state, mechanism.motors.force(tau), tangent):
+        return tau, none
+    friction = mechanism.joints.friction
+    if rubs and friction.any():
+        rubbing = np.flatnonzero(friction)
+        turns = np.vstack([mechanism.motors.turns, np.eye(mechanism.n)[rubbing]])
+        limit = np.concatenate([actuation.limit, friction[rubbing]])
+        weights = np.concatenate([actuation.weights, np.ones(len(rubbing))])
+        preload = np.concatenate([actuation.preload, np.zeros(len(rubbing))])
+        forces = allocate((turns @ tangent).T, needed, limit, weights, preload)
+        if not unbalanced(state, turns.T @ forces, tangent):
+            tau = forces[: len(tau)]
+            return tau, turns.T @ forces - mechanism.motors.force(tau)
+    raise InputError(f"{mechanism.name}: {_why_not(state, tangent, actuation)}")
+
+
+def _why_not(state: Terms, tangent: Array, actuation: Actuation) -> str:
+    mechanism, names = state.mechanism, state.mechanism.actuated
+    without_limits = actuation.distribute(tangent, tangent.T @ state.h_tree)
+    over = np.abs(without_limits) / np.maximum(actuation.limit, 1e-300)
+    motors = f"the motor{'s' if len(names) > 1 else ''} ({', '.join(names)})"
+    if not unbalanced(state, mechanism.motors.force(without_limits), tangent):
+        k = int(np.argmax(over))
+        return (
+            f"{motors} cannot hold this configuration within the torque limits: {names[k]} would need "
+            f"{abs(without_limits[k]):.4g}, its limit is {actuation.limit[k]:.4g}"
+        )
+    loose = _loose(mechanism, tangent)
+    if not names:
+        return (
+            f"nothing holds this configuration: it has no motors, and gravity or springs act along {loose}; take "
+            "another one or the equilibrium, or give it motors"
+        )
+    return (
+        f"{motors} cannot hold this configuration: nothing holds the motion along {loose}, and gravity or springs act "
+        "on it; take another one or the equilibrium, or give it more motors"
+    )
+
+
+def _loose(mechanism: Mechanism, tangent: Array) -> str:
+    """Name freedoms that no motor drives, by the coordinates that tell them best."""
+    motions, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
+    loose = motions @ kernel(mechanism.motors.turns @ (mechanism.tree.reach[:, None] * motions))
+    own = mechanism.partition.q
+    rank = np.linalg.matrix_rank(loose, tol=1e-6)
+    first = own if np.linalg.matrix_rank(loose[own], tol=1e-6) == rank else np.arange(mechanism.n)
+    return ", ".join(mechanism.coordinates[first[k]] for k in sorted(pivoted_columns(loose[first].T)[0][:rank]))
