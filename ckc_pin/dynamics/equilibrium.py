@@ -13,7 +13,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["h_gradient", "stable_equilibrium"]
+__all__ = ["equilibrium", "h_gradient", "stable_equilibrium"]
 
 STEPS = 300
 LONGEST = 0.3  # rad or m along each principal direction of the Hessian
@@ -49,22 +49,42 @@ def _h_tree_gradient(terms: Terms) -> Array:
 
 
 def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
-    """Return the minimum of the potential energy reached from the assembled configuration by descent.
-
-    Newton's steps on h(q) = 0, with the Hessian shifted until it is positive definite and the step
-    shortened until the energy falls, on the loops all the way. Where q fails as coordinates the descent goes on in
-    others, as a mechanism falls through there.
+    """Return the `equilibrium` in the mechanism's own independent coordinates.
 
     Raises
     ------
     InputError
         The loops hold a free root in part.
     NumericalError
-        The descent runs into a configuration where the loops lose rank, does not end, or ends where the mechanism's
-        own independent coordinates do not determine the others.
+        There is none, or those coordinates do not determine the others there.
     """
     if mechanism.splits_root:
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
+    at = equilibrium(mechanism)
+    own = mechanism.kinematics(at.q_tree)
+    if mechanism.d == 0 or own.margin() > SINGULAR:
+        return own
+    names = ", ".join(mechanism.coordinates[k] for k in at.partition.q)
+    raise _none(
+        mechanism,
+        at,
+        f"where it comes to rest, {', '.join(mechanism.independent)} do not determine the other coordinates; take "
+        f"independent = {names}",
+    )
+
+
+def equilibrium(mechanism: Mechanism) -> Kinematics:
+    """Return the minimum of the potential energy reached from the assembled configuration by descent.
+
+    Newton's steps on h(q) = 0, with the Hessian shifted until it is positive definite and the step
+    shortened until the energy falls, on the loops all the way. Where q fails as coordinates the descent goes on in
+    others, as a mechanism falls through there, and what is returned is in those.
+
+    Raises
+    ------
+    NumericalError
+        The descent runs into a configuration where the loops lose rank, or does not end.
+    """
     terms = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
     scale = 1e-13 * (1.0 + _weight(mechanism))
     if mechanism.d == 0:
@@ -75,7 +95,7 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
         falls_away = values[0] < -FLAT * steepest
         calm = np.abs(terms.h).max() <= scale
         if calm and not falls_away:
-            return _in_own_coordinates(mechanism, terms)
+            return terms.at
         if calm:  # balanced on a top or a saddle, as an upright start is: off it, either way leads down
             step = 0.1 * vectors[:, 0]
         else:
@@ -83,12 +103,12 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
             step = -vectors @ np.clip(wanted, -LONGEST, LONGEST)  # each by itself: a soft direction stops no stiff one
         moved, fraction = _downhill(mechanism, terms, step)
         if moved is None and np.abs(terms.h).max() <= 1e3 * scale and not falls_away:
-            return _in_own_coordinates(mechanism, terms)  # energy differences are rounding here
+            return terms.at  # energy differences are rounding here
         other = _other_coordinates(mechanism, moved or terms, 2.0 if fraction < SHORT else POOR)
         if moved is None and other is None:
-            raise _none(mechanism, terms, "the descent ends where the loops lose rank")
+            raise _none(mechanism, terms.at, "the descent ends where the loops lose rank")
         terms = other or moved or terms
-    raise _none(mechanism, terms, f"after {STEPS} steps it still falls, as something does that nothing holds")
+    raise _none(mechanism, terms.at, f"after {STEPS} steps it still falls, as something does that nothing holds")
 
 
 def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> tuple[Terms | None, float]:
@@ -111,8 +131,11 @@ def _downhill(mechanism: Mechanism, terms: Terms, step: Array) -> tuple[Terms | 
 
 
 def _other_coordinates(mechanism: Mechanism, terms: Terms, factor: float) -> Terms | None:
-    """Return the same state in the coordinates that are best there; None where they are not better by a factor."""
-    best = mechanism.best_partition(terms.at)
+    """Return the same state in the coordinates that are best there; None where they are not better by a factor.
+
+    Of a free root that is held in part those are tangent coordinates of it, some of them dependent.
+    """
+    best = mechanism.best_partition(terms.at, whole=not mechanism.splits_root)
     if best is None:
         return None
     other = Kinematics(terms.at.tree, terms.at.closure, best, terms.at.q_tree)
@@ -120,23 +143,10 @@ def _other_coordinates(mechanism: Mechanism, terms: Terms, factor: float) -> Ter
     return Terms(mechanism, other, np.zeros(mechanism.n)) if better else None
 
 
-def _in_own_coordinates(mechanism: Mechanism, terms: Terms) -> Kinematics:
-    own = mechanism.kinematics(terms.at.q_tree)
-    if own.margin() > SINGULAR:
-        return own
-    names = ", ".join(mechanism.coordinates[k] for k in terms.at.partition.q)
-    raise _none(
-        mechanism,
-        terms,
-        f"where it comes to rest, {', '.join(mechanism.independent)} do not determine the other coordinates; take "
-        f"independent = {names}",
-    )
-
-
-def _none(mechanism: Mechanism, terms: Terms, why: str) -> NumericalError:
+def _none(mechanism: Mechanism, at: Kinematics, why: str) -> NumericalError:
     return NumericalError(
         f"{mechanism.name}: no stable equilibrium is reached from q_guess: {why}",
-        q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.at.q_tree)),
+        q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree)),
     )
 
 

@@ -7,6 +7,7 @@ says how that ended, `move` the same for a step of q.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,9 +17,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["Newton", "Sigma", "Verdict", "move", "newton", "predict", "sigma"]
+__all__ = ["Newton", "Sigma", "Verdict", "move", "nearest", "newton", "predict", "shortest", "sigma"]
 
 Verdict = Literal["converged", "out of reach", "singular"]
 
@@ -152,6 +153,37 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
             return Newton(at, iteration + 1, False)
         polish = polish and size < GAINS * previous
     return Newton(at, MAX_ITERATIONS, size <= tolerance)
+
+
+def nearest(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) -> Kinematics:
+    """Close the loops by the shortest steps, q and z alike, as far as these lead.
+
+    Parameters
+    ----------
+    start : Kinematics
+        Nearly closed.
+    rank : int
+        Of J and the rows of what stands still together.
+    still : sequence of int
+        Coordinates that do not move.
+    """
+    at, rows = start, np.eye(start.tree.n)[list(still)]
+    size, none = float(np.abs(at.phi).max(initial=0.0)), np.zeros(len(rows))
+    for _ in range(MAX_ITERATIONS if size > 0.0 else 0):
+        step = shortest(np.vstack([at.J, rows]), rank, np.concatenate([at.phi, none]), at.tree.reach)
+        trial = at.moved(step)
+        previous, size = size, float(np.abs(trial.phi).max())
+        if not size < previous:
+            break
+        at = trial
+    return at
+
+
+def shortest(rows: Array, rank: int, residual: Array, reach: Array) -> Array:
+    """Return the least x with rows x = -residual, radians and the mechanism's size being alike."""
+    u, values, v = np.linalg.svd(rows * reach, full_matrices=False)
+    along = (u[:, :rank].T @ residual) / np.maximum(values[:rank], 1e-300)
+    return np.asarray(-reach * (v[:rank].T @ along))
 
 
 def _unclosed(at: Kinematics, residual: Array) -> float:

@@ -127,13 +127,13 @@ class Mechanism(Shown):
         """Return q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]
 
-    def best_partition(self, at: Kinematics) -> Partition | None:
+    def best_partition(self, at: Kinematics, *, whole: bool = True) -> Partition | None:
         """Return the split whose phi_z is furthest from singular at a configuration, by a pivoted QR.
 
-        None where it would split the coordinates of a free root.
+        None where it would split the coordinates of a free root, if these are to stay `whole`.
         """
         jacobian = scaled(at.J, self.tree, self.closure)
-        z = choose_dependent(jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free])
+        z = choose_dependent(jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free] if whole else [])
         return None if z is None else Partition(np.setdiff1d(np.arange(self.n), z), z)
 
     def point_positions(self, q_tree: Array) -> dict[str, Array]:
