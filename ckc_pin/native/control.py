@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.native.tables import closure_table, core_table, packed
 
-__all__ = ["control_table", "law_table"]
+__all__ = ["actuation_table", "control_table", "law_table"]
 
 QUARTER = math.pi / 2
 
@@ -43,13 +43,7 @@ def control_table(
     InputError
         A controller without u or tau, a sensor or a drive for what is not there.
     """
-    table: dict[str, Any] = {
-        "turns": np.asfortranarray(actuation.motors.turns),
-        "direct": actuation.direct,
-        "limit": actuation.limit,
-        "weights": actuation.weights,
-        "preload": actuation.preload,
-    }
+    table = actuation_table(actuation)
     if isinstance(controller, Sampled):
         clock, controller = controller, controller.controller
         table["clock"] = _clock(clock.sample_time, clock.delay)
@@ -66,6 +60,17 @@ def control_table(
         table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.lines)
     return table | {
         "law": law_table(controller) or {"kind": "call", "function": call(controller), "of_motors": torques}
+    }
+
+
+def actuation_table(actuation: Actuation) -> dict[str, Any]:
+    """Describe how motors turn u to their torques."""
+    return {
+        "turns": np.asfortranarray(actuation.motors.turns),
+        "direct": actuation.direct,
+        "limit": actuation.limit,
+        "weights": actuation.weights,
+        "preload": actuation.preload,
     }
 
 

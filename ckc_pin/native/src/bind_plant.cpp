@@ -51,28 +51,28 @@ double seconds(Plant& plant, Given q_tree, Given v_tree, Given u_tree, int round
   return least / times;
 }
 
-// A controller that measures a mechanism's state.
+// A controller that measures a mechanism's state, and its motors.
 class Feedback {
  public:
-  Feedback(const nb::dict& table, const nb::dict& law) : core_(core_of(table)), law_(law_of(law, *core_, 0, nullptr)) {}
+  Feedback(const nb::dict& table, const nb::dict& control)
+      : core_(core_of(table)), control_(control_of(control, *core_, nullptr)) {}
 
-  // u, and its derivatives by q' (tangent) and v'; why there is none, or none where they are not known.
+  // What acts on the tree, and its derivatives by q' (tangent) and v'; why there is none, or none where they are not known.
   nb::object at(double t, Given q_tree, Given v_tree) {
     Core& core = *core_;
     require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-    core.set(q_tree, true), core.reduce(), core.set_velocity(v_tree);
-    Vector q(core.d), q_dot(core.d), u(core.d);
+    core.set(q_tree, true), core.set_velocity(v_tree);
+    Vector q(core.d), q_dot(core.d), force;
     for (int k = 0; k < core.d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]), q_dot(k) = v_tree(core.q[k]);
-    Problem problem;
-    if (!law_->u({t, core, q, q_dot, core.v_tree, q_dot}, u, problem)) return nb::cast(problem.says);
-    Matrix by_q = Matrix::Zero(core.d, core.n), by_v = by_q;
-    if (!law_->slopes(core, core.q, by_q, by_v)) return nb::none();
-    return nb::make_tuple(u, by_q, by_v);
+    if (!control_->act({t, core, q, q_dot, core.v_tree, q_dot})) return nb::cast(control_->problem.says);
+    Matrix by_q, by_v;
+    if (!control_->slopes(core, by_q, by_v, force)) return nb::none();
+    return nb::make_tuple(force, by_q, by_v);
   }
 
  private:
   std::unique_ptr<Core> core_;
-  std::unique_ptr<Controller> law_;
+  std::unique_ptr<Control> control_;
 };
 
 }  // namespace
@@ -83,7 +83,7 @@ void bind_plant(nb::module_& m) {
       .def("at", &at, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a)
       .def("seconds", &seconds, "q_tree"_a, "v_tree"_a, "u_tree"_a, "rounds"_a);
   nb::class_<Feedback>(m, "Feedback")
-      .def(nb::init<const nb::dict&, const nb::dict&>(), "core"_a, "law"_a)
+      .def(nb::init<const nb::dict&, const nb::dict&>(), "core"_a, "control"_a)
       .def("at", &Feedback::at, "t"_a, "q_tree"_a, "v_tree"_a);
 }
 
