@@ -7,51 +7,21 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ckc_pin.dynamics.formulations import refuse_massless, tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import Library
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native.plant import NONE, Plant
+from ckc_pin.simulation.modes import NO_DAMPING, ComplexArray, Mode, eigenvalues_of, modes_of
+from ckc_pin.simulation.resting import kernel, unbalanced
 
 __all__ = ["LinearModel", "Mode", "eigenvalues_of", "linear_model"]
 
-ComplexArray = NDArray[np.complex128]
-
+COINCIDENT = 1e-9  # of the mechanism's size: ends of a spring so near to each other are at one place
 MOST_NAMES, MOST_ROWS = 14, 12  # names in a list, and modes, in what is printed
-ROUNDING = 1e-12  # a damping ratio as small as that is printed as none
-
-
-@dataclass(frozen=True, eq=False)
-class Mode:
-    """One real eigenvalue, or a pair of conjugate ones.
-
-    Attributes
-    ----------
-    eigenvalue : complex
-        1/s; of a pair the one above the real axis.
-    frequency : float
-        Of a pair without its damping, |eigenvalue| / (2 pi), Hz; 0 of a real one.
-    damping_ratio : float
-        -Re / |eigenvalue|; NaN at zero.
-    shape : (n,) complex array
-        How the tree's coordinates move, the largest part one (in radians, or in the mechanism's size).
-    """
-
-    eigenvalue: complex
-    frequency: float
-    damping_ratio: float
-    shape: ComplexArray
-
-    @property
-    def says(self) -> str:
-        """Frequency and damping ratio of a pair, or the eigenvalue, in words."""
-        if not self.frequency:
-            return f"{self.eigenvalue.real + 0.0:.6g} 1/s"
-        ratio = 0.0 if abs(self.damping_ratio) < ROUNDING else self.damping_ratio
-        return f"{self.frequency:.4g} Hz, damping ratio {ratio:.3g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,29 +82,17 @@ class LinearModel:
     @cached_property
     def eigenvalues(self) -> ComplexArray:
         """Of A, 1/s, in falling order of their real parts."""
-        return eigenvalues_of(self.A)
+        return eigenvalues_of(self.A, self._units)
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
         """Of A, in rising order of |eigenvalue|: of a motion, those of the instant."""
-        values, vectors = np.linalg.eig(self.A)
-        reach = self.mechanism.tree.reach
-        found = []
-        for k in np.argsort(np.abs(values), kind="stable"):
-            if values[k].imag < 0:
-                continue
-            shape = self.motions @ vectors[: len(self.A) // 2, k]
-            largest = shape[np.argmax(np.abs(shape / reach))]
-            size, pair = float(abs(values[k])), values[k].imag > 0
-            found.append(
-                Mode(
-                    complex(values[k]),
-                    size / (2 * np.pi) if pair else 0.0,
-                    float(-values[k].real / size) if size else float("nan"),
-                    shape / largest * reach[np.argmax(np.abs(shape / reach))] if largest else shape,
-                )
-            )
-        return tuple(found)
+        return modes_of(self.A, self.motions, self._units, self.mechanism.tree.reach)
+
+    @cached_property
+    def _units(self) -> Array:
+        tree = self.mechanism.tree
+        return tree.reach[[tree.index[name] for name in self.states[: len(self.states) // 2]]]
 
     def to_statespace(self) -> Any:
         """Return the model for python-control, a `control.StateSpace` with the same names, dots as underscores.
@@ -169,18 +127,16 @@ def _some(names: tuple[str, ...]) -> str:
 
 def _rows(model: LinearModel) -> list[str]:
     rows = [f"inputs  {_some(model.inputs) or 'none'}"]
-    for mode in model.modes[:MOST_ROWS]:
+    rigid = sum(not mode.eigenvalue for mode in model.modes)
+    if rigid:
+        rows.append(f"eigenvalue 0 1/s{f' ({rigid} times)' if rigid > 1 else ''}: motions that nothing brings back")
+    for mode in model.modes[rigid : rigid + MOST_ROWS]:
         value = mode.eigenvalue
-        still = bool(mode.frequency) and abs(mode.damping_ratio) < ROUNDING
+        still = bool(mode.frequency) and abs(mode.damping_ratio) < NO_DAMPING
         pair = f"{0.0 if still else value.real:.6g} +- {value.imag:.6g}i 1/s: " if mode.frequency else ""
         rows.append(f"eigenvalue {pair}{mode.says}")
-    return rows + ([f"and {len(model.modes) - MOST_ROWS} more"] if len(model.modes) > MOST_ROWS else [])
-
-
-def eigenvalues_of(A: Array) -> ComplexArray:
-    """Return a matrix's eigenvalues by falling real parts, conjugate ones side by side."""
-    values = np.linalg.eigvals(A).astype(complex)
-    return values[np.lexsort((-values.imag, np.round(np.abs(values.imag), 9), -np.round(values.real, 9)))]
+    more = len(model.modes) - rigid - MOST_ROWS
+    return rows + ([f"and {more} more"] if more > 0 else [])
 
 
 def linear_model(
@@ -221,11 +177,18 @@ def linear_model(
     NumericalError
         J has lost rank.
     InputError
-        Nothing is free to move.
+        Nothing is free to move, a motion moves no mass, a damper or spring has no direction.
     """
     mechanism = terms.mechanism
     names = tuple(mechanism.coordinates[k] for k in locked)
-    found = Plant(mechanism, smoothing, library).at(terms, mechanism.motors.force(tau) + u_tree, locked)
+    if vague := mechanism.springs.without_direction(terms.q_tree, COINCIDENT * mechanism.size):
+        raise InputError(
+            f"{mechanism.name}: no linear model there: the ends of {_some(tuple(vague))} coincide, so that it has no "
+            "direction to act along, and its force no derivative; take another configuration"
+        )
+    _refuse_massless(terms, locked)
+    u_tree = mechanism.motors.force(tau) + u_tree
+    found = Plant(mechanism, smoothing, library).at(terms, u_tree, locked)
     if not len(found.at):
         why = (
             f"its joints stick or touch ({', '.join(names)}); friction_smoothing lets them slide" if names else "d = 0"
@@ -235,9 +198,15 @@ def linear_model(
         raise NumericalError(f"{mechanism.name}: no linear model there, its derivatives are not finite")
     chart = tuple(mechanism.coordinates[k] for k in found.at)
     if chart != mechanism.independent and not names:
-        notes = (*notes, f"{', '.join(mechanism.independent)} are no coordinates there; {', '.join(chart)} are")
+        no, are = ("is no coordinate", "is") if len(chart) == 1 else ("are no coordinates", "are")
+        notes = (*notes, f"{', '.join(mechanism.independent)} {no} there; {', '.join(chart)} {are}")
     if names:
         notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
+    if not terms.v_tree.any() and unbalanced(terms, u_tree, found.T):
+        a = found.acceleration / mechanism.tree.reach
+        k = int(np.argmax(np.abs(a)))
+        rate = f"{found.acceleration[k]:.4g} {mechanism.tree.units('/s^2')[k]}"
+        notes = (*notes, f"at rest, but nothing keeps it there: {mechanism.coordinates[k]} accelerates with {rate}")
     points = mechanism.point_jacobians(terms.q_tree)
     turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(found.at)))
     places = np.vstack([found.T, *(x @ found.T for x in points.values())])
@@ -265,3 +234,10 @@ def linear_model(
         locked=names,
         notes=notes,
     )
+
+
+def _refuse_massless(terms: Terms, locked: IntArray) -> None:
+    tangent, _ = tangent_basis(terms, np.zeros(terms.mechanism.closure.rows))
+    tangent = tangent @ kernel(tangent[locked] / terms.mechanism.tree.reach[locked, None])
+    if tangent.shape[1]:
+        refuse_massless(terms, tangent, np.arange(terms.mechanism.n))

@@ -7,85 +7,91 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.kinematics.sigma import newton
-from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.sigma import nearest, shortest
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.linear_model import LinearModel, Mode
+from ckc_pin.simulation.linear_model import LinearModel
+from ckc_pin.simulation.modes import ComplexArray, Mode, telling
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import make_scene
 
 __all__ = ["sway", "sways"]
 
-MOST = 12  # modes, the slowest ones
+MOST = 12  # modes
 PERIODS, FRAMES = 2, 48  # shown, and frames in each
+CONSTANTS = 3  # time constants of a decay
 LARGEST, LEAST = 0.2, 1e-3  # rad, or of the mechanism's size: how far the coordinate that moves most does
 
 
 def sways(model: LinearModel) -> dict[int, Run]:
-    """Return the modes that swing, by their number among `LinearModel.modes`, counted from 1; at most a dozen."""
-    swinging = [k for k, mode in enumerate(model.modes, 1) if mode.frequency > 0]
-    return {k: run for k in swinging[:MOST] if (run := sway(model, k)) is not None}
+    """Return modes as runs, by their number among `LinearModel.modes`, counted from 1.
+
+    At most a dozen, those that swing before those that decay or grow; none that is rigid, or that the loops forbid.
+    """
+    moving = [k + 1 for k in telling(model.modes, MOST) if model.modes[k].eigenvalue]
+    return {k: run for k in moving if (run := sway(model, k)) is not None}
 
 
 def sway(model: LinearModel, number: int) -> Run | None:
-    """Return a mode as a run of a few periods without its damping, as large as the loops allow; None where they do not.
+    """Return a mode as a run, as large as the loops allow; None where they do not.
 
-    Rates and energies are those of the motion; no force acts.
+    A few periods without damping, or of a real eigenvalue the decay or growth in three time constants. Rates and
+    energies are those of the motion; no force acts.
 
     Parameters
     ----------
     number : int
         Of the mode, counted from 1.
+
+    Raises
+    ------
+    InputError
+        No mode of that number, or a rigid one: nothing says how it goes on.
     """
+    if not 1 <= number <= len(model.modes):
+        raise InputError(f"mode {number}: {model.name} has modes 1 to {len(model.modes)}")
     mode, size = model.modes[number - 1], LARGEST
+    if not mode.eigenvalue:
+        raise InputError(f"mode {number} is rigid (eigenvalue 0): nothing drives it, and no time belongs to it")
+    rate = 2j * np.pi * mode.frequency if mode.frequency else complex(mode.eigenvalue.real)
+    seconds = np.linspace(0.0, PERIODS * 2 * np.pi if mode.frequency else CONSTANTS, PERIODS * FRAMES + 1) / abs(rate)
+    swing = np.exp(rate * seconds) / max(1.0, float(np.exp(rate.real * seconds[-1])))
     while size > LEAST:
-        found = _swing(model, mode, size)
-        if found is not None:
-            return _run(model, number, mode, *found)
+        states = _swing(model, size * mode.shape, swing, rate)
+        if states is not None:
+            return _run(model, number, mode, seconds, states)
         size /= 2
     return None
 
 
-def _swing(model: LinearModel, mode: Mode, size: float) -> tuple[Array, list[Terms]] | None:
-    """States of the motion: what the shape says of the model's own coordinates, the others as the loops have it."""
+def _swing(model: LinearModel, shape: ComplexArray, swing: ComplexArray, rate: complex) -> list[Terms] | None:
+    """States of the motion, the shortest way off the shape that the loops ask for."""
     mechanism, tree = model.mechanism, model.mechanism.tree
-    q = np.array([tree.index[name] for name in model.states[: len(model.states) // 2]], dtype=np.intp)
-    z = np.setdiff1d(np.arange(mechanism.n), q)
-    start = tree.from_coordinates(model.q_tree)
-    angles = np.linspace(0.0, 2 * np.pi, FRAMES, endpoint=False)
-    one: list[Terms] = []
-    for angle in angles:
-        part = size * mode.shape * np.exp(1j * angle)
-        at = _closed(model, Partition(q, z), tree.integrate(start, part.real), part.real)
-        if at is None:
+    start, still = tree.from_coordinates(model.q_tree), [tree.index[name] for name in model.locked]
+    rank, tolerance = mechanism.n - len(model.states) // 2, mechanism.tolerance * tree.coarseness(start)
+    rest = np.eye(mechanism.n)[still]
+    states: list[Terms] = []
+    for factor in swing:
+        part = (shape * factor).real
+        moved = mechanism.kinematics(tree.integrate(start, part))
+        at = nearest(moved, rank, still)
+        off = np.abs(tree.difference(moved.q_tree, at.q_tree) / tree.reach).max()
+        if np.abs(at.phi).max(initial=0.0) > tolerance or off > max(float(np.abs(part / tree.reach).max()), LEAST):
             return None
-        rate = (2j * np.pi * mode.frequency * part).real
-        one.append(Terms(mechanism, at, rate - np.linalg.pinv(at.J, rcond=1e-9) @ (at.J @ rate)))
-    return np.append(
-        np.tile(angles, PERIODS) + 2 * np.pi * np.repeat(np.arange(PERIODS), FRAMES), 2 * np.pi * PERIODS
-    ), [
-        *(PERIODS * one),
-        one[0],
-    ]
+        rows, v = np.vstack([at.J, rest]), (rate * shape * factor).real
+        states.append(Terms(mechanism, at, v + shortest(rows, rank, rows @ v, tree.reach)))
+    return states
 
 
-def _closed(model: LinearModel, partition: Partition, q_tree: Array, step: Array) -> Kinematics | None:
-    at = Kinematics(model.mechanism.tree, model.mechanism.closure, partition, q_tree)
-    found = newton(at, 0.0, model.mechanism.tolerance)
-    moved = model.mechanism.tree.difference(q_tree, found.at.q_tree) / model.mechanism.tree.reach
-    return found.at if found.converged and np.abs(moved).max(initial=0.0) < np.abs(step).max() else None
-
-
-def _run(model: LinearModel, number: int, mode: Mode, angles: Array, states: list[Terms]) -> Run:
-    mechanism, m = model.mechanism, len(angles)
+def _run(model: LinearModel, number: int, mode: Mode, seconds: Array, states: list[Terms]) -> Run:
+    mechanism, m = model.mechanism, len(seconds)
     rows = mechanism.closure.rows
     name = f"{model.name}: mode {number}, {mode.says}"
     stats: dict[str, Any] = dict.fromkeys(
         ("rhs", "steps", "rejected", "newton", "factorizations", "jacobians", "switches"), 0
     )
     stats |= {"python_calls": 0, "wall_s": 0.0, "method": "none", "steps_by_method": {}, "terms": "pinocchio"}
-    seconds = angles / (2 * np.pi * mode.frequency)
     scene = {"mechanism": MECHANISM_FILE, "formulation": "reduced", "t_end": float(seconds[-1])}
     scene |= {"initial": {"at": "assembled"}}
     run = Run(
