@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,23 +13,25 @@ import numpy as np
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.spec import FeedbackSpec
-from ckc_pin.dynamics.equilibrium import stable_equilibrium
-from ckc_pin.dynamics.formulations import tangent_basis
+from ckc_pin.control.torques import Torques
+from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.loading import load
-from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.kinds import require_kind, require_table
+from ckc_pin.kinematics.sigma import nearest, shortest, sigma
+from ckc_pin.mechanism.kinds import is_number, require_kind, require_table
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.native.plant import NONE
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.linear_model import LinearModel, linear_model
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
+from ckc_pin.simulation.resting import beyond_stops, hold
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.simulate import simulate
@@ -38,10 +40,9 @@ __all__ = ["At", "linearize"]
 
 At = str | float | Mapping[str, float]
 
-LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which no motor needs to hold
-ROUNDING = 1e-4  # of that along the others
 NO_CHART = 1e-6  # margin of phi_z below which q is none
 OPEN = 1e-6  # of the mechanism's size: loops further open are not those of eq. 1
+AT_TARGET = 1e-9  # rad, or of the mechanism's size: a configuration so near to a set point's target is it
 MOMENT = 1e-9  # s: a run to its very start
 
 
@@ -49,6 +50,14 @@ MOMENT = 1e-9  # s: a run to its very start
 class _Subject:
     mechanism: Mechanism
     scene: Scene | None
+
+    @property
+    def name(self) -> str:
+        return self.mechanism.name if self.scene is None else self.scene.name
+
+    @property
+    def actuation(self) -> Actuation:
+        return Actuation(self.mechanism) if self.scene is None else scene_actuation(self.scene, self.mechanism)
 
     @property
     def smoothing(self) -> float | None:
@@ -68,29 +77,30 @@ def linearize(
     ----------
     what : Mechanism, Scene, str or Path
         As `check` takes it. Of a mechanism's name with `changes` or an instant, its default scene.
-    at : "equilibrium", "assembled", float or {coordinate: value}
-        The stable equilibrium reached from q_guess, motors at rest; an instant of the scene's run, s; or at rest, held
-        by the least torques of the motors, the configuration as assembled, or one as `terms` takes it.
+    at : "equilibrium", "assembled", "target", float or {coordinate: value}
+        The stable equilibrium reached from q_guess, motors at rest; an instant of the scene's run, s; or at rest the
+        configuration as assembled, at the target of the scene's set point, or one as `terms` takes it: held by stops
+        that joints rest on, by the least torques of the motors, shared as in a run, and where these fail by friction.
     changes : mapping, optional
         Values of the scene by dotted key, e.g. ``{"friction_smoothing": 0.01}``.
 
     Returns
     -------
     LinearModel
-        Of the plant, with the motors' torques as inputs; at an instant of a scene with a set point or tracking, the
-        closed loop's A besides.
+        Of the plant, with the motors' torques as inputs; at an instant of a scene with a set point or tracking, and at
+        a set point's target, the closed loop's A besides.
 
     Raises
     ------
     InputError
-        An operating point that the motors cannot hold, an instant outside the run, no freedom left.
+        An operating point that nothing holds, a joint beyond its stops, an instant outside the run, no freedom left.
     NumericalError
-        No equilibrium there, a singular configuration.
+        No equilibrium there, a singular configuration, a run that stopped before.
 
     Notes
     -----
     Dry friction is smoothed as the scene's friction_smoothing says; else joints with friction that are at rest are
-    locked, and those that slide feel a constant force.
+    locked, and those that slide feel a constant force. Joints that rest on a stop are locked.
 
     >>> model = linearize("five_bar")
     >>> model.A.shape, model.inputs
@@ -106,12 +116,17 @@ def linearize(
             raise InputError(f"{subject.mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
         if isinstance(at, Mapping):
             return _at_point(subject, at)
-        if at == "equilibrium":
-            return _at_equilibrium(subject)
-        if at == "assembled":
-            mechanism = subject.mechanism
-            return _operating(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
-        return _at_instant(subject, _instant(at))
+        if not isinstance(at, str):
+            return _at_instant(subject, _instant(at))
+        match at:
+            case "equilibrium":
+                return _at_equilibrium(subject)
+            case "target":
+                return _at_target(subject)
+            case "assembled":
+                mechanism = subject.mechanism
+                return _operating(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
+        raise _no_state(at)
 
 
 def _subject(what: Mechanism | Scene | str | Path, at: At, changes: Mapping[str, Any] | None) -> _Subject:
@@ -125,10 +140,16 @@ def _subject(what: Mechanism | Scene | str | Path, at: At, changes: Mapping[str,
     return _Subject(scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
 
 
-def _instant(at: At) -> float:
-    if isinstance(at, int | float | np.integer | np.floating) and not isinstance(at, bool) and math.isfinite(at):
+def _instant(at: Any) -> float:
+    if is_number(at) and abs(at) <= sys.float_info.max:
         return float(at)
-    raise InputError(f'at = {at!r:.80}: give "equilibrium", "assembled", a time in seconds, or a table of coordinates')
+    raise _no_state(at)
+
+
+def _no_state(at: Any) -> InputError:
+    return InputError(
+        f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or a table of coordinates'
+    )
 
 
 # --- at rest -------------------------------------------------------------------------------------
@@ -137,14 +158,34 @@ def _instant(at: At) -> float:
 def _at_equilibrium(subject: _Subject) -> LinearModel:
     mechanism = subject.mechanism
     try:
-        at = stable_equilibrium(mechanism)
+        at = equilibrium(mechanism)
     except NumericalError as error:
         raise NumericalError(
             f"{error}; or linearize it as assembled, or at coordinates, where its motors hold it, or at an instant of "
             "a scene's run",
             q_tree=error.q_tree,
         ) from None
-    return _at_rest(subject, at, np.zeros(len(mechanism.actuated)), "at its equilibrium")
+    if says := beyond_stops(mechanism, at.q_tree):
+        raise InputError(f"{mechanism.name}: at its equilibrium {says}; give coordinates within them")
+    return _at_rest(
+        subject,
+        Terms(mechanism, at, np.zeros(mechanism.n)),
+        np.zeros(len(mechanism.actuated)),
+        NONE,
+        "at its equilibrium",
+    )
+
+
+def _at_target(subject: _Subject) -> LinearModel:
+    law = None if subject.scene is None else scene_controller(subject.scene, subject.mechanism)
+    if not isinstance(law, SetPoint):
+        raise InputError(
+            f'at = "target": {subject.name} has no set point; give a scene whose controller is of type "set_point"'
+        )
+    found = sigma(subject.mechanism, law.q_d)
+    if found.verdict != "converged":
+        raise InputError(f'at = "target": {subject.mechanism.name} cannot be there: {found.reason}')
+    return _operating(subject, Terms(subject.mechanism, found.at, np.zeros(subject.mechanism.n)))
 
 
 def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
@@ -163,54 +204,38 @@ def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
             f"give {', '.join(mechanism.coordinates)}",
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(state.q_tree)),
         )
-    return _operating(subject, state)
+    return _operating(subject, _closed(state))
 
 
 def _operating(subject: _Subject, state: Terms) -> LinearModel:
-    """Hold a configuration by the least torques; refuse what the motors do not reach."""
-    mechanism, actuation = subject.mechanism, _actuation(subject)
-    tangent, _ = tangent_basis(state, np.zeros(mechanism.closure.rows))
-    needed = tangent.T @ state.h_tree
-    tau = actuation.distribute(tangent, needed)
-    u_tree = mechanism.motors.force(tau)
-    enough = LEFT_OVER * (np.abs(tangent.T) @ (np.abs(state.h_tree) + np.abs(u_tree)))
-    if np.any(np.abs(needed - tangent.T @ u_tree) > enough + ROUNDING * enough.max()):
-        loose = _loose(state, tangent, actuation)
-        names = ", ".join(mechanism.actuated) or "no motor"
-        raise InputError(
-            f"{mechanism.name}: the motors ({names}) cannot hold this configuration: nothing holds the motion along "
-            f"{loose}, and gravity or springs act on it; take another one, the equilibrium, or more motors"
-        )
-    weak = np.flatnonzero(np.abs(tau) > actuation.limit * (1 + 1e-9))
-    if len(weak):
-        k = int(weak[0])
-        raise InputError(
-            f"{mechanism.name}: the motors cannot hold this configuration: {mechanism.actuated[k]} would need "
-            f"{abs(tau[k]):.4g}, its limit is {actuation.limit[k]:.4g}"
-        )
-    return _at_rest(subject, state.at, tau, "held by its motors")
+    """Hold a configuration by stops, the least torques and, where these fail, friction; refuse what nothing holds."""
+    mechanism = subject.mechanism
+    if says := beyond_stops(mechanism, state.q_tree):
+        raise InputError(f"{mechanism.name}: at: {says}; give coordinates within them")
+    rest = hold(state, subject.actuation, rubs=subject.smoothing is None)
+    notes = []
+    if rest.rubs:
+        notes.append("dry friction holds what the motors do not: other torques would do as well")
+    if len(rest.idle):
+        names = ", ".join(mechanism.coordinates[k] for k in rest.idle)
+        notes.append(f"at a stop that nothing pushes it into, and that the model leaves out: {names}")
+    says = "held by its motors" if mechanism.actuated else "at rest"
+    return _at_rest(subject, state, rest.tau, rest.touching, says, tuple(notes))
 
 
-def _loose(state: Terms, tangent: Array, actuation: Actuation) -> str:
-    """Name freedoms that no motor drives; where q is no chart, the coordinate that moves most in the loosest one."""
-    if state.at.margin() > NO_CHART:
-        return ", ".join(actuation.undriven(state.at))
-    mechanism = state.mechanism
-    motions, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
-    grip = mechanism.motors.turns @ motions
-    loosest = np.linalg.eigh(grip.T @ grip)[1][:, 0]
-    return mechanism.coordinates[int(np.argmax(np.abs(motions @ loosest)))]
-
-
-def _actuation(subject: _Subject) -> Actuation:
-    return Actuation(subject.mechanism) if subject.scene is None else scene_actuation(subject.scene, subject.mechanism)
-
-
-def _at_rest(subject: _Subject, at: Kinematics, tau: Array, says: str) -> LinearModel:
+def _at_rest(
+    subject: _Subject, state: Terms, tau: Array, touching: IntArray, says: str, notes: tuple[str, ...] = ()
+) -> LinearModel:
     mechanism, smoothing = subject.mechanism, subject.smoothing
-    sticks = np.flatnonzero(mechanism.joints.friction) if smoothing is None else np.zeros(0, dtype=np.intp)
-    state = Terms(mechanism, at, np.zeros(mechanism.n))
-    return linear_model(state, tau, at=says, locked=sticks, smoothing=smoothing, library=subject.library)
+    sticks = np.flatnonzero(mechanism.joints.friction) if smoothing is None else NONE
+    locked = np.union1d(sticks, touching)
+    model = linear_model(state, tau, at=says, locked=locked, smoothing=smoothing, library=subject.library, notes=notes)
+    scene = subject.scene
+    law = None if scene is None else scene_controller(scene, mechanism)
+    if not isinstance(law, SetPoint):
+        return model
+    off = (mechanism.independent_part(state.q_tree) - law.q_d) / mechanism.tree.reach[mechanism.partition.q]
+    return _with_controller(subject, model, law, 0.0, state, 0.0, locked) if np.abs(off).max() <= AT_TARGET else model
 
 
 # --- along a run ---------------------------------------------------------------------------------
@@ -222,13 +247,13 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
         raise InputError(f"at = {t:g}: a mechanism has no time; give one of its scenes")
     run = _run_to(scene, t)
     k = run.at(t)
-    state = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k])), run.v_tree[k])
     miss = float(np.abs(run.phi[k]).max(initial=0.0))
     if miss > max(OPEN * mechanism.size, 10 * mechanism.tolerance):
-        raise InputError(
-            f"at t = {t:g} s the loops of {scene.name} are open (|phi| = {miss:.3g}), as an SPF off its manifold is; "
-            "give a later instant"
-        )
+        why = "as an SPF off its manifold is" if scene.spec.formulation == "spf" else "as a DAE's that drifts are"
+        remedy = "give a later instant" if scene.spec.formulation == "spf" else "let solver.projection close them"
+        raise InputError(f"at t = {t:g} s the loops of {scene.name} are open (|phi| = {miss:.3g}), {why}; {remedy}")
+    at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
+    state = _closed(Terms(mechanism, at, run.v_tree[k]))
     of_joints = RecordedJoints(run)
     locked, smoothing = of_joints.locked[k], subject.smoothing
     sliding = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * of_joints.sign[k]
@@ -244,32 +269,56 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
         notes=_notes(scene, run, k),
     )
     law = scene_controller(scene, mechanism)
-    if law is None:
-        return model
-    if not isinstance(law, SetPoint | Tracking) or model.states[: mechanism.d] != mechanism.independent:
+    return model if law is None else _with_controller(subject, model, law, t, state, sliding, locked)
+
+
+def _with_controller(
+    subject: _Subject,
+    model: LinearModel,
+    law: SetPoint | Tracking | Torques,
+    t: float,
+    state: Terms,
+    sliding: Array | float,
+    locked: IntArray,
+) -> LinearModel:
+    """Add the closed loop, or say why there is none."""
+    if isinstance(law, Torques):
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
+    try:
+        loop = ClosedLoop(subject.mechanism, law, subject.smoothing, subject.library, subject.actuation)
+        closed = loop.at(t, state, sliding, locked).closed
+    except NumericalError as error:
+        says = f"A and B are the plant's, without the scene's controller, since {error}"
+        return replace(model, notes=(*model.notes, says))
     says = "A and B are the plant's; closed_loop is A with the scene's controller"
-    spec = scene.spec.controller
+    spec = None if subject.scene is None else subject.scene.spec.controller
     if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
         says += ", without its sampling and delay"
-    closed = ClosedLoop(mechanism, law, smoothing, subject.library).at(t, state).closed
     return replace(model, closed_loop=closed, notes=(*model.notes, says))
+
+
+def _closed(state: Terms) -> Terms:
+    """Close loops that are slightly open, and make J v' zero."""
+    mechanism = state.mechanism
+    at, v = nearest(state.at, mechanism.rank), state.v_tree
+    if v.any():
+        v = v + shortest(at.J, mechanism.rank, at.J @ v, mechanism.tree.reach)
+    return Terms(mechanism, at, v)
 
 
 def _run_to(scene: Scene, t: float) -> Run:
     """Run a scene up to an instant; its own output instants stay as they are."""
     t_end = scene.spec.t_end
     if not 0 <= t <= t_end:
-        raise InputError(f"t = {t:g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:g} s")
+        raise InputError(f"t = {t:.15g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:.15g} s")
     changes = {"t_end": max(t, min(MOMENT, t_end))}
     run = simulate(make_scene(with_changes(scene.plain(), changes), scene.name, scene.sources))
     if run.status == "interrupted":
         raise KeyboardInterrupt(run.message)
-    if run.status != "done" or run.t[-1] < t * (1 - 1e-12):
-        raise InputError(
-            f"t = {t:g} s is outside the run of {scene.name}, which ends at t = {run.t[-1]:.6g} s: {run.message}"
-        )
-    return run
+    if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):
+        return run
+    says = f"t = {t:.15g} s is outside the run of {scene.name}, which ends at t = {run.t[-1]:.9g} s: {run.message}"
+    raise InputError(says) if run.status == "done" else NumericalError(says, t=float(run.t[-1]))
 
 
 def _notes(scene: Scene, run: Run, k: int) -> tuple[str, ...]:

@@ -1,0 +1,200 @@
+"""Linear models of states of rest: what holds them, what is locked there, what cannot be linearized."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate
+from ckc_pin.dynamics import Terms, dae_acceleration
+from ckc_pin.mechanism.library import mechanism_file
+from tests.analytic.small_models import plate_on_springs
+
+G = 9.81
+BOB = '<link name="{name}"><inertial><origin xyz="0 0 -{l}"/><mass value="{m}"/>{no}</inertial></link>'
+NO = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+SLIDES = ('<joint name="slide" type="prismatic"><parent link="base"/><child link="cart"/><axis xyz="0.8 0 0.6"/>'
+          '<limit lower="-1" upper="0.5" effort="1" velocity="1"/></joint>')  # fmt: skip
+SWINGS = ('<joint name="swing" type="revolute"><parent link="cart"/><child link="bob"/><axis xyz="0 1 0"/>'
+          '<limit lower="-2" upper="0.4" effort="1" velocity="1"/></joint>')  # fmt: skip
+M, m, L = 2.0, 0.7, 0.4
+
+
+def cart_and_pendulum(folder: Path, more: str) -> Mechanism:
+    """A cart on a slope of 3 in 5, and a pendulum on it."""
+    cart, bob = BOB.format(name="cart", l=0, m=M, no=NO), BOB.format(name="bob", l=L, m=m, no=NO)
+    (folder / "it.urdf").write_text(f'<robot name="it"><link name="base"/>{cart}{bob}{SLIDES}{SWINGS}</robot>')
+    (folder / "mechanism.toml").write_text('name = "cart"\nurdf = "it.urdf"\n' + more)
+    return load(str(folder / "mechanism.toml"))
+
+
+def joint(name: str, key: str) -> str:
+    return f'[[joint]]\nname = "{name}"\n{key}\n'
+
+
+def agree(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> None:
+    assert np.abs(ours - theirs).max() <= tolerance * max(np.abs(theirs).max(), 1e-300)
+
+
+# --- stops ---------------------------------------------------------------------------------------
+
+
+def test_a_joint_pushed_into_its_stop_is_held_there(tmp_path: Path) -> None:
+    """Gravity pulls the cart down the slope to its lower stop: no torque of its motor is needed, and it stays there."""
+    mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true"))
+    model = linearize(mechanism, {"slide": -1.0, "swing": -0.6})
+    assert model.locked == ("slide",)
+    agree(model.tau, np.array([0.0, m * G * L * np.sin(-0.6)]), 1e-12)
+    agree(model.A, np.array([[0.0, 1.0], [-G / L * np.cos(-0.6), 0.0]]))
+    agree(model.B, np.array([[0.0, 0.0], [0.0, 1 / (m * L * L)]]))
+
+
+def test_a_joint_that_its_stop_would_have_to_pull_is_free(tmp_path: Path) -> None:
+    mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true"))
+    model = linearize(mechanism, {"slide": 0.5, "swing": -0.6})
+    free = linearize(cart_and_pendulum(tmp_path, ""), {"slide": 0.5, "swing": -0.6})
+    assert not model.locked
+    agree(model.tau, free.tau)
+    agree(model.A, free.A)
+    assert "at a stop that nothing pushes it into" in " ".join(model.notes)
+
+
+def test_two_joints_at_their_stops_are_told_apart(tmp_path: Path) -> None:
+    """The cart rests on its stop, the pendulum's would have to pull: its motor holds it, with 0.4 rad to the side."""
+    mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true") + joint("swing", "stops = true"))
+    model = linearize(mechanism, {"slide": -1.0, "swing": 0.4})
+    assert model.locked == ("slide",)
+    agree(model.tau, np.array([0.0, m * G * L * np.sin(0.4)]), 1e-12)
+
+
+def test_a_state_beyond_stops_is_refused(tmp_path: Path) -> None:
+    mechanism = cart_and_pendulum(tmp_path, joint("swing", "stops = true"))
+    with pytest.raises(InputError, match=r"at: swing = 0\.5 is beyond its stops, -2 to 0\.4"):
+        linearize(mechanism, {"slide": 0.0, "swing": 0.5})
+    mechanism = cart_and_pendulum(tmp_path, joint("swing", "stops = true") + SPRING)
+    with pytest.raises(InputError, match=r"at its equilibrium swing = 0\.\d+ is beyond its stops, -2 to 0\.4"):
+        linearize(mechanism)
+
+
+SPRING = ('[[spring]]\njoint = "swing"\nstiffness = 90.0\nrest = 0.9\n'
+          '[[spring]]\njoint = "slide"\nstiffness = 90.0\nrest = 0.1\n')  # fmt: skip
+
+# --- motors and friction -------------------------------------------------------------------------
+
+
+def test_friction_holds_what_no_motor_does(tmp_path: Path) -> None:
+    """The slope asks for 0.6 (M + m) g."""
+    needed = 0.6 * (M + m) * G
+    for friction in (1.01 * needed, 0.99 * needed):
+        rubs = joint("slide", f"friction = {friction}")
+        mechanism = cart_and_pendulum(tmp_path, f'actuated = ["swing"]\n{rubs}')
+        if friction > needed:
+            model = linearize(mechanism, {"slide": 0.1, "swing": 0.0})
+            assert model.locked == ("slide",)
+            assert "dry friction holds" in " ".join(model.notes)
+            agree(model.A, np.array([[0.0, 1.0], [-G / L, 0.0]]))
+        else:
+            with pytest.raises(InputError, match=r"motor \(swing\) cannot hold .* along slide"):
+                linearize(mechanism, {"slide": 0.1, "swing": 0.0})
+
+
+def test_friction_helps_a_motor_at_its_limit(tmp_path: Path) -> None:
+    needed = 0.6 * (M + m) * G
+    rubs = joint("slide", f"friction = {0.7 * needed}")
+    motors = f'[[motor]]\njoint = "slide"\ntorque_limit = {0.4 * needed}\n[[motor]]\njoint = "swing"\n'
+    model = linearize(cart_and_pendulum(tmp_path, motors + rubs), {"slide": 0.1, "swing": 0.0})
+    assert 0.3 * needed <= model.tau[0] <= 0.4 * needed
+    with pytest.raises(InputError, match=rf"slide would need {needed:.4g}, its limit is {0.4 * needed:.4g}"):
+        linearize(cart_and_pendulum(tmp_path, motors), {"slide": 0.1, "swing": 0.0})
+
+
+@pytest.mark.parametrize("limit", [None, {"theta_2": 0.05}])
+def test_redundant_motors_hold_it_as_a_run_does(tmp_path: Path, limit: dict[str, float] | None) -> None:
+    for file in mechanism_file("five_bar").parent.iterdir():
+        if file.is_file():
+            text = file.read_text().replace(
+                'actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1", "theta_3", "theta_2"]'
+            )
+            (tmp_path / file.name).write_text(text)
+    path = tmp_path / "it.scene.toml"
+    target = {"theta_1": -1.1, "theta_3": -1.6}
+    path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "equilibrium"\n')
+    control = {"type": "set_point", "K_P": 30.0, "K_V": 5.0, "q_d": target,
+               "allocation": {"preload": {"theta_1": 0.4, "theta_2": -0.2}, "weights": {"theta_1": 2.0}}}  # fmt: skip
+    if limit:
+        control["torque_limit"] = limit
+    scene = load_scene(path, {"controller": control, "initial": {"q": target}})
+    run = simulate(scene)
+    for at in ("target", target):
+        model = linearize(scene, at)
+        agree(model.tau, run.tau[-1], 1e-8)
+        assert not any("accelerates" in note for note in model.notes)
+        assert model.closed_loop is not None
+
+
+# --- rest or none --------------------------------------------------------------------------------
+
+
+def test_a_start_at_rest_that_does_not_last_is_told() -> None:
+    start = {"initial": {"q": {"theta_1": -1.0, "theta_3": -1.5}}}
+    model = linearize(load_scene("five_bar/swing", start), 0.0)
+    state = Terms(model.mechanism, model.mechanism.kinematics(model.q_tree), np.zeros(4))
+    a = dae_acceleration(state, np.zeros(4))
+    k = int(np.argmax(np.abs(a)))
+    wanted = f"nothing keeps it there: {model.coordinates[k]} accelerates with {a[k]:.4g} rad/s^2"
+    assert any(wanted in note for note in model.notes)
+    assert not any("accelerates" in note for note in linearize("five_bar").notes)
+
+
+def test_a_root_held_in_part_has_an_equilibrium(tmp_path: Path) -> None:
+    mechanism = plate_on_springs(tmp_path)
+    model = linearize(mechanism)
+    state = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(model.q_tree)), np.zeros(mechanism.n))
+    assert np.abs(dae_acceleration(state, np.zeros(mechanism.n))).max() < 1e-9
+    assert model.eigenvalues.real.max() < 0, "with dampers, a minimum of the energy"
+
+
+def test_an_equilibrium_where_q_is_no_chart_has_other_coordinates(tmp_path: Path) -> None:
+    """A slider-crank that gravity pulls out to its dead centre: with q the slider's place nothing would be known."""
+    there, models = mechanism_file("slider_crank").parent, []
+    for name in ("crank", "slider"):
+        for file in there.iterdir():
+            text = file.read_text().replace('independent = ["crank"]', f'independent = ["{name}"]')
+            (tmp_path / file.name).write_text(text.replace("gravity = [0.0, -9.81, 0.0]", "gravity = [9.81, 0.0, 0.0]"))
+        models.append(linearize(load(tmp_path / "mechanism.toml")))
+    assert models[1].states[0] in ("crank", "rod")
+    assert models[1].notes[0] == f"slider is no coordinate there; {models[1].states[0]} is"
+    assert models[1].modes[0].frequency == pytest.approx(models[0].modes[0].frequency, rel=1e-9)
+    assert not any("accelerates" in note for note in models[1].notes)
+
+
+# --- no linear model -----------------------------------------------------------------------------
+
+
+def test_a_spring_between_coincident_ends_is_refused_by_name(tmp_path: Path) -> None:
+    """At zero length a damper and a spring with a length at rest have no direction; one without a length has one."""
+    line = '[[spring]]\nframe_a = {link = "base"}\nframe_b = {link = "cart"}\nstiffness = 40.0\n'
+    at = {"slide": 0.0, "swing": 0.0}
+    for more in ("rest_length = 0.1\n", "damping = 2.0\n"):
+        with pytest.raises(InputError, match=r"the ends of spring 2 coincide"):
+            linearize(cart_and_pendulum(tmp_path, SPRING[: SPRING.rindex("[[")] + line + more), at)
+    with_it, without = (linearize(cart_and_pendulum(tmp_path, more), at) for more in (line, ""))
+    extra = with_it.A[2:] - without.A[2:]
+    mass = np.linalg.inv(np.array([[M + m, -0.8 * m * L], [-0.8 * m * L, m * L * L]]))
+    agree(extra[:, :2], -mass @ np.diag([40.0, 0.0]))
+
+
+def test_a_motion_without_mass_is_refused_as_a_run_refuses_it(tmp_path: Path) -> None:
+    mechanism = cart_and_pendulum(tmp_path, "")
+    text = (tmp_path / "it.urdf").read_text().replace(f'<mass value="{m}"/>', '<mass value="0"/>')
+    (tmp_path / "it.urdf").write_text(text)
+    with pytest.raises(InputError, match=r"the motion along swing moves no mass"):
+        linearize(load(str(tmp_path / "mechanism.toml")), {"slide": 0.1, "swing": 0.2})
+    assert mechanism.n == 2
+
+
+def test_an_instant_that_a_run_does_not_reach_is_for_the_numerics() -> None:
+    with pytest.raises(NumericalError, match=r"ends at t = .* s: stopped at"):
+        linearize(load_scene("five_bar/swing", {"solver.max_rhs": 20}), 1.5)

@@ -1,0 +1,162 @@
+"""Closed loops at instants of runs: differences of eq. 1 with the controller, its motors and the joints in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import InputError, LinearModel, Mechanism, Scene, SetPoint, linearize, load, load_scene
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Controller
+from ckc_pin.dynamics import Terms, dae_acceleration
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.library import mechanism_file
+from ckc_pin.simulation.prepare import scene_actuation, scene_controller
+from tests.analytic.five_bar import Array
+
+TARGET = {"theta_1": -1.2, "theta_3": -1.9}
+SET_POINT = {"type": "set_point", "K_P": [[9.0, 1.0], [1.0, 7.0]], "K_V": 0.9, "q_d": TARGET}
+SLIDES = """
+[[joint]]
+name = "theta_1"
+friction = 0.05
+[[joint]]
+name = "theta_2"
+friction = 0.2
+[[joint]]
+name = "theta_4"
+friction = 0.1
+"""
+GEARED = """
+[[motor]]
+name = "sum"
+joints = {theta_1 = 1.0, theta_3 = 0.3}
+ratio = 3.0
+torque_limit = 0.9
+[[motor]]
+name = "other"
+joints = {theta_3 = 1.0, theta_1 = 0.2}
+"""
+
+
+def five_bar_with(folder: Path, more: str, motors: bool = False) -> Mechanism:
+    for file in mechanism_file("five_bar").parent.iterdir():
+        if file.is_file():
+            (folder / file.name).write_bytes(file.read_bytes())
+    path = folder / "mechanism.toml"
+    kept = [line for line in path.read_text().splitlines() if not (motors and line.startswith("actuated"))]
+    path.write_text("\n".join(kept) + more)
+    return load(str(path))
+
+
+def scene_of(folder: Path, controller: dict[str, Any], **keys: Any) -> Scene:
+    path = folder / "it.scene.toml"
+    path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\n'
+                    "initial.q = { theta_1 = -0.9, theta_3 = -1.5 }\n")  # fmt: skip
+    return load_scene(path, {"controller": controller, "initial.q_dot": {"theta_1": 0.8, "theta_3": -0.6}, **keys})
+
+
+def set_point(scene: Scene, mechanism: Mechanism) -> SetPoint:
+    law = scene_controller(scene, mechanism)
+    assert isinstance(law, SetPoint)
+    return law
+
+
+def closed_by_differences(
+    model: LinearModel, controller: Controller, actuation: Actuation, other: Callable[[Array], Array] | None = None
+) -> Array:
+    """A of the five-bar's closed loop, from eq. 1 at states beside this one; `other`: what else acts, by v'."""
+    mechanism, d, t = model.mechanism, model.mechanism.d, model.t or 0.0
+    start = mechanism.kinematics(mechanism.tree.from_coordinates(model.q_tree))
+    own = mechanism.partition.q
+    x = np.concatenate([model.q_tree[own], model.v_tree[own]])
+
+    def acceleration(x: Array) -> Array:
+        at = sigma(mechanism, x[:d], start).at
+        state = Terms(mechanism, at, at.rho @ x[d:])
+        force = actuation.apply(state, controller.u(t, state)).u_tree
+        return dae_acceleration(state, force + (0.0 if other is None else other(state.v_tree)))[own]
+
+    def slope(k: int, h: float) -> Array:
+        step = h * np.eye(2 * d)[k]
+        return (acceleration(x + step) - acceleration(x - step)) / (2 * h)
+
+    slopes = [(4 * slope(k, 1e-4) - slope(k, 2e-4)) / 3 for k in range(2 * d)]
+    return np.vstack([np.hstack([np.zeros((d, d)), np.eye(d)]), np.array(slopes).T])
+
+
+def agree(ours: Array | None, theirs: Array) -> None:
+    assert ours is not None
+    assert np.abs(ours - theirs).max() <= 1e-7 * np.abs(theirs).max()
+
+
+def test_friction_of_joints_that_slide_is_in_it(tmp_path: Path) -> None:
+    mechanism = five_bar_with(tmp_path, SLIDES)
+    scene = scene_of(tmp_path, SET_POINT)
+    model = linearize(scene, 0.13)
+    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    friction = mechanism.joints.friction
+    assert not model.locked
+    agree(model.closed_loop, closed_by_differences(model, controller, actuation, lambda v: -friction * np.sign(v)))
+
+
+@pytest.mark.parametrize("t", [0.0, 0.05])
+def test_a_motor_at_its_limit_does_not_answer(t: float) -> None:
+    scene = load_scene("five_bar/set_point", {"controller.torque_limit": {"theta_1": 0.2}})
+    mechanism = load("five_bar")
+    model = linearize(scene, t)
+    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    assert abs(model.tau[0]) == 0.2
+    agree(model.closed_loop, closed_by_differences(model, controller, actuation))
+
+
+def test_a_motor_on_several_joints_at_its_limit_does_not_answer(tmp_path: Path) -> None:
+    mechanism = five_bar_with(tmp_path, GEARED, motors=True)
+    scene = scene_of(tmp_path, SET_POINT)
+    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    full = []
+    for t in (0.0, 0.1, 0.3, 0.6):
+        model = linearize(scene, t)
+        full.append(abs(model.tau[0]) == 0.9)
+        agree(model.closed_loop, closed_by_differences(model, controller, actuation))
+    assert set(full) == {True, False}
+
+
+def test_a_joint_that_sticks_is_no_state_of_it(tmp_path: Path) -> None:
+    """Stopped by friction, theta_1 is held; theta_3 goes on under its motor."""
+    mechanism = five_bar_with(tmp_path, '\n[[joint]]\nname = "theta_1"\nfriction = 30.0\n')
+    scene = scene_of(tmp_path, SET_POINT)
+    model = linearize(scene, 0.4)
+    assert model.locked == ("theta_1",)
+    assert model.states == ("theta_3", "theta_3_dot")
+    controller, start = set_point(scene, mechanism), mechanism.kinematics(model.q_tree)
+    own = mechanism.partition.q
+
+    def acceleration(x: Array) -> float:
+        at = sigma(mechanism, np.array([model.q_tree[0], x[0]]), start).at
+        state = Terms(mechanism, at, at.rho @ [0.0, x[1]])
+        u = controller.u(0.4, state)
+        free = state.D[1, 1]  # with theta_1 at rest the second row of eq. 6 alone
+        return float((u - state.C_times(state.q_dot) - state.h)[1] / free)
+
+    x = np.array([model.q_tree[own[1]], model.v_tree[own[1]]])
+    h = 1e-5
+    slopes = [(acceleration(x + h * e) - acceleration(x - h * e)) / (2 * h) for e in np.eye(2)]
+    agree(model.closed_loop, np.array([[0.0, 1.0], slopes]))
+
+
+def test_a_set_point_has_it_at_its_target() -> None:
+    scene = load_scene("five_bar/set_point")
+    model, mechanism = linearize(scene, "target"), load("five_bar")
+    assert np.abs(model.q_tree[mechanism.partition.q] - np.pi / 4).max() < 1e-12
+    agree(model.closed_loop, closed_by_differences(model, set_point(scene, mechanism), Actuation(mechanism)))
+    again = linearize(scene, {"theta_1": np.pi / 4, "theta_3": np.pi / 4})
+    assert model.closed_loop is not None
+    agree(again.closed_loop, model.closed_loop)
+    assert linearize(scene, {"theta_1": 0.7, "theta_3": 0.8}).closed_loop is None
+    with pytest.raises(InputError, match=r"five_bar/tracking has no set point"):
+        linearize("five_bar/tracking", "target")
