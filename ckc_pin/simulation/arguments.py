@@ -49,15 +49,24 @@ def read_table(option: str, text: str) -> dict[str, float]:
     Raises
     ------
     InputError
-        Not JSON, not a table, not a number.
+        Not JSON, not a table, a name that is given twice, not a number.
     """
     example = f"write a table by coordinate, e.g. {option} '{{\"theta_1\": 0.4}}'"
+    twice: list[str] = []
+
+    def table_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        twice.extend(name for k, name in enumerate(names) if name in names[:k])
+        return dict(pairs)
+
     try:
-        table = json.loads(text)
+        table = json.loads(text, object_pairs_hook=table_of)
     except (ValueError, RecursionError):
         raise InputError(f"{option} {text[:80]}: not JSON; {example}") from None
     if not isinstance(table, dict):
         raise InputError(f"{option} {text[:80]}: not a table; {example}")
+    if twice:
+        raise InputError(f"{option}: {twice[0]} is given twice")
     for name, value in table.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) <= sys.float_info.max:
