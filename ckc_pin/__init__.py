@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ckc_pin.simulation.ivp import as_ivp
     from ckc_pin.simulation.linear_model import LinearModel
     from ckc_pin.simulation.linearize import linearize
+    from ckc_pin.simulation.locus import GainLocus, gain_locus
     from ckc_pin.simulation.motion_forces import MotionForces
     from ckc_pin.simulation.run import Run
     from ckc_pin.simulation.scene import Scene, load_scene
@@ -52,6 +53,7 @@ __all__ = [
     "Controller",
     "Event",
     "Floquet",
+    "GainLocus",
     "InputError",
     "LinearModel",
     "Mechanism",
@@ -73,6 +75,7 @@ __all__ = [
     "check",
     "ensemble",
     "floquet",
+    "gain_locus",
     "inverse_dynamics",
     "linearize",
     "load",
@@ -152,13 +155,13 @@ def play(
     )
 
 
-def plot(*runs: Run) -> Figures:
-    """Draw runs; a notebook shows the figures, `save(folder)` writes them.
+def plot(*shown: Run | LinearModel | GainLocus) -> Figures:
+    """Draw runs, a linear model or a locus; a notebook shows the figures, `save(folder)` writes them.
 
     Parameters
     ----------
-    runs : Run
-        Those of one mechanism under one kind of control share a figure.
+    shown : Run, or one LinearModel or GainLocus
+        Runs of one mechanism under one kind of control share a figure. A linear model has poles and modes.
 
     Returns
     -------
@@ -168,11 +171,11 @@ def plot(*runs: Run) -> Figures:
     Raises
     ------
     InputError
-        No run; matplotlib missing.
+        Nothing, or something else; matplotlib missing.
     """
     from ckc_pin.view.inline import Figures
 
-    return Figures(runs)
+    return Figures(shown)
 
 
 def singularity_map(

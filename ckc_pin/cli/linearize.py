@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["linearize"]
 
+OF_MODEL = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # not always written again
+
 
 @click.command(
     epilog=options.examples(
@@ -36,9 +39,9 @@ __all__ = ["linearize"]
 @click.argument("what", metavar="MECHANISM|SCENE", help="A mechanism or a scene.")
 @click.option(
     "--at",
-    metavar="equilibrium|assembled|T|JSON",
-    help="About the stable equilibrium (what is taken without it), an instant of the scene's run in s, or as assembled "
-    "or at coordinates, held by its motors.",
+    metavar="equilibrium|assembled|target|T|JSON",
+    help="About the stable equilibrium (what is taken without it), an instant of the scene's run in s, or as "
+    "assembled, at the set point's target or at coordinates, held by its motors.",
 )
 @click.option(
     "--period",
@@ -70,7 +73,7 @@ def linearize(
         _print(found.plain() if as_json else floquet_text(found), out)
         return
     with Working(f"linearizing {what}"):
-        model = ckc_pin.linearize(what, _at(at or "equilibrium"), read_changes("--set", changes))
+        model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_changes("--set", changes))
     if out is not None:
         _write(model, what, changes, out)
     _print(linear_plain(model) if as_json else linear_text(model), out)
@@ -86,7 +89,7 @@ def _print(found: dict[str, Any] | Text, out: Path | None) -> None:
 
 
 def _at(given: str) -> At:
-    if given in ("equilibrium", "assembled"):
+    if given in ("equilibrium", "assembled", "target"):
         return given
     if given.lstrip().startswith("{"):
         return read_table("--at", given)
@@ -94,7 +97,8 @@ def _at(given: str) -> At:
         return float(given)
     except ValueError:
         raise InputError(
-            f"--at {given!r:.80}: give equilibrium, assembled, a time in seconds, or a table of coordinates as JSON"
+            f"--at {given!r:.80}: give equilibrium, assembled, target, a time in seconds, or a table of coordinates as "
+            "JSON"
         ) from None
 
 
@@ -106,18 +110,20 @@ def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
 
 
 def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> None:
-    """Save the model and its modes, whatever signals come, then draw them."""
-    from ckc_pin.simulation.locus import gain_locus
+    """Save the model and its modes in the place of those of before, whatever signals come, then draw them."""
     from ckc_pin.simulation.sway import sways
 
     with interrupts.deferred(), ExitStack() as stack:
         stack.enter_context(alone_in(out))
+        for path in out.iterdir():
+            if OF_MODEL.fullmatch(path.name) and path.is_file():
+                path.unlink()
         save_linear(model, out / "linear.npz")
         for number, run in sways(model).items():
             run.save(out / f"mode_{number}.npz")
         try:
             from ckc_pin.view.linear_figure import save_linear_figures
 
-            save_linear_figures(model, gain_locus(what, read_changes("--set", changes)), out)
+            save_linear_figures(model, ckc_pin.gain_locus(what, changes=read_changes("--set", changes)), out)
         except InputError as error:  # matplotlib is an extra; the model is saved
             errors().print(f"no figures: {error}")

@@ -8,6 +8,7 @@ from ckc_pin.simulation.inverse import inverse_dynamics
 from ckc_pin.simulation.ivp import as_ivp
 from ckc_pin.simulation.linear_model import LinearModel
 from ckc_pin.simulation.linearize import linearize
+from ckc_pin.simulation.locus import GainLocus, gain_locus
 from ckc_pin.simulation.motion_forces import MotionForces
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, load_scene
@@ -21,6 +22,7 @@ __all__ = [
     "Check",
     "Event",
     "Floquet",
+    "GainLocus",
     "LinearModel",
     "MotionForces",
     "Run",
@@ -33,6 +35,7 @@ __all__ = [
     "check",
     "ensemble",
     "floquet",
+    "gain_locus",
     "inverse_dynamics",
     "linearize",
     "load_scene",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from itertools import count
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native.plant import NONE, Plant
 from ckc_pin.simulation.modes import NO_DAMPING, ComplexArray, Mode, eigenvalues_of, modes_of
 from ckc_pin.simulation.resting import kernel, unbalanced
+
+if TYPE_CHECKING:
+    from ckc_pin.simulation.run import Run
 
 __all__ = ["LinearModel", "Mode", "eigenvalues_of", "linear_model"]
 
@@ -94,13 +98,21 @@ class LinearModel:
         tree = self.mechanism.tree
         return tree.reach[[tree.index[name] for name in self.states[: len(self.states) // 2]]]
 
+    def sway(self, number: int) -> Run | None:
+        """Return a mode, counted from 1, as a run to play; see `ckc_pin.simulation.sway.sway`."""
+        from ckc_pin.simulation.sway import sway
+
+        return sway(self, number)
+
     def to_statespace(self) -> Any:
         """Return the model for python-control, a `control.StateSpace` with the same names, dots as underscores.
+
+        Of names that are the same then, the later ones get a number.
 
         Raises
         ------
         InputError
-            python-control is not installed.
+            python-control is not installed, or there are no motors, and with them no inputs.
         """
         try:
             import control
@@ -108,14 +120,25 @@ class LinearModel:
             raise InputError(
                 "to_statespace needs python-control, which is not installed: pip install ckc_pin[control]"
             ) from error
-        names = ([name.replace(".", "_") for name in x] for x in (self.states, self.inputs, self.outputs))
-        states, inputs, outputs = names
-        return control.ss(self.A, self.B, self.C, self.D, states=states, inputs=inputs, outputs=outputs, name=self.name)
+        if not self.inputs:
+            raise InputError(f"{self.name}: no motors, so that there are no inputs, which python-control asks for")
+        states, inputs, outputs = (_told_apart(x) for x in (self.states, self.inputs, self.outputs))
+        (name,) = _told_apart((self.name,))
+        return control.ss(self.A, self.B, self.C, self.D, states=states, inputs=inputs, outputs=outputs, name=name)
 
     def __repr__(self) -> str:
         head = f"LinearModel of {self.name} {self.at}: {len(self.states)} states, {len(self.inputs)} inputs"
         shown = [f"  {says}" for says in (*_rows(self), *(f"note: {note}" for note in self.notes))]
         return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {_some(self.states)}", *shown])
+
+
+def _told_apart(names: tuple[str, ...]) -> list[str]:
+    made: list[str] = []
+    for name in names:
+        plain = name.replace(".", "_")
+        again = (f"{plain}_{k}" for k in count(2))
+        made.append(plain if plain not in made else next(x for x in again if x not in made))
+    return made
 
 
 def _some(names: tuple[str, ...]) -> str:

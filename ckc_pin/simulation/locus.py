@@ -9,72 +9,104 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.libraries import library_of
+from ckc_pin.simulation.modes import ComplexArray, eigenvalues_of
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.scene import Scene, load_scene
 
 __all__ = ["GainLocus", "gain_locus"]
 
 FACTORS = np.geomspace(0.01, 10.0, 121)
+GAINS = {SetPoint: ("K_P", "K_V"), Tracking: ("K_D", "Lambda")}
 
 
 @dataclass(frozen=True)
 class GainLocus:
-    """Eigenvalues of a scene's closed loop by a factor on one gain.
+    """Eigenvalues of a scene's closed loop by a factor on one gain; `ckc_pin.plot` draws it.
 
     Attributes
     ----------
     name : str
         The scene's.
-    gain : "K_P" or "K_D"
-        Of a set point, of tracking.
+    gain : "K_P" or "K_V"; "K_D" or "Lambda"
+        Of a set point; of tracking.
+    at : str
+        The state, in words.
     factors : (m,) array
     eigenvalues : (m, 2 d) complex array
-        1/s, at the target or at the start of the desired motion; those of one row in no order.
+        1/s, at the target or at the start of the desired motion; those of one row in falling order of real parts.
     """
 
     name: str
     gain: str
+    at: str
     factors: Array
-    eigenvalues: NDArray[np.complex128]
+    eigenvalues: ComplexArray
 
 
-def gain_locus(what: str | Path, changes: Mapping[str, Any] | None = None) -> GainLocus | None:
-    """Return the locus of a scene's closed loop; None where it has no set point and no tracking, or cannot be there.
+def gain_locus(
+    what: Scene | str | Path, gain: str | None = None, changes: Mapping[str, Any] | None = None
+) -> GainLocus | None:
+    """Return the locus of a scene's closed loop over a gain.
 
     Parameters
     ----------
-    what : str or Path
-        A scene; of a mechanism there is none.
+    what : Scene, str or Path
+        A scene, itself, its name or path.
+    gain : "K_P", "K_V", "K_D" or "Lambda", optional
+        One of its controller's; absent, K_P of a set point and K_D of tracking.
+    changes : mapping, optional
+        Values of the scene by dotted key; with a name.
+
+    Returns
+    -------
+    GainLocus or None
+        None where it is no scene, has no set point and no tracking, or cannot be at its target or start. Sampling,
+        torque limits and dry friction are not in it.
+
+    Raises
+    ------
+    InputError
+        No such gain, or what cannot be loaded.
+    NumericalError
+        J has lost rank there.
     """
-    if not names_a_scene(str(what)):
-        return None
-    scene = load_scene(what, changes)
-    mechanism = scene_mechanism(scene)
-    law = scene_controller(scene, mechanism)
+    require_kind(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
+    if not isinstance(what, Scene):
+        if not names_a_scene(str(what)):
+            return None
+        what = load_scene(what, changes)
+    mechanism = scene_mechanism(what)
+    law = scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):
         return None
+    gains = GAINS[type(law)]
+    if gain is not None and gain not in gains:
+        raise InputError(f"gain_locus: gain = {gain!r:.80}: the controller of {what.name} has {' and '.join(gains)}")
+    gain = gain or gains[0]
+    at_rest = isinstance(law, SetPoint)
     q, q_dot = (law.q_d, np.zeros(mechanism.d)) if isinstance(law, SetPoint) else law.desired(0.0)[:2]
     found = sigma(mechanism, q)
     if found.verdict != "converged":
         return None
-    gain = "K_P" if isinstance(law, SetPoint) else "K_D"
     state = Terms(mechanism, found.at, found.at.rho @ q_dot)
     values = []
     with one_blas_thread():
-        loop = ClosedLoop(mechanism, law, scene.spec.friction_smoothing, library_of(mechanism, scene.spec.solver.terms))
+        loop = ClosedLoop(mechanism, law, what.spec.friction_smoothing, library_of(mechanism, what.spec.solver.terms))
         for factor in FACTORS:
             turned = copy.copy(law)
             setattr(turned, gain, factor * getattr(law, gain))
             loop.law = turned
-            values.append(np.linalg.eigvals(loop.at(0.0, state).closed))
-    return GainLocus(scene.name, gain, FACTORS, np.array(values))
+            values.append(eigenvalues_of(loop.at(0.0, state).closed))
+    at = "at its target" if at_rest else "at the start of the desired motion"
+    return GainLocus(what.name, gain, at, FACTORS, np.array(values))

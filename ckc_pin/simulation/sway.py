@@ -87,7 +87,8 @@ def _swing(model: LinearModel, shape: ComplexArray, swing: ComplexArray, rate: c
 def _run(model: LinearModel, number: int, mode: Mode, seconds: Array, states: list[Terms]) -> Run:
     mechanism, m = model.mechanism, len(seconds)
     rows = mechanism.closure.rows
-    name = f"{model.name}: mode {number}, {mode.says}"
+    says = f"{mode.frequency:.4g} Hz" if mode.frequency else mode.says
+    name = f"{model.name}: mode {number}, {says}"  # without its damping
     stats: dict[str, Any] = dict.fromkeys(
         ("rhs", "steps", "rejected", "newton", "factorizations", "jacobians", "switches"), 0
     )

@@ -9,9 +9,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ckc_pin.simulation.linear_model import LinearModel
+from ckc_pin.simulation.locus import GainLocus
 from ckc_pin.simulation.run import Run
 from ckc_pin.view.figures import draw, write_figures
 from ckc_pin.view.gif import save_gif
+from ckc_pin.view.linear_figure import draw_linear
 from ckc_pin.view.player import html, write_page
 
 if TYPE_CHECKING:
@@ -24,15 +27,19 @@ RESOLUTION = 100  # of a figure in a page
 
 
 class Figures(Mapping[str, "Figure"]):
-    """Figures of runs by name, as `view.figures.draw` draws them; shown inline by a notebook.
+    """Figures by name, as `view.figures.draw` and `view.linear_figure.draw_linear` draw them; shown by a notebook.
 
     Parameters
     ----------
-    runs : sequence of Run
+    shown : sequence of Run, or of one LinearModel or GainLocus
     """
 
-    def __init__(self, runs: Sequence[Run]) -> None:
-        self._figures = draw(runs)
+    def __init__(self, shown: Sequence[Run | LinearModel | GainLocus]) -> None:
+        match shown:
+            case [LinearModel() | GainLocus() as one]:
+                self._figures = draw_linear(one)
+            case _:
+                self._figures = draw(shown)  # type: ignore[arg-type]
 
     def __getitem__(self, name: str) -> Figure:
         """Return matplotlib's figure, to be changed as any."""

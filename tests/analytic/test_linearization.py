@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -274,6 +275,32 @@ def test_other_refusals() -> None:
     event = {"coordinate": "theta_1", "of": "q_dot", "value": -0.5, "stop": True}
     with pytest.raises(InputError, match=r"ends at t = 0\..* s: stopped by the event"):
         linearize("five_bar/swing", 1.9, {"event": [event]})
+
+
+@pytest.mark.parametrize("at", [np.zeros(2), [1.0, 2.0], 10**400, float("inf"), True, None, "2.0"])
+def test_what_is_no_state_is_refused(at: Any) -> None:
+    with pytest.raises(InputError, match=r"give \"equilibrium\", \"assembled\", \"target\", a time"):
+        linearize("five_bar/swing", at)
+
+
+def test_names_for_python_control_are_told_apart(tmp_path: Path) -> None:
+    """A joint called x_dot beside x, and two names that differ in a dot alone."""
+    folder = tmp_path / "it"
+    coupled_four_bar(folder)
+    urdf = (folder / "it.urdf").read_text()
+    names = {"crank": "x", "coupler": "x_dot", "rocker": "x.dot"}
+    text = (folder / "mechanism.toml").read_text().replace('name = "coupled"', 'name = "it.is"')
+    for old, new in names.items():
+        urdf = urdf.replace(f'name="{old}"', f'name="{new}"')
+        text = text.replace(f'"{old}"', f'"{new}"').replace(f"\n{old} =", f'\n"{new}" =')
+    (folder / "it.urdf").write_text(urdf)
+    (folder / "mechanism.toml").write_text(text)
+    plant = linearize(load(str(folder / "mechanism.toml"))).to_statespace()
+    assert plant.name == "it_is"
+    assert plant.output_labels[:3] == ["x", "x_dot", "x_dot_2"]
+    coupled_four_bar(tmp_path, actuated="actuated = []")
+    with pytest.raises(InputError, match=r"coupled: no motors"):
+        linearize(load(str(tmp_path / "mechanism.toml"))).to_statespace()
 
 
 def test_where_q_is_no_chart_others_are() -> None:

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin import Run, check, floquet, linearize
-from ckc_pin.simulation.locus import gain_locus
+from ckc_pin import Run, check, floquet, gain_locus, linearize, plot
 from ckc_pin.simulation.sway import sways
-from ckc_pin.view.linear_figure import draw_locus, draw_modes, draw_poles
 from tests.analytic.small_models import plate_on_springs
 from tests.contract.helpers.command import ckc
 
@@ -90,7 +88,9 @@ def test_out_writes_model_figures_and_modes_to_play(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        (("five_bar", "--at", "sometimes"), "give equilibrium, assembled, a time in seconds"),
+        (("five_bar", "--at", "sometimes"), "give equilibrium, assembled, target, a time in seconds"),
+        (("five_bar", "--at", ""), "give equilibrium, assembled, target, a time in seconds"),
+        (("five_bar", "--at", '{"theta_1": 0.3, "theta_1": 0.4}'), "theta_1 is given twice"),
         (("five_bar/swing", "--at", "3"), "outside the run of five_bar/swing, which lasts from 0 to 2 s"),
         (("five_bar", "--at", '{"theta_1": 0.3}'), "theta_3 missing"),
         (("five_bar", "--at", '{"theta_1": 3.0, "theta_3": 0.1}'), "is out of reach"),
@@ -205,20 +205,20 @@ def test_the_root_locus_crosses_at_the_least_gain() -> None:
 
 def test_figures_show_poles_modes_and_the_locus() -> None:
     model = linearize("five_bar/set_point", 0.5)
-    ax = draw_poles(model).axes[0]
+    ax = plot(model)["poles"].axes[0]
     plant, closed = (np.sort_complex(line.get_xdata() + 1j * line.get_ydata()) for line in ax.lines[-2:])
     assert model.closed_loop is not None
     assert np.array_equal(plant, np.sort_complex(model.eigenvalues))
     assert np.abs(closed - np.sort_complex(np.linalg.eigvals(model.closed_loop))).max() < 1e-9
     low, high = ax.get_xlim()
     assert low < closed.real.min() < plant.real.max() < high
-    panels = draw_modes(linearize("stewart")).axes
+    panels = plot(linearize("stewart"))["modes"].axes
     assert len(panels) == 6
     assert panels[0].get_title(loc="left").startswith("1: 1.503 Hz")
     locus = gain_locus("three_rrr/circle")
     assert locus is not None
     assert locus.gain == "K_D"
-    assert len(draw_locus(locus).axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
+    assert len(plot(locus)["locus"].axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
 
 
 def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_period_later(
@@ -226,7 +226,7 @@ def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_pe
 ) -> None:
     monkeypatch.setattr("ckc_pin.simulation.sway.LARGEST", 0.01)
     model = linearize(plate_on_springs(tmp_path))  # with dampers, so that not all coordinates are in phase
-    figure, sways_in_time = draw_modes(model), sways(model)
+    figure, sways_in_time = plot(model)["modes"], sways(model)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
         "at one instant",
         "a quarter of a period later",
@@ -247,8 +247,30 @@ def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_pe
         assert np.abs(seen - parts).max() < 0.05
 
 
+def test_a_used_folder_keeps_nothing_of_another_model(tmp_path: Path) -> None:
+    kept = tmp_path / "mode_of_mine.npz"
+    kept.write_bytes(b"")
+    assert ckc("linearize", "five_bar/set_point", "--at", "target", "--out", str(tmp_path)).code == 0
+    assert (tmp_path / "locus.png").exists()
+    (tmp_path / "mode_9.npz").write_bytes(b"")
+    assert ckc("linearize", "slider_crank", "--out", str(tmp_path)).code == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "linear.npz", "mode_1.npz", "mode_of_mine.npz", "modes.png", "poles.png",
+    ]  # fmt: skip
+
+
+def test_a_run_that_stops_before_is_for_the_numerics() -> None:
+    answer = ckc("linearize", "five_bar/swing", "--at", "1.5", "--set", "solver.max_rhs=20", "--json")
+    assert answer.code == 3
+    assert "ends at t = " in answer.json["message"]
+
+
 def test_an_undamped_mode_has_no_damping_ratio_of_rounding() -> None:
-    assert sways(linearize("stewart"))[1].scene_name.endswith("mode 1, 1.503 Hz, damping ratio 0")
+    model = linearize("stewart")
+    assert model.modes[0].says == "1.503 Hz, damping ratio 0"
+    run = model.sway(1)
+    assert run is not None
+    assert run.scene_name == "stewart: mode 1, 1.503 Hz", "a run of it has none"
 
 
 def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
