@@ -14,9 +14,10 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["Desired", "Harmonics", "Table", "read_columns", "read_desired", "read_table"]
+__all__ = ["Desired", "Harmonics", "Table", "cycles", "read_columns", "read_desired", "read_table"]
 
 FEWEST = 6  # rows that a quintic spline needs
+STILL = 1e-9  # rad or m, of a table's numbers: what moves no further does not move
 
 
 class Desired(Protocol):
@@ -26,6 +27,11 @@ class Desired(Protocol):
         """Return q_d, its rate and its acceleration at time t (s), each of shape (d,)."""
 
 
+def cycles(desired: Desired, t_end: float) -> float:
+    """Return how often the quickest part of a trajectory comes round in t_end (s): 0 where it does not say."""
+    return float(getattr(desired, "fastest", 0.0)) * t_end / (2 * np.pi)
+
+
 class Harmonics:
     """offset + sum of amplitude * sin(frequency * t + phase), per coordinate.
 
@@ -33,6 +39,11 @@ class Harmonics:
     ----------
     specs : sequence of HarmonicsSpec
         In the order of `independent`.
+
+    Attributes
+    ----------
+    fastest : float
+        Of its waves' frequencies, rad/s.
     """
 
     def __init__(self, specs: Sequence[HarmonicsSpec]) -> None:
@@ -42,6 +53,7 @@ class Harmonics:
             waves[:, k, : len(spec.harmonics)] = np.array(spec.harmonics).reshape(-1, 3).T
         self.offset = np.array([spec.offset for spec in specs])
         self.amplitude, self.frequency, self.phase = waves
+        self.fastest = float(np.abs(self.frequency[self.amplitude != 0]).max(initial=0.0))
         self.end = np.inf
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
@@ -67,6 +79,9 @@ class Table:
     ----------
     spline : scipy.interpolate.BSpline
         q_d.
+    fastest : float
+        Frequency of a wave with the ratio of largest acceleration to largest rate of the table's quickest column,
+        rad/s.
     """
 
     def __init__(self, t: Array, q: Array) -> None:
@@ -75,6 +90,9 @@ class Table:
         self.spline = make_interp_spline(t, q, k=5)
         self._q_dot = self.spline.derivative()
         self._q_ddot = self._q_dot.derivative()
+        moves = np.ptp(q, axis=0) > STILL * (1 + np.abs(q).max(axis=0))
+        rates, changes = (np.abs(f(t)[:, moves]).max(axis=0) for f in (self._q_dot, self._q_ddot))
+        self.fastest = float((changes / rates).max(initial=0.0))
         self.end = float(t[-1])
 
     def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:

@@ -33,7 +33,15 @@ BISECTIONS = 50
 
 
 class Place(Protocol):
-    """A place over time."""
+    """A place over time.
+
+    Attributes
+    ----------
+    fastest : float
+        As a trajectory's, rad/s.
+    """
+
+    fastest: float
 
     def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
         """Return x, its rate and its acceleration, each of shape (3,) or (count, 3), metres and seconds."""
@@ -127,7 +135,7 @@ class Circle:
         normal = np.array(spec.normal)
         if not np.linalg.norm(normal) > 0:
             raise InputError("controller.desired.circle: normal is no direction; give three numbers, not all zero")
-        self.spec = spec
+        self.spec, self.fastest = spec, abs(spec.frequency)
         self.centre = np.array(spec.centre)
         self.a, self.b = perpendicular(normal / np.linalg.norm(normal))
 
@@ -144,7 +152,7 @@ class Line:
     """The middle of start and end, minus half the way times cos(frequency t): at rest at both ends."""
 
     def __init__(self, spec: LineSpec) -> None:
-        self.spec = spec
+        self.spec, self.fastest = spec, abs(spec.frequency)
         self.middle = (np.array(spec.start) + np.array(spec.end)) / 2
         self.half = (np.array(spec.end) - np.array(spec.start)) / 2
 
@@ -171,6 +179,8 @@ class PointPath:
     ----------
     leaves_at : float or None
         When the path leaves the workspace of its working mode or of its assembly branch, s.
+    fastest : float
+        Of the path, rad/s.
 
     Raises
     ------
@@ -181,6 +191,7 @@ class PointPath:
     def __init__(self, point: Point, place: Place, t_end: float) -> None:
         self.point = point
         self.place = place
+        self.fastest = place.fastest
         self.leaves_at: float | None = None
         with one_blas_thread():
             try:

@@ -139,7 +139,7 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
         )
     if stable is not None:
         stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.sampled))
-    warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired)
+    warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired, what.spec.t_end)
     warnings += stability_warning(stable, mechanism.independent)
     found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
     found = replace(found, stability=stable)
@@ -152,7 +152,7 @@ def run_warnings(scene: Scene) -> list[str]:
         return []
     mechanism = scene_mechanism(scene)
     desired = _desired(scene_controller(scene, mechanism), mechanism, scene.spec.t_end)
-    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, desired)
+    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, desired, scene.spec.t_end)
 
 
 def _branches(mechanism: Mechanism) -> Array:
@@ -252,7 +252,7 @@ def _limits(mechanism: Mechanism, q_tree: Array, what: str) -> list[str]:
     return [f"{what} is outside joint limits: {', '.join(outside)}"] if outside else []
 
 
-def _desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None) -> list[str]:
+def _desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None, t_end: float) -> list[str]:
     if desired is None:
         return []
     if desired.leaves_at is not None:
@@ -260,10 +260,16 @@ def _desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None) -> lis
             f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s: "
             f"{', '.join(mechanism.independent)} cannot follow it from there"
         ]
+    says = []
+    if desired.until < t_end:
+        says.append(
+            f"the desired trajectory is so quick that it was followed to t = {desired.until:.5g} s only: whether it "
+            "leaves the workspace later is not known"
+        )
     usual = mechanism.assembled.sigma_min()
     if desired.sigma_min < MARGIN * usual:
-        return [
+        says.append(
             f"the desired trajectory comes close to a singular configuration at t = {desired.closest_t:.5f} s: "
             f"sigma_min(phi_z) = {desired.sigma_min:.3g} there, {usual:.3g} as assembled"
-        ]
-    return []
+        )
+    return says

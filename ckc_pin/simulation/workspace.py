@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ckc_pin.control.desired import Desired
+from ckc_pin.control.desired import Desired, cycles
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
@@ -14,7 +14,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["DesiredCheck", "follow_desired", "leaving"]
 
-SAMPLES = 1000
+SAMPLES, OF_A_CYCLE = 1000, 32  # at least so many, and of the quickest wave: a straight way between two is off by 0.5 %
+MOST = 10_000  # samples: seconds
+CANDIDATES = 5  # places where the margin may be least
 REFINEMENTS = 50  # bisections: to 1e-15 of a sample interval
 
 
@@ -30,19 +32,26 @@ class DesiredCheck:
         When it comes closest to a singular configuration; `leaves_at` when it leaves.
     sigma_min : float
         Smallest singular value of phi_z then; on the edge of the workspace it is zero.
+    until : float
+        How far it was followed, s: to its end, or as far as ten thousand samples go along quick waves. Infinite of
+        a set point.
     """
 
     leaves_at: float | None
     closest_t: float
     sigma_min: float
+    until: float = np.inf
 
 
-def follow_desired(mechanism: Mechanism, desired: Desired, t_end: float) -> DesiredCheck:
-    """Follow sigma(q_d(t)) over a run and find where it comes closest to a singular configuration."""
-    times = np.linspace(0.0, t_end, SAMPLES + 1)
-    first = sigma(mechanism, desired(0.0)[0])
+def follow_desired(
+    mechanism: Mechanism, desired: Desired, t_end: float, start: Kinematics | None = None
+) -> DesiredCheck:
+    """Follow sigma(q_d(t)) over a run, on the branch of `start`, and find where it comes closest to a singularity."""
+    samples = max(SAMPLES, int(np.ceil(OF_A_CYCLE * min(cycles(desired, t_end), MOST))))
+    times = np.linspace(0.0, t_end, samples + 1)[: MOST + 1]
+    first = sigma(mechanism, desired(0.0)[0], start)
     if first.verdict != "converged":
-        return DesiredCheck(0.0, 0.0, 0.0)
+        return DesiredCheck(0.0, 0.0, 0.0, 0.0)
     at, t_at = first.at, 0.0
     way = [(0.0, at.sigma_min(), at)]
     for t in times[1:]:
@@ -74,21 +83,38 @@ def leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: floa
             outside = middle
         else:
             inside, at = middle, moved
-    return DesiredCheck(inside, inside, at.sigma_min())
+    return DesiredCheck(inside, inside, at.sigma_min(), inside)
 
 
 def _closest(mechanism: Mechanism, desired: Desired, way: list[tuple[float, float, Kinematics]]) -> DesiredCheck:
+    """Look between samples where the margin is least: there the motion may also be outside for a moment."""
+    margins = np.array([margin for _, margin, _ in way])
+    around = np.concatenate([[np.inf], margins, [np.inf]])
+    lows = np.flatnonzero((margins <= around[:-2]) & (margins <= around[2:]))
+    lowest = lows[np.argsort(margins[lows], kind="stable")][:CANDIDATES]
+    finer = [_around(mechanism, desired, way, int(k)) for k in lowest]
+    if any(found.leaves_at is not None for found in finer):
+        every = (_around(mechanism, desired, way, int(k)) for k in lows)
+        return next(found for found in every if found.leaves_at is not None)
+    least = min(finer, key=lambda found: found.sigma_min)
+    return replace(least, until=way[-1][0])
+
+
+def _around(mechanism: Mechanism, desired: Desired, way: list[tuple[float, float, Kinematics]], k: int) -> DesiredCheck:
+    """Look between a sample's two neighbours."""
     from scipy.optimize import minimize_scalar
 
-    k = int(np.argmin([margin for _, margin, _ in way]))
-    t, margin, at = way[k]
-    low, high = way[max(k - 1, 0)][0], way[min(k + 1, len(way) - 1)][0]
+    (t, margin, at), near, outside = way[k], way[max(k - 1, 0) : k + 2], []
 
     def margin_at(time: float) -> float:
-        moved = _move(mechanism, at, desired, time)
+        moved = _move(mechanism, at, desired, time, anywhere=False)
+        if moved is None:
+            outside.append(time)
         return 0.0 if moved is None else moved.sigma_min()
 
-    finer = minimize_scalar(margin_at, bounds=(low, high), method="bounded", options={"xatol": 1e-9})
-    if finer.fun < margin:
-        t, margin = float(finer.x), float(finer.fun)
+    finer = minimize_scalar(margin_at, bounds=(near[0][0], near[-1][0]), method="bounded", options={"xatol": 1e-9})
+    if outside:
+        before = [sample for sample in near if sample[0] < min(outside)][-1]
+        return leaving(mechanism, desired, before[2], before[0], min(outside))
+    margin, t = min((margin, t), (float(finer.fun), float(finer.x)))
     return DesiredCheck(None, t, margin)

@@ -50,7 +50,7 @@ def test_check_of_a_mechanism() -> None:
 
 def test_check_of_a_scene_follows_its_trajectory() -> None:
     desired = ckc("check", "five_bar/tracking", "--json").json["desired"]
-    assert set(desired) == {"leaves_at", "closest_t", "sigma_min"}
+    assert set(desired) == {"leaves_at", "closest_t", "sigma_min", "until"}
     assert desired["leaves_at"] is None
     assert 0 <= desired["closest_t"] <= 9.5
     assert desired["sigma_min"] > 0

@@ -1,0 +1,44 @@
+"""Desired motions that are quick: the five-bar's elbows swing apart until the distal links are one line."""
+
+import numpy as np
+import pytest
+
+from ckc_pin import load
+from ckc_pin.control.desired import Desired, Harmonics, Table, cycles
+from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.simulation.workspace import follow_desired
+from tests.analytic.five_bar import FIVE_BAR
+
+EDGE = float(np.arcsin((FIVE_BAR.l[1] + FIVE_BAR.l[3] - FIVE_BAR.base) / (2 * FIVE_BAR.l[0])))  # of each link's swing
+
+
+def apart(swing: float, frequency: float) -> Harmonics:
+    waves = ([(sign * swing, frequency, 0.0)] for sign in (-1, 1))
+    return Harmonics([HarmonicsSpec(offset=-np.pi / 2, harmonics=wave) for wave in waves])
+
+
+@pytest.mark.parametrize("turns", [3.3, 100.0, 1000.0])
+def test_however_quick_a_motion_is_it_is_seen_to_leave(turns: float) -> None:
+    """It is outside for 2 % of each turn; the samples of a thousand turns must not see all of them at one phase."""
+    w = 2 * np.pi * turns
+    found = follow_desired(load("five_bar"), apart(1.002 * EDGE, w), 1.0)
+    assert found.leaves_at == pytest.approx(np.arcsin(1 / 1.002) / w, rel=1e-9)
+    assert found.until == found.leaves_at
+
+
+def test_of_a_motion_that_is_too_quick_to_be_followed_to_its_end_it_is_said_how_far() -> None:
+    found = follow_desired(load("five_bar"), apart(0.9 * EDGE, 2 * np.pi * 1e4), 1.0)
+    assert found.leaves_at is None
+    assert 100 < 1e4 * found.until < 1000
+
+
+def test_a_tables_quickest_wave_is_about_that_which_it_was_made_of() -> None:
+    random, t = np.random.default_rng(0), np.linspace(0.0, 3.0, 2001)
+    for _ in range(5):
+        slow, quick = random.uniform(1.0, 2.0), random.uniform(10.0, 40.0)
+        waves = np.column_stack([np.sin(slow * t), 0.3 * np.sin(quick * t + random.uniform(0, 6))])
+        table: Desired = Table(t, waves)
+        assert cycles(table, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-3)
+        written = Table(t, np.round(waves, 7))  # as a file has it: rounding is no wave
+        assert cycles(written, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-2)
+    assert cycles(Table(t, np.ones((2001, 1))), 3.0) == 0.0
