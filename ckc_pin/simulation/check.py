@@ -131,7 +131,9 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     controller = scene_controller(what, mechanism)
     desired = _desired(controller, mechanism, what.spec.t_end)
     stable = None
-    if isinstance(controller, SetPoint | Tracking) and desired is not None and desired.leaves_at is None:
+    if desired is not None and desired.leaves_at is not None:
+        stable = Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
+    elif isinstance(controller, SetPoint | Tracking):
         library = None if what.spec.solver.terms == "pinocchio" else find(mechanism)
         spec = what.spec
         stable = stability(

@@ -147,13 +147,15 @@ def stability_plain(found: Stability | None) -> dict[str, Any] | None:
         return None
     return {
         **vars(found),
-        "eigenvalues": pairs(found.eigenvalues),
+        "eigenvalues": None if found.eigenvalues is None else pairs(found.eigenvalues),
         "least_K_P": None if found.least_K_P is None else found.least_K_P.tolist(),
     }
 
 
 def stability_text(found: Stability) -> str:
     """Say in a line whether a closed loop is stable, and how much."""
+    if found.stable is None:
+        return f"not known whether it is stable: {found.reason}"
     says = "stable" if found.stable else "UNSTABLE"
     if found.leaves_out:
         says += f", {' and '.join(found.leaves_out)} left out,"
@@ -165,35 +167,46 @@ def stability_text(found: Stability) -> str:
         )
     if found.multiplier is not None:
         says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
-    slowest = f", slowest decay {found.slowest:.3g} s" if np.isfinite(found.slowest) else ""
+    slowest = "" if found.slowest is None or np.isinf(found.slowest) else f", slowest decay {found.slowest:.3g} s"
     return f"{says} at its target{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
 
 
 def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> list[str]:
-    """Say of an unstable loop what would make it stable."""
+    """Say of an unstable loop what would make it stable, and of one that may be why it is not known."""
     if found is None or found.stable:
         return []
-    if found.least_K_P is None and found.sampled:
+    if found.stable is None:
+        return [f"whether the closed loop is stable is not known: {found.reason}"]
+    if found.growth is not None:
+        along = "along the desired motion" + (" as sampled" if found.sampled else "")
+        helps = (
+            "; sample more often, delay less, or take other gains" if found.sampled else
+            "; larger Lambda and K_D would help"
+        )  # fmt: skip
         return [
-            "the closed loop is unstable along the desired motion as sampled: an error may be "
-            f"{found.growth:.3g} times as large at its end; sample more often, delay less, or take other gains"
+            f"the closed loop is unstable {along}: an error may be {found.growth:.3g} times as large at its end{helps}"
         ]
-    if found.least_K_P is None:
-        return [
-            f"the closed loop is unstable along the desired motion: an error may be {found.growth:.3g} times as large "
-            "at its end; larger Lambda and K_D would help"
-        ]
+    assert found.eigenvalues is not None
+    assert found.least_eigenvalue is not None
     worst = float(found.eigenvalues[0].real)
+    if found.least_eigenvalue <= 0:
+        least = (
+            ""
+            if found.least_K_P is None
+            else f"; the least K_P in its proportions is {_gain(found.least_K_P, independent)}"
+        )
+        return [
+            f"the closed loop is unstable at its target: eigenvalue {worst:.3g} 1/s, and K_P + dh/dq has the "
+            f"eigenvalue {found.least_eigenvalue:.4g}{least}"
+        ]
     if found.multiplier is not None and worst < 0:
         return [
             f"the closed loop is unstable as sampled: errors grow {found.multiplier:.4g} times a sample, while without "
             "sampling and delay they would decay; sample more often, delay less, or take smaller gains"
         ]
-    if not found.least_K_P.any():
-        return [f"the closed loop does not come to rest at its target (eigenvalue {worst:.3g} 1/s): K_V is too small"]
     return [
-        f"the closed loop is unstable at its target: eigenvalue {worst:.3g} 1/s, and K_P + dh/dq has the eigenvalue "
-        f"{found.least_eigenvalue:.4g}; the least K_P in its proportions is {_gain(found.least_K_P, independent)}"
+        "the closed loop does not come to rest at its target: something swings about it that neither K_V nor the "
+        "joints damp; give K_V, or a larger one"
     ]
 
 

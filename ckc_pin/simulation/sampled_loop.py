@@ -15,7 +15,7 @@ from ckc_pin.simulation.closed_loop import Feedback
 __all__ = ["MOST_DELAYED", "MOST_SAMPLES", "sampled_loop", "sampled_motion"]
 
 MOST_DELAYED = 200  # samples that a delay may last for the matrix to be made
-MOST_SAMPLES = 20_000  # along a motion
+MOST_SAMPLES = 50_000  # along a motion
 ONE = 1e-9  # of a sample time: instants nearer than that are one
 
 
@@ -57,7 +57,7 @@ def sampled_loop(loop: Feedback, sample_time: float, delay: float) -> Array:
 
 def sampled_motion(
     pieces: Sequence[Feedback], dt: float, start: Array, sample_time: float, delay: float
-) -> list[Array]:
+) -> list[tuple[Array, float]]:
     """Return what states become along a motion whose loop is another one in each piece of time.
 
     Parameters
@@ -72,8 +72,9 @@ def sampled_motion(
 
     Returns
     -------
-    list of (2 d, k) arrays
-        At the start and at the end of each piece.
+    list of ((2 d, k) array, float)
+        At the start and at the end of each piece: the states divided by a factor that keeps them numbers, and its
+        logarithm.
     """
     near, end = ONE * sample_time, len(pieces) * dt
     samples = sample_time * np.arange(int((end + near) / sample_time) + 1)
@@ -84,20 +85,31 @@ def sampled_motion(
     def constant_input(piece: int, spans: int) -> tuple[Array, Array]:
         return _constant_input(pieces[piece], near * spans)
 
-    x, u, number, found = start, np.zeros((pieces[0].B.shape[1], start.shape[1])), 0, [start]
+    x, u, number, log = start, np.zeros((pieces[0].B.shape[1], start.shape[1])), 0, 0.0
+    found = [(x, log)]
     under_way: deque[tuple[float, Array]] = deque()
     for t, then in pairwise(instants):
         piece = min(int((t + near) / dt), len(pieces) - 1)
         if number < len(samples) and samples[number] <= t + near:
-            under_way.append((samples[number] + delay, pieces[piece].K @ x))
+            under_way.append((samples[number] + delay, _gain(pieces, samples[number] / dt) @ x))
             number += 1
         while under_way and under_way[0][0] <= t + near:
             u = under_way.popleft()[1]
         state, force = constant_input(piece, round((then - t) / near))
         x = state @ x + force @ u
         if int((then + near) / dt) > piece:
-            found.append(x)
+            size = max(1e-300, *(float(np.abs(y).max()) for y in (x, u, *(y for _, y in under_way))))
+            x, u, log = x / size, u / size, log + float(np.log(size))
+            under_way = deque((when, y / size) for when, y in under_way)
+            found.append((x, log))
     return found
+
+
+def _gain(pieces: Sequence[Feedback], t: float) -> Array:
+    """K at an instant, in pieces, on a line between those of two middles."""
+    k = min(max(int(t - 0.5), 0), max(len(pieces) - 2, 0))
+    one, two = pieces[k].K, pieces[min(k + 1, len(pieces) - 1)].K
+    return np.asarray(one + (t - 0.5 - k) * (two - one))
 
 
 def _constant_input(loop: Feedback, seconds: float) -> tuple[Array, Array]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.desired import cycles
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
@@ -23,8 +25,10 @@ from ckc_pin.simulation.sampled_loop import sampled_loop, sampled_motion
 
 __all__ = ["Stability", "stability"]
 
-FEWEST, MOST = 48, 768  # steps of the variational equation
-AGREED = 0.05  # of the growth, between a number of steps and half as many: it is known four times as well
+FEWEST, MOST = 24, 8192  # steps of the variational equation
+OF_A_CYCLE = 4  # steps of the quickest wave, where half as many are taken: all of them see it at different phases
+AGREED = 0.02  # of the growth, between a number of steps and half as many: it is known four times as well
+SURELY = 0.3  # of the growth's logarithm: where half as many steps are off by more, its sign is not known
 SURE = 1e-12  # of the fastest eigenvalue: what is no further left of the axis may be on it
 NEWTON = 30  # iterations to where a controller with a model of its own comes to rest
 
@@ -35,8 +39,11 @@ class Stability:
 
     Attributes
     ----------
-    stable : bool
-    eigenvalues : (2 d,) complex array
+    stable : bool or None
+        None where it is not known; what is not known besides is None too.
+    reason : str or None
+        Why not.
+    eigenvalues : (2 d,) complex array or None
         Of the closed loop at its target, 1/s, in falling order of real parts; of tracking at the start of the motion,
         where they say nothing about the rest of it.
     least_K_P : (d, d) array or None
@@ -44,25 +51,25 @@ class Stability:
         stable; zero where it is without any.
     least_eigenvalue : float or None
         Of a set point: of K_P + dh/dq, N m/rad; the stiffness that is left in its weakest direction.
-    slowest : float
+    slowest : float or None
         Time constant of the slowest decay, s: infinite where there is none. Of tracking, of the whole motion.
     growth, largest_growth : float or None
-        Of tracking: by how much the variational equation multiplies an error of position that starts with e_dot = 0,
-        the worst there is, until the end of the motion, and at most on the way.
+        Of tracking: by how much the variational equation multiplies the worst error of state until the end of the
+        motion, and at most on the way, measured by the root of eq. 18's function.
     sampled : bool
         Whether the verdict, `slowest` and `growth` are those of the loop as it is sampled and delayed.
     multiplier : float or None
         Of a set point that is sampled: the largest factor of an error from one sample to the next, delay included.
     leaves_out : tuple of str
-        What of the scene the linear model does not have: "sampling", "delay", "sensor and drive", "torque limits",
-        "dry friction".
+        What of the scene the linear model does not have: "sensor and drive", "torque limits", "dry friction".
     """
 
-    stable: bool
-    eigenvalues: NDArray[np.complex128]
-    least_K_P: Array | None
-    least_eigenvalue: float | None
-    slowest: float
+    stable: bool | None
+    reason: str | None = None
+    eigenvalues: NDArray[np.complex128] | None = None
+    least_K_P: Array | None = None
+    least_eigenvalue: float | None = None
+    slowest: float | None = None
     growth: float | None = None
     largest_growth: float | None = None
     sampled: bool = False
@@ -77,7 +84,7 @@ def stability(
     smoothing: float | None = None,
     sampling: tuple[float, float] | None = None,
     library: Library | None = None,
-) -> Stability | None:
+) -> Stability:
     """Linearize a controller's closed loop.
 
     Parameters
@@ -90,27 +97,23 @@ def stability(
         s; the verdict is then that of the sampled loop.
     library : Library, optional
         The mechanism's terms, compiled.
-
-    Returns
-    -------
-    Stability or None
-        None where the target or the motion cannot be reached, or nothing comes to rest.
     """
     import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
 
     with one_blas_thread():
-        loop = ClosedLoop(mechanism, law, smoothing, library)
-        if isinstance(law, SetPoint):
-            return _about(mechanism, law, loop, sampling)
-        return _along(mechanism, law, loop, t_end, sampling)
+        try:
+            loop = ClosedLoop(mechanism, law, smoothing, library)
+            if isinstance(law, SetPoint):
+                return _about(mechanism, law, loop, sampling)
+            return _along(mechanism, law, loop, t_end, sampling)
+        except NumericalError as error:
+            return Stability(None, str(error))
 
 
 def _about(
     mechanism: Mechanism, law: SetPoint, closed_loop: ClosedLoop, sampling: tuple[float, float] | None
-) -> Stability | None:
+) -> Stability:
     at = _rest(mechanism, law)
-    if at is None:
-        return None
     loop = closed_loop.at(0.0, Terms(mechanism, at, np.zeros(mechanism.n)))
     values = eigenvalues_of(loop.closed)
     stable, slowest = bool(values[0].real < -SURE * np.abs(values).max()), _time_constant(float(values[0].real))
@@ -132,19 +135,19 @@ def _about(
     )
 
 
-def _rest(mechanism: Mechanism, law: SetPoint) -> Kinematics | None:
+def _rest(mechanism: Mechanism, law: SetPoint) -> Kinematics:
     """Where the closed loop rests: its target, or near it where its model is another than the plant."""
     found = sigma(mechanism, law.q_d)
     for _ in range(NEWTON):
         if found.verdict != "converged":
-            return None
+            break
         state = Terms(mechanism, found.at, np.zeros(mechanism.n))
         missing = law.u(0.0, state) - state.h
         if np.abs(missing).max() <= 1e-10 * (np.abs(law.target.h) + np.abs(law.K_P).max(axis=1)).max():
             return found.at
         step = np.linalg.lstsq(law.K_P + h_gradient(mechanism, found.at), missing, rcond=None)[0]
         found = sigma(mechanism, state.q + step, found.at)
-    return None
+    raise NumericalError("where it comes to rest is not found")
 
 
 def _time_constant(rate: float) -> float:
@@ -156,65 +159,84 @@ def _time_constant(rate: float) -> float:
 
 def _along(
     mechanism: Mechanism, law: Tracking, loop: ClosedLoop, t_end: float, sampling: tuple[float, float] | None
-) -> Stability | None:
-    linear = _linear_along(mechanism, law, loop)
-    first = linear(0.0)
-    if first is None:
-        return None
-    steps, reach = FEWEST, mechanism.tree.reach[mechanism.partition.q]
+) -> Stability:
+    turns = cycles(law.desired, t_end)
+    if 2 * OF_A_CYCLE * turns > MOST:
+        most = MOST / (2 * OF_A_CYCLE * turns) * t_end
+        raise NumericalError(f"the desired motion is too quick to be followed for longer than {most:.3g} s")
+    steps, end = max(FEWEST, int(np.ceil(OF_A_CYCLE * turns))), np.nan
     while True:
-        pieces = [linear((k + 0.5) * t_end / steps) for k in range(steps)]
-        known = [x for x in pieces if x is not None and np.all(np.isfinite(x.closed))]
-        if len(known) < steps:
-            return None
-        coarse = [one.mean(two) for one, two in zip(known[::2], known[1::2], strict=True)]
-        grown, check = (_growth(x, t_end, reach, sampling) for x in (known, coarse))
-        if not abs(grown[-1] - check[-1]) > AGREED * grown[-1] or 2 * steps > MOST:
+        before, grown = end, _growth(*_pieces(mechanism, law, loop, t_end, steps), t_end, sampling)
+        end = float(grown[-1])
+        off = 0.0 if end == before else abs(end - before)  # both may be infinite
+        if off <= AGREED * max(1.0, abs(end)) or 2 * steps > MOST:
             break
         steps *= 2
+    known = off < SURELY * abs(end)
+    with np.errstate(over="ignore"):
+        growth, largest_growth = (float(np.exp(x)) for x in (end, grown.max()))
     return Stability(
-        stable=bool(grown[-1] < 1.0),
-        eigenvalues=eigenvalues_of(first.closed),
-        least_K_P=None,
-        least_eigenvalue=None,
-        slowest=_time_constant(float(np.log(max(grown[-1], 1e-300))) / t_end),
-        growth=float(grown[-1]),
-        largest_growth=float(grown.max()),
+        stable=end < 0 if known else None,
+        eigenvalues=eigenvalues_of(loop.at(0.0, _desired_state(mechanism, law, 0.0, mechanism.assembled)).closed),
+        slowest=_time_constant(end / t_end),
+        growth=growth,
+        largest_growth=largest_growth,
         sampled=sampling is not None,
+        reason=None if known else f"errors change by {growth:.3g} times, which is not known well enough to tell from 1",
     )
 
 
-def _linear_along(mechanism: Mechanism, law: Tracking, loop: ClosedLoop) -> Callable[[float], Feedback | None]:
-    """Return the linear loop by time where the motion is as desired; None where it cannot be."""
-    near = mechanism.assembled
+def _pieces(
+    mechanism: Mechanism, law: Tracking, loop: ClosedLoop, t_end: float, steps: int
+) -> tuple[list[Feedback], list[Array]]:
+    """Return the linear loop in the middle of each step, and the root of eq. 18's matrix from step to step."""
+    at, pieces, inertias = mechanism.assembled, [], []
+    middles = (np.arange(steps) + 0.5) * t_end / steps
+    for t in (0.0, *middles, t_end):
+        state = _desired_state(mechanism, law, float(t), at)
+        at = state.at
+        inertias.append(state.D)
+        if 0.0 < t < t_end:
+            pieces.append(loop.at(float(t), state))
+    between = [(one + two) / 2 for one, two in pairwise(inertias[1:-1])]
+    return pieces, [_metric(law, D) for D in (inertias[0], *between, inertias[-1])]
 
-    def linear(t: float) -> Feedback | None:
-        nonlocal near
-        q_d, q_d_dot, _ = law.desired(t)
-        found = sigma(mechanism, q_d, near)
-        if found.verdict != "converged":
-            return None
-        near = found.at
-        return loop.at(t, Terms(mechanism, near, near.rho @ q_d_dot))
 
-    return linear
+def _desired_state(mechanism: Mechanism, law: Tracking, t: float, near: Kinematics) -> Terms:
+    """Where the motion is as desired, on the branch of what is near."""
+    q_d, q_d_dot, _ = law.desired(t)
+    found = sigma(mechanism, q_d, near)
+    if found.verdict != "converged":
+        raise NumericalError(f"the desired motion cannot be followed at t = {t:.5g} s: {found.reason}")
+    return Terms(mechanism, found.at, found.at.rho @ q_d_dot)
 
 
-def _growth(pieces: list[Feedback], t_end: float, reach: Array, sampling: tuple[float, float] | None) -> Array:
-    """Growth of errors of position by time, from the variational equation, the loop constant in each piece.
+def _metric(law: Tracking, D: Array) -> Array:
+    """Return R with eq. 18's function |R x|^2 of x = (e, e_dot): it falls along eq. 16's own closed loop."""
+    root, of_e = (np.linalg.cholesky(x / 2 + x.T / 2).T for x in (D / 2, law.Lambda.T @ law.K_D))
+    return np.block([[of_e, np.zeros_like(root)], [root @ law.Lambda, root]])
+
+
+def _growth(pieces: list[Feedback], metrics: list[Array], t_end: float, sampling: tuple[float, float] | None) -> Array:
+    """Logarithm of the growth of errors by time, from the variational equation, the loop constant in each piece.
 
     Infinite where it is no number any more.
     """
+    dt, start = t_end / len(pieces), np.asarray(np.linalg.inv(metrics[0]), dtype=float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        states = _motion(pieces, dt, start) if sampling is None else sampled_motion(pieces, dt, start, *sampling)
+        sizes = [(metric @ state, log) for metric, (state, log) in zip(metrics, states, strict=True)]
+    return np.array([log + np.log(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x, log in sizes])
+
+
+def _motion(pieces: list[Feedback], dt: float, start: Array) -> list[tuple[Array, float]]:
+    """Return what states become without sampling, as `sampled_motion` does."""
     from scipy.linalg import expm
 
-    d, dt = len(reach), t_end / len(pieces)
-    start = np.eye(2 * d)[:, :d] * reach
-    with np.errstate(over="ignore", invalid="ignore"):
-        if sampling is not None:
-            states = sampled_motion(pieces, dt, start, *sampling)
-        else:
-            states = [start]
-            for piece in pieces:
-                states.append(expm(piece.closed * dt) @ states[-1])
-    sizes = [state[:d] / reach[:, None] for state in states]
-    return np.array([float(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x in sizes])
+    found = [(start, 0.0)]
+    for piece in pieces:
+        x, log = found[-1]
+        x = expm(piece.closed * dt) @ x
+        size = max(float(np.abs(x).max()), 1e-300)
+        found.append((x / size, log + float(np.log(size))))
+    return found
