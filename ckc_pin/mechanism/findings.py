@@ -7,10 +7,11 @@ import numpy as np
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["acting_joints", "findings", "moving_mass", "outside_limits"]
+__all__ = ["acting_joints", "beyond_stops", "findings", "moving_mass", "outside_limits"]
 
 FAR = 0.5  # rad, or sizes of the mechanism: further from q_guess than that is another pose than the one described
 ROUNDING = 1e-9  # rad, or sizes: at a limit, not beyond it
+AT_STOP = 1e-11  # rad, or sizes: so far beyond a stop is at it
 LENGTH = 1e-12  # sizes: less is no length
 
 
@@ -41,6 +42,19 @@ def outside_limits(mechanism: Mechanism, q_tree: Array) -> list[str]:
     outside = np.flatnonzero((numbers < lower - slack) | (numbers > upper + slack))
     names = mechanism.coordinates
     return [f"{names[k]} = {numbers[k]:.6g} (limits {lower[k]:.6g} to {upper[k]:.6g})" for k in outside]
+
+
+def beyond_stops(mechanism: Mechanism, q_tree: Array) -> str:
+    """Say which coordinate of a configuration is furthest beyond its stops, with both; empty where none is."""
+    joints, numbers = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
+    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
+    worst = int(np.argmax(off))
+    if off[worst] <= AT_STOP:
+        return ""
+    return (
+        f"{mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
+        f"{joints.lower[worst]:.6g} to {joints.upper[worst]:.6g}"
+    )
 
 
 def moving_mass(mechanism: Mechanism) -> tuple[float, Array]:

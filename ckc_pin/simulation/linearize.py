@@ -20,6 +20,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import nearest, shortest, sigma
+from ckc_pin.mechanism.findings import beyond_stops
 from ckc_pin.mechanism.kinds import is_number, require_kind, require_table
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -31,7 +32,7 @@ from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.linear_model import LinearModel, linear_model
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
-from ckc_pin.simulation.resting import beyond_stops, hold
+from ckc_pin.simulation.resting import hold
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes
 from ckc_pin.simulation.simulate import simulate

@@ -32,6 +32,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.generated.library import Library
 from ckc_pin.kinematics.loading import load
+from ckc_pin.mechanism.findings import beyond_stops
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.parameters import Changes
@@ -44,15 +45,16 @@ from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, find_start, require_chart
 from ckc_pin.simulation.libraries import changing_library, library_of
 from ckc_pin.simulation.loop_terms import controller_call
-from ckc_pin.simulation.resting import beyond_stops
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.scene_spec import SceneSpec
 from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
 
 __all__ = [
     "Prepared",
+    "in_samples",
     "output_instants",
     "prepare",
+    "require_runnable",
     "scene_actuation",
     "scene_controller",
     "scene_mechanism",
@@ -97,9 +99,9 @@ def scene_controller(
     spec = scene.spec
     if spec.controller is None:
         return None
-    of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, load_model
+    of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources
     with scene.sources.naming():
-        return make_controller(*of)
+        return make_controller(*of, load_model)
 
 
 def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
@@ -108,6 +110,52 @@ def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
     allocation = spec.allocation if isinstance(spec, FeedbackSpec) else None
     with scene.sources.naming():
         return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
+
+
+def in_samples(
+    scene: Scene, controller: SetPoint | Tracking | Torques | None
+) -> SetPoint | Tracking | Torques | Sampled | None:
+    """Return a scene's controller on the clock that the scene gives it, if it does."""
+    spec = scene.spec.controller
+    if controller is None or not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
+        return controller
+    with scene.sources.naming():
+        return Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
+
+
+def require_runnable(
+    scene: Scene,
+    mechanism: Mechanism,
+    controller: Controller | TorqueController | Sampled | None,
+    actuation: Actuation,
+    *,
+    free: bool = False,
+) -> Start:
+    """Return where a scene starts, where it can be run from there under a controller.
+
+    Raises
+    ------
+    InputError, NumericalError
+        It cannot: no freedoms, no or a singular start, motors that cannot do what the controller wants.
+    """
+    if isinstance(controller, Sampled):
+        with scene.sources.naming():
+            controller.require_countable(scene.spec.t_end)
+            controller.require_sensible(mechanism)
+    if mechanism.d == 0:
+        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
+    if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
+    start = find_start(mechanism, scene)
+    with scene.sources.naming():
+        if beyond := beyond_stops(mechanism, start.at.q_tree):
+            raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within them")
+    refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
+    law = controller.controller if isinstance(controller, Sampled) else controller
+    if law is not None and not gives_tau(law):
+        require_chart(mechanism, start)
+        actuation.require_transmission(start.at)
+    return start
 
 
 @dataclass(frozen=True)
@@ -198,34 +246,14 @@ def prepare(
     instants = np.zeros(0) if free else output_instants(scene)  # refused before anything is loaded
     mechanism = scene_mechanism(scene)
     texts: dict[str, str] = {}
-    spec = scene.spec.controller
     if controller is None and not free:
-        controller = scene_controller(scene, mechanism, texts)
-        if controller is not None and isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-            with scene.sources.naming():
-                controller = Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)
+        controller = in_samples(scene, scene_controller(scene, mechanism, texts))
     elif controller is not None and not isinstance(controller, Sampled):
         controller = as_controller(controller)
-    if isinstance(controller, Sampled):
-        with scene.sources.naming():
-            controller.require_countable(scene.spec.t_end)
-            controller.require_sensible(mechanism)
     actuation = scene_actuation(scene, mechanism)
-    if mechanism.d == 0:
-        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
-    if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
-        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     functions = event_functions(scene.spec.event, events, mechanism)
-    start = find_start(mechanism, scene)
-    with scene.sources.naming():
-        if says := beyond_stops(mechanism, start.at.q_tree):
-            raise InputError(f"initial: {says}; give another initial.q, or a q_guess within them")
+    start = require_runnable(scene, mechanism, controller, actuation, free=free)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
-    refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
-    law = controller.controller if isinstance(controller, Sampled) else controller
-    if law is not None and not gives_tau(law):
-        require_chart(mechanism, start)
-        actuation.require_transmission(start.at)
     formulation, labels = _formulation(mechanism, scene.spec, np.diagonal(D_tree)), tuple[str, ...]()
     changing: dict[str, BoolArray] | None = None
     terms = scene.spec.solver.terms

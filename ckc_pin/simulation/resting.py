@@ -11,13 +11,13 @@ from ckc_pin.control.allocation import allocate
 from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.findings import AT_STOP
 from ckc_pin.mechanism.linear import pivoted_columns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 
-__all__ = ["Rest", "beyond_stops", "hold", "kernel", "unbalanced"]
+__all__ = ["Rest", "hold", "kernel", "unbalanced"]
 
-AT_STOP = 1e-11  # rad, or of the mechanism's size: a joint so far beyond a stop, or so near to it, is at it
 LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which nothing needs to hold
 ROUNDING = 1e-4  # of that along the others
 NOTHING = 1e-14  # of the largest force on any coordinate
@@ -83,20 +83,6 @@ def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
     enough += NOTHING * (reach * sizes).max() * np.abs(tangent / reach[:, None]).max(axis=0)
     left = np.abs(tangent.T @ (state.h_tree - u_tree))
     return bool(np.any(left > enough + ROUNDING * enough.max(initial=0.0)))
-
-
-def beyond_stops(mechanism: Mechanism, q_tree: Array) -> str:
-    """Say which joint is furthest beyond its stops; empty where none is."""
-    joints = mechanism.joints
-    numbers = mechanism.tree.to_coordinates(q_tree)
-    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
-    worst = int(np.argmax(off))
-    if off[worst] <= AT_STOP:
-        return ""
-    return (
-        f"{mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, {joints.lower[worst]:.6g} to "
-        f"{joints.upper[worst]:.6g}"
-    )
 
 
 def _side(mechanism: Mechanism, q_tree: Array) -> Array:
