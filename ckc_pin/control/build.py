@@ -10,6 +10,7 @@ from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
 from ckc_pin.control.torques import Torques, read_torques
 from ckc_pin.dynamics.formulations import CoriolisVelocity
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.sources import Sources
 
@@ -22,6 +23,7 @@ def make_controller(
     convention: CoriolisVelocity,
     t_end: float,
     sources: Sources,
+    near: Kinematics,
     load_model: Callable[[str], Mechanism],
 ) -> SetPoint | Tracking | Torques:
     """Build and check a controller.
@@ -36,6 +38,8 @@ def make_controller(
         A tabulated trajectory must last as long, s.
     sources : Sources
         Where the scene's files come from.
+    near : Kinematics
+        On the plant's assembly branch that a run starts on.
     load_model : callable
         Loads the controller's own mechanism file, when it has one.
 
@@ -54,6 +58,7 @@ def make_controller(
             gain_matrix(spec.K_P, names, "K_P"),
             gain_matrix(spec.K_V, names, "K_V"),
             plant.vector(spec.q_d, names, "controller.q_d"),
+            None if model else near,
         )
     desired = make_desired(spec.desired, plant, sources, t_end)
     return Tracking(gain_matrix(spec.Lambda, names, "Lambda"), gain_matrix(spec.K_D, names, "K_D"), desired, model)

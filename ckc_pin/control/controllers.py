@@ -18,6 +18,7 @@ from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.kinds import a_kind, require_arguments, require_callable, require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -145,6 +146,8 @@ class SetPoint:
         Symmetric positive definite, in the order of `independent`; K_V may be semi-definite.
     q_d : (d,) array or {coordinate: number}
         The target.
+    near : Kinematics, optional
+        On whose assembly branch h is that at the target, where a run starts; default: as assembled.
 
     Raises
     ------
@@ -153,7 +156,12 @@ class SetPoint:
     """
 
     def __init__(
-        self, mechanism: Mechanism, K_P: Gain | Array, K_V: Gain | Array, q_d: Array | Mapping[str, float]
+        self,
+        mechanism: Mechanism,
+        K_P: Gain | Array,
+        K_V: Gain | Array,
+        q_d: Array | Mapping[str, float],
+        near: Kinematics | None = None,
     ) -> None:
         require_kind(mechanism, Mechanism, "SetPoint: mechanism", "a Mechanism, as load returns it")
         names = mechanism.independent
@@ -166,7 +174,7 @@ class SetPoint:
                 raise InputError(f"SetPoint: q_d has {len(q_d)} numbers; {len(names)} are needed: {', '.join(names)}")
             q_d = dict(zip(names, q_d, strict=True))
         self.q_d = q_d = mechanism.vector(q_d, names, "controller.q_d")
-        target = sigma(mechanism, q_d)
+        target = sigma(mechanism, q_d, near)
         if target.verdict != "converged":
             wanted = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
             raise InputError(f"controller.q_d: the target {wanted} is {target.verdict}: {target.reason}")
