@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
 from ckc_pin.mechanism.kinds import require_flag, require_kind
@@ -22,10 +25,15 @@ from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.cards import check_card
-from ckc_pin.simulation.initial import find_start
+from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.linear_report import stability_warning
-from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.simulation.sampled_loop import MOST_DELAYED, MOST_SAMPLES
+from ckc_pin.simulation.prepare import (
+    in_samples,
+    require_runnable,
+    scene_actuation,
+    scene_controller,
+    scene_mechanism,
+)
 from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
 from ckc_pin.simulation.scene_spec import TermsOf
 from ckc_pin.simulation.stability import Stability, stability
@@ -128,24 +136,53 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
         found = _mechanism_check(what, None, outside, "auto", what.name)
         return replace(found, branches=_branches(what)) if branches else found
     mechanism = scene_mechanism(what)
-    controller = scene_controller(what, mechanism)
-    desired = _desired(controller, mechanism, what.spec.t_end)
+    controller, actuation = scene_controller(what, mechanism), scene_actuation(what, mechanism)
+    start: Start | None = None
+    try:
+        start, refused = require_runnable(what, mechanism, in_samples(what, controller), actuation), ""
+    except CkcError as error:
+        refused = str(error)
+    desired = _desired(controller, mechanism, what.spec.t_end, start)
     stable = None
-    if desired is not None and desired.leaves_at is not None:
-        stable = Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
-    elif isinstance(controller, SetPoint | Tracking):
-        library = None if what.spec.solver.terms == "pinocchio" else find(mechanism)
-        spec = what.spec
-        stable = stability(
-            mechanism, controller, spec.t_end, spec.friction_smoothing, _sampling(what, controller), library
-        )
-    if stable is not None:
-        stable = replace(stable, leaves_out=_leaves_out(what, mechanism, stable.sampled))
-    warnings = _start_warnings(what, mechanism) + _desired_warnings(mechanism, desired, what.spec.t_end)
-    warnings += stability_warning(stable, mechanism.independent)
+    if isinstance(controller, SetPoint | Tracking):
+        stable = _stability(what, controller, actuation, start, desired, refused)
+    warnings = [] if start is None else _limits(mechanism, start.at.q_tree, "the start")
+    warnings += _desired_warnings(mechanism, desired, what.spec.t_end)
+    if stable is None:
+        warnings += [refused] if refused else []
+    elif desired is None or desired.leaves_at is None:
+        warnings += stability_warning(stable, mechanism.independent)
     found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
     found = replace(found, stability=stable)
     return replace(found, branches=_branches(mechanism)) if branches else found
+
+
+def _stability(
+    scene: Scene,
+    controller: SetPoint | Tracking,
+    actuation: Actuation,
+    start: Start | None,
+    desired: DesiredCheck | None,
+    refused: str,
+) -> Stability:
+    mechanism, spec = actuation.mechanism, scene.spec
+    if start is None:
+        return Stability(None, f"a run does not begin: {refused}")
+    if desired is not None and desired.leaves_at is not None:
+        return Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
+    library = None if spec.solver.terms == "pinocchio" else find(mechanism)
+    clocked = in_samples(scene, controller)
+    found = stability(
+        mechanism,
+        controller,
+        spec.t_end,
+        spec.friction_smoothing,
+        (clocked.sample_time, clocked.delay) if isinstance(clocked, Sampled) else None,
+        library,
+        start.at,
+        actuation,
+    )
+    return replace(found, leaves_out=_leaves_out(scene, controller, actuation))
 
 
 def run_warnings(scene: Scene) -> list[str]:
@@ -153,8 +190,13 @@ def run_warnings(scene: Scene) -> list[str]:
     if scene.spec.controller is None:
         return []
     mechanism = scene_mechanism(scene)
-    desired = _desired(scene_controller(scene, mechanism), mechanism, scene.spec.t_end)
-    return _start_warnings(scene, mechanism) + _desired_warnings(mechanism, desired, scene.spec.t_end)
+    try:
+        start = find_start(mechanism, scene)
+    except CkcError:  # the run says so itself
+        return []
+    desired = _desired(scene_controller(scene, mechanism), mechanism, scene.spec.t_end, start)
+    outside = _limits(mechanism, start.at.q_tree, "the start")
+    return outside + _desired_warnings(mechanism, desired, scene.spec.t_end)
 
 
 def _branches(mechanism: Mechanism) -> Array:
@@ -204,49 +246,28 @@ def _mechanism_check(
 
 
 def _desired(
-    controller: SetPoint | Tracking | Torques | None, mechanism: Mechanism, t_end: float
+    controller: SetPoint | Tracking | Torques | None, mechanism: Mechanism, t_end: float, start: Start | None
 ) -> DesiredCheck | None:
+    near = None if start is None else start.at
     if isinstance(controller, Tracking):
-        return follow_desired(mechanism, controller.desired, t_end)
+        return follow_desired(mechanism, controller.desired, t_end, near)
     if isinstance(controller, SetPoint):
-        return DesiredCheck(None, 0.0, controller.target.at.sigma_min())
+        target = sigma(mechanism, controller.q_d, near)
+        return DesiredCheck(None, 0.0, target.at.sigma_min()) if target.verdict == "converged" else None
     return None
 
 
-def _sampling(scene: Scene, controller: SetPoint | Tracking) -> tuple[float, float] | None:
-    """Sample time and delay of a scene's controller; None without, or of more samples than are gone through."""
-    spec = scene.spec.controller
-    if not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
-        return None
-    along = scene.spec.t_end if isinstance(controller, Tracking) else 0.0
-    if spec.delay > MOST_DELAYED * spec.sample_time or along > MOST_SAMPLES * spec.sample_time:
-        return None
-    return spec.sample_time, spec.delay
-
-
-def _leaves_out(scene: Scene, mechanism: Mechanism, sampled_in: bool) -> tuple[str, ...]:
+def _leaves_out(scene: Scene, controller: SetPoint | Tracking, actuation: Actuation) -> tuple[str, ...]:
     """What of a scene stands between a run and the linear model of its closed loop."""
-    spec = scene.spec.controller
-    sampled = spec if isinstance(spec, FeedbackSpec) and spec.sample_time is not None else None
+    spec, joints = scene.spec.controller, actuation.mechanism.joints
     there = {
-        "sampling": sampled is not None and not sampled_in,
-        "delay": sampled is not None and sampled.delay > 0 and not sampled_in,
-        "sensor and drive": sampled is not None and (sampled.sensor is not None or sampled.drive is not None),
-        "torque limits": bool(np.isfinite(scene_actuation(scene, mechanism).limit).any()),
-        "dry friction": bool(mechanism.joints.friction.any()) and scene.spec.friction_smoothing is None,
+        "sensor and drive": isinstance(spec, FeedbackSpec) and (spec.sensor or spec.drive) is not None,
+        "torque limits": bool(np.isfinite(actuation.limit).any()),
+        "stops": bool(joints.stopped.any()),
+        "dry friction": bool(joints.friction.any()) and scene.spec.friction_smoothing is None,
+        "errors of its model": isinstance(controller, Tracking) and controller.model is not None,
     }
     return tuple(name for name, is_there in there.items() if is_there)
-
-
-def _start_warnings(scene: Scene, mechanism: Mechanism) -> list[str]:
-    """Say what of the start is outside joint limits, or why there is no start."""
-    if not np.isfinite(mechanism.tree.limits()).any():
-        return []
-    try:
-        start = find_start(mechanism, scene)
-    except CkcError as error:
-        return [str(error)]
-    return _limits(mechanism, start.at.q_tree, "the start")
 
 
 def _limits(mechanism: Mechanism, q_tree: Array, what: str) -> list[str]:

@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 NEUTRAL = 1e-4  # of a multiplier's size: what the error of a run does to a double one at 1 (its square root)
+UNDAMPED = 1e-9  # of the fastest eigenvalue: a rate of decay that is none
 SHOWN = 6  # eigenvalues, in what people read
 
 
@@ -149,6 +150,7 @@ def stability_plain(found: Stability | None) -> dict[str, Any] | None:
         **vars(found),
         "eigenvalues": None if found.eigenvalues is None else pairs(found.eigenvalues),
         "least_K_P": None if found.least_K_P is None else found.least_K_P.tolist(),
+        "offset": None if found.offset is None else found.offset.tolist(),
     }
 
 
@@ -168,13 +170,14 @@ def stability_text(found: Stability) -> str:
     if found.multiplier is not None:
         says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
     slowest = "" if found.slowest is None or np.isinf(found.slowest) else f", slowest decay {found.slowest:.3g} s"
-    return f"{says} at its target{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
+    where = "where it rests" if found.least_K_P is None else "at its target"
+    return f"{says} {where}{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
 
 
-def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> list[str]:
+def stability_warning(found: Stability, independent: tuple[str, ...]) -> list[str]:
     """Say of an unstable loop what would make it stable, and of one that may be why it is not known."""
-    if found is None or found.stable:
-        return []
+    if found.stable:
+        return _off_target(found, independent)
     if found.stable is None:
         return [f"whether the closed loop is stable is not known: {found.reason}"]
     if found.growth is not None:
@@ -199,15 +202,22 @@ def stability_warning(found: Stability | None, independent: tuple[str, ...]) -> 
             f"the closed loop is unstable at its target: eigenvalue {worst:.3g} 1/s, and K_P + dh/dq has the "
             f"eigenvalue {found.least_eigenvalue:.4g}{least}"
         ]
-    if found.multiplier is not None and worst < 0:
+    if found.multiplier is not None and worst < -UNDAMPED * np.abs(found.eigenvalues).max():
         return [
-            f"the closed loop is unstable as sampled: errors grow {found.multiplier:.4g} times a sample, while without "
+            f"the closed loop is unstable as sampled: errors grow {found.multiplier:.6g} times a sample, while without "
             "sampling and delay they would decay; sample more often, delay less, or take smaller gains"
         ]
     return [
         "the closed loop does not come to rest at its target: something swings about it that neither K_V nor the "
         "joints damp; give K_V, or a larger one"
     ]
+
+
+def _off_target(found: Stability, independent: tuple[str, ...]) -> list[str]:
+    if found.offset is None or found.least_K_P is not None:
+        return []
+    off = ", ".join(f"{name} {x:+.4g}" for name, x in zip(independent, found.offset, strict=True))
+    return [f"the closed loop rests off its target ({off}): its model's h there is not what the mechanism needs"]
 
 
 def _gain(K_P: Array, names: tuple[str, ...]) -> str:

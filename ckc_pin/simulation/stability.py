@@ -8,20 +8,24 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import cycles
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.generated.library import Library
-from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.kinematics.continuation import follow
+from ckc_pin.kinematics.sigma import move, sigma
 from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.findings import beyond_stops
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.native import _core
 from ckc_pin.simulation.closed_loop import ClosedLoop, Feedback
 from ckc_pin.simulation.linear_model import eigenvalues_of
-from ckc_pin.simulation.sampled_loop import sampled_loop, sampled_motion
+from ckc_pin.simulation.sampled_loop import MOST_DELAYED, MOST_SAMPLES, sampled_loop, sampled_motion
 
 __all__ = ["Stability", "stability"]
 
@@ -30,7 +34,11 @@ OF_A_CYCLE = 4  # steps of the quickest wave, where half as many are taken: all 
 AGREED = 0.02  # of the growth, between a number of steps and half as many: it is known four times as well
 SURELY = 0.3  # of the growth's logarithm: where half as many steps are off by more, its sign is not known
 SURE = 1e-12  # of the fastest eigenvalue: what is no further left of the axis may be on it
-NEWTON = 30  # iterations to where a controller with a model of its own comes to rest
+NEWTON = 8  # iterations of a piece of the way to where a controller with another model's h comes to rest
+SMALLEST_PIECE = 1e-4  # of that way
+OFF = 1e-9  # rad, or of the mechanism's size: at its target
+BALANCED = 1e-11  # of the forces: rounding
+MISSED = 1e-9  # of what is wanted of the motors
 
 
 @dataclass(frozen=True)
@@ -48,9 +56,12 @@ class Stability:
         where they say nothing about the rest of it.
     least_K_P : (d, d) array or None
         Of a set point: the least multiple of its K_P with K_P + dh/dq positive definite, from which on eq. 14 is
-        stable; zero where it is without any.
+        stable; zero where it is without any. None where it rests off its target, for where depends on K_P.
     least_eigenvalue : float or None
         Of a set point: of K_P + dh/dq, N m/rad; the stiffness that is left in its weakest direction.
+    offset : (d,) array or None
+        Of a set point: where it rests, from its target: rad, m. Not zero where what the controller compensates is
+        another model's h.
     slowest : float or None
         Time constant of the slowest decay, s: infinite where there is none. Of tracking, of the whole motion.
     growth, largest_growth : float or None
@@ -61,7 +72,8 @@ class Stability:
     multiplier : float or None
         Of a set point that is sampled: the largest factor of an error from one sample to the next, delay included.
     leaves_out : tuple of str
-        What of the scene the linear model does not have: "sensor and drive", "torque limits", "dry friction".
+        What of the scene the linear model does not have: "sensor and drive", "torque limits", "stops", "dry friction",
+        "errors of its model" (of tracking: it is linearized along the desired motion).
     """
 
     stable: bool | None
@@ -69,6 +81,7 @@ class Stability:
     eigenvalues: NDArray[np.complex128] | None = None
     least_K_P: Array | None = None
     least_eigenvalue: float | None = None
+    offset: Array | None = None
     slowest: float | None = None
     growth: float | None = None
     largest_growth: float | None = None
@@ -84,6 +97,8 @@ def stability(
     smoothing: float | None = None,
     sampling: tuple[float, float] | None = None,
     library: Library | None = None,
+    near: Kinematics | None = None,
+    actuation: Actuation | None = None,
 ) -> Stability:
     """Linearize a controller's closed loop.
 
@@ -97,57 +112,136 @@ def stability(
         s; the verdict is then that of the sampled loop.
     library : Library, optional
         The mechanism's terms, compiled.
+    near : Kinematics, optional
+        Where a run starts: target and motion are meant on its assembly branch; default: as assembled.
+    actuation : Actuation, optional
+        Whose limits have to leave what holds the target, or the motion.
     """
     import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
 
     with one_blas_thread():
         try:
-            loop = ClosedLoop(mechanism, law, smoothing, library)
+            _require_countable(law, t_end, sampling)
+            loop = _Loop(mechanism, law, ClosedLoop(mechanism, law, smoothing, library), actuation)
+            near = near or mechanism.assembled
             if isinstance(law, SetPoint):
-                return _about(mechanism, law, loop, sampling)
-            return _along(mechanism, law, loop, t_end, sampling)
+                return _about(law, loop, near, sampling)
+            return _along(law, loop, near, t_end, sampling)
         except NumericalError as error:
             return Stability(None, str(error))
 
 
-def _about(
-    mechanism: Mechanism, law: SetPoint, closed_loop: ClosedLoop, sampling: tuple[float, float] | None
-) -> Stability:
-    at = _rest(mechanism, law)
-    loop = closed_loop.at(0.0, Terms(mechanism, at, np.zeros(mechanism.n)))
+def _require_countable(law: SetPoint | Tracking, t_end: float, sampling: tuple[float, float] | None) -> None:
+    if sampling is None:
+        return
+    sample_time, delay = sampling
+    if delay > MOST_DELAYED * sample_time:
+        raise NumericalError(
+            f"controller.delay lasts {delay / sample_time:.6g} samples; what is under way is followed for "
+            f"{MOST_DELAYED} at most"
+        )
+    if isinstance(law, Tracking) and t_end > MOST_SAMPLES * sample_time:
+        raise NumericalError(
+            f"the motion has {t_end / sample_time:.6g} samples; at most {MOST_SAMPLES} are gone through: "
+            "a shorter t_end has a verdict"
+        )
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A closed loop that is linearized where it can be."""
+
+    mechanism: Mechanism
+    law: SetPoint | Tracking
+    closed_loop: ClosedLoop
+    actuation: Actuation | None
+
+    def at(self, t: float, state: Terms, where: str) -> Feedback:
+        """Linearize it; NumericalError where a joint is beyond its stops or the motors do not give what is wanted."""
+        if beyond := beyond_stops(self.mechanism, state.q_tree):
+            raise NumericalError(f"{where} {beyond}")
+        actuation = self.actuation
+        if actuation is not None and np.isfinite(actuation.limit).any():
+            wanted = self.law.u(t, state)
+            given = actuation.apply(state, wanted)
+            if np.abs(given.u - wanted).max() > MISSED * np.abs(wanted).max():
+                tau = actuation.distribute(state.rho, wanted)
+                k = int(np.argmax(np.abs(tau) / actuation.limit))
+                raise NumericalError(
+                    f"{where} {actuation.motors.names[k]} would need {abs(tau[k]):.4g}, its limit is "
+                    f"{actuation.limit[k]:.4g}"
+                )
+        return self.closed_loop.at(t, state)
+
+
+# --- about a target ------------------------------------------------------------------------------
+
+
+def _about(law: SetPoint, closed_loop: _Loop, near: Kinematics, sampling: tuple[float, float] | None) -> Stability:
+    mechanism = closed_loop.mechanism
+    target = sigma(mechanism, law.q_d, near)
+    if target.verdict != "converged":
+        raise NumericalError(f"the target is not reached from where the run starts: {target.reason}")
+    if target.at.margin() <= _core.chart_margin:
+        names = (", ".join(x) for x in (mechanism.independent, mechanism.dependent))
+        raise NumericalError("the target is singular: {} do not determine {} there".format(*names))
+    rest = Terms(mechanism, _rest(mechanism, law, target.at), np.zeros(mechanism.n))
+    loop = closed_loop.at(0.0, rest, "where it would come to rest")
     values = eigenvalues_of(loop.closed)
     stable, slowest = bool(values[0].real < -SURE * np.abs(values).max()), _time_constant(float(values[0].real))
     multiplier = None
     if sampling is not None:
         multiplier = float(np.abs(np.linalg.eigvals(sampled_loop(loop, *sampling))).max())
-        stable, slowest = multiplier < 1.0, _time_constant(float(np.log(max(multiplier, 1e-300))) / sampling[0])
-    K_P, hessian = (x / 2 + x.T / 2 for x in (law.K_P, h_gradient(mechanism, at)))
-    half = np.linalg.inv(np.linalg.cholesky(K_P))
+        stable, slowest = multiplier < 1.0 - SURE, _time_constant(float(np.log(max(multiplier, 1e-300))) / sampling[0])
+    reach = mechanism.tree.reach[mechanism.partition.q]
+    K_P, hessian = (x / 2 + x.T / 2 for x in (law.K_P, h_gradient(mechanism, rest.at)))
+    half, offset = np.linalg.inv(np.linalg.cholesky(K_P)), rest.q - law.q_d
     factor = max(0.0, -float(np.linalg.eigvalsh(half @ hessian @ half.T)[0]))
     return Stability(
         stable=stable,
         eigenvalues=values,
-        least_K_P=factor * law.K_P,
+        least_K_P=factor * law.K_P if np.all(np.abs(offset) <= OFF * reach) else None,
         least_eigenvalue=float(np.linalg.eigvalsh(K_P + hessian)[0]),
+        offset=offset,
         slowest=slowest,
         sampled=sampling is not None,
         multiplier=multiplier,
     )
 
 
-def _rest(mechanism: Mechanism, law: SetPoint) -> Kinematics:
-    """Where the closed loop rests: its target, or near it where its model is another than the plant."""
-    found = sigma(mechanism, law.q_d)
-    for _ in range(NEWTON):
-        if found.verdict != "converged":
-            break
-        state = Terms(mechanism, found.at, np.zeros(mechanism.n))
-        missing = law.u(0.0, state) - state.h
-        if np.abs(missing).max() <= 1e-10 * (np.abs(law.target.h) + np.abs(law.K_P).max(axis=1)).max():
-            return found.at
-        step = np.linalg.lstsq(law.K_P + h_gradient(mechanism, found.at), missing, rcond=None)[0]
-        found = sigma(mechanism, state.q + step, found.at)
-    raise NumericalError("where it comes to rest is not found")
+def _rest(mechanism: Mechanism, law: SetPoint, target: Kinematics) -> Kinematics:
+    """Where the closed loop rests: its target, or where that goes as h(q_d) becomes what the controller takes it for.
+
+    The way from one to the other is followed, as long as K_P + dh/dq keeps its rank on it.
+    """
+    own = Terms(mechanism, target, np.zeros(mechanism.n)).h
+    excess, scale = law.target.h - own, np.abs(own).max() + np.abs(law.K_P).max()
+    if np.abs(excess).max() <= BALANCED * scale:
+        return target
+
+    def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
+        sign = np.linalg.slogdet(law.K_P + h_gradient(mechanism, at))[0]
+        for _ in range(NEWTON):
+            state = Terms(mechanism, at, np.zeros(mechanism.n))
+            missing = own + (done + part) * excess - law.K_P @ (state.q - law.q_d) - state.h
+            stiffness = law.K_P + h_gradient(mechanism, at)
+            if np.linalg.slogdet(stiffness)[0] != sign:
+                return None
+            if np.abs(missing).max() <= BALANCED * scale:
+                return at
+            step = np.asarray(np.linalg.solve(stiffness, missing), dtype=float)
+            found = move(at, step, 0.0, mechanism.tolerance, anywhere=False)
+            if found.verdict != "converged":
+                return None
+            at = found.at
+        return None
+
+    at, done = follow(target, advance, SMALLEST_PIECE)
+    if done < 1.0:
+        raise NumericalError(
+            "what the controller takes for h(q_d) is so far from the plant's that the loop has no rest near its target"
+        )
+    return at
 
 
 def _time_constant(rate: float) -> float:
@@ -158,7 +252,7 @@ def _time_constant(rate: float) -> float:
 
 
 def _along(
-    mechanism: Mechanism, law: Tracking, loop: ClosedLoop, t_end: float, sampling: tuple[float, float] | None
+    law: Tracking, loop: _Loop, near: Kinematics, t_end: float, sampling: tuple[float, float] | None
 ) -> Stability:
     turns = cycles(law.desired, t_end)
     if 2 * OF_A_CYCLE * turns > MOST:
@@ -166,7 +260,7 @@ def _along(
         raise NumericalError(f"the desired motion is too quick to be followed for longer than {most:.3g} s")
     steps, end = max(FEWEST, int(np.ceil(OF_A_CYCLE * turns))), np.nan
     while True:
-        before, grown = end, _growth(*_pieces(mechanism, law, loop, t_end, steps), t_end, sampling)
+        before, grown = end, _growth(*_pieces(law, loop, near, t_end, steps), t_end, sampling)
         end = float(grown[-1])
         off = 0.0 if end == before else abs(end - before)  # both may be infinite
         if off <= AGREED * max(1.0, abs(end)) or 2 * steps > MOST:
@@ -177,27 +271,27 @@ def _along(
         growth, largest_growth = (float(np.exp(x)) for x in (end, grown.max()))
     return Stability(
         stable=end < 0 if known else None,
-        eigenvalues=eigenvalues_of(loop.at(0.0, _desired_state(mechanism, law, 0.0, mechanism.assembled)).closed),
+        reason=None if known else f"errors change by {growth:.3g} times, which is not known well enough to tell from 1",
+        eigenvalues=eigenvalues_of(loop.at(0.0, _desired_state(loop.mechanism, law, 0.0, near), "at t = 0").closed),
         slowest=_time_constant(end / t_end),
         growth=growth,
         largest_growth=largest_growth,
         sampled=sampling is not None,
-        reason=None if known else f"errors change by {growth:.3g} times, which is not known well enough to tell from 1",
     )
 
 
 def _pieces(
-    mechanism: Mechanism, law: Tracking, loop: ClosedLoop, t_end: float, steps: int
+    law: Tracking, loop: _Loop, near: Kinematics, t_end: float, steps: int
 ) -> tuple[list[Feedback], list[Array]]:
     """Return the linear loop in the middle of each step, and the root of eq. 18's matrix from step to step."""
-    at, pieces, inertias = mechanism.assembled, [], []
+    at, pieces, inertias = near, [], []
     middles = (np.arange(steps) + 0.5) * t_end / steps
-    for t in (0.0, *middles, t_end):
-        state = _desired_state(mechanism, law, float(t), at)
+    for t in (0.0, *middles.tolist(), t_end):
+        state = _desired_state(loop.mechanism, law, t, at)
         at = state.at
         inertias.append(state.D)
         if 0.0 < t < t_end:
-            pieces.append(loop.at(float(t), state))
+            pieces.append(loop.at(t, state, f"at t = {t:.5g} s of the desired motion"))
     between = [(one + two) / 2 for one, two in pairwise(inertias[1:-1])]
     return pieces, [_metric(law, D) for D in (inertias[0], *between, inertias[-1])]
 
