@@ -9,7 +9,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.output import LONG, Working, errors, print_card, print_json, print_table
-from ckc_pin.simulation.arguments import read_table
+from ckc_pin.simulation.arguments import read_changes, read_table
 from ckc_pin.simulation.report import check_plain, terms_plain, terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
@@ -31,19 +31,31 @@ def list_(as_json: bool) -> None:
             print(f"  {name + '/' + scene:<30} {says}")
 
 
-@click.command(epilog=options.examples("ckc check five_bar", "ckc check five_bar_as_printed/tracking"))
+@click.command(
+    epilog=options.examples(
+        "ckc check five_bar",
+        "ckc check five_bar --set link.link_2.mass=0.3",
+        "ckc check five_bar_as_printed/tracking",
+        "ckc check five_bar/set_point --set controller.K_P=2 --set controller.sample_time=0.005",
+    )
+)
 @click.argument(
     "what",
     metavar="MECHANISM|SCENE",
     shell_complete=options.complete_scenes,
     help="A shipped name, a folder or a file; of a folder, the mechanism.",
 )
+@options.changes
 @click.option("--branches", is_flag=True, help="List the assembly branches too.")
 @options.as_json
-def check(what: str, branches: bool, as_json: bool) -> None:
-    """Freedoms, rank, redundant rows, partition. For a scene also whether its trajectory stays in the workspace."""
+def check(what: str, changes: tuple[str, ...], branches: bool, as_json: bool) -> None:
+    """Freedoms, rank, redundant rows, partition.
+
+    Of a scene whether a run begins at all, whether its desired trajectory stays in the workspace, and whether its
+    controller is stable about the target or along that trajectory.
+    """
     with Working(f"checking {what}"):
-        found = ckc_pin.check(what, branches=branches)
+        found = ckc_pin.check(what, read_changes("--set", changes), branches=branches)
     if as_json:
         print_json(check_plain(found))
     else:

@@ -67,7 +67,7 @@ changes = click.option(
     "changes",
     metavar="KEY=VALUE",
     multiple=True,
-    help="Change a key of the scene; may be given many times.",
+    help="Change a key of the scene, or a number of the mechanism; may be given many times.",
 )
 mechanism = click.argument(
     "mechanism", metavar="MECHANISM", shell_complete=complete_mechanisms, help="A shipped name, a folder or a file."

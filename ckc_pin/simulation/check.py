@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os.path import isfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +15,14 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
-from ckc_pin.errors import CkcError
+from ckc_pin.errors import CkcError, InputError
 from ckc_pin.generated.library import find
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.findings import acting_joints, findings, moving_mass, outside_limits
-from ckc_pin.mechanism.kinds import require_flag, require_kind
+from ckc_pin.mechanism.kinds import require_flag, require_kind, require_table
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -34,7 +36,7 @@ from ckc_pin.simulation.prepare import (
     scene_controller,
     scene_mechanism,
 )
-from ckc_pin.simulation.scene import SUFFIX, Scene, load_scene
+from ckc_pin.simulation.scene import CHANGES, SUFFIX, Scene, load_scene
 from ckc_pin.simulation.scene_spec import TermsOf
 from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
@@ -112,13 +114,17 @@ class Check(Shown):
         return check_card(self)
 
 
-def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Check:
+def check(
+    what: Mechanism | Scene | str | Path, changes: Mapping[str, Any] | None = None, *, branches: bool = False
+) -> Check:
     """Check a mechanism, or a scene with its mechanism.
 
     Parameters
     ----------
     what : Mechanism, Scene, str or Path
         "five_bar" is a mechanism, "five_bar/tracking" and "x.scene.toml" are scenes.
+    changes : mapping, optional
+        With a name: of a scene as `load_scene` takes them, of a mechanism as `load` does.
     branches : bool
         List the assembly branches too (small mechanisms).
 
@@ -129,8 +135,12 @@ def check(what: Mechanism | Scene | str | Path, *, branches: bool = False) -> Ch
     """
     require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
     require_flag(branches, "check: branches")
+    if changes is not None:
+        require_table(changes, "check: changes", CHANGES)
     if isinstance(what, str | Path):
-        what = load_scene(what) if names_a_scene(str(what)) else load(what)
+        what = load_scene(what, changes) if names_a_scene(str(what)) else load(what, changes)
+    elif changes:
+        raise InputError("check: changes go with a name; a Scene or a Mechanism is complete")
     if isinstance(what, Mechanism):
         outside = _limits(what, what.q_tree, "the assembled configuration")
         found = _mechanism_check(what, None, outside, "auto", what.name)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from ckc_pin import check, load
+from ckc_pin import InputError, check, load, load_scene
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.library import shipped
+from ckc_pin.simulation.report import check_plain, to_json
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 
@@ -41,6 +43,32 @@ def warnings(what: str) -> list[str]:
     found: list[str] = answer.json["warnings"]
     assert answer.err == ""
     return found
+
+
+# --- changes on the way ----------------------------------------------------------------------------
+
+
+def test_a_check_takes_changes_as_a_run_does() -> None:
+    """Of a scene its keys and numbers of the mechanism, of a mechanism those numbers."""
+    changes = {"controller.K_P": 2.0, "link.link_2.mass": 0.3}
+    line = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
+    of_command = ckc("check", "five_bar/set_point", *line, "--json").json
+    of_python, of_scene = check("five_bar/set_point", changes), check(load_scene("five_bar/set_point", changes))
+    assert of_command == json.loads(to_json(check_plain(of_python))) == json.loads(to_json(check_plain(of_scene)))
+    assert of_python.stability is not None
+    assert of_python.stability.least_eigenvalue != check("five_bar/set_point").stability.least_eigenvalue  # type: ignore[union-attr]
+    lighter = {"link.link_2.mass": 0.0625}
+    usual = load("five_bar")
+    by_hand = usual.tree.model.inertias[usual.tree.model.getJointId("theta_2")].mass
+    assert check("five_bar", lighter).mass == pytest.approx(check("five_bar").mass - by_hand + 0.0625)
+
+
+def test_changes_that_go_with_nothing_are_refused() -> None:
+    with pytest.raises(InputError, match="check: changes go with a name"):
+        check(load("five_bar"), {"link.link_2.mass": 0.3})
+    answer = ckc("check", "five_bar", "--set", "t_end=3")
+    assert answer.code == 2
+    assert "'t_end' names nothing; names begin with" in answer.err
 
 
 # --- mass and inertia ------------------------------------------------------------------------------
