@@ -30,7 +30,6 @@ __all__ = [
     "stability_warning",
 ]
 
-NEUTRAL = 1e-4  # of a multiplier's size: what the error of a run does to a double one at 1 (its square root)
 UNDAMPED = 1e-9  # of the fastest eigenvalue: a rate of decay that is none
 SHOWN = 6  # eigenvalues, in what people read
 
@@ -111,12 +110,14 @@ def floquet_text(found: Floquet) -> Text:
     """Return the multipliers of a periodic motion for people, and what they say."""
     from rich.text import Text
 
-    largest = float(np.abs(found.multipliers[0]))
+    says = {
+        False: "pushes grow, the motion is unstable",
+        True: "pushes die out",
+        None: "to first order pushes neither grow nor die out as a power",
+    }[found.stable]
     says = (
-        f"largest {largest:.6g} in size: "
-        + ("pushes grow, the motion is unstable" if largest > 1 + NEUTRAL else
-           "pushes die out" if largest < 1 - NEUTRAL else "to first order pushes neither grow nor die out as a power")
-    )  # fmt: skip
+        f"largest {np.abs(found.multipliers[0]):.6g} in size: {says} (their matrix is known to {found.uncertainty:.1g})"
+    )
     return Text(
         f"Motion of {found.run.scene_name}, period {found.period:.9g} s\n"
         f"  states  {', '.join(found.states)}\n"

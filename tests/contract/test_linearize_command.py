@@ -119,7 +119,8 @@ PERIOD = "4.99171151369"  # of bricard/period, which swings to and fro and keeps
 
 def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Path) -> None:
     found = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
-    assert list(found) == ["name", "states", "period", "monodromy", "multipliers"]
+    assert list(found) == ["name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"]
+    assert found["stable"] is None
     assert found == floquet("bricard/period", float(PERIOD)).plain()
     # one freedom without damping: the area of pushes stays, and one along the motion comes back as it was
     monodromy = np.array(found["monodromy"])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a
 
 from ckc_pin import InputError, load_scene
+from ckc_pin.control.controllers import Tracking
 from ckc_pin.simulation.floquet import floquet
+from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
 PERIOD = 2 * np.pi / w
@@ -59,7 +62,7 @@ def block(gravity: float, amplitude: float) -> np.ndarray:
     return found.y[:, -1].reshape(2, 2).T
 
 
-@pytest.mark.parametrize("amplitude", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("amplitude", [0.05, 0.2, 0.25, 0.4])
 def test_multipliers_are_those_of_mathieus_equation(amplitude: float, tmp_path: Path) -> None:
     found = floquet(written(tmp_path, g, amplitude), PERIOD, TIGHT)
     assert found.states == ("y", "theta", "y_dot", "theta_dot")
@@ -69,6 +72,7 @@ def test_multipliers_are_those_of_mathieus_equation(amplitude: float, tmp_path: 
     for value in of_pendulum:
         assert np.abs(found.multipliers - value).min() <= 1e-8
     assert np.prod(found.multipliers).real == pytest.approx(1.0, abs=1e-8)  # it keeps its energy
+    assert found.stable is (False if abs(np.trace(wanted)) > 2 else None)
 
 
 def test_on_the_edge_of_the_first_tongue_both_are_minus_one(tmp_path: Path) -> None:
@@ -88,7 +92,7 @@ def test_a_period_that_is_none_is_refused_by_how_much_it_misses(tmp_path: Path) 
 
 
 def test_what_hardly_moves_has_not_come_back(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"period = 1e-06 s is none: after it y \(rate\) is off by"):
+    with pytest.raises(InputError, match=r"period = 1e-06 s is none: after it y is off by"):
         floquet(written(tmp_path, g, 0.2), 1e-6)
     small = floquet(written(tmp_path, g, 1e-5), PERIOD, TIGHT)  # as small a motion that does come back
     assert np.abs(small.run.q_tree[:, 0]).max() == pytest.approx(1e-5, rel=1e-6)
@@ -110,7 +114,59 @@ def test_before_its_variational_equations_the_motion_is_run_alone(
         floquet(written(tmp_path, g, 0.2), 0.9)
 
 
+# --- how sure ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("late", [0.0, 1e-6, -1e-5])
+@pytest.mark.parametrize("rtol", [1e-10, 1e-6, 1e-5])
+def test_a_motion_that_keeps_its_energy_is_never_said_to_be_unstable(rtol: float, late: float) -> None:
+    """Its double multiplier at 1 moves by the root of what the motion misses: 0.006 by 2e-5."""
+    found = floquet("bricard/period", 4.99171151369 + late, {"solver.rtol": rtol})
+    assert found.stable is None
+    assert found.multipliers == pytest.approx([1.0, 1.0], abs=0.01)
+
+
+def on_its_way(changes: dict[str, Any]) -> dict[str, Any]:
+    """Tracking of the five-bar that starts on its desired motion."""
+    scene = load_scene("five_bar/tracking", changes)
+    law = scene_controller(scene, scene_mechanism(scene))
+    assert isinstance(law, Tracking)
+    q, q_dot, _ = (dict(zip(("theta_1", "theta_3"), x.tolist(), strict=True)) for x in law.desired(0.0))
+    return {**changes, "initial": {"q": q, "q_dot": q_dot}, "formulation": "reduced", "solver.rtol": 1e-10}
+
+
+def test_of_tracking_pushes_die_out_as_lambda_says() -> None:
+    """Where r = 0 errors fall by exp(-Lambda t): two multipliers; the other two are those of r, which K_D damps."""
+    found = floquet("five_bar/tracking", 2 * np.pi, on_its_way({"controller.Lambda": 0.5, "controller.K_D": 3.0}))
+    assert found.stable is True
+    for multiplier in found.multipliers[:2]:
+        assert multiplier == pytest.approx(np.exp(-np.pi), rel=1e-4)
+    assert np.abs(found.multipliers[2:]).max() < 1e-3
+
+
+def test_what_drives_the_motion_has_to_come_back_too() -> None:
+    """sin^3 t is where it began after half of its period, at the same rate, and goes the other way from there."""
+    changes = {"controller.desired.theta_1": {"offset": -1.4, "harmonics": [[0.15, 1.0, 0.0], [-0.05, 3.0, 0.0]]},
+               "controller.desired.theta_3": {"offset": -1.7}}  # fmt: skip
+    with pytest.raises(InputError, match=r"period = 3\.14\d+ s is none: .* the desired motion is off by 0\.\d+"):
+        floquet("five_bar/tracking", np.pi, on_its_way(changes))
+    assert floquet("five_bar/tracking", 2 * np.pi, on_its_way(changes)).stable
+
+
+def test_in_no_time_nothing_comes_back(tmp_path: Path) -> None:
+    for period in (1e-320, 1e-12):
+        with pytest.raises(InputError, match=r"s is none: nothing moves in less than 1e-09 s"):
+            floquet(written(tmp_path, g, 0.2), period)
+    with pytest.raises(InputError, match="is none: after it y"):
+        floquet(written(tmp_path, g, 0.2), 3e-9)
+
+
+def test_of_a_motion_with_samples_it_is_said_what_is_not_known() -> None:
+    with pytest.raises(InputError, match=r"controller\.sample_time: of a motion with samples the monodromy matrix"):
+        floquet("five_bar/tracking", 2 * np.pi, {"controller.sample_time": 1e-3})
+
+
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
     plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
-    assert set(plain) == {"name", "states", "period", "monodromy", "multipliers"}
+    assert set(plain) == {"name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"}
     assert all(len(pair) == 2 for pair in plain["multipliers"])
