@@ -155,12 +155,12 @@ def play(
     )
 
 
-def plot(*shown: Run | LinearModel | GainLocus) -> Figures:
-    """Draw runs, a linear model or a locus; a notebook shows the figures, `save(folder)` writes them.
+def plot(*shown: Run | LinearModel | GainLocus | Sensitivities) -> Figures:
+    """Draw runs, a linear model, a locus or sensitivities; a notebook shows the figures, `save(folder)` writes them.
 
     Parameters
     ----------
-    shown : Run, or one LinearModel or GainLocus
+    shown : Run, or one LinearModel, GainLocus or Sensitivities
         Runs of one mechanism under one kind of control share a figure. A linear model has poles and modes.
 
     Returns

@@ -21,7 +21,7 @@ from ckc_pin.native.tables import core_table, packed
 
 __all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "variation_table"]
 
-Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b"]
+Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b", "reported"]
 
 ACTING = (
     "friction",
@@ -43,7 +43,8 @@ class Lock:
     Attributes
     ----------
     placed : str
-        What stands on it: a joint, a point of a loop, an end of a spring, a direction, a relative rotation's frame.
+        What stands on it: a joint, a point of a loop, an end of a spring, a direction, a relative rotation's frame, or
+        a point that is only reported.
     carrier : int
         The joint that it is placed in.
     axis : (3,) array
@@ -103,12 +104,15 @@ class Varying:
     q : (n,) array or None
         How the start's independent coordinates change, tangent.
     q_dot : (d,) array or None
+    places : tuple of Effect
+        What places the joints, and the points that are only reported.
     """
 
     name: str
     effects: tuple[Effect, ...] = ()
     q: Array | None = None
     q_dot: Array | None = None
+    places: tuple[Effect, ...] = ()
 
 
 # --- where terms are written out ---------------------------------------------------------------------

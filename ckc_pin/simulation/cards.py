@@ -18,17 +18,26 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.units import joined
 from ckc_pin.simulation.linear_report import stability_text
-from ckc_pin.simulation.units import quantity_units
+from ckc_pin.simulation.units import key_unit, per, quantity_units
 
 if TYPE_CHECKING:
     from ckc_pin.simulation.check import Check
     from ckc_pin.simulation.motion_forces import MotionForces
     from ckc_pin.simulation.run import Run
     from ckc_pin.simulation.scene import Scene
+    from ckc_pin.simulation.sensitivities import Sensitivities
     from ckc_pin.simulation.simulator import Simulator
     from ckc_pin.simulation.state import State
 
-__all__ = ["check_card", "forces_card", "run_card", "scene_card", "simulator_card", "state_card"]
+__all__ = [
+    "check_card",
+    "forces_card",
+    "run_card",
+    "scene_card",
+    "sensitivities_card",
+    "simulator_card",
+    "state_card",
+]
 
 MOST_EVENTS = 10
 LONG = 10.0  # s: what compiling a mechanism's terms takes at most, as a rule
@@ -204,6 +213,29 @@ def forces_card(found: MotionForces) -> Card:
     rows += [("exceeded", f"{x['motor']}: {x['most']:.4g} at t = {x['t_most']:.4g} s, its limit is {x['limit']:.4g}")
              for x in found.exceeded]  # fmt: skip
     return Card(f"MotionForces of {found.name}, {found.status}: {found.message}", rows)
+
+
+def sensitivities_card(found: Sensitivities) -> Card:
+    """Return how far each parameter moves the independent coordinates, and the points, at most along the run."""
+    run = found.run
+    tree, at = run.mechanism.tree, [run.coordinates.index(name) for name in run.independent]
+    names = [*run.independent, *found.points]
+    units = [*(tree.units()[k] for k in at), *("m" for _ in found.points)]
+    rows: list[Row] = [
+        ("instants", f"{len(found.t)}, from t = {found.t[0]:g} to {found.t[-1]:g} s"),
+        ("largest along it", ""),
+    ]
+    for k, name in enumerate(found.parameters):
+        unit = key_unit(run.mechanism, name)
+        most = [np.abs(found.q_tree[:, j, k]).max() for j in at]
+        most += [np.linalg.norm(moved[:, :, k], axis=1).max() for moved in found.points.values()]
+        rows.append((f"by {name}", quantities(names, np.array(most), [per(one, unit) for one in units], 4)))
+    if found.end_time is not None:
+        shown = [f"{x:.4g} {per('s', key_unit(run.mechanism, name))}" for name, x in
+                 zip(found.parameters, found.end_time.tolist(), strict=True)]  # fmt: skip
+        rows.append(("the end comes later by", shown))
+    said = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"
+    return Card(f"Sensitivities of {run.scene_name}, {said}", rows)
 
 
 # --- step by step ----------------------------------------------------------------------------------

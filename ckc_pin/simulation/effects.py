@@ -163,8 +163,8 @@ def _of_placement(mechanism: Mechanism, name: str, key: str, k: int) -> Iterator
     behind = _Behind(mechanism, joint)
     yield from _placed(base.joint, behind.things(), twist)
     if base.joint:
-        for link in behind.links:
-            yield _Body(mechanism, link).moved(*twist)
+        bodies = [_Body(mechanism, link) for link in behind.links]
+        yield from (body.moved(*twist) for body in bodies if body.mass or body.about.any())
 
 
 def _twist(base: Frame, key: str, k: int, xyz: Array, rpy: Array) -> Twist:
@@ -217,6 +217,9 @@ class _Behind:
             for end, stands in enumerate((spring.frame_a, spring.frame_b)):
                 if stands is not None and self._carries(stands):
                     found.append(("spring", k + end * len(lines)))
+        for k, point in enumerate(spec.point):
+            if self._carries(point.frame):
+                found.append(("reported", k))
         return found
 
     def _carries(self, frame: str | FrameSpec) -> bool:

@@ -40,7 +40,7 @@ from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
-from ckc_pin.native.variation import directions_of, variation_table
+from ckc_pin.native.variation import Varying, directions_of, variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
 from ckc_pin.simulation.initial import Start, branch, find_start, require_chart
 from ckc_pin.simulation.libraries import changing_library, library_of
@@ -179,7 +179,7 @@ class Prepared:
     tables : tuple
         What the loop is made of: core, formulation, control, solver, events.
     loop : native Loop
-    varying : tuple of str
+    varying : tuple of Varying
         Numbers that the motion's changes with are integrated beside it.
     changing : dict of str to bool arrays, or None
         Numbers that compiled terms would have to take to say how the motion changes; None where they do or cannot.
@@ -195,7 +195,7 @@ class Prepared:
     texts: dict[str, str]
     tables: tuple[Any, ...]
     loop: Any
-    varying: tuple[str, ...] = ()
+    varying: tuple[Varying, ...] = ()
     changing: dict[str, BoolArray] | None = None
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
@@ -255,7 +255,8 @@ def prepare(
     functions = event_functions(scene.spec.event, events, mechanism)
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
-    formulation, labels = _formulation(mechanism, scene.spec, np.diagonal(D_tree)), tuple[str, ...]()
+    formulation = _formulation(mechanism, scene.spec, np.diagonal(D_tree))
+    varying: list[Varying] = []
     changing: dict[str, BoolArray] | None = None
     terms = scene.spec.solver.terms
     if parameters:
@@ -270,7 +271,6 @@ def prepare(
             mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=compensated_at(mechanism, controller),
         )  # fmt: skip
-        labels = tuple(x.name for x in varying)
     with scene.sources.naming():
         control = control_table(controller, actuation, partial(controller_call, mechanism=mechanism))
     tables = (
@@ -283,7 +283,18 @@ def prepare(
     loop = _core.Loop(*tables)
     texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
     return Prepared(
-        scene, mechanism, controller, actuation, functions, instants, start, texts, tables, loop, labels, changing
+        scene,
+        mechanism,
+        controller,
+        actuation,
+        functions,
+        instants,
+        start,
+        texts,
+        tables,
+        loop,
+        tuple(varying),
+        changing,
     )
 
 

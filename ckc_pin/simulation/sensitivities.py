@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,12 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.kinds import require_callable, require_kind
+from ckc_pin.mechanism.card import Card, Shown
+from ckc_pin.mechanism.kinds import require_callable, require_kind, require_path
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.simulation.cards import sensitivities_card
+from ckc_pin.simulation.moved_points import moved_points
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene
@@ -24,8 +29,8 @@ NAMES = 'a list of names, as ["link.link_2.mass"]'
 RATES = ("q", "q_dot")  # of which an event's time is known to change
 
 
-@dataclass(frozen=True)
-class Sensitivities:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivities(Shown):
     """A run with its derivatives by parameters, at fixed times.
 
     Attributes
@@ -39,6 +44,8 @@ class Sensitivities:
     u, tau : (m, d, p) and (m, motors, p) arrays
         How eq. 6's force and the motors' torques change, as `Run.u` and `Run.tau` have them; NaN where motors that are
         more than freedoms share a force. Zero without a controller.
+    points : dict of str to (m, 3, p) arrays
+        How the mechanism's points move, in world axes: with the coordinates, and with what places them.
     end_time : (p,) array or None
         How the time of the event that ended the run changes, s; None where it ended at `t_end`.
     """
@@ -49,7 +56,12 @@ class Sensitivities:
     v_tree: Array
     u: Array
     tau: Array
+    points: dict[str, Array]
     end_time: Array | None
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return sensitivities_card(self)
 
     @property
     def t(self) -> Array:
@@ -57,31 +69,75 @@ class Sensitivities:
         return self.run.t
 
     def of(self, name: str, parameter: str) -> Array:
-        """Return how a number changes with a parameter along the run, shape (m,).
+        """Return how a quantity changes with a parameter along the run, shape (m,).
 
         Parameters
         ----------
         name : str
-            A coordinate's, ``theta_1``; with ``v.`` before it its rate's; ``u.`` and an independent coordinate, or
-            ``tau.`` and a motor.
+            A coordinate, ``theta_1``; with ``v.`` before it its rate; ``u.`` and an independent coordinate, ``tau.``
+            and a motor, or a point's, ``point:tip.x``.
         parameter : str
 
         Raises
         ------
         InputError
-            No such number or parameter; the message lists those there are.
+            No such quantity or parameter; the message lists those there are.
         """
-        run = self.run
         if parameter not in self.parameters:
             raise InputError(f"no parameter {parameter!r} among these; there are {', '.join(self.parameters)}")
+        curves = self._curves()
+        if name not in curves:
+            raise InputError(f"no {name!r}; there are {', '.join(curves)}")
+        return np.array(curves[name][:, self.parameters.index(parameter)], dtype=float)
+
+    def _curves(self) -> dict[str, Array]:
+        """By name, (m, p)."""
+        run, found = self.run, dict[str, Array]()
         parts = {"": (run.coordinates, self.q_tree), "v.": (run.coordinates, self.v_tree),
                  "u.": (run.independent, self.u), "tau.": (run.actuated, self.tau)}  # fmt: skip
         for prefix, (names, array) in parts.items():
-            if name.startswith(prefix) and name.removeprefix(prefix) in names:
-                at = names.index(name.removeprefix(prefix))
-                return np.array(array[:, at, self.parameters.index(parameter)], dtype=float)
-        there = [prefix + of for prefix, (names, _) in parts.items() for of in names]
-        raise InputError(f"no {name!r}; there are {', '.join(there)}")
+            found |= {prefix + name: array[:, k] for k, name in enumerate(names)}
+        for name, moved in self.points.items():
+            found |= {f"point:{name}.{axis}": moved[:, k] for k, axis in enumerate("xyz")}
+        return found
+
+    def plain(self) -> dict[str, Any]:
+        """Return them as JSON has them; a row of each list an instant, by coordinate and parameter."""
+        run = self.run
+        names = {"coordinates": run.coordinates, "independent": run.independent, "actuated": run.actuated}
+        arrays = {name: getattr(self, name).tolist() for name in ("t", "q_tree", "v_tree", "u", "tau")}
+        return {
+            "name": run.scene_name, "status": run.status, "message": run.message,
+            "parameters": list(self.parameters), **{key: list(x) for key, x in names.items()}, **arrays,
+            "points": {name: x.tolist() for name, x in self.points.items()},
+            "end_time": None if self.end_time is None else self.end_time.tolist(),
+            "stats": run.stats,
+        }  # fmt: skip
+
+    def save(self, path: str | Path) -> Path:
+        """Write them to a file, NumPy's npz without pickle (docs/reference/run_file.md): whole or not at all.
+
+        Raises
+        ------
+        InputError
+            It cannot be written.
+        """
+        require_path(path, "Sensitivities.save: path")
+        run, path = self.run, Path(path)
+        about = {"name": run.scene_name, "status": run.status, "message": run.message}
+        names = {"parameters": self.parameters, "coordinates": run.coordinates, "independent": run.independent,
+                 "actuated": run.actuated, "points": tuple(self.points)}  # fmt: skip
+        none = np.zeros((len(self.t), 0, 3, len(self.parameters)))
+        arrays = {
+            **{name: getattr(self, name) for name in ("t", "q_tree", "v_tree", "u", "tau")},
+            **{key: np.array(x, dtype=str) for key, x in names.items()},
+            "point_moved": np.stack(list(self.points.values()), axis=1) if self.points else none,
+            "end_time": np.full(len(self.parameters), np.nan) if self.end_time is None else self.end_time,
+            "meta": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
+        }
+        with written_whole(path) as file:
+            np.savez_compressed(file, **arrays)
+        return path
 
 
 def sensitivities(
@@ -146,7 +202,9 @@ def sensitivities(
     q_tree, v_tree, u, tau = _parts(ready, rows)
     if np.isnan(q_tree[0]).any():
         raise NumericalError(f"sensitivities: {_start(ready)}", t=0.0)
-    return Sensitivities(run, ready.varying, q_tree, v_tree, u, tau, _end_time(ready))
+    points = moved_points(ready.mechanism, ready.varying, run.q_tree, q_tree)
+    names = tuple(x.name for x in ready.varying)
+    return Sensitivities(run, names, q_tree, v_tree, u, tau, points, _end_time(ready))
 
 
 def _apart(ready: Prepared) -> str | None:
@@ -155,7 +213,7 @@ def _apart(ready: Prepared) -> str | None:
     if found is None:
         return None
     coordinate, of_rate, parameter = found
-    joint, name, t = ready.mechanism.coordinates[coordinate], ready.varying[parameter], float(ready.loop.t)
+    joint, name, t = ready.mechanism.coordinates[coordinate], ready.varying[parameter].name, float(ready.loop.t)
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
     what = f"{joint} begins to move from rest" if of_rate else f"{joint} comes to its stop"
     there = "at rest" if of_rate else "there"

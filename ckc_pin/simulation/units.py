@@ -6,7 +6,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.units import STIFF, VISCOUS, effort, joined, motor_units, parameter_unit, row_units
 
-__all__ = ["by_time", "key_unit", "quantity_units"]
+__all__ = ["by_time", "key_unit", "per", "quantity_units"]
 
 SECONDS = ("t_end", "epsilon", "max_step", "min_step", "max_wall_s", "output_dt", "sample_time", "delay", "filter")
 
@@ -25,6 +25,11 @@ def quantity_units(mechanism: Mechanism) -> dict[str, list[str]]:
 def by_time(unit: str) -> str:
     """Return the unit of a quantity's integral over time."""
     return unit.removesuffix("/s") if unit.endswith("/s") else "s²" if unit == "s" else f"{unit} s"
+
+
+def per(unit: str, other: str) -> str:
+    """Return the unit of a derivative."""
+    return f"{unit}/({other})" if "/" in other or " " in other else f"{unit}/{other}" if other else unit
 
 
 def key_unit(mechanism: Mechanism, name: str) -> str:

@@ -165,12 +165,19 @@ def varying_of(
     labels = [part for name in names for part in parts_of(name, known)]
     if len(set(labels)) < len(labels):
         raise InputError(f"sensitivities: a parameter is named twice in {', '.join(names)}")
-    return [
-        Varying(name, effects_of(mechanism, actuation, name, scene.spec.parameters, changed))
-        if is_parameter(name)
-        else of_scene[name]
-        for name in labels
-    ]
+    return [_of_mechanism(name, effects_of(mechanism, actuation, name, scene.spec.parameters, changed))
+            if is_parameter(name) else of_scene[name] for name in labels]  # fmt: skip
+
+
+def _of_mechanism(name: str, effects: Sequence[Effect]) -> Varying:
+    """Keep what moves nothing but a point that is reported apart from what the motion depends on."""
+    placed = ["" if effect.lock is None else effect.lock.placed for effect in effects]
+    by_place = list(zip(placed, effects, strict=True))
+    return Varying(
+        name,
+        tuple(effect for place, effect in by_place if place != "reported"),
+        places=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
+    )
 
 
 def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[Varying]:

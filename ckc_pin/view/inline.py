@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING
 from ckc_pin.simulation.linear_model import LinearModel
 from ckc_pin.simulation.locus import GainLocus
 from ckc_pin.simulation.run import Run
+from ckc_pin.simulation.sensitivities import Sensitivities
 from ckc_pin.view.figures import draw, write_figures
 from ckc_pin.view.gif import save_gif
 from ckc_pin.view.linear_figure import draw_linear
 from ckc_pin.view.player import html, write_page
+from ckc_pin.view.sensitivity_figure import draw_sensitivities
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,17 +29,19 @@ RESOLUTION = 100  # of a figure in a page
 
 
 class Figures(Mapping[str, "Figure"]):
-    """Figures by name, as `view.figures.draw` and `view.linear_figure.draw_linear` draw them; shown by a notebook.
+    """Figures by name, as `view.figures.draw` and its like draw them; shown by a notebook.
 
     Parameters
     ----------
-    shown : sequence of Run, or of one LinearModel or GainLocus
+    shown : sequence of Run, or of one LinearModel, GainLocus or Sensitivities
     """
 
-    def __init__(self, shown: Sequence[Run | LinearModel | GainLocus]) -> None:
+    def __init__(self, shown: Sequence[Run | LinearModel | GainLocus | Sensitivities]) -> None:
         match shown:
             case [LinearModel() | GainLocus() as one]:
                 self._figures = draw_linear(one)
+            case [Sensitivities() as one]:
+                self._figures = {"sensitivities": draw_sensitivities(one)}
             case _:
                 self._figures = draw(shown)  # type: ignore[arg-type]
 

@@ -1,0 +1,58 @@
+"""How points that are reported move with parameters: with the coordinates, and with what places them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.tree import Array
+from ckc_pin.native.variation import Varying
+
+__all__ = ["moved_points"]
+
+
+def moved_points(mechanism: Mechanism, varying: Sequence[Varying], q_tree: Array, steps: Array) -> dict[str, Array]:
+    """Return how the mechanism's points move with each parameter, in world axes.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    varying : sequence of Varying
+    q_tree : (m, n) array
+        By instant and coordinate, as a run has them.
+    steps : (m, n, p) array
+        How those change, of a free root as a twist in its own axes.
+
+    Returns
+    -------
+    dict of str to (m, 3, p) arrays
+        m for each parameter's unit.
+    """
+    found = {name: np.zeros((len(q_tree), 3, len(varying))) for name in mechanism.points}
+    if not found:
+        return found
+    for row, (numbers, step) in enumerate(zip(q_tree, steps, strict=True)):
+        q = mechanism.tree.from_coordinates(numbers)
+        pose = Pose(mechanism.tree, mechanism.closure.anchors, q)
+        at, along = mechanism.point_positions(q), mechanism.point_jacobians(q)
+        for number, name in enumerate(mechanism.points):
+            found[name][row] = along[name] @ step
+            for k, x in enumerate(varying):
+                found[name][row, :, k] += _placed(mechanism, x, number, name, at[name], pose)
+    return found
+
+
+def _placed(mechanism: Mechanism, x: Varying, number: int, name: str, at: Array, pose: Pose) -> Array:
+    """How a point moves with what places it, and what places the joints that carry it."""
+    carriers, total = set(mechanism.tree.model.supports[mechanism.points[name].joint]), np.zeros(3)
+    for effect in x.places:
+        assert effect.lock is not None
+        placed, index = effect.lock.placed, effect.index
+        if (placed == "joint" and index in carriers) or (placed == "reported" and index == number):
+            axis = pose.rotation[effect.lock.carrier] @ effect.lock.axis
+            arm = at - pose.translation[effect.lock.carrier]
+            total += effect.numbers[0] * (np.cross(axis, arm) if effect.lock.turns else axis)
+    return total
