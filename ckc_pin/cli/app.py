@@ -42,6 +42,7 @@ COMMANDS = {
     "run": "run:run",
     "inverse": "inverse:inverse",
     "linearize": "linearize:linearize",
+    "sensitivities": "sensitivities:sensitivities",
     "sweep": "sweep:sweep",
     "plot": "view:plot",
     "play": "view:play",

@@ -89,7 +89,7 @@ def _expected(seconds: float) -> None:
 @options.mechanism
 @options.as_json
 def compile_(mechanism: str, as_json: bool) -> None:
-    """Compile a mechanism's terms; its runs take them from then on."""
+    """Compile a mechanism's terms, which its runs then take."""
     from time import perf_counter
 
     from ckc_pin.generated.library import cache_folder, compiled, find

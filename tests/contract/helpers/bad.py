@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.contract.helpers.command import ckc
 
 WRONG_INPUT, STOPPED = 2, 3
-SPEAKS_JSON = ("list", "check", "terms", "run", "inverse", "import")
+SPEAKS_JSON = ("list", "check", "terms", "run", "inverse", "sensitivities", "import")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,74 @@
+"""What `ckc sensitivities` promises: keys and shapes, the card, files, how it ends, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from tests.contract.helpers.bad import Bad, expect
+from tests.contract.helpers.command import ckc
+
+SCENE, NAMES = "five_bar/set_point", ("controller.K_P", "joint.theta_2.xyz.x", "gravity")
+SHORT = ("--set", "t_end=0.2")
+
+
+def test_json() -> None:
+    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT, "--json")
+    assert (answer.code, answer.err) == (0, "")
+    found = answer.json
+    m, p = len(found["t"]), 5
+    assert found["parameters"] == [*NAMES[:2], "gravity.x", "gravity.y", "gravity.z"]
+    for key, width in (("q_tree", 4), ("v_tree", 4), ("u", 2), ("tau", 2)):
+        assert np.shape(found[key]) == (m, width, p)
+    assert {name: np.shape(x) for name, x in found["points"].items()} == {"tip": (m, 3, p)}
+    assert (found["status"], found["end_time"]) == ("done", None)
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if line.startswith("| `sensitivities`"))
+    assert [key for key in found if not re.search(rf"\b{key}\b", row)] == []
+
+
+def test_card_and_files(tmp_path: Path) -> None:
+    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT, "--out", str(tmp_path / "x"), "--figures")
+    assert answer.code == 0
+    found = ckc_pin.sensitivities(SCENE, NAMES, {"t_end": 0.2})
+    most = np.abs(found.of("theta_3", "controller.K_P")).max()
+    assert f"theta_3 = {most:.4g} rad/(N m/rad)" in " ".join(answer.out.split())
+    assert repr(found).splitlines()[0] == "Sensitivities of five_bar/set_point, done: reached t_end"
+    assert {path.name for path in (tmp_path / "x").iterdir()} == {"run.npz", "sensitivities.npz", "sensitivities.png"}
+    with np.load(tmp_path / "x" / "sensitivities.npz", allow_pickle=False) as data:
+        assert list(data["parameters"]) == list(found.parameters)
+        for name in ("t", "q_tree", "v_tree", "u", "tau"):
+            assert np.array_equal(data[name], getattr(found, name))
+        assert np.array_equal(data["point_moved"][:, 0], found.points["tip"])
+        assert json.loads(bytes(data["meta"]))["status"] == "done"
+        page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "run_file.md").read_text(encoding="utf-8")
+        says = page.partition("## sensitivities.npz")[2].partition("##")[0]
+        assert [key for key in data if not re.search(rf"\b{key}\b", says)] == []
+
+
+def test_a_motion_without_a_derivative_keeps_what_it_has(tmp_path: Path) -> None:
+    answer = ckc(
+        "sensitivities", "five_bar/friction", "initial.q_dot.theta_1", "--set", "initial.q_dot.theta_1=0",
+        "--set", "joint.theta_1.friction=1e-3", "--out", str(tmp_path),
+    )  # fmt: skip
+    assert answer.code == 3
+    assert "theta_1 begins to move from rest, and with another initial.q_dot.theta_1" in answer.err
+    assert (tmp_path / "sensitivities.npz").is_file()
+
+
+BAD = [
+    Bad("no name", ["sensitivities", SCENE], ["NAME", "ckc sensitivities --help"]),
+    Bad("unknown", ["sensitivities", SCENE, "link.rod.mass"], ["link.rod.mass", "link.link_2"]),
+    Bad("no folder", ["sensitivities", SCENE, "gravity", "--figures"], ["--figures goes with --out DIR"]),
+    Bad("sampled", ["sensitivities", SCENE, "gravity", "--set", "controller.sample_time=0.01"], ["sample_time"]),
+]
+
+
+@pytest.mark.parametrize("case", BAD, ids=lambda case: case.what)
+def test_bad_input(case: Bad, bar: Path) -> None:
+    expect(case, bar)
