@@ -192,7 +192,7 @@ def _stability(
         start.at,
         actuation,
     )
-    return replace(found, leaves_out=_leaves_out(scene, controller, actuation))
+    return replace(found, leaves_out=_leaves_out(scene, actuation))
 
 
 def run_warnings(scene: Scene) -> list[str]:
@@ -267,7 +267,7 @@ def _desired(
     return None
 
 
-def _leaves_out(scene: Scene, controller: SetPoint | Tracking, actuation: Actuation) -> tuple[str, ...]:
+def _leaves_out(scene: Scene, actuation: Actuation) -> tuple[str, ...]:
     """What of a scene stands between a run and the linear model of its closed loop."""
     spec, joints = scene.spec.controller, actuation.mechanism.joints
     there = {
@@ -275,7 +275,6 @@ def _leaves_out(scene: Scene, controller: SetPoint | Tracking, actuation: Actuat
         "torque limits": bool(np.isfinite(actuation.limit).any()),
         "stops": bool(joints.stopped.any()),
         "dry friction": bool(joints.friction.any()) and scene.spec.friction_smoothing is None,
-        "errors of its model": isinstance(controller, Tracking) and controller.model is not None,
     }
     return tuple(name for name, is_there in there.items() if is_there)
 

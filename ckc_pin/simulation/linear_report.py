@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 UNDAMPED = 1e-9  # of the fastest eigenvalue: a rate of decay that is none
+OFF = 1e-6  # rad or m: less off a motion is not worth a word
 SHOWN = 6  # eigenvalues, in what people read
 
 
@@ -163,10 +164,11 @@ def stability_text(found: Stability) -> str:
     if found.leaves_out:
         says += f", {' and '.join(found.leaves_out)} left out,"
     as_sampled = " as sampled" if found.sampled else ""
-    if found.growth is not None and found.largest_growth is not None:
+    if found.growth is not None and found.largest_growth is not None and found.offset is not None:
+        off = f", a run goes up to {found.offset.max():.2g} off it" if found.offset.max() > OFF else ""
         return (
             f"{says} along the motion{as_sampled}: errors grow to {found.largest_growth:.3g} times at most, to "
-            f"{found.growth:.2e} at its end; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
+            f"{found.growth:.2e} at its end{off}; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
         )
     if found.multiplier is not None:
         says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
@@ -215,7 +217,7 @@ def stability_warning(found: Stability, independent: tuple[str, ...]) -> list[st
 
 
 def _off_target(found: Stability, independent: tuple[str, ...]) -> list[str]:
-    if found.offset is None or found.least_K_P is not None:
+    if found.offset is None or found.least_K_P is not None or found.growth is not None:
         return []
     off = ", ".join(f"{name} {x:+.4g}" for name, x in zip(independent, found.offset, strict=True))
     return [f"the closed loop rests off its target ({off}): its model's h there is not what the mechanism needs"]

@@ -12,6 +12,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import cycles
 from ckc_pin.dynamics.equilibrium import h_gradient
+from ckc_pin.dynamics.formulations import tree_force
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.generated.library import Library
@@ -33,6 +34,8 @@ FEWEST, MOST = 24, 8192  # steps of the variational equation
 OF_A_CYCLE = 4  # steps of the quickest wave, where half as many are taken: all of them see it at different phases
 AGREED = 0.02  # of the growth, between a number of steps and half as many: it is known four times as well
 SURELY = 0.3  # of the growth's logarithm: where half as many steps are off by more, its sign is not known
+NEAR = 0.1  # rad, or of the mechanism's size: what is linearized along the desired motion holds so far off it
+BY_OFFSET = 5.0  # of the growth's logarithm, by that: it was 4 at most in a hundred random sampled loops
 SURE = 1e-12  # of the fastest eigenvalue: what is no further left of the axis may be on it
 NEWTON = 8  # iterations of a piece of the way to where a controller with another model's h comes to rest
 SMALLEST_PIECE = 1e-4  # of that way
@@ -60,8 +63,9 @@ class Stability:
     least_eigenvalue : float or None
         Of a set point: of K_P + dh/dq, N m/rad; the stiffness that is left in its weakest direction.
     offset : (d,) array or None
-        Of a set point: where it rests, from its target: rad, m. Not zero where what the controller compensates is
-        another model's h.
+        Of a set point where it rests, from its target, rad, m: not zero where what the controller compensates is
+        another model's h. Of tracking how far the motion, started as desired, goes off the desired one at most, by
+        sampling, delay, friction or another model.
     slowest : float or None
         Time constant of the slowest decay, s: infinite where there is none. Of tracking, of the whole motion.
     growth, largest_growth : float or None
@@ -72,8 +76,7 @@ class Stability:
     multiplier : float or None
         Of a set point that is sampled: the largest factor of an error from one sample to the next, delay included.
     leaves_out : tuple of str
-        What of the scene the linear model does not have: "sensor and drive", "torque limits", "stops", "dry friction",
-        "errors of its model" (of tracking: it is linearized along the desired motion).
+        What of the scene the linear model does not have: "sensor and drive", "torque limits", "stops", "dry friction".
     """
 
     stable: bool | None
@@ -122,7 +125,7 @@ def stability(
     with one_blas_thread():
         try:
             _require_countable(law, t_end, sampling)
-            loop = _Loop(mechanism, law, ClosedLoop(mechanism, law, smoothing, library), actuation)
+            loop = _Loop(mechanism, law, ClosedLoop(mechanism, law, smoothing, library), smoothing, actuation)
             near = near or mechanism.assembled
             if isinstance(law, SetPoint):
                 return _about(law, loop, near, sampling)
@@ -154,6 +157,7 @@ class _Loop:
     mechanism: Mechanism
     law: SetPoint | Tracking
     closed_loop: ClosedLoop
+    smoothing: float | None
     actuation: Actuation | None
 
     def at(self, t: float, state: Terms, where: str) -> Feedback:
@@ -172,6 +176,13 @@ class _Loop:
                     f"{actuation.limit[k]:.4g}"
                 )
         return self.closed_loop.at(t, state)
+
+    def needed(self, state: Terms, q_ddot: Array) -> Array:
+        """Return the u with which the mechanism moves on at an acceleration, dry friction left out if not smooth."""
+        force = tree_force(state, state.rho @ q_ddot + state.rho_dot_times(state.q_dot))
+        if self.smoothing is not None:
+            force += self.mechanism.joints.friction * np.tanh(state.v_tree / self.smoothing)
+        return state.rho.T @ force
 
 
 # --- about a target ------------------------------------------------------------------------------
@@ -260,19 +271,30 @@ def _along(
         raise NumericalError(f"the desired motion is too quick to be followed for longer than {most:.3g} s")
     steps, end = max(FEWEST, int(np.ceil(OF_A_CYCLE * turns))), np.nan
     while True:
-        before, grown = end, _growth(*_pieces(law, loop, near, t_end, steps), t_end, sampling)
+        before, (pieces, driven, metrics) = end, _pieces(law, loop, near, t_end, steps)
+        grown = _growth(pieces, metrics, t_end, sampling)
         end = float(grown[-1])
         off = 0.0 if end == before else abs(end - before)  # both may be infinite
         if off <= AGREED * max(1.0, abs(end)) or 2 * steps > MOST:
             break
         steps *= 2
-    known = off < SURELY * abs(end)
+    offset = _offset(driven, t_end, sampling)
+    far = float((offset / loop.mechanism.tree.reach[loop.mechanism.partition.q]).max())
     with np.errstate(over="ignore"):
         growth, largest_growth = (float(np.exp(x)) for x in (end, grown.max()))
+    reason = None
+    if not off < SURELY * abs(end):
+        reason = f"errors change by {growth:.3g} times, which is not known well enough to tell from 1"
+    elif (end < 0 and far > NEAR) or not BY_OFFSET * min(far, NEAR) * max(1.0, abs(end)) < abs(end):
+        reason = (
+            f"errors change by {growth:.3g} times along the desired motion, but a run goes up to {far:.2g} rad or "
+            "sizes off it, by sampling, delay, friction or its model"
+        )
     return Stability(
-        stable=end < 0 if known else None,
-        reason=None if known else f"errors change by {growth:.3g} times, which is not known well enough to tell from 1",
+        stable=end < 0 if reason is None else None,
+        reason=reason,
         eigenvalues=eigenvalues_of(loop.at(0.0, _desired_state(loop.mechanism, law, 0.0, near), "at t = 0").closed),
+        offset=offset,
         slowest=_time_constant(end / t_end),
         growth=growth,
         largest_growth=largest_growth,
@@ -282,18 +304,39 @@ def _along(
 
 def _pieces(
     law: Tracking, loop: _Loop, near: Kinematics, t_end: float, steps: int
-) -> tuple[list[Feedback], list[Array]]:
-    """Return the linear loop in the middle of each step, and the root of eq. 18's matrix from step to step."""
-    at, pieces, inertias = near, [], []
+) -> tuple[list[Feedback], list[Feedback], list[Array]]:
+    """Return the linear loop in the middle of each step, of errors and driven, and the root of eq. 18's matrix by step.
+
+    The driven one has a state more, which is 1: it also has the u that the controller gives on the desired motion, and
+    lacks what this needs.
+    """
+    at, pieces, driven, inertias = near, [], [], []
     middles = (np.arange(steps) + 0.5) * t_end / steps
     for t in (0.0, *middles.tolist(), t_end):
         state = _desired_state(loop.mechanism, law, t, at)
         at = state.at
         inertias.append(state.D)
         if 0.0 < t < t_end:
-            pieces.append(loop.at(t, state, f"at t = {t:.5g} s of the desired motion"))
+            piece = loop.at(t, state, f"at t = {t:.5g} s of the desired motion")
+            pieces.append(piece)
+            driven.append(_driven(piece, law.u(t, state), loop.needed(state, law.desired(t)[2])))
     between = [(one + two) / 2 for one, two in pairwise(inertias[1:-1])]
-    return pieces, [_metric(law, D) for D in (inertias[0], *between, inertias[-1])]
+    return pieces, driven, [_metric(law, D) for D in (inertias[0], *between, inertias[-1])]
+
+
+def _driven(piece: Feedback, given: Array, needed: Array) -> Feedback:
+    states, d = piece.B.shape
+    A = np.block([[piece.A, -(piece.B @ needed)[:, None]], [np.zeros((1, states + 1))]])
+    return Feedback(A, np.vstack([piece.B, np.zeros((1, d))]), np.hstack([piece.K, given[:, None]]))
+
+
+def _offset(driven: list[Feedback], t_end: float, sampling: tuple[float, float] | None) -> Array:
+    """Return how far a motion that starts as desired goes off what is desired, at most, by coordinate."""
+    states, d = driven[0].B.shape
+    start = np.eye(states)[:, -1:]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [x[:d, 0] / x[-1, 0] for x, _ in _states(driven, t_end / len(driven), start, sampling)]
+    return np.nan_to_num(np.abs(found), nan=np.inf).max(axis=0)
 
 
 def _desired_state(mechanism: Mechanism, law: Tracking, t: float, near: Kinematics) -> Terms:
@@ -318,15 +361,19 @@ def _growth(pieces: list[Feedback], metrics: list[Array], t_end: float, sampling
     """
     dt, start = t_end / len(pieces), np.asarray(np.linalg.inv(metrics[0]), dtype=float)
     with np.errstate(over="ignore", invalid="ignore"):
-        states = _motion(pieces, dt, start) if sampling is None else sampled_motion(pieces, dt, start, *sampling)
+        states = _states(pieces, dt, start, sampling)
         sizes = [(metric @ state, log) for metric, (state, log) in zip(metrics, states, strict=True)]
     return np.array([log + np.log(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x, log in sizes])
 
 
-def _motion(pieces: list[Feedback], dt: float, start: Array) -> list[tuple[Array, float]]:
-    """Return what states become without sampling, as `sampled_motion` does."""
+def _states(
+    pieces: list[Feedback], dt: float, start: Array, sampling: tuple[float, float] | None
+) -> list[tuple[Array, float]]:
+    """Return what states become, as `sampled_motion` does, or without samples."""
     from scipy.linalg import expm
 
+    if sampling is not None:
+        return sampled_motion(pieces, dt, start, *sampling)
     found = [(start, 0.0)]
     for piece in pieces:
         x, log = found[-1]

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from ckc_pin import Stability, check, load, load_scene, simulate
+from ckc_pin.control.controllers import Tracking
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.mechanism.library import library
+from ckc_pin.simulation.prepare import scene_controller
 from tests.analytic.five_bar import FIVE_BAR, Array
+from tests.analytic.test_stability import waves
 from tests.analytic.test_workspace import EDGE
 
 NAMES = ("theta_1", "theta_3")
@@ -155,9 +158,43 @@ def test_where_the_run_is_refused_nothing_is_said_to_be_stable(tmp_path: Path) -
     assert "a run does not begin: actuated: theta_1 cannot hold every freedom" in str(found.reason)
 
 
-def test_tracking_with_another_model_says_what_is_left_out() -> None:
-    found = verdict("five_bar/tracking", {"controller.model": "five_bar_as_printed"})
-    assert found.leaves_out == ("errors of its model",)
+def on_its_way(changes: dict[str, Any], t_end: float) -> tuple[dict[str, Any], Tracking]:
+    """Tracking of the five-bar that starts on its desired motion."""
+    scene = load_scene("five_bar/tracking", changes)
+    law = scene_controller(scene, load("five_bar"))
+    assert isinstance(law, Tracking)
+    q, q_dot, _ = (dict(zip(NAMES, x.tolist(), strict=True)) for x in law.desired(0.0))
+    exact = {"formulation": "reduced", "solver.rtol": 1e-10, "t_end": t_end}
+    return {**changes, **exact, "initial": {"q": q, "q_dot": q_dot}}, law
+
+
+DRIVEN = [
+    ({"controller.K_D": 0.5, "controller.sample_time": 0.01}, 0.08),
+    ({"controller.K_D": 0.3, "controller.sample_time": 0.004, "controller.delay": 0.005}, 0.05),
+    ({"controller.model": "five_bar_as_printed"}, 0.1),
+    ({"friction_smoothing": 0.2, **{f"joint.{name}.friction": 0.05 for name in NAMES}}, 0.05),
+]
+
+
+@pytest.mark.parametrize(("changes", "rel"), DRIVEN, ids=lambda x: str(x)[:40])
+def test_what_takes_a_motion_off_the_desired_one_is_what_a_run_shows(changes: dict[str, Any], rel: float) -> None:
+    """Samples, delay, another model, friction; up to what is not linear in it."""
+    on_it, law = on_its_way(waves(6.0) | changes, 2.0)
+    found, run = verdict("five_bar/tracking", on_it), simulate("five_bar/tracking", on_it)
+    wanted = np.array([law.desired(float(t))[0] for t in run.t])
+    off = np.abs(run.q_tree[:, [0, 2]] - wanted).max(axis=0)
+    assert off.max() > 1e-3
+    assert found.offset == pytest.approx(off, rel=rel)
+    assert found.stable
+
+
+def test_a_motion_far_off_the_desired_one_has_no_verdict() -> None:
+    """Errors fall along the desired motion, but the run is elsewhere."""
+    found = verdict("five_bar/tracking", waves(6.0) | {"friction_smoothing": 0.2, "joint.theta_1.friction": 5.0})
+    assert found.growth is not None
+    assert found.growth < 1
+    assert found.stable is None
+    assert "off it, by sampling, delay, friction or its model" in str(found.reason)
 
 
 @pytest.mark.parametrize(
