@@ -80,7 +80,7 @@ class Check(Shown):
     desired : DesiredCheck or None
         For a scene with a controller.
     stability : Stability or None
-        Of its closed loop, where its target or its motion can be reached.
+        Of its closed loop, for a scene with a set point or tracking.
     branches : (k, n) array or None
         Closed configurations at the assembled q, when asked for; the assembled one first.
     """

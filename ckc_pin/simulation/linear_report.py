@@ -165,7 +165,7 @@ def stability_text(found: Stability) -> str:
         says += f", {' and '.join(found.leaves_out)} left out,"
     as_sampled = " as sampled" if found.sampled else ""
     if found.growth is not None and found.largest_growth is not None and found.offset is not None:
-        off = f", a run goes up to {found.offset.max():.2g} off it" if found.offset.max() > OFF else ""
+        off = f", a run goes up to {found.offset.max():.2g} rad or m off it" if found.offset.max() > OFF else ""
         return (
             f"{says} along the motion{as_sampled}: errors grow to {found.largest_growth:.3g} times at most, to "
             f"{found.growth:.2e} at its end{off}; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
