@@ -165,10 +165,12 @@ def stability_text(found: Stability) -> str:
         says += f", {' and '.join(found.leaves_out)} left out,"
     as_sampled = " as sampled" if found.sampled else ""
     if found.growth is not None and found.largest_growth is not None and found.offset is not None:
-        off = f", a run goes up to {found.offset.max():.2g} rad or m off it" if found.offset.max() > OFF else ""
+        far = float(found.offset.max())
+        off = f", a run goes up to {far:.2g} rad or m off it" if found.stable and far > OFF else ""
+        values = eigenvalues_text(found.eigenvalues)
         return (
-            f"{says} along the motion{as_sampled}: errors grow to {found.largest_growth:.3g} times at most, to "
-            f"{found.growth:.2e} at its end{off}; eigenvalues at its start {eigenvalues_text(found.eigenvalues)} 1/s"
+            f"{says} along the motion{as_sampled}: errors grow to {_times(found.largest_growth)} at most, to "
+            f"{_times(found.growth)} at its end{off}; eigenvalues at its start {values} 1/s"
         )
     if found.multiplier is not None:
         says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
@@ -190,7 +192,7 @@ def stability_warning(found: Stability, independent: tuple[str, ...]) -> list[st
             "; larger Lambda and K_D would help"
         )  # fmt: skip
         return [
-            f"the closed loop is unstable {along}: an error may be {found.growth:.3g} times as large at its end{helps}"
+            f"the closed loop is unstable {along}: an error may be {_times(found.growth)} as large at its end{helps}"
         ]
     assert found.eigenvalues is not None
     assert found.least_eigenvalue is not None
@@ -214,6 +216,10 @@ def stability_warning(found: Stability, independent: tuple[str, ...]) -> list[st
         "the closed loop does not come to rest at its target: something swings about it that neither K_V nor the "
         "joints damp; give K_V, or a larger one"
     ]
+
+
+def _times(growth: float) -> str:
+    return f"{growth:.3g} times" if np.isfinite(growth) else "more than 1e308 times"
 
 
 def _off_target(found: Stability, independent: tuple[str, ...]) -> list[str]:

@@ -334,9 +334,9 @@ def _offset(driven: list[Feedback], t_end: float, sampling: tuple[float, float] 
     """Return how far a motion that starts as desired goes off what is desired, at most, by coordinate."""
     states, d = driven[0].B.shape
     start = np.eye(states)[:, -1:]
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         found = [x[:d, 0] / x[-1, 0] for x, _ in _states(driven, t_end / len(driven), start, sampling)]
-    return np.nan_to_num(np.abs(found), nan=np.inf).max(axis=0)
+    return np.nan_to_num(np.abs(found), nan=np.inf, posinf=np.inf).max(axis=0)
 
 
 def _desired_state(mechanism: Mechanism, law: Tracking, t: float, near: Kinematics) -> Terms:

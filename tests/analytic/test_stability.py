@@ -167,6 +167,13 @@ def test_a_long_motion_has_its_slowest_decay() -> None:
     assert found.slowest == pytest.approx(-1 / found.eigenvalues.real.max(), rel=5e-3)
 
 
+def test_growth_beyond_all_numbers_is_said_to_be_so() -> None:
+    said = check(load_scene("five_bar/tracking", {"controller.sample_time": 0.02, "t_end": 90.0}))
+    assert said.stability is not None
+    assert said.stability.stable is False
+    assert any("may be more than 1e308 times as large at its end" in warning for warning in said.warnings)
+
+
 def test_a_motion_too_quick_to_be_followed_has_no_verdict() -> None:
     found = stability(*controlled("five_bar/tracking", waves(1e5)), 3.0)
     assert found.stable is None
