@@ -360,10 +360,10 @@ def _growth(pieces: list[Feedback], metrics: list[Array], t_end: float, sampling
     Infinite where it is no number any more.
     """
     dt, start = t_end / len(pieces), np.asarray(np.linalg.inv(metrics[0]), dtype=float)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         states = _states(pieces, dt, start, sampling)
         sizes = [(metric @ state, log) for metric, (state, log) in zip(metrics, states, strict=True)]
-    return np.array([log + np.log(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x, log in sizes])
+        return np.array([log + np.log(np.linalg.norm(x, 2)) if np.all(np.isfinite(x)) else np.inf for x, log in sizes])
 
 
 def _states(

@@ -11,7 +11,9 @@ import pytest
 
 from ckc_pin import Stability, check, load, load_scene, simulate
 from ckc_pin.control.controllers import Tracking
+from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import library
 from ckc_pin.simulation.prepare import scene_controller
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -64,6 +66,25 @@ def test_on_another_branch_it_is_the_target_there(seed: int) -> None:
     errors = np.abs(run.q_tree[:, [0, 2]] - q_d).max(axis=1)
     assert run.q_tree[-1][1] == pytest.approx(2.6, abs=0.3)
     assert errors[-1] < 1e-5 * errors[0]
+
+
+def test_on_another_branch_tracking_is_judged_there() -> None:
+    """At its start: -Lambda, and r_dot = -D^-1 (C + K_D) r with the terms of that branch."""
+    mechanism = load("five_bar")
+    other = mechanism.tree.named(mechanism.tree.to_coordinates(assembly_branches(mechanism)[1].q_tree))
+    scene = load_scene("five_bar/tracking", waves(2.0) | {"initial": {"q": other}, "controller.K_D": 0.1})
+    law = scene_controller(scene, mechanism)
+    assert isinstance(law, Tracking)
+    q_d, q_d_dot, _ = law.desired(0.0)
+    there = mechanism.kinematics(mechanism.tree.from_coordinates(np.array([other[x] for x in mechanism.coordinates])))
+    at = sigma(mechanism, q_d, there).at
+    state = Terms(mechanism, at, at.rho @ q_d_dot)
+    wanted = np.concatenate([[-1.0, -1.0], np.linalg.eigvals(-np.linalg.solve(state.D, state.C + law.K_D))])
+    found = check(scene).stability
+    assert found is not None
+    assert found.stable
+    assert found.eigenvalues is not None
+    assert np.sort_complex(found.eigenvalues) == pytest.approx(np.sort_complex(wanted), rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
