@@ -13,7 +13,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["equilibrium", "h_gradient", "stable_equilibrium"]
+__all__ = ["equilibrium", "h_gradient", "stable_equilibrium", "weight"]
 
 STEPS = 300
 LONGEST = 0.3  # rad or m along each principal direction of the Hessian
@@ -86,7 +86,7 @@ def equilibrium(mechanism: Mechanism) -> Kinematics:
         The descent runs into a configuration where the loops lose rank, or does not end.
     """
     terms = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
-    scale = 1e-13 * (1.0 + _weight(mechanism))
+    scale = 1e-13 * (1.0 + weight(mechanism))
     if mechanism.d == 0:
         return terms.at
     for _ in range(STEPS):
@@ -150,7 +150,7 @@ def _none(mechanism: Mechanism, at: Kinematics, why: str) -> NumericalError:
     )
 
 
-def _weight(mechanism: Mechanism) -> float:
+def weight(mechanism: Mechanism) -> float:
     """Scale of h: what the whole weight does on the arm of the mechanism's size, N m."""
     mass = sum(inertia.mass for inertia in list(mechanism.tree.model.inertias)[1:])
     gravity = float(np.linalg.norm(mechanism.tree.model.gravity.linear))

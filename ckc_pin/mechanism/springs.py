@@ -84,6 +84,14 @@ class Springs:
             force -= (self.stiffness * (length - self.rest_length)) @ length_jacobian
         return force
 
+    def sizes(self, q_tree: Array) -> Array:
+        """What `elastic_force` would be if nothing in it acted against anything else, shape (n,): never negative."""
+        sizes = np.abs(self.constant) + np.abs(self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest))
+        if self.between_frames:
+            length, length_jacobian = self._lengths(q_tree)
+            sizes += np.abs(self.stiffness * (length - self.rest_length)) @ np.abs(length_jacobian)
+        return np.asarray(sizes)
+
     def elastic_gradient(self, q_tree: Array) -> Array:
         """Minus the derivative of `elastic_force` along the tangent coordinates, shape (n, n).
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.allocation import allocate
+from ckc_pin.dynamics.equilibrium import weight
 from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
@@ -20,7 +21,7 @@ __all__ = ["Rest", "hold", "kernel", "unbalanced"]
 
 LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which nothing needs to hold
 ROUNDING = 1e-4  # of that along the others
-NOTHING = 1e-14  # of the largest force on any coordinate
+NOTHING = 1e-13  # of the weight and the largest force on any coordinate: where both balance
 FLAT = 1e-9  # of the largest singular value: motions that joints at stops leave
 
 
@@ -78,9 +79,11 @@ def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
 
 def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
     """Whether more than rounding is left of what acts at rest, along a basis of motions."""
-    reach, sizes = state.mechanism.tree.reach, np.abs(state.h_tree) + np.abs(u_tree)
+    reach, springs = state.mechanism.tree.reach, state.mechanism.springs
+    sizes = np.abs(state.h_tree) + np.abs(u_tree) + springs.sizes(state.q_tree)
     enough = LEFT_OVER * (np.abs(tangent.T) @ sizes)
-    enough += NOTHING * (reach * sizes).max() * np.abs(tangent / reach[:, None]).max(axis=0)
+    scale = weight(state.mechanism) + float((reach * sizes).max())
+    enough += NOTHING * scale * np.abs(tangent / reach[:, None]).max(axis=0, initial=0.0)
     left = np.abs(tangent.T @ (state.h_tree - u_tree))
     return bool(np.any(left > enough + ROUNDING * enough.max(initial=0.0)))
 

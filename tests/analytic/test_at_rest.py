@@ -148,6 +148,25 @@ def test_a_start_at_rest_that_does_not_last_is_told() -> None:
     assert not any("accelerates" in note for note in linearize("five_bar").notes)
 
 
+@pytest.mark.parametrize("name", ["flyball", "stewart", "delta", "talos", "bricard", "three_rrr"])
+def test_an_equilibrium_is_not_said_to_accelerate(name: str) -> None:
+    """Nor where springs carry the weight, so that what is left is rounding of both."""
+    assert not any("accelerates" in note for note in linearize(name).notes)
+
+
+def test_what_balances_needs_no_motor(tmp_path: Path) -> None:
+    """A slider between two springs that pull against each other, and a pendulum whose mass is on its axis."""
+    text = 'actuated = []\n' + "".join(
+        f'[[spring]]\nframe_a = {{link = "cart"}}\nframe_b = {{link = "base", xyz = [{0.8 * x}, 0, {0.6 * x}]}}\n'
+        "stiffness = 900.0\n" for x in (1.3, -1.3)
+    )  # fmt: skip
+    mechanism = cart_and_pendulum(tmp_path, text.replace("actuated", "gravity = [0, -9.81, 0]\nactuated"))
+    model = linearize(mechanism, {"slide": 0.0, "swing": 0.7})
+    assert not any("accelerates" in note for note in model.notes)
+    with pytest.raises(InputError, match="it has no motors"):
+        linearize(mechanism, {"slide": 1e-6, "swing": 0.7})
+
+
 def test_a_root_held_in_part_has_an_equilibrium(tmp_path: Path) -> None:
     mechanism = plate_on_springs(tmp_path)
     model = linearize(mechanism)
