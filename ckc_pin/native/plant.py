@@ -25,9 +25,13 @@ from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
 
-__all__ = ["NONE", "AccelerationDerivatives", "Plant"]
+__all__ = ["LOST_RANK", "NONE", "AccelerationDerivatives", "Plant"]
 
 NONE = np.zeros(0, dtype=np.intp)
+LOST_RANK = (
+    "the loop closure's Jacobian J has lost rank: branches of the motion meet here, and no linear model describes them "
+    "all; take another configuration"
+)
 
 
 @dataclass(frozen=True)
@@ -108,8 +112,7 @@ class Plant:
         if found is None:
             tree = self.mechanism.tree
             raise NumericalError(
-                "the loop closure's Jacobian J has lost rank: branches of the motion meet here, and no linear model "
-                "describes them all; take another configuration",
+                LOST_RANK,
                 q_tree=tree.named(tree.to_coordinates(terms.q_tree)),
             )
         found["at"] = np.array(found["at"], dtype=np.intp)

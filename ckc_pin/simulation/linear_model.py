@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.dynamics.formulations import refuse_massless, tangent_basis
+from ckc_pin.dynamics.formulations import refuse_massless
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import Library
@@ -17,7 +17,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native.plant import NONE, Plant
 from ckc_pin.simulation.modes import NO_DAMPING, ComplexArray, Mode, eigenvalues_of, modes_of
-from ckc_pin.simulation.resting import kernel, unbalanced
+from ckc_pin.simulation.resting import kernel, motions, unbalanced
 
 if TYPE_CHECKING:
     from ckc_pin.simulation.run import Run
@@ -260,7 +260,7 @@ def linear_model(
 
 
 def _refuse_massless(terms: Terms, locked: IntArray) -> None:
-    tangent, _ = tangent_basis(terms, np.zeros(terms.mechanism.closure.rows))
+    tangent = motions(terms)
     tangent = tangent @ kernel(tangent[locked] / terms.mechanism.tree.reach[locked, None])
     if tangent.shape[1]:
         refuse_massless(terms, tangent, np.arange(terms.mechanism.n))

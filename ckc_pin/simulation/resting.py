@@ -11,13 +11,14 @@ from ckc_pin.control.allocation import allocate
 from ckc_pin.dynamics.equilibrium import weight
 from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.findings import AT_STOP
 from ckc_pin.mechanism.linear import pivoted_columns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, IntArray
+from ckc_pin.native.plant import LOST_RANK
 
-__all__ = ["Rest", "hold", "kernel", "unbalanced"]
+__all__ = ["Rest", "hold", "kernel", "motions", "unbalanced"]
 
 LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which nothing needs to hold
 ROUNDING = 1e-4  # of that along the others
@@ -61,9 +62,11 @@ def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
     ------
     InputError
         Nothing holds it.
+    NumericalError
+        J has lost rank.
     """
     mechanism = state.mechanism
-    every, _ = tangent_basis(state, np.zeros(mechanism.closure.rows))
+    every = motions(state)
     side = _side(mechanism, state.q_tree)
     at_stop = touching = np.flatnonzero(side)
     while True:
@@ -75,6 +78,14 @@ def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
         if np.all(push > LEFT_OVER * scale.max(initial=0.0)):
             return Rest(tau, touching, np.setdiff1d(at_stop, touching), bool(friction.any()))
         touching = np.delete(touching, int(np.argmin(push)))  # a stop does not pull
+
+
+def motions(state: Terms) -> Array:
+    """Return a basis of the velocities that the loops allow, (n, d); NumericalError where J has lost rank."""
+    try:
+        return tangent_basis(state, np.zeros(state.mechanism.closure.rows))[0]
+    except NumericalError as error:
+        raise NumericalError(LOST_RANK, q_tree=error.q_tree) from None
 
 
 def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
@@ -149,8 +160,8 @@ def _why_not(state: Terms, tangent: Array, actuation: Actuation) -> str:
 
 def _loose(mechanism: Mechanism, tangent: Array) -> str:
     """Name freedoms that no motor drives, by the coordinates that tell them best."""
-    motions, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
-    loose = motions @ kernel(mechanism.motors.turns @ (mechanism.tree.reach[:, None] * motions))
+    ways, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
+    loose = ways @ kernel(mechanism.motors.turns @ (mechanism.tree.reach[:, None] * ways))
     own = mechanism.partition.q
     rank = np.linalg.matrix_rank(loose, tol=1e-6)
     first = own if np.linalg.matrix_rank(loose[own], tol=1e-6) == rank else np.arange(mechanism.n)

@@ -338,7 +338,7 @@ def test_a_singular_configuration_is_refused() -> None:
     mechanism = load("n_four_bar")
     with pytest.raises(NumericalError, match="theta_0 = 0 is singular"):
         linearize(mechanism, {"theta_0": 0.0})
-    with pytest.raises(NumericalError, match="J has lost rank"):
+    with pytest.raises(NumericalError, match=r"J has lost rank.*take another configuration"):
         linearize(mechanism, dict.fromkeys(mechanism.coordinates, 0.0))
     state = Terms(mechanism, mechanism.kinematics(np.zeros(mechanism.n)), np.zeros(mechanism.n))
     with pytest.raises(NumericalError, match="J has lost rank"):
