@@ -160,13 +160,6 @@ class Actuation:
         """
         return least((self.motors.turns @ tangent).T, force, self.weights)
 
-    def share(self, tangent: Array, force: Array) -> Array:
-        """Return the tau nearest to the preload, within limits, that does what a force on the mechanism does.
-
-        Parameters and what is returned are those of `distribute`.
-        """
-        return allocate((self.motors.turns @ tangent).T, force, self.limit, self.weights, self.preload)
-
     def apply(self, terms: Terms, u: Array) -> Effort:
         """Map u to tau within limits; of redundant motors, as `allocate` does.
 
@@ -183,9 +176,9 @@ class Actuation:
         if self.direct:
             tau = np.clip(u, -self.limit, self.limit)
             return Effort(tau, self.motors.force(tau), tau)
-        tau = self.share(terms.rho, u)
-        u_tree = self.motors.force(tau)
-        return Effort(tau, u_tree, terms.rho.T @ u_tree)
+        transmission = (self.motors.turns @ terms.rho).T  # u = transmission tau
+        tau = allocate(transmission, u, self.limit, self.weights, self.preload)
+        return Effort(tau, self.motors.force(tau), transmission @ tau)
 
     def drive(self, terms: Terms, tau: Any) -> Effort:
         """Take the motors' own torques, within limits.

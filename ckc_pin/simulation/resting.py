@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, combinations, islice
 
 import numpy as np
 
@@ -23,6 +24,7 @@ __all__ = ["Rest", "hold", "kernel", "motions", "unbalanced"]
 LEFT_OVER = 1e-9  # of the forces along a freedom: rounding, which nothing needs to hold
 ROUNDING = 1e-4  # of that along the others
 NOTHING = 1e-13  # of the weight and the largest force on any coordinate: where both balance
+MOST_WAYS = 2000  # sets of joints at stops that are tried
 FLAT = 1e-9  # of the largest singular value: motions that joints at stops leave
 
 
@@ -66,18 +68,22 @@ def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
         J has lost rank.
     """
     mechanism = state.mechanism
-    every = motions(state)
-    side = _side(mechanism, state.q_tree)
-    at_stop = touching = np.flatnonzero(side)
-    while True:
+    every, side = motions(state), _side(mechanism, state.q_tree)
+    at_stop, refused = np.flatnonzero(side), None
+    sets = chain.from_iterable(combinations(at_stop, count) for count in range(len(at_stop), -1, -1))
+    for touching in (np.array(some, np.intp) for some in islice(sets, MOST_WAYS)):
         tangent = every @ kernel(every[touching] / mechanism.tree.reach[touching, None])
-        tau, friction = _share(state, tangent, actuation, rubs=rubs)
+        try:
+            tau, friction = _share(state, tangent, actuation, rubs=rubs)
+        except InputError as error:
+            refused = error
+            continue
         left = every.T @ (state.h_tree - mechanism.motors.force(tau) - friction)
         push = -side[touching] * np.linalg.lstsq(every[touching].T, left, rcond=FLAT)[0]
         scale = np.abs(every.T) @ (np.abs(state.h_tree) + np.abs(mechanism.motors.force(tau)))
-        if np.all(push > LEFT_OVER * scale.max(initial=0.0)):
+        if np.all(push > LEFT_OVER * scale.max(initial=0.0)):  # a stop does not pull
             return Rest(tau, touching, np.setdiff1d(at_stop, touching), bool(friction.any()))
-        touching = np.delete(touching, int(np.argmin(push)))  # a stop does not pull
+    raise refused or InputError(f"{mechanism.name}: too many joints are at stops to tell which of them these hold")
 
 
 def motions(state: Terms) -> Array:
@@ -117,22 +123,32 @@ def kernel(rows: Array) -> Array:
 def _share(state: Terms, tangent: Array, actuation: Actuation, *, rubs: bool) -> tuple[Array, Array]:
     """Torques of motors, and where these do not do it alone forces of friction, (n,), that hold along a basis."""
     mechanism, none = state.mechanism, np.zeros(state.mechanism.n)
-    needed = tangent.T @ state.h_tree
-    tau = actuation.share(tangent, needed)
-    if not unbalanced(state, mechanism.motors.force(tau), tangent):
+    turns, friction = mechanism.motors.turns, mechanism.joints.friction
+    tau = _least(state, tangent, turns, actuation.limit, actuation.weights, actuation.preload)
+    if not unbalanced(state, turns.T @ tau, tangent):
         return tau, none
-    friction = mechanism.joints.friction
-    if rubs and friction.any():
-        rubbing = np.flatnonzero(friction)
-        turns = np.vstack([mechanism.motors.turns, np.eye(mechanism.n)[rubbing]])
-        limit = np.concatenate([actuation.limit, friction[rubbing]])
-        weights = np.concatenate([actuation.weights, np.ones(len(rubbing))])
-        preload = np.concatenate([actuation.preload, np.zeros(len(rubbing))])
-        forces = allocate((turns @ tangent).T, needed, limit, weights, preload)
-        if not unbalanced(state, turns.T @ forces, tangent):
-            tau = forces[: len(tau)]
-            return tau, turns.T @ forces - mechanism.motors.force(tau)
+    rubbing = np.flatnonzero(friction)
+    if rubs and len(rubbing):
+        forces = _least(
+            state,
+            tangent,
+            np.vstack([turns, np.eye(mechanism.n)[rubbing]]),
+            np.concatenate([actuation.limit, friction[rubbing]]),
+            np.concatenate([actuation.weights, np.ones(len(rubbing))]),
+            np.concatenate([actuation.preload, np.zeros(len(rubbing))]),
+        )
+        tau, rubbed = forces[: len(tau)], none
+        rubbed[rubbing] = forces[len(tau) :]
+        if not unbalanced(state, turns.T @ tau + rubbed, tangent):
+            return tau, rubbed
     raise InputError(f"{mechanism.name}: {_why_not(state, tangent, actuation)}")
+
+
+def _least(state: Terms, tangent: Array, turns: Array, limit: Array, weights: Array, preload: Array) -> Array:
+    """Forces that hold along what they move at all of a basis, as `allocate` shares them."""
+    _, values, directions = np.linalg.svd(turns @ tangent)
+    reached = tangent @ directions[: int(np.sum(values > FLAT * values.max(initial=0.0)))].T
+    return allocate((turns @ reached).T, reached.T @ state.h_tree, limit, weights, preload)
 
 
 def _why_not(state: Terms, tangent: Array, actuation: Actuation) -> str:

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate
+from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.mechanism.library import mechanism_file
+from ckc_pin.simulation.resting import hold
 from tests.analytic.small_models import plate_on_springs
 
 G = 9.81
@@ -132,6 +135,45 @@ def test_redundant_motors_hold_it_as_a_run_does(tmp_path: Path, limit: dict[str,
         agree(model.tau, run.tau[-1], 1e-8)
         assert not any("accelerates" in note for note in model.notes)
         assert model.closed_loop is not None
+
+
+def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
+    """Sliders in gravity, at stops, with friction, with motors on several: a linear program knows what is possible."""
+    random, count, held = np.random.default_rng(0), 4, []
+    inertial = '<inertial><mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    for _ in range(40):
+        side, friction = random.integers(-1, 2, count), random.uniform(0.2, 1.5, count) * random.integers(0, 2, count)
+        body, text = '<link name="base"/>', "gravity = [0, 0, -1]\n"
+        for k in range(count):
+            axis = " ".join(str(x) for x in random.normal(size=3))
+            body += f'<link name="m{k}">{inertial.format(random.uniform(0.5, 2.0))}</link>'
+            body += f'<joint name="j{k}" type="prismatic"><parent link="base"/><child link="m{k}"/>'
+            body += f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+            body += f'<dynamics friction="{friction[k]}"/></joint>'
+            text += joint(f"j{k}", "stops = true")
+        turns = random.normal(size=(random.integers(1, 4), count)) * random.integers(0, 2, count)
+        turns[:, 0] += 0.1
+        limit = random.uniform(0.2, 2.0, len(turns))
+        for k, row in enumerate(turns):
+            gear = ", ".join(f"j{i} = {x}" for i, x in enumerate(row) if x)
+            text += f'[[motor]]\nname = "motor{k}"\njoints = {{ {gear} }}\ntorque_limit = {limit[k]}\n'
+        (tmp_path / "it.urdf").write_text(f'<robot name="it">{body}</robot>')
+        (tmp_path / "mechanism.toml").write_text(f'name = "it"\nurdf = "it.urdf"\n{text}')
+        mechanism = load(str(tmp_path / "mechanism.toml"))
+        state = Terms(mechanism, mechanism.kinematics(np.where(side, side, 0.3)), np.zeros(count))
+        stops = [(0, None) if x < 0 else (None, 0) if x > 0 else (0, 0) for x in side]
+        bounds = [(-x, x) for x in (*limit, *friction)] + stops
+        forces = np.hstack([turns.T, np.eye(count), np.eye(count)])
+        possible = linprog(np.zeros(forces.shape[1]), A_eq=forces, b_eq=state.h_tree, bounds=bounds).status == 0
+        held.append(possible)
+        if possible:
+            rest = hold(state, Actuation(mechanism), rubs=True)
+            assert np.all(np.abs(rest.tau) <= limit * (1 + 1e-9))
+            assert set(rest.touching) <= set(np.flatnonzero(side))
+        else:
+            with pytest.raises(InputError, match="cannot hold"):
+                hold(state, Actuation(mechanism), rubs=True)
+    assert 10 < sum(held) < 30
 
 
 # --- rest or none --------------------------------------------------------------------------------
