@@ -21,7 +21,7 @@ from ckc_pin.native.tables import core_table
 
 __all__ = ["ClosedLoop", "Feedback"]
 
-UNKNOWN = "it has no u, q is no chart, or motors that share u are at their limits"
+UNKNOWN = "q is no chart or has coordinates of a free root, or motors that share u are at their limits"
 
 
 @dataclass(frozen=True)

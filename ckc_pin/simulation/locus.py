@@ -81,6 +81,8 @@ def gain_locus(
     NumericalError
         J has lost rank there.
     """
+    import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
+
     require_kind(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
     if not isinstance(what, Scene):
         if not names_a_scene(str(what)):

@@ -17,7 +17,7 @@ ComplexArray = NDArray[np.complex128]
 NO_DAMPING = 1e-12  # a damping ratio as small as that is printed as none
 SLACK = 64 * np.finfo(float).eps  # roundings in an entry of A
 BLOCK = SLACK ** (1 / 3)  # of its size: what these make of a triple zero, and more than they do of a double one
-EQUAL = 1e-9  # of a matrix' size: eigenvalues no further from each other are one
+EQUAL = 1e-8  # of their size: eigenvalues no further from each other are one
 REAL = 1e-5  # of the size of shapes: what is left of them beside real ones is rounding
 FLAT = 1e-9  # of the largest singular value of A, by rows: motions that nothing brings back
 
@@ -76,14 +76,12 @@ def modes_of(A: Array, motions: Array, units: Array, reach: Array) -> tuple[Mode
     """
     values, vectors = _decomposed(A, units)
     order = [int(k) for k in np.argsort(np.abs(values), kind="stable") if values[k].imag >= 0]
-    near = EQUAL * float(np.abs(values).max(initial=0.0))
     d, found = len(A) // 2, list[Mode]()
     while order:
-        alike = [
-            k for k in order if abs(values[k] - values[order[0]]) <= near and bool(values[k]) == bool(values[order[0]])
-        ]
+        first = values[order[0]]
+        alike = [k for k in order if abs(values[k] - first) <= EQUAL * abs(first)]
         order = [k for k in order if k not in alike]
-        shapes = (motions @ (vectors[:d, alike] if values[alike[0]] else _at_rest(A, units))) / reach[:, None]
+        shapes = (motions @ (vectors[:d, alike] if first else _at_rest(A, units))) / reach[:, None]
         if len(alike) > 1:
             shapes = _real(shapes)
         for place, k in enumerate(alike):  # a double zero, of place and rate, has one shape
