@@ -43,7 +43,6 @@ At = str | float | Mapping[str, float]
 
 NO_CHART = 1e-6  # margin of phi_z below which q is none
 OPEN = 1e-6  # of the mechanism's size: loops further open are not those of eq. 1
-AT_TARGET = 1e-9  # rad, or of the mechanism's size: a configuration so near to a set point's target is it
 MOMENT = 1e-9  # s: a run to its very start
 
 
@@ -80,8 +79,9 @@ def linearize(
         As `check` takes it. Of a mechanism's name with `changes` or an instant, its default scene.
     at : "equilibrium", "assembled", "target", float or {coordinate: value}
         The stable equilibrium reached from q_guess, motors at rest; an instant of the scene's run, s; or at rest the
-        configuration as assembled, at the target of the scene's set point, or one as `terms` takes it: held by stops
-        that joints rest on, by the least torques of the motors, shared as in a run, and where these fail by friction.
+        configuration as assembled, or one as `terms` takes it, held by stops that joints rest on, by the least torques
+        of the motors, shared as in a run, and where these fail by friction; or the target of the scene's set point,
+        with the torques of that.
     changes : mapping, optional
         Values of the scene by dotted key, e.g. ``{"friction_smoothing": 0.01}``.
 
@@ -186,7 +186,13 @@ def _at_target(subject: _Subject) -> LinearModel:
     found = sigma(subject.mechanism, law.q_d)
     if found.verdict != "converged":
         raise InputError(f'at = "target": {subject.mechanism.name} cannot be there: {found.reason}')
-    return _operating(subject, Terms(subject.mechanism, found.at, np.zeros(subject.mechanism.n)))
+    if says := beyond_stops(subject.mechanism, found.at.q_tree):
+        raise InputError(f'{subject.mechanism.name}: at = "target": {says}; give another controller.q_d')
+    state, actuation = Terms(subject.mechanism, found.at, np.zeros(subject.mechanism.n)), subject.actuation
+    actuation.require_transmission(state.at)
+    tau = actuation.apply(state, law.u(0.0, state)).tau
+    model = _at_rest(subject, state, tau, NONE, "at the target of its controller")
+    return _with_controller(subject, model, law, 0.0, state, 0.0)
 
 
 def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
@@ -227,16 +233,11 @@ def _operating(subject: _Subject, state: Terms) -> LinearModel:
 def _at_rest(
     subject: _Subject, state: Terms, tau: Array, touching: IntArray, says: str, notes: tuple[str, ...] = ()
 ) -> LinearModel:
-    mechanism, smoothing = subject.mechanism, subject.smoothing
-    sticks = np.flatnonzero(mechanism.joints.friction) if smoothing is None else NONE
+    sticks = np.flatnonzero(subject.mechanism.joints.friction) if subject.smoothing is None else NONE
     locked = np.union1d(sticks, touching)
-    model = linear_model(state, tau, at=says, locked=locked, smoothing=smoothing, library=subject.library, notes=notes)
-    scene = subject.scene
-    law = None if scene is None else scene_controller(scene, mechanism)
-    if not isinstance(law, SetPoint):
-        return model
-    off = (mechanism.independent_part(state.q_tree) - law.q_d) / mechanism.tree.reach[mechanism.partition.q]
-    return _with_controller(subject, model, law, 0.0, state, 0.0, locked) if np.abs(off).max() <= AT_TARGET else model
+    return linear_model(
+        state, tau, at=says, locked=locked, smoothing=subject.smoothing, library=subject.library, notes=notes
+    )
 
 
 # --- along a run ---------------------------------------------------------------------------------
@@ -250,9 +251,10 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
     k = run.at(t)
     miss = float(np.abs(run.phi[k]).max(initial=0.0))
     if miss > max(OPEN * mechanism.size, 10 * mechanism.tolerance):
-        why = "as an SPF off its manifold is" if scene.spec.formulation == "spf" else "as a DAE's that drifts are"
-        remedy = "give a later instant" if scene.spec.formulation == "spf" else "let solver.projection close them"
-        raise InputError(f"at t = {t:g} s the loops of {scene.name} are open (|phi| = {miss:.3g}), {why}; {remedy}")
+        why = "as an SPF off its manifold has them; give a later instant"
+        if scene.spec.formulation == "dae":
+            why = "since nothing closes those of a DAE that drifts; set solver.projection = true"
+        raise InputError(f"at t = {t:.15g} s the loops of {scene.name} are open (|phi| = {miss:.3g}), {why}")
     at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
     state = _closed(Terms(mechanism, at, run.v_tree[k]))
     of_joints = RecordedJoints(run)
@@ -270,7 +272,7 @@ def _at_instant(subject: _Subject, t: float) -> LinearModel:
         notes=_notes(scene, run, k),
     )
     law = scene_controller(scene, mechanism)
-    return model if law is None else _with_controller(subject, model, law, t, state, sliding, locked)
+    return model if law is None else _with_controller(subject, model, law, t, state, sliding)
 
 
 def _with_controller(
@@ -280,11 +282,11 @@ def _with_controller(
     t: float,
     state: Terms,
     sliding: Array | float,
-    locked: IntArray,
 ) -> LinearModel:
     """Add the closed loop, or say why there is none."""
     if isinstance(law, Torques):
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
+    locked = np.array([model.coordinates.index(name) for name in model.locked], np.intp)
     try:
         loop = ClosedLoop(subject.mechanism, law, subject.smoothing, subject.library, subject.actuation)
         closed = loop.at(t, state, sliding, locked).closed
