@@ -88,6 +88,8 @@ def gain_locus(
         if not names_a_scene(str(what)):
             return None
         what = load_scene(what, changes)
+    elif changes:
+        raise InputError("gain_locus: changes go with a name; a Scene is complete")
     mechanism = scene_mechanism(what)
     law = scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):

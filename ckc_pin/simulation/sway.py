@@ -9,6 +9,7 @@ import numpy as np
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import nearest, shortest
+from ckc_pin.mechanism.kinds import is_number
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.linear_model import LinearModel
@@ -49,8 +50,8 @@ def sway(model: LinearModel, number: int) -> Run | None:
     InputError
         No mode of that number, or a rigid one: nothing says how it goes on.
     """
-    if not 1 <= number <= len(model.modes):
-        raise InputError(f"mode {number}: {model.name} has modes 1 to {len(model.modes)}")
+    if not (is_number(number) and number in range(1, len(model.modes) + 1)):
+        raise InputError(f"mode {number!r:.80}: {model.name} has modes 1 to {len(model.modes)}")
     mode, size = model.modes[number - 1], LARGEST
     if not mode.eigenvalue:
         raise InputError(f"mode {number} is rigid (eigenvalue 0): nothing drives it, and no time belongs to it")

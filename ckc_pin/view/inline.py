@@ -9,6 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ckc_pin.errors import InputError
 from ckc_pin.simulation.linear_model import LinearModel
 from ckc_pin.simulation.locus import GainLocus
 from ckc_pin.simulation.run import Run
@@ -34,6 +35,11 @@ class Figures(Mapping[str, "Figure"]):
     Parameters
     ----------
     shown : sequence of Run, or of one LinearModel, GainLocus or Sensitivities
+
+    Raises
+    ------
+    InputError
+        Nothing, something else, several linear models; matplotlib missing.
     """
 
     def __init__(self, shown: Sequence[Run | LinearModel | GainLocus | Sensitivities]) -> None:
@@ -42,6 +48,8 @@ class Figures(Mapping[str, "Figure"]):
                 self._figures = draw_linear(one)
             case [Sensitivities() as one]:
                 self._figures = {"sensitivities": draw_sensitivities(one)}
+            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities) for x in shown):
+                raise InputError("plot: a linear model, a locus and sensitivities are drawn by themselves; give one alone")
             case _:
                 self._figures = draw(shown)  # type: ignore[arg-type]
 

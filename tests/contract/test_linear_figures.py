@@ -66,3 +66,14 @@ def test_modes_that_swing_come_before_others_in_a_figure(tmp_path: Path) -> None
     figure.canvas.draw()
     label = figure._supxlabel.get_window_extent()
     assert figure.bbox.x0 <= label.x0 < label.x1 <= figure.bbox.x1
+
+
+def test_what_cannot_be_drawn_or_played_is_refused() -> None:
+    model, scene = linearize("five_bar"), load_scene("five_bar/set_point")
+    with pytest.raises(InputError, match="give it alone"):
+        plot(model, model)
+    with pytest.raises(InputError, match="a Scene is complete"):
+        gain_locus(scene, changes={"controller.K_P": 1.0})
+    for number in ("a", 0, 1.5, None):
+        with pytest.raises(InputError, match="five_bar has modes 1 to 2"):
+            model.sway(number)  # type: ignore[arg-type]
