@@ -52,6 +52,7 @@ def sway(model: LinearModel, number: int) -> Run | None:
     """
     if not (is_number(number) and number in range(1, len(model.modes) + 1)):
         raise InputError(f"mode {number!r:.80}: {model.name} has modes 1 to {len(model.modes)}")
+    number = int(number)
     mode, size = model.modes[number - 1], LARGEST
     if not mode.eigenvalue:
         raise InputError(f"mode {number} is rigid (eigenvalue 0): nothing drives it, and no time belongs to it")

@@ -74,6 +74,6 @@ def test_what_cannot_be_drawn_or_played_is_refused() -> None:
         plot(model, model)
     with pytest.raises(InputError, match="a Scene is complete"):
         gain_locus(scene, changes={"controller.K_P": 1.0})
-    for number in ("a", 0, 1.5, None):
+    for number in ("a", 0, 1.5, None, 3):
         with pytest.raises(InputError, match="five_bar has modes 1 to 2"):
             model.sway(number)  # type: ignore[arg-type]
