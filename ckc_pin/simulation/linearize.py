@@ -28,6 +28,7 @@ from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native.plant import NONE
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
+from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.linear_model import LinearModel, linear_model
 from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
@@ -178,17 +179,18 @@ def _at_equilibrium(subject: _Subject) -> LinearModel:
 
 
 def _at_target(subject: _Subject) -> LinearModel:
-    law = None if subject.scene is None else scene_controller(subject.scene, subject.mechanism)
-    if not isinstance(law, SetPoint):
+    scene, mechanism = subject.scene, subject.mechanism
+    law = None if scene is None else scene_controller(scene, mechanism)
+    if scene is None or not isinstance(law, SetPoint):
         raise InputError(
             f'at = "target": {subject.name} has no set point; give a scene whose controller is of type "set_point"'
         )
-    found = sigma(subject.mechanism, law.q_d)
+    found = sigma(mechanism, law.q_d, find_start(mechanism, scene).at)  # on the branch that a run is on
     if found.verdict != "converged":
-        raise InputError(f'at = "target": {subject.mechanism.name} cannot be there: {found.reason}')
-    if says := beyond_stops(subject.mechanism, found.at.q_tree):
-        raise InputError(f'{subject.mechanism.name}: at = "target": {says}; give another controller.q_d')
-    state, actuation = Terms(subject.mechanism, found.at, np.zeros(subject.mechanism.n)), subject.actuation
+        raise InputError(f'at = "target": {mechanism.name} cannot be there: {found.reason}')
+    if says := beyond_stops(mechanism, found.at.q_tree):
+        raise InputError(f'{mechanism.name}: at = "target": {says}; give another controller.q_d')
+    state, actuation = Terms(mechanism, found.at, np.zeros(mechanism.n)), subject.actuation
     actuation.require_transmission(state.at)
     tau = actuation.apply(state, law.u(0.0, state)).tau
     model = _at_rest(subject, state, tau, NONE, "at the target of its controller")

@@ -19,6 +19,7 @@ from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
+from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.modes import ComplexArray, eigenvalues_of
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
@@ -77,9 +78,9 @@ def gain_locus(
     Raises
     ------
     InputError
-        No such gain, or what cannot be loaded.
+        No such gain, a start out of reach, or what cannot be loaded.
     NumericalError
-        J has lost rank there.
+        A start that is singular, J that has lost rank.
     """
     import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
 
@@ -100,7 +101,7 @@ def gain_locus(
     gain = gain or gains[0]
     at_rest = isinstance(law, SetPoint)
     q, q_dot = (law.q_d, np.zeros(mechanism.d)) if isinstance(law, SetPoint) else law.desired(0.0)[:2]
-    found = sigma(mechanism, q)
+    found = sigma(mechanism, q, find_start(mechanism, what).at)  # on the branch that a run is on
     if found.verdict != "converged":
         return None
     state = Terms(mechanism, found.at, found.at.rho @ q_dot)

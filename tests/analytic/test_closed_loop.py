@@ -7,9 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from ckc_pin import InputError, LinearModel, Mechanism, Scene, SetPoint, linearize, load, load_scene
+from ckc_pin import (
+    InputError,
+    LinearModel,
+    Mechanism,
+    Scene,
+    SetPoint,
+    check,
+    gain_locus,
+    linearize,
+    load,
+    load_scene,
+    terms,
+)
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics import Terms, dae_acceleration
@@ -172,3 +185,32 @@ def test_loops_of_a_dae_that_drifts_are_said_to_be_open() -> None:
     drifts = {"formulation": "dae", "solver": {"projection": False, "rtol": 1e-3}}
     with pytest.raises(InputError, match=r"are open .* set solver\.projection = true"):
         linearize(load_scene("five_bar/swing", drifts), 2.0)
+
+
+def test_target_and_locus_are_on_the_branch_that_a_run_is_on() -> None:
+    """The tip above the elbows; the five-bar is assembled with it below."""
+    start = terms(load("five_bar"), {"theta_1": -1.0, "theta_3": -1.5}).q_tree
+    mirrored = start.copy()  # elbows where they are, the distal links mirrored in the line between them
+    first, second = (_elbow(load("five_bar"), start, name) for name in ("left", "right"))
+    line = np.arctan2(*(second - first)[1::-1])
+    mirrored[1] = 2 * line - 2 * start[0] - start[1]
+    mirrored[3] = 2 * line - 2 * start[2] - start[3]
+    q = dict(zip(load("five_bar").coordinates, mirrored.tolist(), strict=True))
+    scene = load_scene("five_bar/set_point", {"controller.q_d": TARGET, "initial": {"q": q}})
+    model, found, locus = linearize(scene, "target"), check(scene).stability, gain_locus(scene)
+    plain = linearize(load_scene("five_bar/set_point", {"controller.q_d": TARGET}), "target")
+    assert abs(model.q_tree[1] - plain.q_tree[1]) > 0.1
+    assert found is not None
+    assert locus is not None
+    assert model.closed_loop is not None
+    ours = np.sort_complex(np.linalg.eigvals(model.closed_loop))
+    assert np.abs(ours - np.sort_complex(found.eigenvalues)).max() < 1e-8 * np.abs(ours).max()
+    own = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
+    assert np.abs(ours - np.sort_complex(own)).max() < 1e-8 * np.abs(ours).max()
+
+
+def _elbow(mechanism: Mechanism, q_tree: Array, side: str) -> Array:
+    model = mechanism.tree.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, q_tree)
+    return np.array(data.oMi[2 if side == "left" else 4].translation[:2])
