@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.optimize import linprog
 
-from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate
+from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate, terms
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.mechanism.library import mechanism_file
@@ -70,6 +71,49 @@ def test_two_joints_at_their_stops_are_told_apart(tmp_path: Path) -> None:
     model = linearize(mechanism, {"slide": -1.0, "swing": 0.4})
     assert model.locked == ("slide",)
     agree(model.tau, np.array([0.0, m * G * L * np.sin(0.4)]), 1e-12)
+
+
+def test_a_joint_of_a_loop_at_its_stop_moves_as_in_a_run(tmp_path: Path) -> None:
+    """The five-bar with its left elbow at an upper stop: it stays, and small torques beside do what the model says."""
+    q = {"theta_1": -1.1, "theta_3": -1.6}
+    numbers = terms(load("five_bar"), q).q_tree.tolist()
+    there = mechanism_file("five_bar").parent
+    turns = f'type="revolute"><limit lower="-9" upper="{numbers[1]!r}" effort="9" velocity="9"/>'
+    urdf = (there / "five_bar.urdf").read_text().replace('name="theta_2" type="continuous">', f'name="theta_2" {turns}')
+    text = (there / "mechanism.toml").read_text()
+    for name, old, new in zip(
+        load("five_bar").coordinates, ("-1.434", "0.248", "-1.707", "-0.248"), numbers, strict=True
+    ):
+        text = text.replace(f"{name} = {old}", f"{name} = {new!r}")
+    (tmp_path / "five_bar.urdf").write_text(urdf)
+    (tmp_path / "mechanism.toml").write_text(text + joint("theta_2", "stops = true"))
+    mechanism = load(str(tmp_path / "mechanism.toml"))
+    model = linearize(mechanism, dict(zip(mechanism.coordinates, numbers, strict=True)))
+    assert model.locked == ("theta_2",)
+    path, more = tmp_path / "it.scene.toml", np.array([1e-5, -5e-6])
+    path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.3\nsolver.rtol = 1e-11\n')
+    still, moved = (
+        simulate(load_scene(path, {"initial": {"q": q}}), controller=Constant(x)) for x in (model.tau, model.tau + more)
+    )
+    assert np.abs(still.q_tree - still.q_tree[0]).max() < 1e-12
+    step = np.block([[model.A, (model.B @ more)[:, None]], [np.zeros((1, 3))]])
+    k = model.coordinates.index(model.states[0])
+    assert moved.q_tree[-1, k] - moved.q_tree[0, k] == pytest.approx(expm(0.3 * step)[0, 2], rel=1e-4)
+
+
+class Constant:
+    """Torques that do not change.
+
+    Parameters
+    ----------
+    torques : (motors,) array
+    """
+
+    def __init__(self, torques: np.ndarray) -> None:
+        self.torques = torques
+
+    def tau(self, t: float, terms: Terms) -> np.ndarray:
+        return self.torques
 
 
 def test_a_state_beyond_stops_is_refused(tmp_path: Path) -> None:
