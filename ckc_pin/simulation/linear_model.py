@@ -122,8 +122,8 @@ class LinearModel:
             ) from error
         if not self.inputs:
             raise InputError(f"{self.name}: no motors, so that there are no inputs, which python-control asks for")
-        states, inputs, outputs = (_told_apart(x) for x in (self.states, self.inputs, self.outputs))
-        (name,) = _told_apart((self.name,))
+        states, inputs, outputs = (_distinct(x) for x in (self.states, self.inputs, self.outputs))
+        (name,) = _distinct((self.name,))
         return control.ss(self.A, self.B, self.C, self.D, states=states, inputs=inputs, outputs=outputs, name=name)
 
     def __repr__(self) -> str:
@@ -132,7 +132,7 @@ class LinearModel:
         return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {_some(self.states)}", *shown])
 
 
-def _told_apart(names: tuple[str, ...]) -> list[str]:
+def _distinct(names: tuple[str, ...]) -> list[str]:
     made: list[str] = []
     for name in names:
         plain = name.replace(".", "_")

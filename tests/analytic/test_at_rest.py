@@ -45,7 +45,7 @@ def agree(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> Non
 # --- stops ---------------------------------------------------------------------------------------
 
 
-def test_a_joint_pushed_into_its_stop_is_held_there(tmp_path: Path) -> None:
+def test_a_joint_pushed_into_its_stop_rests_there(tmp_path: Path) -> None:
     """Gravity pulls the cart down the slope to its lower stop: no torque of its motor is needed, and it stays there."""
     mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true"))
     model = linearize(mechanism, {"slide": -1.0, "swing": -0.6})
@@ -65,7 +65,7 @@ def test_a_joint_that_its_stop_would_have_to_pull_is_free(tmp_path: Path) -> Non
     assert "at a stop that nothing pushes it into" in " ".join(model.notes)
 
 
-def test_two_joints_at_their_stops_are_told_apart(tmp_path: Path) -> None:
+def test_of_two_joints_at_stops_one_is_locked(tmp_path: Path) -> None:
     """The cart rests on its stop, the pendulum's would have to pull: its motor holds it, with 0.4 rad to the side."""
     mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true") + joint("swing", "stops = true"))
     model = linearize(mechanism, {"slide": -1.0, "swing": 0.4})
@@ -183,7 +183,7 @@ def test_redundant_motors_hold_it_as_a_run_does(tmp_path: Path, limit: dict[str,
 
 def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
     """Sliders in gravity, at stops, with friction, with motors on several: a linear program knows what is possible."""
-    random, count, held = np.random.default_rng(0), 4, []
+    random, count, found = np.random.default_rng(0), 4, []
     inertial = '<inertial><mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     for _ in range(40):
         side, friction = random.integers(-1, 2, count), random.uniform(0.2, 1.5, count) * random.integers(0, 2, count)
@@ -209,7 +209,7 @@ def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
         bounds = [(-x, x) for x in (*limit, *friction)] + stops
         forces = np.hstack([turns.T, np.eye(count), np.eye(count)])
         possible = linprog(np.zeros(forces.shape[1]), A_eq=forces, b_eq=state.h_tree, bounds=bounds).status == 0
-        held.append(possible)
+        found.append(possible)
         if possible:
             rest = hold(state, Actuation(mechanism), rubs=True)
             assert np.all(np.abs(rest.tau) <= limit * (1 + 1e-9))
@@ -217,13 +217,13 @@ def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
         else:
             with pytest.raises(InputError, match="cannot hold"):
                 hold(state, Actuation(mechanism), rubs=True)
-    assert 10 < sum(held) < 30
+    assert 10 < sum(found) < 30
 
 
 # --- rest or none --------------------------------------------------------------------------------
 
 
-def test_a_start_at_rest_that_does_not_last_is_told() -> None:
+def test_a_start_at_rest_that_does_not_last_is_noted() -> None:
     start = {"initial": {"q": {"theta_1": -1.0, "theta_3": -1.5}}}
     model = linearize(load_scene("five_bar/swing", start), 0.0)
     state = Terms(model.mechanism, model.mechanism.kinematics(model.q_tree), np.zeros(4))
@@ -253,7 +253,7 @@ def test_what_balances_needs_no_motor(tmp_path: Path) -> None:
         linearize(mechanism, {"slide": 1e-6, "swing": 0.7})
 
 
-def test_a_root_held_in_part_has_an_equilibrium(tmp_path: Path) -> None:
+def test_a_root_constrained_in_part_has_an_equilibrium(tmp_path: Path) -> None:
     mechanism = plate_on_springs(tmp_path)
     model = linearize(mechanism)
     state = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(model.q_tree)), np.zeros(mechanism.n))

@@ -283,7 +283,7 @@ def test_what_is_no_state_is_refused(at: Any) -> None:
         linearize("five_bar/swing", at)
 
 
-def test_names_for_python_control_are_told_apart(tmp_path: Path) -> None:
+def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
     """A joint called x_dot beside x, and two names that differ in a dot alone."""
     folder = tmp_path / "it"
     coupled_four_bar(folder)
