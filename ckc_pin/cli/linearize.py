@@ -13,7 +13,7 @@ import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import interrupts
 from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
-from ckc_pin.errors import InputError
+from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes, read_table
 from ckc_pin.simulation.linear_report import floquet_text, linear_plain, linear_text, save_floquet, save_linear
@@ -74,18 +74,18 @@ def linearize(
         return
     with Working(f"linearizing {what}"):
         model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_changes("--set", changes))
-    if out is not None:
-        _write(model, what, changes, out)
-    _print(linear_plain(model) if as_json else linear_text(model), out)
+    runs, modes = 0 if out is None else _write(model, what, changes, out), len(model.modes)
+    more = "" if runs == modes else f"; {runs} of {modes} modes play: not rigid ones, what the loops bar, over a dozen"
+    _print(linear_plain(model) if as_json else linear_text(model), out, more)
 
 
-def _print(found: dict[str, Any] | Text, out: Path | None) -> None:
+def _print(found: dict[str, Any] | Text, out: Path | None, more: str = "") -> None:
     if isinstance(found, dict):
         print_json(found)
         return
     print_table(found)
     if out is not None:
-        print(f"written to {out}")
+        print(f"written to {out}{more}")
 
 
 def _at(given: str) -> At:
@@ -109,8 +109,11 @@ def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
         found.run.save(out / "run.npz")
 
 
-def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> None:
-    """Save the model and its modes in the place of those of before, whatever signals come, then draw them."""
+def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> int:
+    """Save the model and its modes in the place of those of before, whatever signals come, then draw them.
+
+    Returns how many modes are runs.
+    """
     from ckc_pin.simulation.sway import sways
 
     with interrupts.deferred(), ExitStack() as stack:
@@ -119,11 +122,18 @@ def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out:
             if OF_MODEL.fullmatch(path.name) and path.is_file():
                 path.unlink()
         save_linear(model, out / "linear.npz")
-        for number, run in sways(model).items():
+        runs = sways(model)
+        for number, run in runs.items():
             run.save(out / f"mode_{number}.npz")
+        locus = None
+        try:
+            locus = ckc_pin.gain_locus(what, changes=read_changes("--set", changes))
+        except CkcError as error:
+            errors().print(f"no root locus: {error}")
         try:
             from ckc_pin.view.linear_figure import save_linear_figures
 
-            save_linear_figures(model, ckc_pin.gain_locus(what, changes=read_changes("--set", changes)), out)
+            save_linear_figures(model, locus, out)
         except InputError as error:  # matplotlib is an extra; the model is saved
             errors().print(f"no figures: {error}")
+    return len(runs)

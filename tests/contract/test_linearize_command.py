@@ -260,6 +260,19 @@ def test_a_used_folder_keeps_nothing_of_another_model(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_what_is_not_written_is_said(tmp_path: Path) -> None:
+    """Modes that are rigid have no run, and a start out of reach leaves a locus without a branch."""
+    assert "0 of 6 modes play: not rigid ones" in " ".join(
+        ckc("linearize", "three_rrr", "--out", str(tmp_path)).out.split()
+    )
+    start = "initial={q={theta_1=3.0, theta_3=0.1}}"
+    answer = ckc("linearize", "five_bar/set_point", "--set", start, "--out", str(tmp_path))
+    assert answer.code == 0
+    assert "no root locus: " in answer.err
+    assert (tmp_path / "poles.png").exists()
+    assert not (tmp_path / "locus.png").exists()
+
+
 def test_a_run_that_stops_before_is_for_the_numerics() -> None:
     answer = ckc("linearize", "five_bar/swing", "--at", "1.5", "--set", "solver.max_rhs=20", "--json")
     assert answer.code == 3
