@@ -298,7 +298,8 @@ def _with_controller(
     says = "A and B are the plant's; closed_loop is A with the scene's controller"
     spec = None if subject.scene is None else subject.scene.spec.controller
     if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-        says += ", without its sampling and delay"
+        more = {"delay": spec.delay > 0, "sensor": spec.sensor is not None, "drive": spec.drive is not None}
+        says += f", without its {', '.join(['sampling', *(name for name, there in more.items() if there)])}"
     return replace(model, closed_loop=closed, notes=(*model.notes, says))
 
 
