@@ -162,11 +162,9 @@ def _at_equilibrium(subject: _Subject) -> LinearModel:
     try:
         at = equilibrium(mechanism)
     except NumericalError as error:
-        raise NumericalError(
-            f"{error}; or linearize it as assembled, or at coordinates, where its motors hold it, or at an instant of "
-            "a scene's run",
-            q_tree=error.q_tree,
-        ) from None
+        motors = "as assembled, or at coordinates, where its motors hold it, or " if mechanism.actuated else ""
+        says = f"{error}; or linearize it {motors}at an instant of a scene's run"
+        raise NumericalError(says, q_tree=error.q_tree) from None
     if says := beyond_stops(mechanism, at.q_tree):
         raise InputError(f"{mechanism.name}: at its equilibrium {says}; give coordinates within them")
     return _at_rest(
@@ -335,5 +333,5 @@ def _notes(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
     limits = scene_actuation(scene, run.mechanism).limit
     full = [name for name, x, most in zip(run.actuated, run.tau[k], limits, strict=True) if abs(x) >= most * (1 - 1e-9)]
     if full:
-        notes.append(f"at their torque limit, so that the controller moves them no more there: {', '.join(full)}")
+        notes.append(f"at the torque limit, so that no controller moves it further: {', '.join(full)}")
     return tuple(notes)
