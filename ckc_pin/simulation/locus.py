@@ -114,4 +114,6 @@ def gain_locus(
             loop.law = turned
             values.append(eigenvalues_of(loop.at(0.0, state).closed))
     at = "at its target" if at_rest else "at the start of the desired motion"
+    if mechanism.joints.friction.any() and what.spec.friction_smoothing is None:
+        at += " without dry friction"
     return GainLocus(what.name, gain, at, FACTORS, np.array(values))

@@ -20,6 +20,9 @@ def test_a_locus_without_imaginary_parts_shows_no_rounding() -> None:
     own = int(np.argmin(np.abs(locus.factors - 1)))
     assert np.array_equal(np.unique(np.round(locus.eigenvalues[own], 6)), np.unique(np.round(_by_hand(), 6)))
     assert "at its target" in plot(gain_locus("five_bar/set_point", "K_V"))["locus"].get_suptitle()
+    rubs = gain_locus("talos/squat")
+    assert rubs is not None
+    assert rubs.at == "at its target without dry friction"
     with pytest.raises(InputError, match=r"'K_I': the controller of five_bar/set_point has K_P and K_V"):
         gain_locus("five_bar/set_point", "K_I")
 
