@@ -49,7 +49,7 @@ class Figures(Mapping[str, "Figure"]):
             case [Sensitivities() as one]:
                 self._figures = {"sensitivities": draw_sensitivities(one)}
             case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities) for x in shown):
-                raise InputError("plot: a linear model, a locus and sensitivities are drawn by themselves; give one alone")
+                raise InputError("plot: what is no run is drawn by itself; give it alone")
             case _:
                 self._figures = draw(shown)  # type: ignore[arg-type]
 
