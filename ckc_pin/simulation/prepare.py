@@ -261,7 +261,7 @@ def prepare(
     terms = scene.spec.solver.terms
     if parameters:
         changed = partial(_built, scene)
-        varying = varying_of(mechanism, scene, controller, actuation, parameters, changed)
+        varying = varying_of(mechanism, scene, controller, actuation, parameters, changed, start.at.q_tree)
         require_known_motion(mechanism, scene, controller, varying)
         require_movable(mechanism, scene.spec.parameters, varying, changed)
         changing, directions = directions_of(mechanism, varying) or (None, None)

@@ -183,6 +183,8 @@ def sensitivities(
     scene = as_scene(scene, changes, "sensitivities")
     require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
     parameters = [parameters] if isinstance(parameters, str) else parameters
+    if isinstance(parameters, bytes):
+        parameters = [parameters]  # refused as one, not by its numbers
     require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)
     for name in parameters:
         require_kind(name, str, "sensitivities: parameters", NAMES)
@@ -231,9 +233,10 @@ def _start(ready: Prepared) -> str:
             "the start is an equilibrium beside which there are others, or where "
             f"{', '.join(mechanism.independent)} are no coordinates: which one it is with other parameters is not known"
         )
+    names = mechanism.independent
     return (
-        f"at the start phi_z is singular: {', '.join(mechanism.independent)} do not determine the others, so that how "
-        "they change is not known; other independent coordinates would"
+        f"at the start phi_z is singular: {', '.join(names)} {'does' if len(names) == 1 else 'do'} not determine the "
+        "others, so that how they change is not known; other independent coordinates would"
     )
 
 

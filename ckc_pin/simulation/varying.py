@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
@@ -151,15 +152,20 @@ def varying_of(
     actuation: Actuation,
     names: Sequence[str],
     changed: Callable[[Changes], Mechanism],
+    q_tree: Array,
 ) -> list[Varying]:
-    """Look names up; a vector's stands for its three components. `changed` makes the mechanism of other changes.
+    """Look names up; a vector's stands for its three components.
+
+    `changed` makes the mechanism of other changes; `q_tree` is q' at the start.
 
     Raises
     ------
     InputError
         A name that is none (those there are near it are listed), is given twice, or on which nothing has a derivative.
     """
-    of_scene = {x.name: x for x in (*_of_controller(mechanism, scene, controller), *_of_start(mechanism, scene))}
+    of_scene = {
+        x.name: x for x in (*_of_controller(mechanism, scene, controller), *_of_start(mechanism, scene, q_tree))
+    }
     known = with_components(values_of(mechanism.spec, mechanism.urdf)) | dict.fromkeys(of_scene, 0.0)
     require_known(names, known, "sensitivities", (*ROOTS, *SCENE_ROOTS))
     labels = [part for name in names for part in parts_of(name, known)]
@@ -195,9 +201,18 @@ def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> It
             yield Varying(f"controller.q_d.{name}", (Effect("target", k, controller.K_P[:, k]),))
 
 
-def _of_start(mechanism: Mechanism, scene: Scene) -> Iterator[Varying]:
-    tree = mechanism.tree
+def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[Varying]:
+    tree, moved = mechanism.tree, np.eye(mechanism.tree.n)
+    for q, v in tree.free:  # numbers in the world's axes, tangent in the body's
+        moved[v : v + 3, v : v + 3] = pin.Quaternion(q_tree[q + 3 : q + 7]).matrix().T
+        moved[v + 3 : v + 6, v + 3 : v + 6] = pin.Jexp3(tree.to_coordinates(q_tree)[v + 3 : v + 6])
+    parted = {name for names in _roots(mechanism) if not set(names) <= set(mechanism.independent) for name in names}
     for k, name in enumerate(mechanism.independent):
-        if name not in tree.free_coordinates and scene.spec.initial.at is None:
-            yield Varying(f"initial.q.{name}", q=np.eye(tree.n)[tree.index[name]])
+        if name not in parted and scene.spec.initial.at is None:
+            yield Varying(f"initial.q.{name}", q=moved[:, tree.index[name]])
         yield Varying(f"initial.q_dot.{name}", q_dot=np.eye(mechanism.d)[k])
+
+
+def _roots(mechanism: Mechanism) -> list[tuple[str, ...]]:
+    """The coordinates of each free root."""
+    return [mechanism.coordinates[v : v + 6] for _, v in mechanism.tree.free]

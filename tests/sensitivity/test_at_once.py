@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin import simulate
+from ckc_pin import NumericalError, simulate
 from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from tests.regression.test_dae import IN_LINE, by_slider
 from tests.sensitivity.changed import NUMBERS, differentiated, written
 from tests.sensitivity.sliders import force, joint, sliders
 
@@ -167,3 +168,20 @@ def test_an_event_of_a_free_root_in_the_worlds_axes(tmp_path: Path) -> None:
     row = np.array([np.cos(turn), -np.sin(turn), 0.0])
     assert found.run.t[-1] == pytest.approx(0.4 / (row @ along))
     assert found.end_time == pytest.approx(-0.4 / (row @ along) ** 2 * row, abs=1e-9)
+
+
+def test_a_start_where_q_is_no_chart_tells_what_does_not_hang_on_it(tmp_path: Path) -> None:
+    """The slider-crank with the slider as q, crank and rod in line: lengths there move the crank without bound."""
+    scene = by_slider(tmp_path)
+    changes = {"initial": {"q": IN_LINE}, "t_end": 0.3, "solver.rtol": 1e-10, "solver.output_dt": 0.05}
+    found = sensitivities(scene, ["gravity.y", "link.rod_link.mass"], changes)
+    same = sensitivities("slider_crank", ["gravity.y", "link.rod_link.mass"], {**changes, "formulation": "dae"})
+    assert np.abs(found.q_tree - same.q_tree).max() <= 1e-8 * np.abs(same.q_tree).max()
+    with pytest.raises(NumericalError, match="at the start phi_z is singular: slider does not determine the others"):
+        sensitivities(scene, ["loop.slider_pin.frame_a.xyz.x"], changes)
+
+
+def test_a_start_at_an_equilibrium_beside_others_is_refused(tmp_path: Path) -> None:
+    changes = {"initial": {"at": "equilibrium"}, "parameters": {"gravity": [0.0, 0.0, 0.0]}, "t_end": 0.1}
+    with pytest.raises(NumericalError, match="an equilibrium beside which there are others"):
+        sensitivities("five_bar/swing", ["link.link_2.mass"], changes)

@@ -87,6 +87,26 @@ def test_of_a_free_root(tmp_path: Path) -> None:
         assert np.abs(ours - wanted).max() <= CLOSE * np.abs(wanted).max(), name
 
 
+def test_of_where_a_free_root_starts(tmp_path: Path) -> None:
+    """In the world's axes, and by its rotation vector."""
+    scene = tethered(tmp_path)
+    start = dict(ckc_pin.load_scene(scene).spec.initial.q)
+    names = [f"root.{name}" for name in ("x", "z", "rx", "rz")]
+    found = sensitivities(scene, [f"initial.q.{name}" for name in names], TIGHT)
+    h = 2e-3
+    for k, name in enumerate(names):
+        runs = [
+            [simulate(scene, {**TIGHT, f"initial.q.{name}": start[name] + x / s}) for x in (h, -h)] for s in (1, 2, 4)
+        ]
+        one, two, four = (
+            (more.q_tree - less.q_tree) / (2 * h / s) for (more, less), s in zip(runs, (1, 2, 4), strict=True)
+        )
+        wanted = ((16 * (4 * four - two) - (4 * two - one)) / 45)[:, :3]
+        every = zip(found.run.q_tree, found.q_tree[:, :3, k], strict=True)
+        ours = np.array([pin.exp3(q[3:]) @ change for q, change in every])
+        assert np.abs(ours - wanted).max() <= CLOSE * np.abs(wanted).max(), name
+
+
 def test_what_does_nothing_has_no_effect(tmp_path: Path) -> None:
     scene = arms(tmp_path, "hinge", more='[[motor]]\njoint = "ra"\nratio = 5.0\nspeed_limit = 3.0\n' + REST)
     found = sensitivities(scene, ["motor.ra.speed_limit"], TIGHT)
