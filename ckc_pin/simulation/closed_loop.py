@@ -40,10 +40,6 @@ class Feedback:
     B: Array
     K: Array
 
-    def mean(self, other: Feedback) -> Feedback:
-        """Return what is half-way between this and another one."""
-        return Feedback((self.A + other.A) / 2, (self.B + other.B) / 2, (self.K + other.K) / 2)
-
     @property
     def closed(self) -> Array:
         """A of the closed loop, (2 d, 2 d)."""
