@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
 from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.tree import Array, IntArray, Tree
@@ -89,17 +89,20 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     )
 
 
-def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, turns: Array) -> list[str]:
-    """Name coordinates that only spin a body about itself: no centre of mass moves, no actuator turns.
+def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequence[Anchors], turns: Array) -> list[str]:
+    """Name coordinates that only spin a body about itself: no centre of mass moves, nor what loops or springs hold.
 
     Parameters
     ----------
     tangent : (n, d) array
         Basis of the velocities that the loops allow.
+    anchors : sequence of Anchors
+        Of loops and of springs.
     turns : (m, n) array
-        What motors turn with each joint.
+        What motors, and springs on joints, turn with each joint.
     """
-    moves = np.vstack([tree.centre_jacobians(q_tree), turns]) @ tangent
+    held = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
+    moves = np.vstack([tree.centre_jacobians(q_tree), *held, turns]) @ tangent
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)

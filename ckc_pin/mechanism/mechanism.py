@@ -218,7 +218,9 @@ class Mechanism(Shown):
         joints = [name for name in self.independent if name not in self.tree.free_coordinates]
         self.motors = Motors.on_joints(self.tree, joints) if motors is None else motors
         self.actuated = self.motors.names
-        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, self.motors.turns)
+        anchors = [self.closure.anchors, self.springs.anchors]
+        turns = np.vstack([self.motors.turns, np.diag(self.springs.joint_stiffness)])
+        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, anchors, turns)
         if idle:
             self.warnings.append(
                 f"idle freedoms, bodies that spin about themselves and move nothing: {', '.join(idle)}"
