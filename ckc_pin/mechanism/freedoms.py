@@ -101,8 +101,8 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequenc
     turns : (m, n) array
         What motors, and springs on joints, turn with each joint.
     """
-    held = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
-    moves = np.vstack([tree.centre_jacobians(q_tree), *held, turns]) @ tangent
+    ends = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
+    moves = np.vstack([tree.centre_jacobians(q_tree), *ends, turns]) @ tangent
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)

@@ -17,7 +17,7 @@ from ckc_pin.native import _core
 from ckc_pin.simulation.scene import Scene
 from ckc_pin.simulation.scene_spec import SceneSpec
 
-__all__ = ["Start", "branch", "find_start", "require_chart"]
+__all__ = ["Start", "branch", "find_start", "is_chart", "require_chart"]
 
 ROUNDED = 1e-4  # rad, or of the mechanism's size: how far a configuration that is given whole may be from a closed one
 
@@ -93,11 +93,11 @@ def _off_chart(mechanism: Mechanism, given: dict[str, float]) -> Kinematics | No
         return None
     numbers = mechanism.vector(given, mechanism.coordinates, "initial.q")
     at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-    best = None if _is_chart(at) else mechanism.best_partition(at)
+    best = None if is_chart(at) else mechanism.best_partition(at)
     if best is None:
         return None
     at = Kinematics(at.tree, at.closure, best, at.q_tree)
-    if not _is_chart(at):
+    if not is_chart(at):
         return None
     closed = newton(at, 0.0, mechanism.tolerance)
     moved = mechanism.tree.difference(at.q_tree, closed.at.q_tree) / mechanism.tree.reach
@@ -162,7 +162,7 @@ def _singular(mechanism: Mechanism, where: str, at: Kinematics) -> NumericalErro
 def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
     """Say what is singular; other independent coordinates help where J keeps its rank."""
     best = mechanism.best_partition(at)
-    if best is not None and _is_chart(Kinematics(at.tree, at.closure, best, at.q_tree)):
+    if best is not None and is_chart(Kinematics(at.tree, at.closure, best, at.q_tree)):
         names = ", ".join(mechanism.coordinates[k] for k in best.q)
         return (
             f"{', '.join(mechanism.independent)} do not determine {', '.join(mechanism.dependent)} there; "
@@ -173,7 +173,8 @@ def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
     )
 
 
-def _is_chart(at: Kinematics) -> bool:
+def is_chart(at: Kinematics) -> bool:
+    """Say whether the independent coordinates determine the others there."""
     return at.margin() > _core.chart_margin
 
 

@@ -42,7 +42,7 @@ from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
 from ckc_pin.native.variation import Varying, directions_of, variation_table
 from ckc_pin.simulation.events import Event, EventFunction, event_functions
-from ckc_pin.simulation.initial import Start, branch, find_start, require_chart
+from ckc_pin.simulation.initial import Start, branch, find_start, is_chart, require_chart
 from ckc_pin.simulation.libraries import changing_library, library_of
 from ckc_pin.simulation.loop_terms import controller_call
 from ckc_pin.simulation.scene import Scene
@@ -102,7 +102,10 @@ def scene_controller(
     of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources
     with scene.sources.naming():
         start = {name: x for name, x in spec.initial.q.items() if name in mechanism.coordinates}
-        return make_controller(*of, branch(mechanism, start), load_model)
+        near = branch(mechanism, start)
+        if not is_chart(near):  # between branches; the start itself is refused
+            near = mechanism.assembled
+        return make_controller(*of, near, load_model)
 
 
 def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:

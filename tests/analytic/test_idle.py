@@ -13,10 +13,10 @@ BODY = """<robot name="body"><link name="body"><inertial><mass value="{mass}"/>
 ROUND, LONG = 0.3, 0.8  # m: where the wires are, and how long
 
 
-def hung(folder: Path, held: str) -> str:
+def hung(folder: Path, more: str) -> str:
     (folder / "body.urdf").write_text(BODY.format(mass=2.0))
     (folder / "mechanism.toml").write_text(
-        'name = "hung"\nq_guess = { "root.z" = -0.8 }\n[[tree]]\nfile = "body.urdf"\nroot = "free"\n' + held
+        'name = "hung"\nq_guess = { "root.z" = -0.8 }\n[[tree]]\nfile = "body.urdf"\nroot = "free"\n' + more
     )
     return str(folder / "mechanism.toml")
 
@@ -30,23 +30,23 @@ def wires(frame: str) -> str:
 
 def test_a_plate_on_three_wires_swings_about_itself(tmp_path: Path) -> None:
     """Its centre stays where it is, but it rises: a bifilar pendulum's law, of three wires."""
-    held = wires('[[loop]]\nname = "wire_{k}"\ntype = "distance"\nlength = 0.8\nframe_a = {{ link = "body", xyz = '
+    more = wires('[[loop]]\nname = "wire_{k}"\ntype = "distance"\nlength = 0.8\nframe_a = {{ link = "body", xyz = '
                  '[{x}, {y}, 0.0] }}\nframe_b = {{ link = "world", xyz = [{x}, {y}, 0.0] }}\n')  # fmt: skip
-    mechanism = load(hung(tmp_path, held))
+    mechanism = load(hung(tmp_path, more))
     assert not any("idle" in warning for warning in mechanism.warnings)
     rates = np.abs(linearize(mechanism, "assembled").eigenvalues.imag)
     assert np.abs(rates - np.sqrt(2.0 * 9.81 * ROUND**2 / (0.03 * LONG))).min() < 1e-8
 
 
 def test_a_body_hung_by_a_point_above_its_centre_turns_unseen(tmp_path: Path) -> None:
-    held = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
-    held += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n'
-    (idle,) = [warning for warning in load(hung(tmp_path, held)).warnings if "idle freedoms" in warning]
+    more = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
+    more += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n'
+    (idle,) = [warning for warning in load(hung(tmp_path, more)).warnings if "idle freedoms" in warning]
     assert idle.endswith(": root.rz")
 
 
 def test_springs_hold_what_they_are_on(tmp_path: Path) -> None:
-    held = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
-    held += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n[[spring]]\nstiffness = 3.0\n'
-    held += 'frame_a = { link = "body", xyz = [0.1, 0.0, 0.0] }\nframe_b = { link = "world", xyz = [0.2, 0.3, -0.8] }\n'
-    assert not any("idle" in warning for warning in load(hung(tmp_path, held)).warnings)
+    more = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
+    more += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n[[spring]]\nstiffness = 3.0\n'
+    more += 'frame_a = { link = "body", xyz = [0.1, 0.0, 0.0] }\nframe_b = { link = "world", xyz = [0.2, 0.3, -0.8] }\n'
+    assert not any("idle" in warning for warning in load(hung(tmp_path, more)).warnings)
