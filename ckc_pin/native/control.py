@@ -28,6 +28,8 @@ def control_table(
     controller: Controller | TorqueController | Sampled | None,
     actuation: Actuation,
     call: Callable[[Controller | TorqueController], Callable[..., Any]],
+    *,
+    differs: bool = False,
 ) -> dict[str, Any]:
     """Describe what acts.
 
@@ -37,6 +39,8 @@ def control_table(
     actuation : Actuation
     call : callable
         Makes of a controller that only Python knows a function of the loop's view of its state, to u or tau.
+    differs : bool
+        Whether how such a one changes with the state is wanted, by differences.
 
     Raises
     ------
@@ -58,9 +62,8 @@ def control_table(
     if type(controller) is Torques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
         table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.lines)
-    return table | {
-        "law": law_table(controller) or {"kind": "call", "function": call(controller), "of_motors": torques}
-    }
+    own = {"kind": "call", "function": call(controller), "of_motors": torques, "differs": differs}
+    return table | {"law": law_table(controller) or own}
 
 
 def actuation_table(actuation: Actuation) -> dict[str, Any]:

@@ -57,6 +57,7 @@ class LoopTerms(Terms):
     @lazy
     def at(self) -> Kinematics:
         """The closure's terms at q'."""
+        self._term("at")  # which it has not: it is told that terms are looked at
         q, z = (np.array(part, np.intp) for part in self._given[4:])
         return Kinematics(self.mechanism.tree, self.mechanism.closure, Partition(q, z), self.q_tree)
 

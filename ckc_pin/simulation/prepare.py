@@ -275,7 +275,9 @@ def prepare(
             target=compensated_at(mechanism, controller),
         )  # fmt: skip
     with scene.sources.naming():
-        control = control_table(controller, actuation, partial(controller_call, mechanism=mechanism))
+        control = control_table(
+            controller, actuation, partial(controller_call, mechanism=mechanism), differs=bool(parameters)
+        )
     tables = (
         core_table(mechanism, library or library_of(mechanism, terms), scene.spec.friction_smoothing or 0.0),
         formulation,

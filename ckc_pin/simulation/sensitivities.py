@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.control.controllers import Controller, Law
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import require_callable, require_kind, require_path
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.simulation.cards import sensitivities_card
+from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.moved_points import moved_points
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run
@@ -145,12 +147,16 @@ def sensitivities(
     parameters: Sequence[str],
     changes: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+    *,
+    controller: Controller | Law | None = None,
+    events: Sequence[Event] = (),
 ) -> Sensitivities:
     """Run a scene together with how its motion changes with parameters, to first order.
 
     What is integrated beside eq. 1 are its variational equations, S' = f_y S + f_p, with S under the same tolerances as
     the motion. They hold through changes of coordinates; where a joint sticks, slides, touches or bounces, S jumps as
-    the motion's kink or jump does (saltation). The derivatives are exact; none are differences.
+    the motion's kink or jump does (saltation). The derivatives are exact; none are differences but those of a caller's
+    own controller.
 
     Parameters
     ----------
@@ -166,6 +172,11 @@ def sensitivities(
         As of `simulate`.
     progress : callable, optional
         As of `simulate`.
+    controller : Controller or function, optional
+        As of `simulate`, giving u. How u changes with the state is found by central differences, 4 n calls a
+        right-hand side.
+    events : sequence of Event, optional
+        As of `simulate`.
 
     Returns
     -------
@@ -174,7 +185,8 @@ def sensitivities(
     Raises
     ------
     InputError
-        An unknown parameter, or a scene whose motion has no known derivatives: sampled control, an SPF off phi = 0.
+        An unknown parameter, or a scene whose motion has no known derivatives: sampled control, an SPF off phi = 0, a
+        caller's controller that looks at terms which change with the parameters.
     NumericalError
         A start that is singular; two joints that change what they do at the same instant.
     MechanismError
@@ -190,7 +202,7 @@ def sensitivities(
         require_kind(name, str, "sensitivities: parameters", NAMES)
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
-    ready = prepare(scene, parameters=tuple(parameters))
+    ready = prepare(scene, controller, events, parameters=tuple(parameters))
     started = perf_counter()
     try:
         rows, status, message = run_rows(ready, progress)
@@ -199,6 +211,7 @@ def sensitivities(
             raise
         raise NumericalError(f"sensitivities: {apart}", t=0.0) from error
     message = _apart(ready) or message
+    _refuse_terms(ready)
     run = run_of(ready, rows, status, message, perf_counter() - started)
     run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
     q_tree, v_tree, u, tau = _parts(ready, rows)
@@ -223,6 +236,16 @@ def _apart(ready: Prepared) -> str | None:
         f"stopped {where}: {what}, and with another {name} it is not {there} just then: either way the motion goes on "
         "differently, so that it has no derivative"
     )
+
+
+def _refuse_terms(ready: Prepared) -> None:
+    """Refuse what a caller's controller makes of terms that are other ones with other parameters."""
+    name = next((x.name for x in ready.varying if any(effect.is_term for effect in x.effects)), None)
+    if name is not None and ready.loop.asked():
+        raise InputError(
+            f"sensitivities: {name}: the controller looks at terms of the mechanism, which change with it in a way "
+            "that it alone knows; let it take q, q_dot, q_tree and v_tree, and terms of a mechanism of its own"
+        )
 
 
 def _start(ready: Prepared) -> str:

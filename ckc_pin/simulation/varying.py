@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.torques import Torques
@@ -47,14 +47,20 @@ def compensated_at(mechanism: Mechanism, controller: object) -> Array:
     return np.zeros(0)
 
 
-def require_known_motion(mechanism: Mechanism, scene: Scene, controller: object, varying: Sequence[Varying]) -> None:
+def require_known_motion(
+    mechanism: Mechanism,
+    scene: Scene,
+    controller: Controller | TorqueController | Sampled | None,
+    varying: Sequence[Varying],
+) -> None:
     """Refuse a scene whose motion has no known derivatives (InputError)."""
     spec = scene.spec
     if isinstance(controller, Sampled):
         raise InputError("sensitivities: controller.sample_time: of what is sampled they are not known; leave it out")
-    if controller is not None and type(controller) not in (SetPoint, Tracking, Torques):
+    if controller is not None and type(controller) is not Torques and gives_tau(controller):
         raise InputError(
-            f"sensitivities: {type(controller).__name__}: only of a scene's own controllers is it known how u changes"
+            f"sensitivities: {type(controller).__name__}: how torques that a function gives change is not known; let "
+            "it give u"
         )
     if spec.formulation == "spf" and spec.spf_coordinates == "z":
         raise InputError('sensitivities: spf_coordinates = "z": eq. 8 as printed is another motion; take "w"')

@@ -11,6 +11,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, simulate
+from ckc_pin.mechanism.parameters import values_of, with_components
 from ckc_pin.simulation.sensitivities import sensitivities
 from tests.sensitivity.changed import TIGHT
 
@@ -132,3 +133,70 @@ def test_lengths_are_refused_where_a_point_follows_a_path(tmp_path: Path) -> Non
     )
     with pytest.raises(InputError, match=r"joint\.theta_2\.xyz\.x: q_d is where the mechanism's own lengths bring"):
         sensitivities(str(scene), ["joint.theta_2.xyz.x"])
+
+
+# --- a caller's own --------------------------------------------------------------------------------
+
+
+class Spring:
+    """Nonlinear in q, with a dependent coordinate and the tree's rates in it, and in t."""
+
+    def u(self, t: float, terms: ckc_pin.Terms) -> list[float]:
+        q, v = terms.q_tree, terms.v_tree
+        return [-3.0 * np.sin(q[0] + 1.0) - 0.2 * v[1] + np.sin(t), -2.0 * q[2] ** 3 - 0.3 * v[2] * np.cos(q[3])]
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_of_a_callers_own_controller(formulation: str) -> None:
+    changes = {
+        **TIGHT,
+        "formulation": formulation,
+        "t_end": 0.15,
+        "solver.output_dt": 0.05,
+        "solver.terms": "pinocchio",
+    }
+    values = {"link.link_2.mass": 0.1, "joint.theta_2.xyz.x": 0.2794, "gravity.y": -9.81, "initial.q_dot.theta_1": 0.0}
+    loaded = ckc_pin.load("five_bar")
+    own = with_components(values_of(loaded.spec, loaded.urdf))
+    values |= {name: own[name] for name in values if name in own}
+    found = ckc_pin.sensitivities("five_bar/swing", list(values), changes, controller=Spring())
+    assert found.run.status == "done"
+    for k, (name, value) in enumerate(values.items()):
+        h = 2e-3 * max(0.3, abs(value))
+        runs = [
+            [simulate("five_bar/swing", {**changes, name: value + x}, controller=Spring()) for x in (h / s, -h / s)]
+            for s in (1, 2, 4)
+        ]
+        for part in ("q_tree", "v_tree", "u"):
+            one, two, four = (
+                (getattr(more, part) - getattr(less, part)) / (2 * h / s)
+                for (more, less), s in zip(runs, (1, 2, 4), strict=True)
+            )
+            wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
+            assert np.abs(getattr(found, part)[:, :, k] - wanted).max() <= 1e-7 * np.abs(wanted).max(), (name, part)
+
+
+def test_a_callers_controller_that_looks_at_terms() -> None:
+    """Which are others with other masses; with another start they are not."""
+
+    def compensated(t: float, terms: ckc_pin.Terms) -> np.ndarray:
+        return terms.h - 2.0 * terms.q_dot
+
+    changes = {**TIGHT, "t_end": 0.2}
+    with pytest.raises(InputError, match=r"link\.link_2\.mass: the controller looks at terms of the mechanism"):
+        ckc_pin.sensitivities("five_bar/swing", ["link.link_2.mass"], changes, controller=compensated)
+    name = "initial.q_dot.theta_3"
+    found = ckc_pin.sensitivities("five_bar/swing", [name], changes, controller=compensated)
+    one, two = (simulate("five_bar/swing", {**changes, name: x}, controller=compensated).q_tree for x in (1e-4, -1e-4))
+    assert np.abs(found.q_tree[:, :, 0] - (one - two) / 2e-4).max() <= 1e-6 * np.abs(one - two).max() / 2e-4
+
+
+def test_what_a_caller_gives_in_the_place_of_a_controller_is_refused() -> None:
+    class Motors:
+        def tau(self, t: float, terms: ckc_pin.Terms) -> list[float]:
+            return [0.0, 0.0]
+
+    with pytest.raises(InputError, match="Motors: how torques that a function gives change is not known"):
+        ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], controller=Motors())  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="sample_time"):
+        ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], controller=ckc_pin.Sampled(Spring(), 0.01))  # type: ignore[arg-type]

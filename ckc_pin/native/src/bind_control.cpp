@@ -47,8 +47,9 @@ std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
 // A caller's own, which gives u as an array of d doubles, or torques, or a string that says why there is none.
 class Caller : public Controller {
  public:
-  Caller(nb::object function, bool of_motors, std::shared_ptr<View> view)
-      : function_(std::move(function)), of_motors_(of_motors), view_(std::move(view)) {}
+  // `differs`: how u changes with the state is found by differences; else that is not known.
+  Caller(nb::object function, bool of_motors, bool differs, std::shared_ptr<View> view)
+      : function_(std::move(function)), of_motors_(of_motors), differs_(differs), view_(std::move(view)) {}
   ~Caller() override {
     nb::gil_scoped_acquire acquired;
     function_.reset();
@@ -57,6 +58,7 @@ class Caller : public Controller {
   bool u(const Measured& at, Out u, Problem& problem) override {
     nb::gil_scoped_acquire acquired;
     nb::object answer;
+    t_ = at.t, v_ = at.v_tree;
     if (!view_->call(function_, at, problem, answer)) return false;
     if (read(answer, u)) return true;
     problem.says = nb::cast<std::string>(answer);
@@ -64,9 +66,39 @@ class Caller : public Controller {
   }
   bool of_motors() const override { return of_motors_; }
 
+  // By central differences along each coordinate and each rate of the tree, whether the loops allow it or not.
+  bool slopes(Core& core, const Indices& own, Matrix& by_q, Matrix& by_v) override {
+    if (!differs_) return false;
+    const Vector here = core.q_tree, v = v_;
+    const auto d = static_cast<Eigen::Index>(own.size());
+    Vector step = Vector::Zero(core.n), there, rates, q(d), q_dot(d), u_there(d);
+    Problem problem;
+    bool known = true;
+    const auto add = [&](int k, bool of_rate, double by, Matrix& slope) {
+      there = here, rates = v;
+      step(k) = by;
+      if (of_rate) rates += step;
+      else core.tree.integrate(there, step);
+      step(k) = 0.0;
+      core.set(there);
+      for (Eigen::Index i = 0; i < d; ++i) q(i) = there(core.tree.place[own[i]]), q_dot(i) = rates(own[i]);
+      known = known && u({t_, core, q, q_dot, rates, q_dot}, u_there, problem);
+      slope.col(k) += u_there / (2.0 * by);
+    };
+    for (int k = 0; k < core.n; ++k)
+      for (const double by : {difference, -difference}) add(k, false, by, by_q), add(k, true, by, by_v);
+    if (problem.raised) view_->raised = nullptr;
+    core.set(here), core.set_velocity(v);
+    v_ = v;
+    return known && by_q.allFinite() && by_v.allFinite();
+  }
+
  private:
+  static constexpr double difference = 6e-6;  // rad, m, rad/s, m/s: the third root of rounding
   nb::object function_;
-  const bool of_motors_;
+  const bool of_motors_, differs_;
+  double t_ = 0.0;  // of the last u
+  Vector v_;
   std::shared_ptr<View> view_;
 };
 
@@ -75,7 +107,7 @@ class Caller : public Controller {
 std::unique_ptr<Controller> law_of(const nb::dict& table, const Core& core, Eigen::Index motors,
                                    const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
-  if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), get<bool>(table, "of_motors"), view);
+  if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), get<bool>(table, "of_motors"), get<bool>(table, "differs"), view);
   if (kind == "torques") {
     const auto times = get<Vector>(table, "times");
     const auto tau = get<Matrix>(table, "tau");
@@ -131,6 +163,7 @@ void View::put(const Measured& at) {
 }
 
 nb::object View::term(long stamp, const std::string& name) {
+  asked = true;
   if (!seen_ || stamp != stamp_) return nb::none();
   seen_->core.set_velocity(seen_->v_tree);
   return term_of(seen_->core, name);

@@ -19,6 +19,7 @@ class View : public std::enable_shared_from_this<View> {
   nb::object term(long stamp, const std::string& name);
 
   long calls = 0;
+  bool asked = false;  // for a term, beside the state's numbers
   std::exception_ptr raised;
 
  private:

@@ -153,6 +153,7 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
 }  // namespace
 
 nb::object term_of(Core& core, const std::string& name) {
+  if (name == "at") return nb::none();
   if (name == "phi") return nb::cast(core.rows.phi);
   if (name == "J") return core.jacobian(), nb::cast(core.rows.J);
   if (name == "rho") return core.reduce(), nb::cast(core.rho);

@@ -107,7 +107,7 @@ void start(Run& run, double t, Given q_tree, Given v_tree, Given w) {
   const Core& core = *run.core;
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"), require(w, core.rows.closure.rows, "w");
   require(std::isfinite(t), "t: a number is not finite");
-  run.view->calls = 0, run.rhs_before = 0;
+  run.view->calls = 0, run.view->asked = false, run.rhs_before = 0;
   run.loop->start(t, q_tree, v_tree, w);
 }
 

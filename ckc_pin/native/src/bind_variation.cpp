@@ -92,7 +92,8 @@ void bind_variation(nb::class_<Run>& loop) {
       .def("motion", &motion)
       .def("rates_found",  // by the code that is written out, and by the tree
            [](Run& run) { return nb::make_tuple(varied(run).variation().written, varied(run).variation().general); })
-      .def("apart", &apart);
+      .def("apart", &apart)
+      .def("asked", [](const Run& run) { return run.view->asked; });  // whether a caller's function looked at terms
 }
 
 }  // namespace ckc
