@@ -264,7 +264,8 @@ def prepare(
     terms = scene.spec.solver.terms
     if parameters:
         changed = partial(_built, scene)
-        varying = varying_of(mechanism, scene, controller, actuation, parameters, changed, start.at.q_tree)
+        law = controller.controller if isinstance(controller, Sampled) else controller
+        varying = varying_of(mechanism, scene, law, actuation, parameters, changed, start.at.q_tree)
         require_known_motion(mechanism, scene, controller, varying)
         require_movable(mechanism, scene.spec.parameters, varying, changed)
         changing, directions = directions_of(mechanism, varying) or (None, None)
@@ -272,7 +273,7 @@ def prepare(
         changing = changing if library is None else None
         formulation["variation"] = variation_table(
             mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
-            target=compensated_at(mechanism, controller),
+            target=compensated_at(mechanism, law),
         )  # fmt: skip
     with scene.sources.naming():
         control = control_table(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.control.controllers import Controller, Law
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import require_callable, require_kind, require_path
@@ -148,7 +149,7 @@ def sensitivities(
     changes: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     *,
-    controller: Controller | Law | None = None,
+    controller: Controller | Sampled | Law | None = None,
     events: Sequence[Event] = (),
 ) -> Sensitivities:
     """Run a scene together with how its motion changes with parameters, to first order.
@@ -172,9 +173,9 @@ def sensitivities(
         As of `simulate`.
     progress : callable, optional
         As of `simulate`.
-    controller : Controller or function, optional
+    controller : Controller, Sampled or function, optional
         As of `simulate`, giving u. How u changes with the state is found by central differences, 4 n calls a
-        right-hand side.
+        right-hand side or a sample.
     events : sequence of Event, optional
         As of `simulate`.
 
@@ -185,8 +186,8 @@ def sensitivities(
     Raises
     ------
     InputError
-        An unknown parameter, or a scene whose motion has no known derivatives: sampled control, an SPF off phi = 0, a
-        caller's controller that looks at terms which change with the parameters.
+        An unknown parameter, or a scene whose motion has no known derivatives: with a sensor or a drive, an SPF off
+        phi = 0, a caller's controller that looks at terms which change with the parameters.
     NumericalError
         A start that is singular; two joints that change what they do at the same instant.
     MechanismError

@@ -56,7 +56,13 @@ def require_known_motion(
     """Refuse a scene whose motion has no known derivatives (InputError)."""
     spec = scene.spec
     if isinstance(controller, Sampled):
-        raise InputError("sensitivities: controller.sample_time: of what is sampled they are not known; leave it out")
+        for key in ("sensor", "drive"):
+            if getattr(controller, key) is not None:
+                raise InputError(
+                    f"sensitivities: controller.{key}: steps, limits of rates and filters of samples have no known "
+                    "derivatives; leave it out"
+                )
+        controller = controller.controller
     if controller is not None and type(controller) is not Torques and gives_tau(controller):
         raise InputError(
             f"sensitivities: {type(controller).__name__}: how torques that a function gives change is not known; let "

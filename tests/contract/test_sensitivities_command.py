@@ -65,7 +65,19 @@ BAD = [
     Bad("no name", ["sensitivities", SCENE], ["NAME", "ckc sensitivities --help"]),
     Bad("unknown", ["sensitivities", SCENE, "link.rod.mass"], ["link.rod.mass", "link.link_2"]),
     Bad("no folder", ["sensitivities", SCENE, "gravity", "--figures"], ["--figures goes with --out DIR"]),
-    Bad("sampled", ["sensitivities", SCENE, "gravity", "--set", "controller.sample_time=0.01"], ["sample_time"]),
+    Bad(
+        "a drive",
+        [
+            "sensitivities",
+            SCENE,
+            "gravity",
+            "--set",
+            "controller.sample_time=0.01",
+            "--set",
+            "controller.drive.torque_resolution=0.1",
+        ],
+        ["controller.drive", "leave it out"],
+    ),
 ]
 
 

@@ -135,6 +135,34 @@ def test_lengths_are_refused_where_a_point_follows_a_path(tmp_path: Path) -> Non
         sensitivities(str(scene), ["joint.theta_2.xyz.x"])
 
 
+# --- sampled ---------------------------------------------------------------------------------------
+
+CLOCK = {"controller.sample_time": 0.01, "controller.delay": 0.013}
+OF_SET_POINT = {"controller.K_P": 10.0, "controller.K_V": 1.0, "initial.q_dot.theta_1": 0.0, "gravity.y": -9.81}
+
+
+@pytest.mark.parametrize(
+    ("formulation", "terms"),
+    [("dae", "pinocchio"), ("reduced", "pinocchio"), ("spf", "pinocchio"), ("dae", "generated")],
+)
+def test_of_sampled_controllers(formulation: str, terms: str) -> None:
+    """Between samples what was found is held, and so is how it changes; delayed by more than a period."""
+    settings = {**TIGHT, **CLOCK, "formulation": formulation, "solver.terms": terms}
+    agree("five_bar/set_point", OF_SET_POINT, {**settings, "t_end": 0.1, "solver.output_dt": 0.025})
+    names = {"initial.q_dot.theta_1": 0.0} | ({"controller.Lambda": 1.0} if terms == "pinocchio" else {})
+    quick = {"controller.sample_time": 1e-3, "controller.delay": 1.3e-3, "t_end": 0.1, "solver.output_dt": 0.025}
+    agree("five_bar/tracking", names, {**settings, **quick})
+
+
+def test_of_samples_that_ask_for_more_than_there_is() -> None:
+    """A torque at its limit does not answer until the sample that brings it back."""
+    limited = {"controller.torque_limit": 2.0, "controller.sample_time": 0.01}
+    changes = {**TIGHT, **limited, "formulation": "reduced", "t_end": 0.5, "solver.output_dt": 0.1}
+    run = simulate("five_bar/set_point", changes)
+    assert np.abs(run.tau).max() == 2.0 > np.abs(run.tau[-1]).max()
+    agree("five_bar/set_point", OF_SET_POINT, changes)
+
+
 # --- a caller's own --------------------------------------------------------------------------------
 
 
@@ -146,8 +174,10 @@ class Spring:
         return [-3.0 * np.sin(q[0] + 1.0) - 0.2 * v[1] + np.sin(t), -2.0 * q[2] ** 3 - 0.3 * v[2] * np.cos(q[3])]
 
 
-@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
-def test_of_a_callers_own_controller(formulation: str) -> None:
+@pytest.mark.parametrize(
+    ("formulation", "sampled"), [("dae", False), ("reduced", False), ("spf", False), ("dae", True)]
+)
+def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
     changes = {
         **TIGHT,
         "formulation": formulation,
@@ -159,12 +189,13 @@ def test_of_a_callers_own_controller(formulation: str) -> None:
     loaded = ckc_pin.load("five_bar")
     own = with_components(values_of(loaded.spec, loaded.urdf))
     values |= {name: own[name] for name in values if name in own}
-    found = ckc_pin.sensitivities("five_bar/swing", list(values), changes, controller=Spring())
+    law = ckc_pin.Sampled(Spring(), 0.01) if sampled else Spring()
+    found = ckc_pin.sensitivities("five_bar/swing", list(values), changes, controller=law)
     assert found.run.status == "done"
     for k, (name, value) in enumerate(values.items()):
         h = 2e-3 * max(0.3, abs(value))
         runs = [
-            [simulate("five_bar/swing", {**changes, name: value + x}, controller=Spring()) for x in (h / s, -h / s)]
+            [simulate("five_bar/swing", {**changes, name: value + x}, controller=law) for x in (h / s, -h / s)]
             for s in (1, 2, 4)
         ]
         for part in ("q_tree", "v_tree", "u"):
@@ -198,5 +229,3 @@ def test_what_a_caller_gives_in_the_place_of_a_controller_is_refused() -> None:
 
     with pytest.raises(InputError, match="Motors: how torques that a function gives change is not known"):
         ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], controller=Motors())  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="sample_time"):
-        ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], controller=ckc_pin.Sampled(Spring(), 0.01))  # type: ignore[arg-type]

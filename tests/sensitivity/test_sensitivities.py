@@ -117,7 +117,7 @@ def test_what_is_no_parameter_is_refused_with_those_there_are(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("scene", "changes", "says"),
     [
-        ("five_bar/set_point", {"controller.sample_time": 0.01}, "sample_time"),
+        ("five_bar/set_point", {"controller.sample_time": 0.01, "controller.sensor": {"resolution": 0.01}}, "sensor"),
         ("five_bar/swing", {"formulation": "spf", "spf_coordinates": "z"}, "eq. 8 as printed"),
         ("five_bar/swing", {"formulation": "spf", "initial.w": [0.01, 0.0]}, r"initial\.w"),
         ("five_bar/swing", {"solver.projection": False}, "projection"),

@@ -313,11 +313,13 @@ bool Control::answer(const Measured& at) {
 
 bool Control::sample(const Measured& at, bool& changed) {
   changed = false;
+  sampling->taken = sampling->acted = 0;
   const double now = at.t + sampling->near(at.t);
   const double sample = sampling->due();
   if (sample <= now) {
     if (sampling->holds) {
       if (!answer(at)) return false;
+      ++sampling->taken;
       sampling->put(sample + sampling->delay, sampled_);
     } else {
       changed = true;
@@ -327,6 +329,7 @@ bool Control::sample(const Measured& at, bool& changed) {
   for (; sampling->count && sampling->ring[sampling->first].first <= now; --sampling->count) {
     const Vector& value = sampling->ring[sampling->first].second;
     changed |= hold(value, constant_of_motors);
+    ++sampling->acted;
     sampling->first = (sampling->first + 1) % sampling->ring.size();
   }
   return true;

@@ -126,6 +126,7 @@ struct Sampling {
   Vector times;        // the instants, if they are not those
   bool holds = true;   // else what acts has only no derivative there
   long next = 0;       // the number of the next sample
+  int taken = 0, acted = 0;  // at the instant that was looked at last: samples, and what came to act
   // A ring of what waits to act, u and when: `first` is the next, `count` how many there are.
   std::vector<std::pair<double, Vector>> ring;
   size_t first = 0, count = 0;

@@ -71,6 +71,7 @@ void Variation::balance(Matrix& q, Matrix& effort, Matrix& stiffness) {
 // How the independent coordinates start is the parameters' to say; the others follow from the closure.
 bool Variation::start(In v, Matrix& s) {
   written = general = 0;
+  waiting_.clear(), held_.resize(0, 0);
   const Vector here = core_.q_tree, none = Vector::Zero(n), no_force = Vector::Zero(core_.rows.closure.rows);
   s.setZero(2 * n, count);
   compensated_.setZero(core_.d, count);
@@ -187,7 +188,7 @@ bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s
   if (along_.empty()) begin_written();
   ++written;
   force_.setZero();
-  if (answers_ || acting_varies_) add_acting(q_tree, v, force_), force_ = -force_;
+  if (answers_ || acting_varies_ || holds()) add_acting(q_tree, v, force_), force_ = -force_;
   if (answers_) add_answer(s);
   move(v, s, s_dot);
   const int nq = core_.tree.nq;

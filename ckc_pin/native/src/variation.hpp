@@ -6,6 +6,7 @@
 // parameter is a direction in the space of the numbers that the code takes.
 #pragma once
 
+#include <deque>
 #include <optional>
 
 #include "system.hpp"
@@ -79,6 +80,9 @@ class Variation {
   // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
   // what acts there; NaN where that is not known.
   void efforts(In v, const Matrix& s, Matrix& u, Matrix& tau);
+  // What a controller on a clock makes of s, where it has looked at the core's state; what acts is held until the next.
+  bool sampled(const Matrix& s, const Sampling& clock);
+  bool holds() const { return held_.size() && !held_.isZero(0.0); }
   // Where joints change what they do: as the system's. In between s is of the instant that comes with the parameters.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
   bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
@@ -106,7 +110,8 @@ class Variation {
   bool tidy(In v, Matrix& s);
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
-  // How a controller's u changes with the parameters, with that sign, in the rows of q.
+  Matrix wanted(In q_tree, In v) const;  // how a controller's u changes with the parameters, (d, parameters)
+  // The same, or what is held of it, with that sign, in the rows of q.
   void add_wanted(In q_tree, In v, Matrix& force) const;
   void clipped_efforts(In v);  // clipped_: how torques change with the parameters where motors are at limits
   void add_state(const Matrix& s);
@@ -127,6 +132,8 @@ class Variation {
     Matrix directions, changes;
   };
   std::vector<Along> along_;
+  std::deque<Matrix> waiting_;  // of samples that do not act yet
+  Matrix held_;
   Vector acting_, back_, move_, more_, of_group_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };

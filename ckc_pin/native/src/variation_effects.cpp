@@ -154,29 +154,43 @@ void Variation::add_control(In q_tree, In v, Matrix& force) const {
     }
   if (clipped)
     force.noalias() -= table_.turns.transpose() * clipped_;
-  else if (control.feedback())
+  else
     add_wanted(q_tree, v, force);
 }
 
-void Variation::add_wanted(In q_tree, In v, Matrix& force) const {
+Matrix Variation::wanted(In q_tree, In v) const {
   const auto d = static_cast<Eigen::Index>(table_.own.size());
-  const auto answer = [&](const Vector& u, int p) {
-    for (Eigen::Index i = 0; i < d; ++i)
-      if (system_.control.answers(i)) force(table_.own[i], p) -= u(i);
-  };
   Vector q(d), q_dot(d), more(d);
   for (Eigen::Index i = 0; i < d; ++i) q(i) = q_tree(core_.tree.place[table_.own[i]]), q_dot(i) = v(table_.own[i]);
   const Matrix none = Matrix::Zero(d, d);
-  for (int p = 0; p < count; ++p) {
+  Matrix u = compensated_;
+  for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
       if (of.kind != Effect::gain_q && of.kind != Effect::gain_q_dot) continue;
       const Eigen::Map<const Matrix> gain(of.numbers.data(), d, d);
       const bool of_q = of.kind == Effect::gain_q;
       system_.control.law->by_gains({0.0, core_, q, q_dot, v, q_dot}, of_q ? Matrix(gain) : none, of_q ? none : Matrix(gain), more);
-      answer(more, p);
+      u.col(p) += more;
     }
-    if (compensated_.size()) answer(compensated_.col(p), p);
+  return u;
+}
+
+void Variation::add_wanted(In q_tree, In v, Matrix& force) const {
+  if (!system_.control.feedback() && !holds()) return;
+  const Matrix u = system_.control.feedback() ? wanted(q_tree, v) : held_;
+  for (Eigen::Index i = 0; i < u.rows(); ++i)
+    if (system_.control.answers(i)) force.row(table_.own[i]) -= u.row(i);
+}
+
+bool Variation::sampled(const Matrix& s, const Sampling& clock) {
+  if (clock.taken) {
+    const auto d = static_cast<Eigen::Index>(table_.own.size());
+    Matrix by_q = Matrix::Zero(d, n), by_v = by_q;
+    if (!system_.control.law->slopes(core_, table_.own, by_q, by_v)) return false;
+    waiting_.push_back(wanted(core_.q_tree, system_.velocity) + by_q * s.topRows(n) + by_v * s.bottomRows(n));
   }
+  for (int k = 0; k < clock.acted; ++k) held_ = waiting_.front(), waiting_.pop_front();
+  return true;
 }
 
 // How phi changes with the parameters where the whole tree was computed, and J v.

@@ -77,7 +77,7 @@ void Variation::clipped_efforts(In v) {
     for (const Effect& of : table_.parameters[p].effects)
       if (of.kind == Effect::gear) force_.col(p) -= control.clipped.tau(of.index) * of.numbers;
   Matrix wanted = Matrix::Zero(n, count), u = core_.rho.transpose() * force_;
-  if (control.feedback()) add_wanted(core_.q_tree, v, wanted);
+  add_wanted(core_.q_tree, v, wanted);
   for (Eigen::Index i = 0; i < u.rows(); ++i) u.row(i) -= wanted.row(table_.own[i]);
   clipped_ = control.clipped.answer * u;
 }

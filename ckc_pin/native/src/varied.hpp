@@ -105,6 +105,11 @@ class Varied : public Base, public WithVariation {
     put(y);
     return true;
   }
+  bool sampled(In y) override {
+    if (!this->control.sampling->holds) return true;
+    take(y);
+    return variation_.sampled(s_, *this->control.sampling) || this->fails(Trouble::infinite);
+  }
   int extra() const override { return (rows() + this->core.d + static_cast<int>(this->control.tau.size())) * variation_.count; }
   void put_extra(In y, Out row) override {
     take(y);
@@ -131,7 +136,7 @@ class Varied : public Base, public WithVariation {
     v_ = std::is_same_v<Base, Dae> ? this->velocity : this->v_tree;
     a_.resize(variation_.n);
     if (!Base::tree_acceleration(y_dot.head(size_), a_)) return false;
-    if (!of_start_ || !this->core.written) return variation_.rates(v_, a_, s_, s_dot_);
+    if (!of_start_ || !this->core.written || variation_.holds()) return variation_.rates(v_, a_, s_, s_dot_);
     this->core.set_velocity(v_);
     if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return false;
     variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
