@@ -19,7 +19,7 @@ from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import prepare, scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
 from ckc_pin.simulation.sensitivities import sensitivities
@@ -129,8 +129,13 @@ def floquet(
     if loaded.spec.initial.at is not None:
         loaded = _from_coordinates(loaded, mechanism)
     names = mechanism.independent
+    pushes = [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names]
+    try:
+        prepare(loaded, parameters=pushes)  # what has no derivatives is refused before anything is run
+    except InputError as error:
+        raise InputError(f"floquet: {str(error).removeprefix('sensitivities: ')}") from None
     _miss(simulate(loaded), period)  # the motion alone: the variational equations are 2 d more of it
-    found = sensitivities(loaded, [f"initial.{of}.{name}" for of in ("q", "q_dot") for name in names], None, progress)
+    found = sensitivities(loaded, pushes, None, progress)
     run, q = found.run, mechanism.partition.q
     monodromy = np.concatenate([found.q_tree[-1][q], found.v_tree[-1][q]])
     multipliers = np.linalg.eigvals(monodromy).astype(np.complex128)

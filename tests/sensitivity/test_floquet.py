@@ -166,6 +166,11 @@ def test_of_a_motion_with_samples_it_is_said_what_is_not_known() -> None:
         floquet("five_bar/tracking", 2 * np.pi, {"controller.sample_time": 1e-3})
 
 
+def test_what_has_no_derivatives_is_refused_before_anything_is_run() -> None:
+    with pytest.raises(InputError, match=r'^floquet: spf_coordinates = "z": eq. 8 as printed is another motion'):
+        floquet("five_bar/swing", 1.0, {"formulation": "spf", "spf_coordinates": "z"})
+
+
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
     plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
     assert set(plain) == {"name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"}
