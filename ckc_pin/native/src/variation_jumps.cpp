@@ -24,7 +24,7 @@ bool Variation::tidy(In v, Matrix& s) {
   Matrix rate;
   compute(v, none, no_force, false);
   closure_changes(v, row_, rate);
-  core_.tree_inertia();
+  core_.tree_inertia(), core_.jacobian();
   force_.setZero();
   row_ += core_.rows.J * s.topRows(n);
   if (!core_.respond(force_, row_, change_)) return false;
