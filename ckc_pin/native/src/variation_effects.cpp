@@ -146,10 +146,12 @@ void Variation::add_control(In q_tree, In v, Matrix& force) const {
   for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
       const int k = of.index;
-      if (!control.of_motors() && !clipped && !(control.direct() && control.limited(k))) continue;
+      if (of.kind != Effect::gear && of.kind != Effect::torque_limit) continue;
+      const bool limited = control.limited(k);
+      if (!control.of_motors() && !clipped && !(control.direct() && limited)) continue;
       if (of.kind == Effect::gear)
         force.col(p) -= control.tau(k) * of.numbers;
-      else if (of.kind == Effect::torque_limit && control.limited(k))
+      else if (limited)
         force.col(p) -= (control.tau(k) > 0.0 ? 1.0 : -1.0) * of.numbers;
     }
   if (clipped)
