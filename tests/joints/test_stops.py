@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import ellipk
@@ -153,3 +155,34 @@ def test_stops_that_the_loops_cannot_keep_are_left(with_joints: Make) -> None:
     assert_close(delta.q_tree, load("delta").q_tree, 0)
     with pytest.raises(InputError, match=r"is beyond its stops, .* give another initial.q, or a q_guess within them"):
         simulate(folder / "default.scene.toml")
+
+
+LINK = """<link name="{name}"><inertial><origin xyz="{x} {y} 0"/><mass value="{m}"/>
+<inertia ixx="0.05" iyy="0.05" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+HINGE = """<joint name="{name}" type="revolute"><parent link="{on}"/><child link="{to}"/><origin xyz="{x} 0 0"/>
+<axis xyz="0 0 1"/><limit lower="{low}" upper="{high}" effort="1" velocity="1"/></joint>"""
+
+
+def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path) -> None:
+    """Without it the joint would fall off its stop: it is by what holds the other one that it comes back."""
+    parts = '<link name="ground"/>' + LINK.format(name="upper", x=0.365, y=-0.055, m=1.624)
+    parts += LINK.format(name="lower", x=0.264, y=-0.075, m=0.995)
+    parts += HINGE.format(name="a", on="ground", to="upper", x=0.285, low=-0.424, high=0.241)
+    parts += HINGE.format(name="b", on="upper", to="lower", x=0.277, low=-0.518, high=0.274)
+    (tmp_path / "two.urdf").write_text(f'<robot name="two">{parts}</robot>')
+    stops = "".join(
+        f'[[joint]]\nname = "{name}"\nstops = true\nrestitution = {e}\n' for name, e in (("a", 0.6), ("b", 0.3))
+    )
+    (tmp_path / "two.toml").write_text(
+        f'name = "two"\nurdf = "two.urdf"\ngravity = [1.587, -9.81, 0.0]\nindependent = ["a", "b"]\n{stops}'
+    )
+    (tmp_path / "two.scene.toml").write_text(
+        'mechanism = "two.toml"\nformulation = "dae"\nt_end = 2.0\ninitial.q = { a = -0.1323, b = -0.2151 }\n'
+        "initial.q_dot = { a = -0.583, b = 0.0 }\nsolver.rtol = 1e-10\nsolver.max_rhs = 20000\n"
+    )
+    run = simulate(tmp_path / "two.scene.toml")
+    assert run.status == "done"
+    assert run.q_tree[-1] == pytest.approx([-0.424, -0.518], abs=1e-9)
+    assert not run.v_tree[-1].any()
+    times = np.array([event["t"] for event in run.events if event["name"].startswith("b ")])
+    assert np.diff(times)[-3:] / np.diff(times)[-4:-1] == pytest.approx([0.3] * 3, rel=1e-2)

@@ -20,7 +20,7 @@ constexpr double exactly = 1e-9;    // of the largest acceleration: none
 JointChanges::JointChanges(System& system, double rise, const Tolerance& tolerance)
     : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise), tolerance_(tolerance) {
   const int n = core_.n;
-  for (Vector* x : {&coordinates, &v_, &a_, &rest_, &step_, &unit_}) x->setZero(n);
+  for (Vector* x : {&coordinates, &v_, &a_, &held_, &rest_, &step_, &unit_}) x->setZero(n);
   near_.assign(n, 0);
 }
 
@@ -124,9 +124,12 @@ bool JointChanges::impact(double t, Out y) {
       if (is_into(k)) arrived_.push_back({k, false, near_[k]});
     }
   if (!into) return true;
+  if (!system_.acceleration(t, held_)) return false;
   joints_.locked.clear();
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
   if (!system_.acceleration(t, a_) || !movable(at)) return false;
+  // Back to the stop, by what holds others before or without it: a bounce that either way rises no further is none.
+  const auto returning = [&](int k) { return std::max(near_[k] * a_(k), near_[k] * held_(k)); };
   const auto m = static_cast<Eigen::Index>(at.size());
   if (!m) return joints_.touch = touched, true;
   scale(at);
@@ -135,7 +138,7 @@ bool JointChanges::impact(double t, Out y) {
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = at[i], side = near_[k];
     const double speed = std::max(side * v_(k), 0.0), after = joints_.table.restitution(k) * speed;
-    const double towards = side * a_(k), rise = towards > 0.0 ? after * after / (2 * towards) : infinity;
+    const double towards = returning(k), rise = towards > 0.0 ? after * after / (2 * towards) : infinity;
     back(i) = rise > rise_ * joints_.table.reach(k) ? after : 0.0;
     if (towards > 0.0 && back(i) > 0.0) flight = std::min(flight, 2 * after / towards);
     b_(i) = scale_(i) * (v_(k) + side * back(i));
@@ -152,7 +155,7 @@ bool JointChanges::impact(double t, Out y) {
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = at[i];
     // who is pushed off a stop by what happens at another one, or comes to rest at it
-    const double off = -near_[k] * (v_(k) + step_(k)), towards = near_[k] * a_(k);
+    const double off = -near_[k] * (v_(k) + step_(k)), towards = returning(k);
     const bool slow = towards > 0.0 && off * off / (2 * towards) <= rise_ * joints_.table.reach(k);
     if (slow || off <= exactly * std::max(std::abs(v_(k)), std::abs(step_(k)))) joints_.touch[k] = near_[k];
     change += x_(i) * (v_(k) + 0.5 * step_(k));

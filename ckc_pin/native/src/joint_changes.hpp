@@ -40,7 +40,7 @@ class JointChanges {
   const double rise_;
   const Tolerance& tolerance_;
   bool known_ = false;  // whether a decision was made since the begin
-  Vector v_, a_, rest_, step_, unit_;
+  Vector v_, a_, held_, rest_, step_, unit_;
   Indices near_;        // (n): the stop that a joint is at, as `touch`
   std::vector<System::Met> arrived_;  // what is as it is now because it has come there now
   bool slips_ = false;  // what holds has given way
