@@ -161,6 +161,9 @@ def stability_text(found: Stability) -> str:
     if found.stable is None:
         return f"not known whether it is stable: {found.reason}"
     says = "stable" if found.stable else "UNSTABLE"
+    swings = found.eigenvalues is not None and not found.eigenvalues[0].real
+    if swings and not (found.stable or found.sampled or found.growth is not None):
+        says = "neither stable nor unstable, nothing damps it,"
     if found.leaves_out:
         says += f", {' and '.join(found.leaves_out)} left out,"
     as_sampled = " as sampled" if found.sampled else ""

@@ -17,6 +17,7 @@ ComplexArray = NDArray[np.complex128]
 NO_DAMPING = 1e-12  # a damping ratio as small as that is printed as none
 SLACK = 64 * np.finfo(float).eps  # roundings in an entry of A
 BLOCK = SLACK ** (1 / 3)  # of its size: what these make of a triple zero, and more than they do of a double one
+NEITHER = 1e-14  # of an eigenvalue's size: a real part that is rounding
 EQUAL = 1e-8  # of their size: eigenvalues no further from each other are one
 REAL = 1e-5  # of the size of shapes: what is left of them beside real ones is rounding
 FLAT = 1e-9  # of the largest singular value of A, by rows: motions that nothing brings back
@@ -56,8 +57,9 @@ class Mode:
 
 
 def eigenvalues_of(A: Array, units: Array | None = None) -> ComplexArray:
-    """Return a matrix's eigenvalues by falling real parts, conjugate ones side by side, zeros exact."""
+    """Return a matrix's eigenvalues by falling real parts, conjugate ones side by side; what is zero is so exactly."""
     values, _ = _decomposed(A, units)
+    values.real[np.abs(values.real) <= NEITHER * np.abs(values)] = 0.0
     return values[np.lexsort((-values.imag, np.round(np.abs(values.imag), 9), -np.round(values.real, 9)))]
 
 
