@@ -75,7 +75,8 @@ def linearize(
     with Working(f"linearizing {what}"):
         model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_changes("--set", changes))
     runs, modes = 0 if out is None else _write(model, what, changes, out), len(model.modes)
-    more = "" if runs == modes else f"; {runs} of {modes} modes play: not rigid ones, what the loops bar, over a dozen"
+    barred = "rigid ones do not, nor any whose swing the loops do not follow, nor more than twelve"
+    more = "" if runs == modes else f"; {runs} of {modes} modes can be played: {barred}"
     _print(linear_plain(model) if as_json else linear_text(model), out, more)
 
 

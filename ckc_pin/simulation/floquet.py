@@ -118,7 +118,10 @@ def floquet(
     loaded = make_scene(with_changes(given.plain(), {"t_end": float(period)}), given.name, given.sources)
     mechanism = scene_mechanism(loaded)
     if mechanism.rooted:
-        raise InputError(f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates")
+        raise InputError(
+            f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates: of its "
+            "rotation there is no one matrix over a period; take other independent coordinates, or fix the root"
+        )
     if isinstance(loaded.spec.controller, FeedbackSpec) and loaded.spec.controller.sample_time is not None:
         raise InputError(
             f"{loaded.name}: controller.sample_time: of a motion with samples the monodromy matrix is not known; leave "

@@ -213,9 +213,8 @@ def linear_model(
     u_tree = mechanism.motors.force(tau) + u_tree
     found = Plant(mechanism, smoothing, library).at(terms, u_tree, locked)
     if not len(found.at):
-        why = (
-            f"its joints stick or touch ({', '.join(names)}); friction_smoothing lets them slide" if names else "d = 0"
-        )
+        smoothed = "; friction_smoothing lets them slide" if np.any(mechanism.joints.friction[locked]) else ""
+        why = f"its joints stick or touch ({', '.join(names)}){smoothed}" if names else "d = 0"
         raise InputError(f"{mechanism.name}: no freedom is left to linearize in: {why}")
     if not np.all(np.isfinite(found.A)):
         raise NumericalError(f"{mechanism.name}: no linear model there, its derivatives are not finite")

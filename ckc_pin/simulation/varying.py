@@ -179,6 +179,10 @@ def varying_of(
         x.name: x for x in (*_of_controller(mechanism, scene, controller), *_of_start(mechanism, scene, q_tree))
     }
     known = with_components(values_of(mechanism.spec, mechanism.urdf)) | dict.fromkeys(of_scene, 0.0)
+    at = scene.spec.initial.at
+    placed = next((name for name in names if name.startswith("initial.q.") and at is not None), None)
+    if placed is not None:
+        raise InputError(f'sensitivities: {placed}: the scene starts "{at}"; give its start as [initial.q]')
     require_known(names, known, "sensitivities", (*ROOTS, *SCENE_ROOTS))
     labels = [part for name in names for part in parts_of(name, known)]
     if len(set(labels)) < len(labels):
