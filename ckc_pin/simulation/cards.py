@@ -17,11 +17,13 @@ from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.units import joined
-from ckc_pin.simulation.linear_report import stability_text
+from ckc_pin.simulation.linear_report import eigenvalues_text, multipliers_say, stability_text
 from ckc_pin.simulation.units import key_unit, per, quantity_units
 
 if TYPE_CHECKING:
     from ckc_pin.simulation.check import Check
+    from ckc_pin.simulation.floquet import Floquet
+    from ckc_pin.simulation.locus import GainLocus
     from ckc_pin.simulation.motion_forces import MotionForces
     from ckc_pin.simulation.run import Run
     from ckc_pin.simulation.scene import Scene
@@ -31,7 +33,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "check_card",
+    "floquet_card",
     "forces_card",
+    "locus_card",
     "run_card",
     "scene_card",
     "sensitivities_card",
@@ -213,6 +217,25 @@ def forces_card(found: MotionForces) -> Card:
     rows += [("exceeded", f"{x['motor']}: {x['most']:.4g} at t = {x['t_most']:.4g} s, its limit is {x['limit']:.4g}")
              for x in found.exceeded]  # fmt: skip
     return Card(f"MotionForces of {found.name}, {found.status}: {found.message}", rows)
+
+
+def floquet_card(found: Floquet) -> Card:
+    """Return the multipliers of a periodic motion, and what they say."""
+    return Card(f"Floquet of {found.run.scene_name}, period {found.period:.9g} s", [
+        ("states", list(found.states)),
+        ("multipliers", eigenvalues_text(found.multipliers)),
+        ("verdict", multipliers_say(found)),
+    ])  # fmt: skip
+
+
+def locus_card(found: GainLocus) -> Card:
+    """Return where the eigenvalues of a closed loop are at the ends of a locus, and as the scene has the gain."""
+    own = int(np.argmin(np.abs(found.factors - 1.0)))
+    rows: list[Row] = [
+        (f"{found.gain} times {found.factors[k]:.4g}", f"{eigenvalues_text(found.eigenvalues[k])} 1/s")
+        for k in sorted({0, own, len(found.factors) - 1})
+    ]
+    return Card(f"GainLocus of {found.name}, {found.at}: {len(found.factors)} factors on {found.gain}", rows)
 
 
 def sensitivities_card(found: Sensitivities) -> Card:

@@ -15,9 +15,11 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray
+from ckc_pin.simulation.cards import floquet_card
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.prepare import prepare, scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run
@@ -34,8 +36,8 @@ INSTANTS = 24  # at which what drives it is compared with a period later
 BETWEEN = 9  # steps from a multiplier to the unit circle
 
 
-@dataclass(frozen=True)
-class Floquet:
+@dataclass(frozen=True, eq=False, repr=False)
+class Floquet(Shown):
     """A periodic motion to first order.
 
     Attributes
@@ -65,6 +67,10 @@ class Floquet:
     uncertainty: float
     period: float
     run: Run
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return floquet_card(self)
 
     def plain(self) -> dict[str, Any]:
         """Return it as JSON has it, complex numbers as [re, im]."""

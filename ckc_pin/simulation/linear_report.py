@@ -19,9 +19,11 @@ if TYPE_CHECKING:
     from ckc_pin.simulation.floquet import Floquet
 
 __all__ = [
+    "eigenvalues_text",
     "floquet_text",
     "linear_plain",
     "linear_text",
+    "multipliers_say",
     "pairs",
     "save_floquet",
     "save_linear",
@@ -107,22 +109,25 @@ def save_linear(model: LinearModel, path: Path) -> Path:
 # --- periodic motions ----------------------------------------------------------------------------
 
 
-def floquet_text(found: Floquet) -> Text:
-    """Return the multipliers of a periodic motion for people, and what they say."""
-    from rich.text import Text
-
+def multipliers_say(found: Floquet) -> str:
+    """Say what the multipliers of a periodic motion mean for it."""
     says = {
         False: "pushes grow, the motion is unstable",
         True: "pushes die out",
         None: "to first order pushes neither grow nor die out as a power",
     }[found.stable]
-    says = (
-        f"largest {np.abs(found.multipliers[0]):.6g} in size: {says} (their matrix is known to {found.uncertainty:.1g})"
-    )
+    largest = np.abs(found.multipliers[0])
+    return f"largest {largest:.6g} in size: {says} (their matrix is known to {found.uncertainty:.1g})"
+
+
+def floquet_text(found: Floquet) -> Text:
+    """Return the multipliers of a periodic motion for people, and what they say."""
+    from rich.text import Text
+
     return Text(
         f"Motion of {found.run.scene_name}, period {found.period:.9g} s\n"
         f"  states  {', '.join(found.states)}\n"
-        f"  Floquet multipliers {eigenvalues_text(found.multipliers)}; {says}"
+        f"  Floquet multipliers {eigenvalues_text(found.multipliers)}; {multipliers_say(found)}"
     )
 
 

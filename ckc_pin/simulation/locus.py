@@ -14,9 +14,11 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import require_kind
 from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.tree import Array
+from ckc_pin.simulation.cards import locus_card
 from ckc_pin.simulation.check import names_a_scene
 from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.initial import find_start
@@ -31,8 +33,8 @@ FACTORS = np.geomspace(0.01, 10.0, 121)
 GAINS = {SetPoint: ("K_P", "K_V"), Tracking: ("K_D", "Lambda")}
 
 
-@dataclass(frozen=True)
-class GainLocus:
+@dataclass(frozen=True, eq=False, repr=False)
+class GainLocus(Shown):
     """Eigenvalues of a scene's closed loop by a factor on one gain; `ckc_pin.plot` draws it.
 
     Attributes
@@ -53,6 +55,10 @@ class GainLocus:
     at: str
     factors: Array
     eigenvalues: ComplexArray
+
+    def card(self) -> Card:
+        """Return what there is to see of it."""
+        return locus_card(self)
 
 
 def gain_locus(

@@ -71,6 +71,14 @@ def test_modes_that_swing_come_before_others_in_a_figure(tmp_path: Path) -> None
     assert figure.bbox.x0 <= label.x0 < label.x1 <= figure.bbox.x1
 
 
+def test_a_locus_shows_itself_on_a_few_lines() -> None:
+    found = gain_locus("five_bar/set_point", "K_V")
+    lines = repr(found).splitlines()
+    assert lines[0].startswith("GainLocus of five_bar/set_point, ")
+    assert 3 <= len(lines) <= 8
+    assert any(line.split()[:3] == ["K_V", "times", "1"] for line in lines)
+
+
 def test_what_cannot_be_drawn_or_played_is_refused() -> None:
     model, scene = linearize("five_bar"), load_scene("five_bar/set_point")
     with pytest.raises(InputError, match="give it alone"):

@@ -171,6 +171,12 @@ def test_what_has_no_derivatives_is_refused_before_anything_is_run() -> None:
         floquet("five_bar/swing", 1.0, {"formulation": "spf", "spf_coordinates": "z"})
 
 
+def test_it_shows_itself_on_a_few_lines(tmp_path: Path) -> None:
+    lines = repr(floquet(written(tmp_path, g, 0.05), PERIOD)).splitlines()
+    assert lines[0].startswith("Floquet of ")
+    assert [line.split()[0] for line in lines[1:] if line[2] != " "] == ["states", "multipliers", "verdict"]
+
+
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
     plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
     assert set(plain) == {"name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"}
