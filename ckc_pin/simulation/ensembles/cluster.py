@@ -72,14 +72,16 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
             "`dask scheduler` and `dask worker ADDRESS`, or leave it out for processes on this machine"
         ) from None
-    log = logging.getLogger("distributed.client")
-    before = log.level
-    log.setLevel(logging.CRITICAL)  # it logs tracebacks of a scheduler that is lost, of which a message tells
+    logs = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
+    before = [log.level for log in logs]
+    for log in logs:  # they have tracebacks of a scheduler that is lost, of which a message tells
+        log.setLevel(logging.CRITICAL)
     try:
         with client:
             yield client
     finally:
-        log.setLevel(before)
+        for log, level in zip(logs, before, strict=True):
+            log.setLevel(level)
 
 
 def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
