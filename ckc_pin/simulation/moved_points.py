@@ -34,14 +34,17 @@ def moved_points(mechanism: Mechanism, varying: Sequence[Varying], q_tree: Array
     found = {name: np.zeros((len(q_tree), 3, len(varying))) for name in mechanism.points}
     if not found:
         return found
+    placing = [(k, x) for k, x in enumerate(varying) if x.places]
     for row, (numbers, step) in enumerate(zip(q_tree, steps, strict=True)):
         q = mechanism.tree.from_coordinates(numbers)
+        for name, along in mechanism.point_jacobians(q).items():
+            found[name][row] = along @ step
+        if not placing:
+            continue
         pose = Pose(mechanism.tree, mechanism.closure.anchors, q)
-        at, along = mechanism.point_positions(q), mechanism.point_jacobians(q)
-        for number, name in enumerate(mechanism.points):
-            found[name][row] = along[name] @ step
-            for k, x in enumerate(varying):
-                found[name][row, :, k] += _placed(mechanism, x, number, name, at[name], pose)
+        for number, (name, at) in enumerate(mechanism.point_positions(q).items()):
+            for k, x in placing:
+                found[name][row, :, k] += _placed(mechanism, x, number, name, at, pose)
     return found
 
 

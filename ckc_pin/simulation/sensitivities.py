@@ -16,8 +16,10 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import require_callable, require_kind, require_path
+from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.native.variation import Varying
 from ckc_pin.simulation.cards import sensitivities_card
 from ckc_pin.simulation.events import Event
 from ckc_pin.simulation.moved_points import moved_points
@@ -47,10 +49,10 @@ class Sensitivities(Shown):
     u, tau : (m, d, p) and (m, motors, p) arrays
         How eq. 6's force and the motors' torques change, as `Run.u` and `Run.tau` have them; NaN where motors that are
         more than freedoms share a force. Zero without a controller.
-    points : dict of str to (m, 3, p) arrays
-        How the mechanism's points move, in world axes: with the coordinates, and with what places them.
     end_time : (p,) array or None
         How the time of the event that ended the run changes, s; None where it ended at `t_end`.
+    varying : tuple of Varying
+        What the parameters do.
     """
 
     run: Run
@@ -59,8 +61,8 @@ class Sensitivities(Shown):
     v_tree: Array
     u: Array
     tau: Array
-    points: dict[str, Array]
     end_time: Array | None
+    varying: tuple[Varying, ...]
 
     def card(self) -> Card:
         """Return what there is to see of it."""
@@ -70,6 +72,11 @@ class Sensitivities(Shown):
     def t(self) -> Array:
         """Output instants, s."""
         return self.run.t
+
+    @lazy
+    def points(self) -> dict[str, Array]:
+        """How the mechanism's points move, (m, 3, p) in world axes: with the coordinates, and with what places them."""
+        return moved_points(self.run.mechanism, self.varying, self.run.q_tree, self.q_tree)
 
     def of(self, name: str, parameter: str) -> Array:
         """Return how a quantity changes with a parameter along the run, shape (m,).
@@ -195,9 +202,7 @@ def sensitivities(
     """
     scene = as_scene(scene, changes, "sensitivities")
     require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
-    parameters = [parameters] if isinstance(parameters, str) else parameters
-    if isinstance(parameters, bytes):
-        parameters = [parameters]  # refused as one, not by its numbers
+    parameters = [parameters] if isinstance(parameters, str | bytes) else parameters
     require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)
     for name in parameters:
         require_kind(name, str, "sensitivities: parameters", NAMES)
@@ -218,9 +223,8 @@ def sensitivities(
     q_tree, v_tree, u, tau = _parts(ready, rows)
     if np.isnan(q_tree[0]).any():
         raise NumericalError(f"sensitivities: {_start(ready)}", t=0.0)
-    points = moved_points(ready.mechanism, ready.varying, run.q_tree, q_tree)
     names = tuple(x.name for x in ready.varying)
-    return Sensitivities(run, names, q_tree, v_tree, u, tau, points, _end_time(ready))
+    return Sensitivities(run, names, q_tree, v_tree, u, tau, _end_time(ready), ready.varying)
 
 
 def _apart(ready: Prepared) -> str | None:
