@@ -76,20 +76,17 @@ def require_known_motion(
         raise InputError(
             "sensitivities: solver.baumgarte, solver.projection: the loops have to be closed; leave them out"
         )
-    if type(controller) is Tracking and isinstance(controller.desired, PointPath):
-        shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
-        if shaping is not None:
-            raise InputError(
-                f"sensitivities: {shaping}: q_d is where the mechanism's own lengths bring the point that is to follow "
-                "a path, and how it moves with them is not known; give controller.desired by joint"
-            )
-    if spec.initial.at == "assembled":
-        shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
-        if shaping is not None:
-            raise InputError(
-                f'sensitivities: {shaping}: a start that is "assembled" follows from where things are placed in a way '
-                "of its own; give initial.q"
-            )
+    shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
+    if shaping is not None and type(controller) is Tracking and isinstance(controller.desired, PointPath):
+        raise InputError(
+            f"sensitivities: {shaping}: q_d is where the mechanism's own lengths bring the point that is to follow a "
+            "path, and how it moves with them is not known; give controller.desired by joint"
+        )
+    if shaping is not None and spec.initial.at == "assembled":
+        raise InputError(
+            f'sensitivities: {shaping}: a start that is "assembled" follows from where things are placed in a way of '
+            "its own; give initial.q"
+        )
     if not spec.friction_smoothing:
         rubs = mechanism.joints.friction
         for x in varying:
@@ -222,13 +219,9 @@ def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[Var
     for q, v in tree.free:  # numbers in the world's axes, tangent in the body's
         moved[v : v + 3, v : v + 3] = pin.Quaternion(q_tree[q + 3 : q + 7]).matrix().T
         moved[v + 3 : v + 6, v + 3 : v + 6] = pin.Jexp3(tree.to_coordinates(q_tree)[v + 3 : v + 6])
-    parted = {name for names in _roots(mechanism) if not set(names) <= set(mechanism.independent) for name in names}
+    roots = (mechanism.coordinates[v : v + 6] for _, v in tree.free)
+    parted = {name for root in roots if not set(root) <= set(mechanism.independent) for name in root}
     for k, name in enumerate(mechanism.independent):
         if name not in parted and scene.spec.initial.at is None:
             yield Varying(f"initial.q.{name}", q=moved[:, tree.index[name]])
         yield Varying(f"initial.q_dot.{name}", q_dot=np.eye(mechanism.d)[k])
-
-
-def _roots(mechanism: Mechanism) -> list[tuple[str, ...]]:
-    """The coordinates of each free root."""
-    return [mechanism.coordinates[v : v + 6] for _, v in mechanism.tree.free]
