@@ -230,10 +230,9 @@ def floquet_card(found: Floquet) -> Card:
 
 def locus_card(found: GainLocus) -> Card:
     """Return where the eigenvalues of a closed loop are at the ends of a locus, and as the scene has the gain."""
-    own = int(np.argmin(np.abs(found.factors - 1.0)))
     rows: list[Row] = [
         (f"{found.gain} times {found.factors[k]:.4g}", f"{eigenvalues_text(found.eigenvalues[k])} 1/s")
-        for k in sorted({0, own, len(found.factors) - 1})
+        for k in sorted({0, found.own, len(found.factors) - 1})
     ]
     return Card(f"GainLocus of {found.name}, {found.at}: {len(found.factors)} factors on {found.gain}", rows)
 

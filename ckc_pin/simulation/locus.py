@@ -56,6 +56,11 @@ class GainLocus(Shown):
     factors: Array
     eigenvalues: ComplexArray
 
+    @property
+    def own(self) -> int:
+        """Where the scene's own gain is among the factors."""
+        return int(np.argmin(np.abs(np.log(self.factors))))
+
     def card(self) -> Card:
         """Return what there is to see of it."""
         return locus_card(self)

@@ -132,11 +132,11 @@ def _locus(locus: GainLocus) -> Figure:
     gain = GAINS[locus.gain]
     figure.suptitle(f"{plain(locus.name)}, {locus.at}: root locus over {gain}", x=0.01, ha="left", fontweight="bold")
     values, factors = locus.eigenvalues, np.repeat(locus.factors, locus.eigenvalues.shape[1])
-    own = int(np.argmin(np.abs(np.log(locus.factors))))
-    _plane(ax, values, values[own])
+    own = values[locus.own]
+    _plane(ax, values, own)
     dots = ax.scatter(values.real, values.imag, c=np.log10(factors), s=5, cmap="viridis")
-    ax.plot(values[own].real, values[own].imag, "o", color=style.COLOURS[1], fillstyle="none")
-    _count(ax, values[own], style.COLOURS[1], above=True)
+    ax.plot(own.real, own.imag, "o", color=style.COLOURS[1], fillstyle="none")
+    _count(ax, own, style.COLOURS[1], above=True)
     bar = figure.colorbar(dots, ax=ax, label=f"factor on {gain} (circles: 1)")
     bar.set_ticks([-2, -1, 0, 1], labels=["0.01", "0.1", "1", "10"])
     return figure
