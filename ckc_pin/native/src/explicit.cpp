@@ -26,11 +26,28 @@ Matrix rows_of(const double* values, int rows, int columns, bool triangular) {
 
 Vector vector_of(const double* values, int size) { return Eigen::Map<const Vector>(values, size); }
 
-// What the first rates make of h by their coefficients, many of which are zero.
+// What the first rates make of h by their coefficients, many of which are zero. Some numbers of all rates after others, so
+// that what they add up to stays in registers.
 template <class Coefficients>
 void add(const Matrix& rates, const Coefficients& of, Eigen::Index count, double h, Out sum) {
+  constexpr Eigen::Index at_a_time = 8, most = 16;
+  double factor[most];
+  const double* rate[most];
+  int used = 0;
   for (Eigen::Index i = 0; i < count; ++i)
-    if (of(i) != 0.0) sum += (h * of(i)) * rates.col(i);
+    if (of(i) != 0.0) factor[used] = h * of(i), rate[used++] = rates.col(i).data();
+  const Eigen::Index size = sum.size();
+  Eigen::Index k = 0;
+  for (; k + at_a_time <= size; k += at_a_time) {
+    Eigen::Array<double, at_a_time, 1> x = sum.segment<at_a_time>(k);
+    for (int i = 0; i < used; ++i) x += factor[i] * Eigen::Map<const Eigen::Array<double, at_a_time, 1>>(rate[i] + k);
+    sum.segment<at_a_time>(k) = x;
+  }
+  for (; k < size; ++k) {
+    double x = sum(k);
+    for (int i = 0; i < used; ++i) x += factor[i] * rate[i][k];
+    sum(k) = x;
+  }
 }
 
 }  // namespace
