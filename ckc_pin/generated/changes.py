@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.generated.branches import Places
 from ckc_pin.generated.graph import Graph, Lane
-from ckc_pin.generated.text import Alike, result_lanes, split
+from ckc_pin.generated.text import Alike, length, operations, result_lanes, split
 
 __all__ = ["TOGETHER", "change_functions"]
 
@@ -33,16 +34,23 @@ def change_functions(
     state : mapping of str to casadi.SX
         What they depend on beside the direction: q, trig, v, u and numbers.
     along : mapping of str to casadi.SX
-        A direction, changes of q and v and `more`, and at last `varied`.
+        A direction, a step of q in tangent coordinates, the change of v, and `more`, and at last `varied`.
     groups : sequence of sequences of int
         What of the latter changes together: the columns of `by_arguments`.
     alike : mapping
         Whose the state's numbers are.
+
+    Returns
+    -------
+    dict of str to casadi.Function
+        `changes`, of several directions, only where alike branches do not already halve what one of them takes: one
+        after the other costs less then than that much text does.
+    mapping
     """
     import casadi as cs
 
-    of, (q, v, more, varied) = [*state.values()], along.values()
-    direction = cs.vertcat(q, v, more)
+    of, (step, v, more, varied) = [*state.values()], along.values()
+    direction = cs.vertcat(step, v, more)
     every = cs.cse(cs.vertcat(part["change"], part["by_arguments"]))
     every, taken, made_of = cs.extract_parametric(every, cs.vertcat(*of))
     every = cs.cse(every)
@@ -62,24 +70,33 @@ def change_functions(
     given_by = cs.vertcat(*(cs.SX(np.nan) if k is None else given_by[k] for k in order))
     change, *by_arguments = split(every, [part["change"].numel(), *[more.numel()] * len(groups)])
     one = cs.Function("change", [known, direction], [change], ["known", "direction"], ["change"])
-    directions = cs.SX.sym("directions", TOGETHER, direction.numel())
-    together = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
-    several = [known, cs.vec(directions)], [cs.vec(together)], ["shared", "directions"], ["changes"]
     sums = [cs.sum1(cs.fabs(varied[group])) for group in groups]
     found = {
         "state": of_state(given_by),
         "change": one,
-        "changes": cs.Function("changes", *several),
         "groups": cs.Function("groups", [varied], [cs.vertcat(*sums)]),
     }
     found |= {f"varied_{k}": cs.Function(f"varied_{k}", [known, varied], [x]) for k, x in enumerate(by_arguments)}
-    starts = {"q": 0, "v": q.numel(), "u": q.numel() + v.numel()}
-    whose = {
-        "direction": {start + k: x for name, start in starts.items() for k, x in alike[name].items()},
-        "directions": {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in range(directions.numel())},
+    starts = {0: alike["v"], step.numel(): alike["v"], step.numel() + v.numel(): alike["u"]}
+    whose: dict[str, Places] = {
+        "direction": {start + k: x for start, places in starts.items() for k, x in places.items()},
         "known": result_lanes(found["state"], "known", alike),
     }
+    if 2 * length(one, whose) > operations(one):
+        found["changes"], whose["directions"] = _several(one)
     return found, whose
+
+
+def _several(one: Any) -> tuple[Any, Places]:
+    """Return code for several directions at a time, and whose their numbers are."""
+    import casadi as cs
+
+    known, direction = one.sx_in()
+    directions = cs.SX.sym("directions", TOGETHER, direction.numel())
+    together = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(TOGETHER)))
+    given, names = [known, cs.vec(directions)], (["shared", "directions"], ["changes"])
+    whose = {k: ((ALL, k % TOGETHER), k // TOGETHER) for k in range(directions.numel())}
+    return cs.Function("changes", given, [cs.vec(together)], *names), whose
 
 
 def _divisors(function: Any) -> list[int]:

@@ -41,10 +41,11 @@ class Code:
     with a free root, whose twist has several C', and `jacobian` where it would be too long to be compiled.
 
     With changes also how the acceleration changes along any direction: `state` of (q, trig, v, u, numbers) gives what
-    does not depend on the direction, the acceleration, and whether it is sound; `change` takes the first of these and a
-    direction, changes of q', v' and `more`: of u', and of J v'_dot by the rows that are kept. So does `changes`, of
-    `TOGETHER` directions, each number's side by side as in its result. Of what may be varied, `more` is the sum of what
-    `varied_K` gives, for each group K that changes at all; `groups` of a change tells by how much.
+    does not depend on the direction, the acceleration, and whether it is sound; `change` takes the first of these and
+    a direction, a step of q', changes of v' and `more`: of u', and of J v'_dot by the rows that are kept. `changes`,
+    there where it is worth its text, does so of `TOGETHER` directions, each number's side by side as in its result.
+    Of what may be varied, `more` is the sum of what `varied_K` gives, for each group K that changes at all; `groups`
+    of a change tells by how much.
 
     Attributes
     ----------
@@ -73,7 +74,7 @@ class Code:
             "x": cs.SX.sym("x", mechanism.n),
         }
         along = {
-            "q": cs.SX.sym("q_change", mechanism.tree.nq),
+            "step": cs.SX.sym("step", mechanism.n),
             "v": cs.SX.sym("v_change", mechanism.n),
             "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
             "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
@@ -142,7 +143,8 @@ def _results(terms: Expressions, symbols: dict[str, Any], along: dict[str, Any] 
     if along is None:
         return {name: cs.densify(x) for name, x in found.items()}
     found["acceleration_of_u"] = inertia.acceleration(symbols["u"], cs.SX(rows.phi.numel(), 1))[0]  # uncorrected
-    *direction, varied = along.values()
-    found["change"] = inertia.change(symbols["u"], *direction)
+    step, v, more, varied = along.values()
+    moved = cs.substitute(terms.q_dot, terms.v, step)
+    found["change"] = inertia.change(symbols["u"], moved, v, more)
     found["by_arguments"] = inertia.by_arguments(symbols["u"], varied)
     return {name: cs.densify(x) for name, x in found.items()}

@@ -249,6 +249,6 @@ def _configuration_rate(mechanism: Mechanism, q: Any, v: Any) -> Any:
         u, w, spin = q[at_q + 3 : at_q + 6], q[at_q + 6], v[at_v + 3 : at_v + 6]
         slide = v[at_v : at_v + 3]
         rate[at_q : at_q + 3] = slide + 2 * cs.cross(u, cs.cross(u, slide) + w * slide)
-        rate[at_q + 3 : at_q + 6] = (w * spin + cs.cross(u, spin)) / 2
-        rate[at_q + 6] = -cs.dot(u, spin) / 2
+        rate[at_q + 3 : at_q + 6] = 0.5 * (w * spin + cs.cross(u, spin))
+        rate[at_q + 6] = -0.5 * cs.dot(u, spin)
     return rate

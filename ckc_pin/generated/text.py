@@ -12,7 +12,7 @@ from typing import Any
 
 from ckc_pin.generated.graph import Graph, Lane, Packing
 
-__all__ = ["result_lanes", "split", "text"]
+__all__ = ["length", "operations", "result_lanes", "split", "text"]
 
 Alike = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: whose, and which of theirs
 
@@ -60,6 +60,17 @@ def result_lanes(function: Any, result: str, alike: Alike) -> dict[int, tuple[La
     at = function.index_out(result)
     whose = {place: packing.whose(k) for (to, place), k in graph.results if to == at}
     return {place: found for place, found in whose.items() if found is not None}
+
+
+def operations(function: Any) -> int:
+    """How many operations a function is."""
+    return sum(1 for node in Graph.of(function).nodes if node.of)
+
+
+def length(function: Any, alike: Alike) -> int:
+    """How many operations its text has, where those that are done together count as one."""
+    graph, packing = _packed(function, alike)
+    return sum(1 for k, node in enumerate(graph.nodes) if node.of and k not in packing.pack) + len(packing.packs)
 
 
 def split(column: Any, sizes: Sequence[int]) -> list[Any]:

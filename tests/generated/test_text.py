@@ -19,7 +19,7 @@ from ckc_pin.generated.changes import TOGETHER
 from ckc_pin.generated.code import Code
 from ckc_pin.generated.graph import Graph, Packing
 from ckc_pin.generated.library import FLAGS
-from ckc_pin.generated.text import text
+from ckc_pin.generated.text import length, text
 
 TWO = {"q": {k: ((0, k // 2), k % 2) for k in range(4)}}
 THREE = {"q": {k: ((0, k // 2), k % 2) for k in range(6)}}  # two numbers of each of three branches
@@ -114,6 +114,15 @@ def test_changes_along_several_directions_are_done_together() -> None:
     assert packed(code, "changes") * TOGETHER == operations(code.functions["changes"])
 
 
+def test_several_directions_are_written_only_where_branches_leave_vectors_half_empty() -> None:
+    """Three arms fill three of four numbers along one direction; four directions would be more than twice the text."""
+    found = Code.of(load("delta"), changes=True)
+    assert "changes" not in found.functions
+    assert 2 * length(found.functions["change"], found.alike) < operations(found.functions["change"])
+    five_bar = Code.of(load("five_bar"), changes=True)
+    assert length(five_bar.functions["changes"], five_bar.alike) == packed(five_bar, "changes")
+
+
 def test_along_one_direction_alike_branches_are_done_together() -> None:
     """With few operations: eq. 1 is differentiated as inverse dynamics, D' a is never taken apart."""
     for name, most in (("five_bar", 330), ("delta", 7300)):
@@ -121,14 +130,15 @@ def test_along_one_direction_alike_branches_are_done_together() -> None:
         change = code.functions["change"]
         together = 2 if name == "five_bar" else 3
         assert operations(change) <= most
-        assert packed(code, "change") * together > (0.8 if name == "five_bar" else 0.9) * operations(change)
+        own = operations(change) - (55 if name == "delta" else 0)  # the plate's quaternion is no arm's
+        assert packed(code, "change") * together > (0.8 if name == "five_bar" else 0.9) * own
 
 
 def test_pivots_are_inverted_once_a_state() -> None:
     """A division takes as long as ten products: one for each of the delta's 39 pivots, none along a direction."""
     found = Code.of(load("delta"), changes=True).functions
     divisions = {cs.OP_DIV, cs.OP_INV}
-    for name, most in (("state", 39), ("change", 0), ("changes", 0)):
+    for name, most in (("state", 39), ("change", 0)):
         graph = Graph.of(found[name])
         graph = graph.divided_once() if name == "state" else graph
         assert sum(node.operation in divisions for node in graph.nodes) <= most, name

@@ -26,7 +26,7 @@ Variation::Variation(System& system, VariationTable table)
   const int m = core_.rows.closure.rows;
   q_.setZero(tree_.nq), v_.setZero(tree_.n), a_.setZero(tree_.n), of_tree_.setZero(tree_.n);
   back_.setZero(n), delay_.setZero(count), acting_.setZero(n), lacking_.setZero(n), lambda_.setZero(m);
-  move_.setZero(core_.tree.nq), force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
+  force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
   for (const Parameter& of : table_.parameters)
     acting_varies_ |= std::any_of(of.effects.begin(), of.effects.end(), is_acting);
 }
@@ -172,14 +172,25 @@ bool Variation::is_written() const {
 
 // The code may be there from some time of the run on.
 void Variation::begin_written() {
-  const Matrix& numbers = table_.directions;
   for (int first = 0; first < count; first += core_.written->lanes()) {
     const int here = std::min(count - first, core_.written->lanes()), rows = here == 1 ? 1 : core_.written->lanes();
-    Along& along = along_.emplace_back(Along{first, here, {}, {}, {}});
+    Along& along = along_.emplace_back(Along{first, here, {}, {}});
     along.changes.setZero(rows, n), along.directions.setZero(rows, core_.written->directions());
-    for (int p = first; p < first + here; ++p) along.groups.push_back(core_.written->groups(numbers.col(p)));
   }
-  more_.setZero(core_.written->directions() - core_.tree.nq - n), of_group_ = more_;
+  for (int p = 0; p < count; ++p) groups_.push_back(core_.written->groups(table_.directions.col(p)));
+  direction_.setZero(core_.written->directions()), of_group_.setZero(direction_.size() - 2 * n);
+}
+
+// What a parameter's change of the state is to the code, where force_ is what acts, or nothing that changes does.
+void Variation::direction(const Eigen::Ref<const Matrix>& s, int p, bool acts, Out to) {
+  to.head(2 * n) = s.col(p);
+  auto more = to.tail(of_group_.size());
+  more.setZero();
+  if (acts) more.head(n) = force_.col(p);
+  for (int group : groups_[static_cast<size_t>(p)]) {
+    core_.written->varied(group, table_.directions.col(p), of_group_);
+    more += of_group_;
+  }
 }
 
 bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) {
@@ -187,32 +198,22 @@ bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s
   if (!what_acts(v) || !core_.written->state(q_tree, v, acting_)) return false;
   if (along_.empty()) begin_written();
   ++written;
-  force_.setZero();
-  if (answers_ || acting_varies_ || holds()) add_acting(q_tree, v, force_), force_ = -force_;
+  const bool acts = answers_ || acting_varies_ || holds();
+  if (acts) force_.setZero(), add_acting(q_tree, v, force_), force_ = -force_;
   if (answers_) add_answer(s);
   move(v, s, s_dot);
-  const int nq = core_.tree.nq;
   for (Along& along : along_) {
-    const auto apart = along.directions.rows();
-    for (int row = 0; row < along.count; ++row) {
-      const int p = along.first + row;
-      more_.head(n) = force_.col(p), more_.tail(more_.size() - n).setZero();
-      for (int group : along.groups[row]) {
-        core_.written->varied(group, table_.directions.col(p), of_group_);
-        more_ += of_group_;
-      }
-      core_.tree.configuration_rate(q_tree, s.col(p).head(n), move_);
-      double* to = along.directions.data() + row;
-      for (int k = 0; k < nq; ++k, to += apart) *to = move_(k);
-      for (int k = 0; k < n; ++k, to += apart) *to = s(n + k, p);
-      for (Eigen::Index k = 0; k < more_.size(); ++k, to += apart) *to = more_(k);
+    if (along.directions.rows() == 1) {
+      direction(s, along.first, acts, direction_);
+      core_.written->change(direction_, s_dot.col(along.first).tail(n));
+      continue;
     }
-    if (along.directions.rows() == 1)
-      core_.written->change(along.directions.reshaped(), along.changes.reshaped());
-    else
-      core_.written->changes(along.directions, along.changes);
-    for (int row = 0; row < along.count; ++row)
-      for (int k = 0; k < n; ++k) s_dot(n + k, along.first + row) = along.changes(row, k);
+    for (int row = 0; row < along.count; ++row) {
+      direction(s, along.first + row, acts, direction_);
+      along.directions.row(row) = direction_;
+    }
+    core_.written->changes(along.directions, along.changes);
+    for (int row = 0; row < along.count; ++row) s_dot.col(along.first + row).tail(n) = along.changes.row(row);
   }
   if (locked) {
     if (!core_.responses(core_.joints.locked, responses_)) return false;
@@ -224,9 +225,10 @@ bool Variation::written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s
 }
 
 void Variation::move(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const {
-  s_dot.topRows(n) = s.bottomRows(n);
-  if (!core_.tree.roots.empty())
-    for (int p = 0; p < count; ++p) core_.tree.add_bracket(s.col(p).head(n), v, s_dot.col(p).head(n));
+  for (int p = 0; p < count; ++p) {
+    s_dot.col(p).head(n) = s.col(p).tail(n);
+    core_.tree.add_bracket(s.col(p).head(n), v, s_dot.col(p).head(n));
+  }
 }
 
 void Variation::rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const {

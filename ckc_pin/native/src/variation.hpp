@@ -94,6 +94,7 @@ class Variation {
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
   void move(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const;  // the places' part of the rates
   void begin_written();
+  void direction(const Eigen::Ref<const Matrix>& s, int p, bool acts, Out to);
   bool what_acts(In v);  // acting_, and its slopes where it answers_
   void add_answer(const Eigen::Ref<const Matrix>& s);  // to force_
   void add_back(Matrix& change);  // what holds the joints that are locked
@@ -128,13 +129,13 @@ class Variation {
   Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_, clipped_;
   struct Along {  // parameters that the code which is written out takes at a time, rows
     int first, count;
-    std::vector<Indices> groups;  // of the numbers that the code takes, by row
     Matrix directions, changes;
   };
   std::vector<Along> along_;
+  std::vector<Indices> groups_;  // by parameter, of the numbers that the code takes
   std::deque<Matrix> waiting_;  // of samples that do not act yet
   Matrix held_;
-  Vector acting_, back_, move_, more_, of_group_, of_tree_, lambda_, lacking_;
+  Vector acting_, back_, direction_, of_group_, of_tree_, lambda_, lacking_;
   Vector q_, v_, a_, delay_;
 };
 

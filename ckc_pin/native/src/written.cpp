@@ -23,7 +23,7 @@ Written::Written(const std::string& path, In parameters) : library_(dlopen(path.
     groups_ = perhaps("groups", 1);
     if (state_) {
       known_.resize(size("state_sparsity_out") / 8 + 1), acceleration_at_.setZero(size("state_sparsity_out", 1));
-      lanes_ = static_cast<int>(size("changes_sparsity_out") / size("change_sparsity_out"));
+      if (changes_) lanes_ = static_cast<int>(size("changes_sparsity_out") / size("change_sparsity_out"));
       directions_ = static_cast<int>(size("change_sparsity_in", 1));
       for (long long k = 0; k < size("groups_sparsity_out"); ++k)
         varied_.push_back(code(("varied_" + std::to_string(k)).c_str(), 2));
@@ -112,7 +112,10 @@ static bool same(In a, const Vector& b) {
 }
 
 bool Written::state(In q, In v, In u_tree) const {
-  if (q_.size() && same(q, q_) && same(v, v_) && same(u_tree, u_)) return sound_;
+  return q_.size() && same(q, q_) && same(v, v_) && same(u_tree, u_) ? sound_ : find_state(q, v, u_tree);
+}
+
+bool Written::find_state(In q, In v, In u_tree) const {
   q_ = q, v_ = v, u_ = u_tree;
   double sound = 0.0;
   const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), numbers_.data()};
@@ -152,7 +155,7 @@ void Written::varied(int group, In varied, Out more) const {
 
 bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
   if (state_ && correction.isZero(0)) {  // what its change needs too is most of it
-    if (!state(q, v, u_tree)) return false;
+    if (!find_state(q, v, u_tree)) return false;
     acceleration = acceleration_at_;
     return true;
   }

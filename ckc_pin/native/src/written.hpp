@@ -29,9 +29,9 @@ class Written {
   double potential_energy(In q) const;
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // How that changes: at a state, and then along a direction, a change of q', v', and `more`: of u', and of J v'_dot by
-  // the rows that are kept; or along as many at a time as there are lanes, a row each. Only of a library made for it.
-  // False as above, and no changes there are known.
+  // How that changes: at a state, and then along a direction, a step of q', a change of v', and `more`: of u', and of
+  // J v'_dot by the rows that are kept; or along as many at a time as there are lanes, a row each, where there are more
+  // than one. Only of a library made for it. False as above, and no changes there are known.
   bool has_changes() const { return state_; }
   int lanes() const { return lanes_; }
   int directions() const { return directions_; }  // how many numbers one is
@@ -52,6 +52,7 @@ class Written {
   Code code(const char* name, int arguments) const;     // of so many
   Code perhaps(const char* name, int arguments) const;  // null where there is none
   long long size(const char* of, long long k = 0) const;
+  bool find_state(In q, In v, In u_tree) const;  // one that was not asked for last
 
   // Cosines and sines of q, which most functions of one state share.
   const double* trig(In q) const { return trig_.of(q); }
@@ -66,7 +67,7 @@ class Written {
   mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
   mutable std::vector<Line> known_;             // and what is known there
   mutable bool sound_ = false;
-  int lanes_ = 0, directions_ = 0;
+  int lanes_ = 1, directions_ = 0;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
   Code state_, change_, changes_, groups_;
   std::vector<Code> varied_;
