@@ -141,7 +141,7 @@ def test_a_run_that_is_nearly_done_does_not_compile(tmp_path: Path, monkeypatch:
     assert late.stats["rhs_by_terms"] == usual.stats["rhs_by_terms"]
     assert np.array_equal(late.q_tree, usual.q_tree)
     monkeypatch.setattr(RUNNING, "REPAYS", 300)
-    monkeypatch.setattr("ckc_pin.generated.library._compiler", lambda: None)  # and neither does one that cannot
+    monkeypatch.setattr("ckc_pin.generated.library._compiler", lambda fuses: None)  # and neither does one that cannot
     late = simulate("five_bar/set_point", changes)
     assert np.array_equal(late.q_tree, usual.q_tree)
 
