@@ -111,8 +111,11 @@ def test_of_a_limit_that_other_motors_make_up_for(tmp_path: Path) -> None:
     assert np.abs(found.q_tree[-1, :, 2]).max() > 1e-3
 
 
-def test_redundant_motors_that_do_not_reach_u_stop_it(tmp_path: Path) -> None:
-    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], {"t_end": 0.3})
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+@pytest.mark.parametrize("method", ["DOP853", "Radau"])
+def test_redundant_motors_that_do_not_reach_u_stop_it(method: str, formulation: str, tmp_path: Path) -> None:
+    changes = {"t_end": 0.3, "solver.method": method, "formulation": formulation}
+    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], changes)
     assert found.run.status == "stopped"
     assert "motors at their limits do not reach what is wanted of them together" in found.run.message
 

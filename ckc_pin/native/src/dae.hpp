@@ -47,7 +47,7 @@ class Dae : public System {
   const bool projects_;
   long placed_ = -1;  // core.sets, when it was done here
   Vector step_, z_step_, residual_, unforced_;
-  Matrix by_q_, by_v_, more_;
+  Matrix more_;
 };
 
 }  // namespace ckc

@@ -67,7 +67,7 @@ class LevelSet : public System {
   Vector w0_, q_tree_, residual_, z_, step_;
   bool written_ = false;  // whether a_tree_ is that of the last right-hand side
   Vector a_tree_, unit_;
-  Matrix by_q_, by_v_, rho_dot_;
+  Matrix rho_dot_;
 };
 
 }  // namespace ckc

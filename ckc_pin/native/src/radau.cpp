@@ -30,7 +30,7 @@ Radau::Radau(System& system, Step& step, Work& work, const Tolerance& tolerance)
     : Method(system, step, work, tolerance), stages_(stages_for(tolerance.rtol)), most_iterations_(iterations_for(stages_, tolerance.newton)) {
   const int n = system.size, s = stages_;
   tabulate();
-  J_.setZero(n, n), Z_dot_.setZero(n, s), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
+  Z_dot_.setZero(n, s), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
   for (Vector* x : {&scale_, &error_, &y_stage_, &f_stage_, &real_right_, &real_correction_}) x->setZero(n);
   right_.setZero(n), correction_.setZero(n);
   pairs_.resize(s / 2);
@@ -103,46 +103,69 @@ bool Radau::new_jacobian(double h) {
     else
       y_stage_ = step_.y;
     ++work_.jacobians;
-    if (system_.jacobian(step_.t + x * h, y_stage_, J_, work_.rhs)) {
+    if (system_.jacobian(step_.t + x * h, y_stage_, motion_.J, work_.rhs)) {
       J_known_ = J_fresh_ = true, factorized_ = 0.0;
-      system_.rates(rates_);
-      rest_.clear(), place_.assign(system_.size, 0);
-      for (const auto& [i, j] : rates_) place_[i] = -1;
-      for (int k = 0; k < system_.size; ++k)
-        if (place_[k] == 0) place_[k] = static_cast<int>(rest_.size()), rest_.push_back(k);
+      system_.rates(motion_.rates), motion_.begin();
+      if (const Matrix* J = system_.beside_jacobian()) {
+        beside_.J = *J, system_.beside_rates(beside_.rates), beside_.begin();
+        alike_ = beside_.J.rows() == motion_.J.rows() && beside_.J == motion_.J && beside_.rates == motion_.rates;
+      }
       return true;
     }
   }
   return false;
 }
 
+void Radau::Block::begin() {
+  const auto size = static_cast<int>(J.rows());
+  rest.clear(), place.assign(static_cast<size_t>(size), 0);
+  for (const auto& [i, j] : rates) place[i] = -1;
+  for (int k = 0; k < size; ++k)
+    if (place[k] == 0) place[k] = static_cast<int>(rest.size()), rest.push_back(k);
+}
+
 template <class Scalar>
-void Radau::Shifted<Scalar>::compute(const Radau& of, Scalar shift_) {
+void Radau::Shifted<Scalar>::compute(const Block& of, Scalar shift_) {
   shift = shift_;
-  const auto m = static_cast<Eigen::Index>(of.rest_.size());
+  const auto m = static_cast<Eigen::Index>(of.rest.size());
   left.resize(m, m), rest.resize(m);
   for (Eigen::Index c = 0; c < m; ++c) {
-    for (Eigen::Index r = 0; r < m; ++r) left(r, c) = -of.J_(of.rest_[r], of.rest_[c]);
+    for (Eigen::Index r = 0; r < m; ++r) left(r, c) = -of.J(of.rest[r], of.rest[c]);
     left(c, c) += shift;
   }
   const Scalar inverse = Scalar(1.0) / shift;
-  for (const auto& [i, j] : of.rates_)
-    for (Eigen::Index r = 0; r < m; ++r) left(r, of.place_[j]) -= of.J_(of.rest_[r], i) * inverse;
+  for (const auto& [i, j] : of.rates)
+    for (Eigen::Index r = 0; r < m; ++r) left(r, of.place[j]) -= of.J(of.rest[r], i) * inverse;
   lu.compute(left);
 }
 
 template <class Scalar>
-void Radau::Shifted<Scalar>::solve(const Radau& of, const Column& b, Column& x) {
-  const auto m = static_cast<Eigen::Index>(of.rest_.size());
+void Radau::Shifted<Scalar>::solve(const Block& of, const Eigen::Ref<const Column>& b, Eigen::Ref<Column> x) {
+  const auto m = static_cast<Eigen::Index>(of.rest.size());
   const Scalar inverse = Scalar(1.0) / shift;
-  for (Eigen::Index r = 0; r < m; ++r) rest(r) = b(of.rest_[r]);
-  for (const auto& [i, j] : of.rates_) {
+  for (Eigen::Index r = 0; r < m; ++r) rest(r) = b(of.rest[r]);
+  for (const auto& [i, j] : of.rates) {
     const Scalar x_i = inverse * b(i);
-    for (Eigen::Index r = 0; r < m; ++r) rest(r) += of.J_(of.rest_[r], i) * x_i;
+    for (Eigen::Index r = 0; r < m; ++r) rest(r) += of.J(of.rest[r], i) * x_i;
   }
   right = lu.solve(rest);
-  for (Eigen::Index r = 0; r < m; ++r) x(of.rest_[r]) = right(r);
-  for (const auto& [i, j] : of.rates_) x(i) = (b(i) + x(j)) * inverse;
+  for (Eigen::Index r = 0; r < m; ++r) x(of.rest[r]) = right(r);
+  for (const auto& [i, j] : of.rates) x(i) = (b(i) + x(j)) * inverse;
+}
+
+template <class Scalar>
+void Radau::Factors<Scalar>::compute(const Radau& of, Scalar shift) {
+  motion.compute(of.motion_, shift);
+  if (of.beside_.J.size() && !of.alike_) beside.compute(of.beside_, shift);
+}
+
+template <class Scalar>
+void Radau::Factors<Scalar>::solve(const Radau& of, const Eigen::Ref<const typename Shifted<Scalar>::Column>& b,
+                                   Eigen::Ref<typename Shifted<Scalar>::Column> x) {
+  const auto size = of.motion_.J.rows(), column = of.beside_.J.rows();
+  motion.solve(of.motion_, b.head(size), x.head(size));
+  for (auto k = size; k < b.size(); k += column)
+    (of.alike_ ? motion : beside).solve(of.alike_ ? of.motion_ : of.beside_, b.segment(k, column), x.segment(k, column));
 }
 
 void Radau::factorize(double h) {

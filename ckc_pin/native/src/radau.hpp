@@ -56,7 +56,15 @@ class Radau : public Method {
   Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1, one of each pair
   Eigen::VectorXcd lambda_;
 
-  // lambda / h - J, with the entries of y whose rate is another entry eliminated: x_i = h / lambda (b_i + x_j).
+  // A block of the Jacobian, of numbers that move by themselves: the motion's, or a column's that y has beside it.
+  struct Block {
+    Matrix J;
+    std::vector<std::pair<int, int>> rates;  // entries whose rate is another entry
+    Indices rest, place;  // those that are not eliminated; where an entry is among them, else -1
+    void begin();         // `rest` and `place` from `rates`
+  };
+
+  // lambda / h - J of a block, with the entries whose rate is another entry eliminated: x_i = h / lambda (b_i + x_j).
   template <class Scalar>
   struct Shifted {
     using Square = Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic>;
@@ -65,17 +73,26 @@ class Radau : public Method {
     Square left;
     Column right, rest;
     Eigen::PartialPivLU<Square> lu;
-    void compute(const Radau& of, Scalar shift);
-    void solve(const Radau& of, const Column& b, Column& x);
+    void compute(const Block& of, Scalar shift);
+    void solve(const Block& of, const Eigen::Ref<const Column>& b, Eigen::Ref<Column> x);
   };
 
-  Matrix J_, Z_, F_, dZ_;
+  // And of all of y: columns beside the motion are alike.
+  template <class Scalar>
+  struct Factors {
+    Shifted<Scalar> motion, beside;
+    void compute(const Radau& of, Scalar shift);
+    void solve(const Radau& of, const Eigen::Ref<const typename Shifted<Scalar>::Column>& b,
+               Eigen::Ref<typename Shifted<Scalar>::Column> x);
+  };
+
+  Matrix Z_, F_, dZ_;
   Matrix Z_dot_, X_;  // rates of the collocation polynomials, and with them of the whole motion
   Vector b_, x_stage_;
-  Shifted<double> real_;                  // of the real eigenvalue
-  std::vector<Shifted<Complex>> pairs_;   // of the others
-  std::vector<std::pair<int, int>> rates_;
-  Indices rest_, place_;                  // entries of y that are not eliminated; where they are among those, else -1
+  Block motion_, beside_;
+  bool alike_ = false;                    // columns beside the motion move as it does
+  Factors<double> real_;                  // of the real eigenvalue
+  std::vector<Factors<Complex>> pairs_;   // of the others
   Eigen::VectorXcd right_, correction_;
   Vector scale_, error_, y_stage_, f_stage_, real_right_, real_correction_;
   double factorized_ = 0.0;  // the length that the factors are of

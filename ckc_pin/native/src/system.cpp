@@ -78,15 +78,16 @@ double System::phi_z_margin() {
 }
 
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  const auto size = y.size();
   jacobian.resize(size, size), rate_.resize(size), rate_here_.resize(size);
   moved_ = y;
   ++evaluations, ++counts.differences;
-  if (!rhs(t, moved_, rate_here_)) return false;
-  for (int k = 0; k < size; ++k) {
+  if (!moves(t, moved_, rate_here_)) return false;
+  for (Eigen::Index k = 0; k < size; ++k) {
     moved_(k) = y(k) + difference * std::max(1.0, std::abs(y(k)));
     const double step = moved_(k) - y(k);
     ++evaluations;
-    if (!rhs(t, moved_, rate_)) return false;
+    if (!moves(t, moved_, rate_)) return false;
     jacobian.col(k) = (rate_ - rate_here_) / step;
     moved_(k) = y(k);
   }

@@ -42,6 +42,8 @@ class System {
   virtual void start(double t, In q_tree, In v_tree, In w, Out y) = 0;
   // False where it does not exist or is not finite.
   virtual bool rhs(double t, In y, Out y_dot) = 0;
+  // Of the motion alone, of its part of y.
+  virtual bool moves(double t, In y, Out y_dot) { return rhs(t, y, y_dot); }
   // The core at the state, closed as well as the formulation closes it, with everything below; false where it fails.
   virtual bool exact(double t, In y) = 0;
   // The same, but with the loops as open as y has them, where they can be.
@@ -63,10 +65,13 @@ class System {
   virtual Accepted accept(double t, Out y, double margin) = 0;
   // Make the user's own partition that of q; false where phi_z is singular there.
   virtual bool own_partition(double, Out, bool& changed) { return changed = false, true; }
-  // d rhs / d y, here by differences, counted in `evaluations`; false where one does not exist.
+  // d rhs / d y of the motion, here by differences, counted in `evaluations`; false where one does not exist.
   virtual bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
-  // Entries of y whose rate is another entry: (where, which).
+  // Its entries of y whose rate is another entry: (where, which).
   virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
+  // And by itself of each column that y has beside the motion, where `jacobian` was asked for last; null where it has none.
+  virtual const Matrix* beside_jacobian() const { return nullptr; }
+  virtual void beside_rates(std::vector<std::pair<int, int>>&) const {}
   // Time in which the motion may change, known from the start, s: that of a boundary layer.
   virtual double layer() const { return std::numeric_limits<double>::infinity(); }
   // Whether the motion keeps its energy where nothing acts and nothing dampens.
@@ -147,6 +152,7 @@ class System {
   bool slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v);
 
   Vector uncorrected_;  // zero, (rows)
+  Matrix by_q_, by_v_;  // eq. 1's, where `jacobian` was asked for last and found without differences
 
  private:
   std::unique_ptr<Spectrum> phi_z_;

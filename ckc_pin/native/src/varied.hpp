@@ -62,10 +62,7 @@ class Varied : public Base, public WithVariation {
   bool place(In y) override { return Base::place(y.head(size_)); }
   Accepted accept(double t, Out y, double margin) override { return Base::accept(t, y.head(size_), margin); }
   bool own_partition(double t, Out y, bool& changed) override { return Base::own_partition(t, y.head(size_), changed); }
-  bool modes(In y, Matrix& jacobian) override {
-    jacobian = Matrix(jacobian.topLeftCorner(size_, size_));
-    return Base::modes(y.head(size_), jacobian);
-  }
+  bool modes(In y, Matrix& jacobian) override { return Base::modes(y.head(size_), jacobian); }
   bool tree_acceleration(In f, Out a) const override { return Base::tree_acceleration(f.head(size_), a); }
   void whole(In f, Out x, Out x_dot) const override { Base::whole(f.head(size_), x, x_dot); }
   int beside() const override { return this->size - size_; }
@@ -73,23 +70,25 @@ class Varied : public Base, public WithVariation {
   void shift(Out y, In step) const override { Base::shift(y.head(size_), step); }
   void go_on(double t, Out y) override { Base::go_on(t, y.head(size_)); }
 
-  // Without how the changes' own rates change along the motion, which an iteration can do without.
+  // Of the motion; how the changes' own rates change along it, an iteration can do without.
   bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override {
+    const long differences = this->counts.differences;
+    if (!Base::jacobian(t, y.head(size_), jacobian, evaluations)) return false;
+    const bool of_dae = std::is_same_v<Base, Dae>, known = this->counts.differences == differences;
+    if (of_dae && !known) Base::at_last(t, y.head(size_));
+    v_ = !of_dae ? this->v_tree : known ? Vector(y.segment(this->core.tree.nq, variation_.n)) : this->velocity;
+    if (!known && !this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, this->by_q_, this->by_v_)) return false;
     const int n = variation_.n;
-    Matrix of_motion, by_q, by_v;
-    if (!Base::jacobian(t, y.head(size_), of_motion, evaluations)) return false;
-    Vector v = this->v_tree;
-    if (std::is_same_v<Base, Dae>) Base::at_last(t, y.head(size_)), v = this->velocity;
-    if (!this->slopes(Vector(this->core.q_tree), v, this->uncorrected_, by_q, by_v)) return false;
-    jacobian.setZero(this->size, this->size);
-    jacobian.topLeftCorner(size_, size_) = of_motion;
-    for (int p = 0; p < variation_.count; ++p) {
-      auto block = jacobian.block(size_ + 2 * n * p, size_ + 2 * n * p, 2 * n, 2 * n);
-      block.topLeftCorner(n, n) = -this->core.tree.brackets(v);
-      block.topRightCorner(n, n).setIdentity();
-      block.bottomLeftCorner(n, n) = by_q, block.bottomRightCorner(n, n) = by_v;
-    }
-    return jacobian.allFinite();
+    block_.setZero(2 * n, 2 * n), block_.topRightCorner(n, n).setIdentity();
+    if (!this->core.tree.roots.empty()) block_.topLeftCorner(n, n) = -this->core.tree.brackets(v_);
+    block_.bottomLeftCorner(n, n) = this->by_q_, block_.bottomRightCorner(n, n) = this->by_v_;
+    return block_.allFinite();
+  }
+  bool moves(double t, In y, Out y_dot) override { return Base::rhs(t, y, y_dot); }
+  const Matrix* beside_jacobian() const override { return &block_; }
+  void beside_rates(std::vector<std::pair<int, int>>& of) const override {
+    of.clear();
+    for (int k : this->core.tree.single) of.emplace_back(k, variation_.n + k);
   }
 
   bool before_change(double t, In y, const std::vector<System::Met>& met) override {
@@ -138,8 +137,8 @@ class Varied : public Base, public WithVariation {
     if (!Base::tree_acceleration(y_dot.head(size_), a_)) return false;
     if (!of_start_ || !this->core.written || variation_.holds()) return variation_.rates(v_, a_, s_, s_dot_);
     this->core.set_velocity(v_);
-    if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, by_q_, by_v_)) return false;
-    variation_.rates_of_start(v_, by_q_, by_v_, s_, s_dot_);
+    if (!this->slopes(Vector(this->core.q_tree), v_, this->uncorrected_, this->by_q_, this->by_v_)) return false;
+    variation_.rates_of_start(v_, this->by_q_, this->by_v_, s_, s_dot_);
     return true;
   }
   void put(Out y) const { Eigen::Map<Matrix>(y.data() + size_, rows(), variation_.count) = s_; }
@@ -147,7 +146,7 @@ class Varied : public Base, public WithVariation {
   const int size_;  // of the base's y
   const bool of_start_;  // nothing varies but where it starts
   Variation variation_;
-  Matrix s_, s_dot_, by_q_, by_v_, u_, tau_;
+  Matrix s_, s_dot_, block_, u_, tau_;
   Vector v_, a_;
 };
 
