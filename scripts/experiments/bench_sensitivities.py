@@ -13,6 +13,8 @@ RUNS = (
                               "link.link_2.com.x", "joint.theta_2.xyz.x")),
     ("delta", 1e-6, ("link.plate.mass", "initial.q.arm_1", "link.arm_link_1.mass", "gravity.z",
                      "link.arm_link_2.com.x", "initial.q_dot.arm_2")),
+    ("five_bar/set_point", 1e-8, ("link.link_2.mass", "controller.K_P", "controller.q_d.theta_1", "gravity.y",
+                                  "initial.q_dot.theta_1", "link.link_3.mass")),
 )  # fmt: skip
 NUMBERS, TIMES = (1, 2, 6), 25
 TERMS = {"pinocchio": "Pinocchio's", "generated": "generated"}

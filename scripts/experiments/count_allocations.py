@@ -34,14 +34,19 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("delta/default", {}),
     ("delta/circle", {}),
 ]
+VARIED: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+    ("five_bar/swing", {"formulation": "dae"}, ("gravity.y",)),
+    ("five_bar/swing", {"formulation": "dae", "solver.terms": "generated"}, ("gravity.y", "link.link_2.mass")),
+    ("five_bar/set_point", {"formulation": "dae", "solver.terms": "generated"}, ("gravity.y", "controller.K_P")),
+]
 
 
 def main(library: Path) -> int:
     counter = CDLL(str(library)).allocations
     counter.restype = c_long
     bad = 0
-    for scene, changes in SCENES:
-        ready = prepare(load_scene(scene, changes))
+    for scene, changes, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
+        ready = prepare(load_scene(scene, changes), parameters=parameters)
         loop = ready.loop
         instants = np.linspace(0.0, 0.3, 31)
         rows = np.empty((40, loop.width))
@@ -58,7 +63,7 @@ def main(library: Path) -> int:
         stretch(0.1)  # whatever grows has grown
         few, short, once = stretch(0.12)
         many, long, often = stretch(0.3)
-        print(f"{scene} {changes or ''}: {few} allocations in {short} steps, {many} in {long}")
+        print(f"{scene} {changes or ''} {' '.join(parameters)}: {few} allocations in {short} steps, {many} in {long}")
         jacobians = often / once if once and ready.scene.spec.controller else 1.0
         bad += many > few * jacobians or long < 2 * short
     return 1 if bad else 0

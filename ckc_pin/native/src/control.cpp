@@ -200,7 +200,10 @@ bool SetPoint::slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) {
 }
 
 void SetPoint::by_gains(const Measured& at, const Matrix& K_P, const Matrix& K_V, Out more) {
-  more = -K_P * (at.q - q_d_) - K_V * at.q_dot;
+  e_ = at.q - q_d_;
+  more.noalias() = K_P * e_;
+  more.noalias() += K_V * at.q_dot;
+  more = -more;
 }
 
 // Where an actuator is at its limit, it does not answer. Motors that are not q's own share u: as long as they amount to

@@ -29,6 +29,14 @@ Variation::Variation(System& system, VariationTable table)
   force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
   for (const Parameter& of : table_.parameters)
     acting_varies_ |= std::any_of(of.effects.begin(), of.effects.end(), is_acting);
+  const auto d = static_cast<Eigen::Index>(table_.own.size());
+  for (Vector* x : {&q_own_, &q_dot_own_, &more_}) x->setZero(d);
+  for (int p = 0; p < count; ++p)
+    for (const Effect& of : table_.parameters[p].effects) {
+      if (of.kind != Effect::gain_q && of.kind != Effect::gain_q_dot) continue;
+      const Matrix gain = of.numbers.reshaped(d, d), none = Matrix::Zero(d, d);
+      gains_.push_back(of.kind == Effect::gain_q ? Gain{p, gain, none} : Gain{p, none, gain});
+    }
 }
 
 void Variation::compute(In v, In a, In lambda, bool impulsive) {

@@ -102,8 +102,8 @@ class Variation {
   void add_parameters(In v, In a, In lambda, bool impulsive, Matrix& force, Matrix& row);
   void add_effect(const Effect& of, In a, In lambda, bool impulsive, Out force, Out row);
   void add_force(const Effect& of, In v, Out force);
-  void add_acting(In q_tree, In v, Matrix& force) const;  // of that the part of what acts
-  void add_control(In q_tree, In v, Matrix& force) const;  // and of that the controller's and the motors'
+  void add_acting(In q_tree, In v, Matrix& force);  // of that the part of what acts
+  void add_control(In q_tree, In v, Matrix& force);  // and of that the controller's and the motors'
   void add_inertia(const Effect& of, bool impulsive, Out force);
   void add_gravity(const Effect& of, Out force);
   void add_spring(const Effect& of, Out force);
@@ -111,9 +111,9 @@ class Variation {
   bool tidy(In v, Matrix& s);
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
-  Matrix wanted(In q_tree, In v) const;  // how a controller's u changes with the parameters, (d, parameters)
+  const Matrix& wanted(In q_tree, In v);  // how a controller's u changes with the parameters, (d, parameters)
   // The same, or what is held of it, with that sign, in the rows of q.
-  void add_wanted(In q_tree, In v, Matrix& force) const;
+  void add_wanted(In q_tree, In v, Matrix& force);
   void clipped_efforts(In v);  // clipped_: how torques change with the parameters where motors are at limits
   void add_state(const Matrix& s);
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
@@ -126,17 +126,23 @@ class Variation {
   Derivatives derivatives_;
   bool acting_varies_ = false;  // some effect is of what acts
   bool answers_ = false;        // what acts changes with the state
-  Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_, clipped_;
+  Matrix u_by_q_, u_by_v_, force_, row_, change_, responses_, compensated_, clipped_, wanted_;
+  Matrix geared_;  // of the motors' force with the gears alone
   struct Along {  // parameters that the code which is written out takes at a time, rows
     int first, count;
     Matrix directions, changes;
   };
   std::vector<Along> along_;
   std::vector<Indices> groups_;  // by parameter, of the numbers that the code takes
+  struct Gain {
+    int parameter;
+    Matrix of_q, of_q_dot;  // K_P's change, or Lambda's, and K_V's, or K_D's
+  };
+  std::vector<Gain> gains_;
   std::deque<Matrix> waiting_;  // of samples that do not act yet
   Matrix held_;
   Vector acting_, back_, direction_, of_group_, of_tree_, lambda_, lacking_;
-  Vector q_, v_, a_, delay_;
+  Vector q_, v_, a_, delay_, q_own_, q_dot_own_, more_;
 };
 
 }  // namespace ckc

@@ -130,7 +130,7 @@ void Variation::add_force(const Effect& of, In v, Out force) {
 }
 
 // What each parameter does by way of friction, of motors and of a controller, with the sign of what is lacking.
-void Variation::add_acting(In q_tree, In v, Matrix& force) const {
+void Variation::add_acting(In q_tree, In v, Matrix& force) {
   const Joints& joints = core_.joints;
   const double smoothing = joints.table.smoothing;
   for (int p = 0; p < count; ++p)
@@ -140,7 +140,7 @@ void Variation::add_acting(In q_tree, In v, Matrix& force) const {
   add_control(q_tree, v, force);
 }
 
-void Variation::add_control(In q_tree, In v, Matrix& force) const {
+void Variation::add_control(In q_tree, In v, Matrix& force) {
   const Control& control = system_.control;
   const bool clipped = clipped_.size() > 0;
   for (int p = 0; p < count; ++p)
@@ -160,26 +160,23 @@ void Variation::add_control(In q_tree, In v, Matrix& force) const {
     add_wanted(q_tree, v, force);
 }
 
-Matrix Variation::wanted(In q_tree, In v) const {
-  const auto d = static_cast<Eigen::Index>(table_.own.size());
-  Vector q(d), q_dot(d), more(d);
-  for (Eigen::Index i = 0; i < d; ++i) q(i) = q_tree(core_.tree.place[table_.own[i]]), q_dot(i) = v(table_.own[i]);
-  const Matrix none = Matrix::Zero(d, d);
-  Matrix u = compensated_;
-  for (int p = 0; p < count; ++p)
-    for (const Effect& of : table_.parameters[p].effects) {
-      if (of.kind != Effect::gain_q && of.kind != Effect::gain_q_dot) continue;
-      const Eigen::Map<const Matrix> gain(of.numbers.data(), d, d);
-      const bool of_q = of.kind == Effect::gain_q;
-      system_.control.law->by_gains({0.0, core_, q, q_dot, v, q_dot}, of_q ? Matrix(gain) : none, of_q ? none : Matrix(gain), more);
-      u.col(p) += more;
-    }
-  return u;
+const Matrix& Variation::wanted(In q_tree, In v) {
+  wanted_ = compensated_;
+  if (gains_.empty()) return wanted_;
+  for (size_t i = 0; i < table_.own.size(); ++i) {
+    const auto k = static_cast<Eigen::Index>(i);
+    q_own_(k) = q_tree(core_.tree.place[table_.own[i]]), q_dot_own_(k) = v(table_.own[i]);
+  }
+  for (const Gain& gain : gains_) {
+    system_.control.law->by_gains({0.0, core_, q_own_, q_dot_own_, core_.v_tree, q_dot_own_}, gain.of_q, gain.of_q_dot, more_);
+    wanted_.col(gain.parameter) += more_;
+  }
+  return wanted_;
 }
 
-void Variation::add_wanted(In q_tree, In v, Matrix& force) const {
+void Variation::add_wanted(In q_tree, In v, Matrix& force) {
   if (!system_.control.feedback() && !holds()) return;
-  const Matrix u = system_.control.feedback() ? wanted(q_tree, v) : held_;
+  const Matrix& u = system_.control.feedback() ? wanted(q_tree, v) : held_;
   for (Eigen::Index i = 0; i < u.rows(); ++i)
     if (system_.control.answers(i)) force.row(table_.own[i]) -= u.row(i);
 }

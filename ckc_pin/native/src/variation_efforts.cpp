@@ -15,10 +15,10 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   bool torques = control.of_motors();
   u.setZero(d, count), tau.setZero(motors, count);
   if (!control.acts()) return;
-  Matrix geared = Matrix::Zero(n, count);  // of f with the gears alone
+  geared_.setZero(n, count);
   for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
-      if (of.kind == Effect::gear) geared.col(p) += control.tau(of.index) * of.numbers;
+      if (of.kind == Effect::gear) geared_.col(p) += control.tau(of.index) * of.numbers;
       if (of.kind == Effect::torque_limit && control.limited(of.index))
         tau(of.index, p) += control.tau(of.index) > 0.0 ? 1.0 : -1.0;
     }
@@ -36,10 +36,10 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   if (!torques) {
     clipped_.resize(0, 0), force_.setZero();
     add_control(core_.q_tree, v, force_);
-    force_ = u_by_q_ * s.topRows(n) + u_by_v_ * s.bottomRows(n) - force_;
+    force_ = -force_, add_answer(s);
     for (Eigen::Index i = 0; i < d; ++i) u.row(i) = force_.row(table_.own[i]);
     if (control.direct()) {
-      for (Eigen::Index i = 0; i < d; ++i) tau.row(i) = u.row(i) - geared.row(table_.own[i]);
+      for (Eigen::Index i = 0; i < d; ++i) tau.row(i) = u.row(i) - geared_.row(table_.own[i]);
       return;
     }
   }
@@ -57,7 +57,7 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   Matrix places = s;
   places.bottomRows(n).setZero();
   add_state(places);
-  const Matrix turned = basis.transpose() * (geared - force_), transmission = basis.transpose() * table_.turns.transpose();
+  const Matrix turned = basis.transpose() * (geared_ - force_), transmission = basis.transpose() * table_.turns.transpose();
   if (torques)
     u = turned + transmission * tau;
   else if (motors == d)
