@@ -93,10 +93,8 @@ def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechan
     if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
         return deepcopy(built, {id(built.sources): sources})
     mechanism = _build(text, sources, changes)
-    built = deepcopy(mechanism)
-    built.tree.rest()
     with _building:
-        _built[key] = built
+        _built[key] = deepcopy(mechanism)
         while len(_built) > MOST_KEPT:
             _built.pop(next(iter(_built)))
     return mechanism

@@ -11,6 +11,7 @@ anyway, and a workspace for each thread would take memory by the gigabyte.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from threading import RLock
 from typing import Any
 
@@ -99,11 +100,25 @@ class Tree:
 
     def _work_on(self, model: Any) -> None:
         self.model = model
-        self.data = model.createData()
         self.lock = RLock()  # held while something is in the workspace
-        self._placement = _strided_placements(self.data)
-        # a matrix of one column would come as a vector
-        self._jacobian, self._jacobian_dot = self.data.J.reshape(6, model.nv), self.data.dJ.reshape(6, model.nv)
+
+    @cached_property
+    def data(self) -> Any:
+        """Pinocchio's workspace, made where it is first needed: it has some n^3 numbers."""
+        return self.model.createData()
+
+    @cached_property
+    def _placement(self) -> Array:
+        return _strided_placements(self.data)
+
+    # a matrix of one column would come as a vector
+    @cached_property
+    def _jacobian(self) -> Array:
+        return self.data.J.reshape(6, self.n)
+
+    @cached_property
+    def _jacobian_dot(self) -> Array:
+        return self.data.dJ.reshape(6, self.n)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tree:
         """Copy the model, and give the copy a workspace of its own; labels and places stay as they are."""
@@ -120,11 +135,6 @@ class Tree:
         self.__dict__.update(state)
         self._work_on(self.model)
 
-    def rest(self) -> None:
-        """Let the workspace go, of a tree that is only to be copied."""
-        for name in WORKSPACE:
-            del self.__dict__[name]
-
     def evaluate(self, algorithm: Callable[..., Any], *state: Array) -> Array:
         """Return a copy of what an algorithm of Pinocchio, (model, data, *state), leaves in the workspace."""
         with self.lock:
@@ -138,8 +148,8 @@ class Tree:
 
     def many_kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Return what `kinematics` does for each of (count, nq) configurations: (count, joints, 12), (count, 6, n)."""
-        placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
         with self.lock:
+            placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
             for k, q in enumerate(q_tree):
                 pin.computeJointJacobians(self.model, self.data, q)
                 placement[k], jacobian[k] = self._placement, self._jacobian

@@ -72,6 +72,16 @@ def test_two_have_two_workspaces() -> None:
     assert other.springs.tree is other.tree
 
 
+def test_a_workspace_is_made_when_it_is_needed() -> None:
+    """It has some n^3 numbers, and what is kept to be copied needs none."""
+    load("delta")
+    assert all("data" not in vars(kept.tree) for kept in loading._built.values())
+    again = load("delta")
+    assert "data" not in vars(again.tree)
+    again.tree.kinematics(again.q_tree)
+    assert "data" in vars(again.tree)
+
+
 def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
     """What was loaded long ago is built again, what was loaded lately is copied."""
     paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.MOST_KEPT + 3)]
