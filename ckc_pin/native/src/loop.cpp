@@ -146,7 +146,7 @@ std::optional<Stop> Loop::sample() {
   if (!system->exact(now.t, now.y)) return trouble();
   system->core.set_velocity(system->v_tree);
   bool changed;
-  if (!control->sample(system->measured(now.t), changed) || !system->sampled(now.y)) return trouble();
+  if (!control->sample(system->measured(now.t), changed) || !system->sampled(now.y, changed)) return trouble();
   if (changed) jump();
   return {};
 }

@@ -114,7 +114,8 @@ class System {
   virtual bool at_impact(In, const Indices&, const Matrix&, In, In) { return true; }
   virtual bool after_change(double, Out, const std::vector<Met>&, double, double) { return true; }
   // A controller has looked at y, where the core is, or what it found has come to act; false where that is not known.
-  virtual bool sampled(In) { return true; }
+  // Whether from here on rates of y are others.
+  virtual bool sampled(In, bool&) { return true; }
   // Numbers that are recorded behind those of the state.
   virtual int extra() const { return 0; }
   virtual void put_extra(In, Out) {}  // at the core's state, that of y, with what acts there

@@ -81,7 +81,8 @@ class Variation {
   // what acts there; NaN where that is not known.
   void efforts(In v, const Matrix& s, Matrix& u, Matrix& tau);
   // What a controller on a clock makes of s, where it has looked at the core's state; what acts is held until the next.
-  bool sampled(const Matrix& s, const Sampling& clock);
+  // Whether that is another one now: s goes on otherwise then, even where u is what it was.
+  bool sampled(const Matrix& s, const Sampling& clock, bool& changed);
   bool holds() const { return held_.size() && !held_.isZero(0.0); }
   // Where joints change what they do: as the system's. In between s is of the instant that comes with the parameters.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);

@@ -181,14 +181,17 @@ void Variation::add_wanted(In q_tree, In v, Matrix& force) {
     if (system_.control.answers(i)) force.row(table_.own[i]) -= u.row(i);
 }
 
-bool Variation::sampled(const Matrix& s, const Sampling& clock) {
+bool Variation::sampled(const Matrix& s, const Sampling& clock, bool& changed) {
   if (clock.taken) {
     const auto d = static_cast<Eigen::Index>(table_.own.size());
     Matrix by_q = Matrix::Zero(d, n), by_v = by_q;
     if (!system_.control.law->slopes(core_, table_.own, by_q, by_v)) return false;
     waiting_.push_back(wanted(core_.q_tree, system_.velocity) + by_q * s.topRows(n) + by_v * s.bottomRows(n));
   }
-  for (int k = 0; k < clock.acted; ++k) held_ = waiting_.front(), waiting_.pop_front();
+  for (int k = 0; k < clock.acted; ++k) {
+    changed |= held_.size() != waiting_.front().size() || held_ != waiting_.front();  // though u may be what it was
+    held_ = waiting_.front(), waiting_.pop_front();
+  }
   return true;
 }
 

@@ -104,10 +104,10 @@ class Varied : public Base, public WithVariation {
     put(y);
     return true;
   }
-  bool sampled(In y) override {
+  bool sampled(In y, bool& changed) override {
     if (!this->control.sampling->holds) return true;
     take(y);
-    return variation_.sampled(s_, *this->control.sampling) || this->fails(Trouble::infinite);
+    return variation_.sampled(s_, *this->control.sampling, changed) || this->fails(Trouble::infinite);
   }
   int extra() const override { return (rows() + this->core.d + static_cast<int>(this->control.tau.size())) * variation_.count; }
   void put_extra(In y, Out row) override {
