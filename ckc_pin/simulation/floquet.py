@@ -32,6 +32,7 @@ __all__ = ["Floquet", "floquet"]
 RETURNS = 1e-5  # rad, m and their rates, of the motion's own size: a motion that comes back
 SHARE, ROUNDING = 1e-2, 1e-9  # of how far it goes, if that is little: what hardly moves has not come back from anywhere
 LEAST = 1e-9  # s: nothing moves in less
+CLOCK = 1e-12  # of a period: how near its end is to a sample
 INSTANTS = 24  # at which what drives it is compared with a period later
 BETWEEN = 9  # steps from a multiplier to the unit circle
 
@@ -129,10 +130,7 @@ def floquet(
             "rotation there is no one matrix over a period; take other independent coordinates, or fix the root"
         )
     if isinstance(loaded.spec.controller, FeedbackSpec) and loaded.spec.controller.sample_time is not None:
-        raise InputError(
-            f"{loaded.name}: controller.sample_time: of a motion with samples the monodromy matrix is not known; leave "
-            "it out, or let check tell whether the sampled loop is stable"
-        )
+        _require_whole_samples(loaded.spec.controller, loaded.spec.controller.sample_time, float(period), loaded.name)
     if (drive := _drive(scene_controller(loaded, mechanism), mechanism)) is not None:
         _require_period_of_drive(drive, float(period))
     if loaded.spec.initial.at is not None:
@@ -195,6 +193,21 @@ def _drive(law: SetPoint | Tracking | Torques | None, mechanism: Mechanism) -> _
         way, turns = way.place, turns[:0]
     end = float(getattr(way, "end", np.inf))
     return _Drive("the desired motion", lambda t: np.concatenate(way(t)[:2]), end, turns)
+
+
+def _require_whole_samples(controller: FeedbackSpec, sample_time: float, period: float, name: str) -> None:
+    """Refuse a sampled controller that is not where it began at the period's end: about to look at q and q_dot."""
+    if controller.delay > 0:
+        raise InputError(
+            f"{name}: controller.delay: what is on its way at the end of a period is part of the state, and the "
+            "monodromy matrix is of q and q_dot; leave it out, or let check tell whether the sampled loop is stable"
+        )
+    samples = period / sample_time
+    if not abs(samples - max(1.0, round(samples))) <= CLOCK * samples:
+        raise InputError(
+            f"{name}: controller.sample_time: period = {period:.9g} s is {samples:.9g} samples; the motion comes back "
+            "to where it began after a whole number of them"
+        )
 
 
 def _require_period_of_drive(drive: _Drive, period: float) -> None:

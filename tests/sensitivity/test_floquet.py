@@ -18,6 +18,7 @@ from ckc_pin import InputError, load_scene
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.simulation.floquet import floquet
 from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from tests.sensitivity.sliders import sliders
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
 PERIOD = 2 * np.pi / w
@@ -161,9 +162,33 @@ def test_in_no_time_nothing_comes_back(tmp_path: Path) -> None:
         floquet(written(tmp_path, g, 0.2), 3e-9)
 
 
-def test_of_a_motion_with_samples_it_is_said_what_is_not_known() -> None:
-    with pytest.raises(InputError, match=r"controller\.sample_time: of a motion with samples the monodromy matrix"):
-        floquet("five_bar/tracking", 2 * np.pi, {"controller.sample_time": 1e-3})
+@pytest.mark.parametrize(("samples", "stable"), [(1, True), (7, True), (30, False)])
+def test_of_a_sampled_loop_that_rests(samples: int, stable: bool, tmp_path: Path) -> None:
+    """What is held between samples is known in closed form: two masses, each in a loop of its own, slow or too slow."""
+    (mass, other), (K_P, K_V), T = (1.3, 0.7), (11.0, 3.0), 0.05 if stable else 0.9
+    controller = f'[controller]\ntype = "set_point"\nK_P = {K_P!r}\nK_V = {K_V!r}\nsample_time = {T!r}\n'
+    scene = sliders(tmp_path, "", masses=(mass, other), scene=f"{controller}q_d = {{ x = 0.2, y = -0.1 }}\n",
+                    q=(0.2, -0.1))  # fmt: skip
+    found = floquet(scene, samples * T, TIGHT)
+    wanted = np.zeros((4, 4))
+    for k, m in enumerate((mass, other)):
+        step = np.array([[1.0, T], [0.0, 1.0]]) - np.outer([T**2 / 2, T], [K_P, K_V]) / m
+        wanted[np.ix_([k, k + 2], [k, k + 2])] = np.linalg.matrix_power(step, samples)
+    assert np.abs(found.monodromy - wanted).max() <= 1e-11 * np.abs(wanted).max()
+    assert found.stable is stable
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"sample_time": 1e-3}, r"controller\.sample_time: period = 6\.28318531 s is 6283\.18531 samples; the motion"),
+        ({"sample_time": 10.0}, r"controller\.sample_time: period = 6\.28318531 s is 0\.628318531 samples"),
+        ({"sample_time": np.pi / 500, "delay": 1e-3}, r"controller\.delay: what is on its way at the end of a period"),
+    ],
+)
+def test_samples_that_do_not_come_back_are_refused(changes: dict[str, float], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        floquet("five_bar/tracking", 2 * np.pi, {f"controller.{name}": x for name, x in changes.items()})
 
 
 def test_what_has_no_derivatives_is_refused_before_anything_is_run() -> None:
