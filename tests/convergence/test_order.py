@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import ckc_pin.simulation.prepare as prepare_module
+from ckc_pin.simulation import loop_tables
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
@@ -63,7 +63,7 @@ def ready_at(formulation: str, **solver: Any) -> Prepared:
     q, q_dot = ({"theta_1": float(x[0]), "theta_3": float(x[1])} for x in (START, RATE))
     changes |= {"initial.q": q, "initial.q_dot": q_dot, **{f"solver.{key}": value for key, value in solver.items()}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prepare_module, "SLACK", 0.0)
+        patch.setattr(loop_tables, "SLACK", 0.0)
         return prepare(load_scene("five_bar/swing", changes))
 
 
