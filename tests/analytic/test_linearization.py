@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from ckc_pin import InputError, LinearModel, Mechanism, NumericalError, linearize, load, simulate, terms
+from ckc_pin import InputError, Mechanism, linearize, load, simulate
 from ckc_pin.dynamics import Terms, dae_acceleration, multipliers, reduced_acceleration
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.library import mechanism_file, shipped
-from ckc_pin.native.plant import Plant
+from ckc_pin.mechanism.library import shipped
 from ckc_pin.simulation.linear_model import linear_model
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
-from tests.analytic.small_models import coupled_four_bar, plate_on_springs
+from tests.analytic.small_models import coupled_four_bar
 
 ANGLES = ("theta_1", "theta_3")
 
@@ -87,6 +84,26 @@ def test_labels_say_what_is_what() -> None:
     agree(np.sort(plant.poles().imag), np.sort(model.eigenvalues.imag))
 
 
+def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
+    """A joint called x_dot beside x, and two names that differ in a dot alone."""
+    folder = tmp_path / "it"
+    coupled_four_bar(folder)
+    urdf = (folder / "it.urdf").read_text()
+    names = {"crank": "x", "coupler": "x_dot", "rocker": "x.dot"}
+    text = (folder / "mechanism.toml").read_text().replace('name = "coupled"', 'name = "it.is"')
+    for old, new in names.items():
+        urdf = urdf.replace(f'name="{old}"', f'name="{new}"')
+        text = text.replace(f'"{old}"', f'"{new}"').replace(f"\n{old} =", f'\n"{new}" =')
+    (folder / "it.urdf").write_text(urdf)
+    (folder / "mechanism.toml").write_text(text)
+    plant = linearize(load(str(folder / "mechanism.toml"))).to_statespace()
+    assert plant.name == "it_is"
+    assert plant.output_labels[:3] == ["x", "x_dot", "x_dot_2"]
+    coupled_four_bar(tmp_path, actuated="actuated = []")
+    with pytest.raises(InputError, match=r"coupled: no motors"):
+        linearize(load(str(tmp_path / "mechanism.toml"))).to_statespace()
+
+
 # --- other mechanisms ----------------------------------------------------------------------------
 
 
@@ -146,47 +163,20 @@ def _scene(mechanism: Mechanism, folder: Path) -> Path:
     return path
 
 
-def test_a_free_root_constrained_in_part_has_a_tangent_basis(tmp_path: Path) -> None:
-    """Its motion has no chart of joint coordinates; about a motion the frame that deviations are in turns along."""
-    mechanism = plate_on_springs(tmp_path)
-    assert mechanism.splits_root
-    tree, n, random = mechanism.tree, mechanism.n, np.random.default_rng(0)
-    at = mechanism.assembled
-    J = at.J
-    v = random.uniform(-1, 1, n)
-    v -= np.linalg.pinv(J) @ (J @ v)
-    state = Terms(mechanism, at, v)
-    model = linear_model(state, np.zeros(0), at="somewhere")
-    assert len(model.states) == 8
-    chart = [mechanism.coordinates.index(name) for name in model.states[:4]]
-    # the flow of eq. 1 by SciPy, about the motion and beside it
-    found = Plant(mechanism).at(state, np.zeros(n))
-    x = random.uniform(-1, 1, 8)
-    step, dv = found.T @ x[:4], found.V @ x[:4] + found.T @ x[4:]
-
-    def flow(h: float, t: float) -> Array:
-        def rate(_: float, y: Array) -> Array:
-            here = Terms(mechanism, mechanism.kinematics(y[: tree.nq]), y[tree.nq :])
-            a = dae_acceleration(here, np.zeros(n))
-            return np.concatenate([tree.configuration_rate(y[: tree.nq], y[tree.nq :]), a])
-
-        y = np.concatenate([tree.integrate(at.q_tree, h * step), v + h * dv])
-        return solve_ivp(rate, (0, t), y, rtol=1e-11, atol=1e-13, method="DOP853").y[:, -1]
-
-    def deviation(t: float, h: float) -> Array:
-        here, there, other = flow(0.0, t), flow(h, t), flow(-h, t)
-        q = (
-            tree.difference(here[: tree.nq], there[: tree.nq]) - tree.difference(here[: tree.nq], other[: tree.nq])
-        ) / 2
-        return np.concatenate([q[chart], (there - other)[tree.nq :][chart] / 2]) / h
-
-    h, t = 1e-4, 2e-3
-    rates = (8 * (deviation(t, h) - deviation(-t, h)) - (deviation(2 * t, h) - deviation(-2 * t, h))) / (12 * t)
-    agree(model.A @ x, rates, 1e-5)
-    assert np.abs(model.A[:4, :4]).max() > 0.1
+def test_rows_that_others_imply_stay_so_where_the_loops_are_slightly_open() -> None:
+    """Bricard's six rows of rank five: a step off the closure makes them independent, by rounding."""
+    mechanism, random = load("bricard"), np.random.default_rng(4)
+    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + 0.1).at
+    off = mechanism.kinematics(mechanism.tree.integrate(at.q_tree, 3e-9 * random.uniform(-1, 1, mechanism.n)))
+    v = at.rho @ random.uniform(-1, 1, mechanism.d)
+    closed, opened = (linear_model(Terms(mechanism, x, v), np.zeros(1), at="somewhere") for x in (at, off))
+    assert mechanism.redundant
+    agree(opened.C, closed.C, 1e-7)
+    agree(opened.D, closed.D, 1e-7)
 
 
-# --- friction, operating points ------------------------------------------------------------------
+# --- friction ------------------------------------------------------------------------------------
+
 
 RUBS = '\n[[joint]]\nname = "crank"\nfriction = 0.3\n'
 
@@ -230,167 +220,3 @@ def test_a_locked_joint_leaves_the_others() -> None:
     slopes = complex_step(acceleration, np.zeros(3))[0]
     agree(model.A, np.array([[0.0, 1.0], slopes[:2]]))
     agree(model.B, np.array([[0.0, 0.0], [0.0, slopes[2]]]))
-
-
-def test_motors_hold_an_operating_point() -> None:
-    q = {"theta_1": -1.1, "theta_3": -1.8}
-    model = linearize("five_bar", q)
-    found = terms(load("five_bar"), q)
-    agree(model.tau, FIVE_BAR.h(found.q_tree))
-    agree(model.A, by_hand(found.q_tree, np.zeros(2), model.tau)[0])
-    a = dae_acceleration(found, found.mechanism.motors.force(model.tau))
-    assert np.abs(a).max() < 1e-12
-    assert multipliers(found, found.mechanism.motors.force(model.tau), a).shape == (2,)
-
-
-def test_assembled_is_one_with_redundant_motors() -> None:
-    model = linearize("two_ur5", "assembled")
-    assert len(model.states) == 12
-    assert len(model.inputs) == 12
-    assert np.abs(np.linalg.eigvals(model.A)).max() < 1e3
-
-
-def test_motors_that_cannot_hold_it_are_named(tmp_path: Path) -> None:
-    coupled_four_bar(tmp_path, actuated="actuated = []")
-    mechanism = load(str(tmp_path / "mechanism.toml"))
-    with pytest.raises(InputError, match=r"nothing holds .* it has no motors.*along crank"):
-        linearize(mechanism, {"crank": 0.9})
-    changes = {"controller": {"type": "set_point", "K_P": 1.0, "K_V": 1.0, "q_d": {"theta_1": -1.2, "theta_3": -1.6},
-                              "torque_limit": 1e-3}}  # fmt: skip
-    with pytest.raises(InputError, match=r"theta_1 would need .* its limit is 0\.001"):
-        linearize("five_bar/swing", {"theta_1": -1.0, "theta_3": -1.9}, changes)
-
-
-@pytest.mark.parametrize("t", [-1.0, 2.5])
-def test_an_instant_outside_the_run(t: float) -> None:
-    with pytest.raises(InputError, match=r"outside the run of five_bar/swing, which lasts from 0 to 2 s"):
-        linearize("five_bar/swing", t)
-
-
-def test_other_refusals() -> None:
-    with pytest.raises(InputError, match=r"a mechanism has no time"):
-        linearize(load("five_bar"), 1.0)
-    with pytest.raises(InputError, match=r"give \"equilibrium\""):
-        linearize("five_bar", "there")
-    event = {"coordinate": "theta_1", "of": "q_dot", "value": -0.5, "stop": True}
-    with pytest.raises(InputError, match=r"ends at t = 0\..* s: stopped by the event"):
-        linearize("five_bar/swing", 1.9, {"event": [event]})
-
-
-@pytest.mark.parametrize("at", [np.zeros(2), [1.0, 2.0], 10**400, float("inf"), True, None, "2.0"])
-def test_what_is_no_state_is_refused(at: Any) -> None:
-    with pytest.raises(InputError, match=r"give \"equilibrium\", \"assembled\", \"target\", a time"):
-        linearize("five_bar/swing", at)
-
-
-def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
-    """A joint called x_dot beside x, and two names that differ in a dot alone."""
-    folder = tmp_path / "it"
-    coupled_four_bar(folder)
-    urdf = (folder / "it.urdf").read_text()
-    names = {"crank": "x", "coupler": "x_dot", "rocker": "x.dot"}
-    text = (folder / "mechanism.toml").read_text().replace('name = "coupled"', 'name = "it.is"')
-    for old, new in names.items():
-        urdf = urdf.replace(f'name="{old}"', f'name="{new}"')
-        text = text.replace(f'"{old}"', f'"{new}"').replace(f"\n{old} =", f'\n"{new}" =')
-    (folder / "it.urdf").write_text(urdf)
-    (folder / "mechanism.toml").write_text(text)
-    plant = linearize(load(str(folder / "mechanism.toml"))).to_statespace()
-    assert plant.name == "it_is"
-    assert plant.output_labels[:3] == ["x", "x_dot", "x_dot_2"]
-    coupled_four_bar(tmp_path, actuated="actuated = []")
-    with pytest.raises(InputError, match=r"coupled: no motors"):
-        linearize(load(str(tmp_path / "mechanism.toml"))).to_statespace()
-
-
-def test_where_q_is_no_chart_others_are() -> None:
-    """At the type 1 point of the five-bar, elbows coincident, det phi_z = 0 while J keeps its rank."""
-    mechanism, q_1 = load("five_bar"), float(np.arccos(0.1524 / 0.2794))
-    numbers = np.array([q_1, 1.0 - q_1, np.pi - q_1, 1.0 - (np.pi - q_1)])  # the tip any way up
-    at = mechanism.kinematics(numbers)
-    assert np.abs(at.phi).max() < 1e-12
-    assert at.margin() < 1e-9
-    model = linear_model(Terms(mechanism, at, np.zeros(4)), np.zeros(2), at="at a singular q")
-    assert model.states[:2] != mechanism.independent
-    assert np.all(np.isfinite(model.A))
-    assert "theta_1, theta_3 are no coordinates there" in model.notes[0]
-    # of eq. 1 by complex steps along the other coordinates
-    chart = [mechanism.coordinates.index(name) for name in model.states[:2]]
-    others = [k for k in range(4) if k not in chart]
-    J = FIVE_BAR.J(numbers)
-    T = np.zeros((4, 2))
-    T[chart] = np.eye(2)
-    T[others] = -np.linalg.solve(J[:, others], J[:, chart])
-
-    def acceleration(x: Array) -> Array:
-        return FIVE_BAR.acceleration_and_multipliers(numbers + T @ x[:2], np.zeros(4), x[2:])[0][chart]
-
-    slopes = complex_step(acceleration, np.zeros(4))
-    agree(model.A[2:, :2], slopes[:, :2], 1e-9)
-    agree(model.B[2:], slopes[:, 2:], 1e-9)
-    # where the elbows meet the tip may turn about them, and no motor holds it
-    with pytest.raises(InputError, match=r"cannot hold .* along theta_[24],"):
-        linearize(mechanism, dict(zip(mechanism.coordinates, numbers.tolist(), strict=True)))
-
-
-def test_a_singular_configuration_is_refused() -> None:
-    """Where J loses rank no linear model is that of the whole motion; of independent ones alone phi_z tells."""
-    mechanism = load("n_four_bar")
-    with pytest.raises(NumericalError, match="theta_0 = 0 is singular"):
-        linearize(mechanism, {"theta_0": 0.0})
-    with pytest.raises(NumericalError, match=r"J has lost rank.*take another configuration"):
-        linearize(mechanism, dict.fromkeys(mechanism.coordinates, 0.0))
-    state = Terms(mechanism, mechanism.kinematics(np.zeros(mechanism.n)), np.zeros(mechanism.n))
-    with pytest.raises(NumericalError, match="J has lost rank"):
-        linear_model(state, np.zeros(1), at="there")
-
-
-def test_a_fold_that_is_only_met_to_half_of_its_digits_is_refused(tmp_path: Path) -> None:
-    """At a dead centre the slider does not say how crank and rod stand."""
-    mechanism = _by_slider(tmp_path)
-    for off in (0.0, 1e-13):
-        with pytest.raises(NumericalError, match=r"slider = 0\.4 is singular.*crank, rod, slider"):
-            linearize(mechanism, {"slider": 0.4 - off})
-    assert linearize(mechanism, {"slider": 0.39}).states == ("slider", "slider_dot")
-
-
-def test_an_instant_of_a_run_is_its_state() -> None:
-    model = linearize("five_bar/tracking", 1.25)
-    run = simulate("five_bar/tracking", {"t_end": 1.25})
-    agree(model.q_tree, run.q_tree[-1])
-    agree(model.A, by_hand(run.q_tree[-1], run.v_tree[-1][[0, 2]], run.tau[-1])[0], 1e-9)
-    assert isinstance(model, LinearModel)
-    assert model.closed_loop is not None
-    assert np.linalg.eigvals(model.closed_loop).real.max() < 0
-
-
-def test_rows_that_others_imply_stay_so_where_the_loops_are_slightly_open() -> None:
-    """Bricard's six rows of rank five: a step off the closure makes them independent, by rounding."""
-    mechanism, random = load("bricard"), np.random.default_rng(4)
-    at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + 0.1).at
-    off = mechanism.kinematics(mechanism.tree.integrate(at.q_tree, 3e-9 * random.uniform(-1, 1, mechanism.n)))
-    v = at.rho @ random.uniform(-1, 1, mechanism.d)
-    closed, opened = (linear_model(Terms(mechanism, x, v), np.zeros(1), at="somewhere") for x in (at, off))
-    assert mechanism.redundant
-    agree(opened.C, closed.C, 1e-7)
-    agree(opened.D, closed.D, 1e-7)
-
-
-def _by_slider(folder: Path) -> Mechanism:
-    there = mechanism_file("slider_crank").parent
-    for file in there.iterdir():
-        text = file.read_text(encoding="utf-8").replace('independent = ["crank"]', 'independent = ["slider"]')
-        (folder / file.name).write_text(text, encoding="utf-8")
-    return load(folder / "mechanism.toml")
-
-
-def test_next_to_a_fold_of_one_freedom_another_coordinate_is_taken(tmp_path: Path) -> None:
-    """There a slider tells crank and rod by the square root of its digits: its A would be of size 1 / angle squared."""
-    by_crank, by_slider = load("slider_crank"), _by_slider(tmp_path)
-    for angle, chart in ((1e-3, "slider"), (1e-6, "rod")):
-        at = by_crank.kinematics(sigma(by_crank, np.array([angle])).at.q_tree)
-        other = Terms(by_slider, by_slider.kinematics(at.q_tree), np.zeros(by_slider.n))
-        model = linear_model(other, np.zeros(1), at="near the dead centre")
-        wanted = linear_model(Terms(by_crank, at, np.zeros(by_crank.n)), np.zeros(1), at="there")
-        assert model.states[0] == chart
-    agree(model.A, wanted.A, 1e-4)  # of the rod's angle, which is a multiple of the crank's there
