@@ -328,7 +328,9 @@ class Run(Shown):
         if path.is_dir():
             path = path / "run.npz"
         if not path.is_file():
-            raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one")
+            mode = path.parent / "mode_1.npz"  # a linear model's folder has one for each
+            where = f"; there is {mode}" if mode.is_file() else ""
+            raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one{where}")
         try:
             coordinates, arrays, meta = read_run(path)
         except InputError as error:

@@ -311,5 +311,8 @@ def test_an_array_that_asks_for_too_much_is_refused_before_it_is_made(saved: Pat
 def test_a_missing_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere: no such run file"):
         Run.load(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"run\.npz: no such run file"):
+    with pytest.raises(InputError, match=r"run\.npz: no such run file; ckc run SCENE --out DIR writes one$"):
+        Run.load(tmp_path)
+    (tmp_path / "mode_1.npz").touch()
+    with pytest.raises(InputError, match=r"run\.npz: no such run file; .*; there is .*/mode_1\.npz$"):
         Run.load(tmp_path)
