@@ -71,7 +71,8 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
 }
 
-// What holds gives way where nothing changes yet: at no time of its own.
+// What holds gives way where nothing changes yet: at no time of its own. Where a joint rests at its stop, and nothing holds
+// it there, that is when it does.
 std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) const {
   std::vector<System::Met> found;
   for (int k = 0; k < core_.n; ++k)
@@ -79,7 +80,11 @@ std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) c
   for (const Event& event : met) {
     const int k = event.coordinate;
     if (event.of == Event::q_dot) found.push_back({k, true});
-    if (event.of == Event::q && !is_into(k)) found.push_back({k, false, near_[k]});
+    if (event.of != Event::q || is_into(k)) continue;
+    if (!rests(k))
+      found.push_back({k, false, near_[k]});
+    else if (std::find(joints_.locked.begin(), joints_.locked.end(), k) == joints_.locked.end())
+      found.push_back({k, true});
   }
   return found;
 }
@@ -234,6 +239,7 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
         continue;
       }
       if (!hits(k)) arrived_.push_back({k, true});
+      if (!hits(k) && near_[k]) arrived_.push_back({k, false, near_[k]});
       joints_.touch[k] = 0;
       if (joints_.rubs_at(k)) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
     }

@@ -16,23 +16,27 @@ Vector Variation::delay(const System::Met& met, In v, In a, const Matrix& s) con
   return -from_stop(met, s) / core_.tree.coordinate_step(core_.q_tree, k, v);
 }
 
-// Bring the changes back to what the loops allow, by what is least in the metric of D': they drift within the tolerances,
-// and joints that move only together would come to rest at times of their own.
+// Bring the changes back to what loops and locked joints allow, by what is least in the metric of D': they
+// drift within the tolerances, and joints that move only together would come to rest at times of their own.
 bool Variation::tidy(In v, Matrix& s) {
   const int m = core_.rows.closure.rows;
   const Vector none = Vector::Zero(n), no_force = Vector::Zero(m);
+  const bool locked = !core_.joints.locked.empty();
   Matrix rate;
   compute(v, none, no_force, false);
   closure_changes(v, row_, rate);
   core_.tree_inertia(), core_.jacobian();
   force_.setZero();
   row_ += core_.rows.J * s.topRows(n);
-  if (!core_.respond(force_, row_, change_)) return false;
+  if (!core_.respond(force_, row_, change_) || (locked && !core_.responses(core_.joints.locked, responses_))) return false;
+  if (locked) add_back(change_);
   s.topRows(n) += change_;
   for (int k = 0; k < n; ++k) rate += derivatives_.rate_by_q.col(table_.real_v[k]) * s.row(k);
   row_ = rate + core_.rows.J * s.bottomRows(n);
   if (!core_.respond(force_, row_, change_)) return false;
-  s.bottomRows(n) += change_;
+  change_ += s.bottomRows(n);
+  if (locked) add_back(change_);
+  s.bottomRows(n) = change_;
   return true;
 }
 
@@ -65,12 +69,7 @@ std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, c
 // What sticks or touches from here on is brought to rest by what holds it, whenever it comes: a friction that could hold
 // more, or the last of ever smaller bounces, takes a time and a way that vanish with the rate it comes with.
 bool Variation::after_change(In v, In a, Matrix& s) {
-  if (!core_.joints.locked.empty()) {
-    if (!core_.responses(core_.joints.locked, responses_)) return false;
-    change_ = s.bottomRows(n);
-    add_back(change_);
-    s.bottomRows(n) = change_;
-  }
+  if (!tidy(v, s)) return false;
   s.topRows(n) -= v * delay_.transpose();
   s.bottomRows(n) -= a * delay_.transpose();
   return true;
