@@ -29,14 +29,9 @@ from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.cards import check_card
 from ckc_pin.simulation.initial import Start, find_start
 from ckc_pin.simulation.linear_report import stability_warning
-from ckc_pin.simulation.prepare import (
-    in_samples,
-    require_runnable,
-    scene_actuation,
-    scene_controller,
-    scene_mechanism,
-)
+from ckc_pin.simulation.runnable import require_runnable
 from ckc_pin.simulation.scene import CHANGES, SUFFIX, Scene, load_scene
+from ckc_pin.simulation.scene_parts import in_samples, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene_spec import TermsOf
 from ckc_pin.simulation.stability import Stability, stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired

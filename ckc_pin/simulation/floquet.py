@@ -21,9 +21,10 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.simulation.cards import floquet_card
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.prepare import prepare, scene_controller, scene_mechanism
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from ckc_pin.simulation.sensitivities import sensitivities
 from ckc_pin.simulation.simulate import Progress, simulate
 

@@ -30,10 +30,11 @@ from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.motion_forces import MotionForces, collected
-from ckc_pin.simulation.prepare import output_instants, scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.simulation.output_instants import output_instants
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.scene import CHANGES, Scene, as_scene, make_scene, with_changes
+from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.workspace import leaving
 
 __all__ = ["inverse_dynamics"]

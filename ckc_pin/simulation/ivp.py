@@ -42,8 +42,8 @@ from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene, as_scene
+from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller, scene_mechanism
 
 __all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
 

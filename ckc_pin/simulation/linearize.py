@@ -31,11 +31,11 @@ from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.linear_model import LinearModel, linear_model
-from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.recorded_joints import RecordedJoints
 from ckc_pin.simulation.resting import hold
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import CHANGES, Scene, load_scene, make_scene, with_changes
+from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.simulate import simulate
 
 __all__ = ["At", "linearize"]

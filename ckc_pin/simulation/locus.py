@@ -24,8 +24,8 @@ from ckc_pin.simulation.closed_loop import ClosedLoop
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.libraries import library_of
 from ckc_pin.simulation.modes import ComplexArray, eigenvalues_of
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 
 __all__ = ["GainLocus", "gain_locus"]
 

@@ -38,16 +38,7 @@ from ckc_pin.simulation.scene_parts import (
 )
 from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
 
-__all__ = [
-    "Prepared",
-    "in_samples",
-    "output_instants",
-    "prepare",
-    "require_runnable",
-    "scene_actuation",
-    "scene_controller",
-    "scene_mechanism",
-]
+__all__ = ["Prepared", "prepare"]
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from ckc_pin.native import _core
 from ckc_pin.simulation.cards import simulator_card
 from ckc_pin.simulation.events import Event, events_met
 from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.prepare import prepare, scene_controller
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.simulation.scene_parts import scene_controller
 from ckc_pin.simulation.state import State
 from ckc_pin.simulation.stops import PAUSE, Stop, explain
 

@@ -20,9 +20,9 @@ import numpy as np
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene_parts import scene_mechanism
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.browser import open_in_browser
 from ckc_pin.view.camera import WORLD, extent_of_reach, surroundings

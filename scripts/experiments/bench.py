@@ -19,8 +19,9 @@ import numpy as np
 from ckc_pin import Simulator, Terms, load_scene, simulate
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.prepare import Prepared, prepare, scene_controller
+from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.scene import catalogue
+from ckc_pin.simulation.scene_parts import scene_controller
 from ckc_pin.simulation.simulate import run_prepared
 
 ROOT = Path(__file__).resolve().parents[2]

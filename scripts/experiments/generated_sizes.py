@@ -20,8 +20,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.generated.code import Code
 from ckc_pin.generated.library import Library, compiled
 from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.prepare import prepare, scene_mechanism
+from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.scene_parts import scene_mechanism
 from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, written
 
 __all__ = ["NAMES", "Size", "main", "measure"]

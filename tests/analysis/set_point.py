@@ -14,8 +14,8 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from tests.analytic.five_bar import FIVE_BAR, Array
 
 G = 9.81

@@ -23,7 +23,7 @@ from ckc_pin.analysis.precision.reference import Reference, confirm, find_refere
 from ckc_pin.analysis.precision.settings import settings
 from ckc_pin.formats.exporting import export
 from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.prepare import scene_mechanism
+from ckc_pin.simulation.scene_parts import scene_mechanism
 from tests.analysis.swing_table import START, pendulum, write_table
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close

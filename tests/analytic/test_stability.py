@@ -14,8 +14,8 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.simulation.closed_loop import ClosedLoop
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import scene_names
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from ckc_pin.simulation.stability import stability
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step, set_point
 

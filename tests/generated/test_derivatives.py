@@ -17,7 +17,8 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.native.plant import Plant
 from ckc_pin.simulation.linear_model import linear_model
-from ckc_pin.simulation.prepare import prepare, scene_mechanism
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene_parts import scene_mechanism
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 
 EQUAL = 1e-11  # relative

@@ -13,7 +13,8 @@ import pytest
 
 from ckc_pin import InputError, check, load, load_scene, simulate
 from ckc_pin.generated import library
-from ckc_pin.simulation.prepare import prepare, scene_mechanism
+from ckc_pin.simulation.prepare import prepare
+from ckc_pin.simulation.scene_parts import scene_mechanism
 from ckc_pin.simulation.simulate import run_prepared
 from scripts.experiments.benchmark.growth import Case, written
 from scripts.experiments.generated_sizes import ring

@@ -17,7 +17,7 @@ from scipy.special import mathieu_a
 from ckc_pin import InputError, load_scene
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.simulation.floquet import floquet
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from tests.sensitivity.sliders import sliders
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0

@@ -21,8 +21,8 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.many import evaluate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
 __all__ = ["Wanted", "add_path", "read_wanted"]

@@ -13,8 +13,8 @@ from ckc_pin.errors import InputError
 from ckc_pin.generated.library import compiled
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.prepare import scene_mechanism
 from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.simulation.scene_parts import scene_mechanism
 
 __all__ = ["WORKS", "Budget", "Work"]
 

@@ -15,9 +15,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.prepare import scene_controller, scene_mechanism
 from ckc_pin.simulation.run import Run
 from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
 from ckc_pin.simulation.simulate import simulate
 from ckc_pin.simulation.workspace import follow_desired
 from scripts.experiments.chart import BLACK, COLOURS, chart, save

@@ -14,8 +14,8 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.ivp import LevelSet
-from ckc_pin.simulation.prepare import scene_controller
 from ckc_pin.simulation.scene import load_scene
+from ckc_pin.simulation.scene_parts import scene_controller
 from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, march

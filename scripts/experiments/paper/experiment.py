@@ -24,8 +24,8 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.initial import find_start
 from ckc_pin.simulation.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
-from ckc_pin.simulation.prepare import scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene import Scene
+from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller, scene_mechanism
 
 __all__ = [
     "W0",
