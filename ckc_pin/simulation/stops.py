@@ -22,6 +22,8 @@ TROUBLES = {
     "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
     "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
     "vague": "phi_z is so nearly singular that the other coordinates are not known as exactly as solver.rtol asks",
+    "pole": "what is wanted of the motors passes through infinity, and they jump from limit to limit: how the "
+    "parameters move that instant is not known",
     "shares": "motors at their limits do not reach what is wanted of them together, and how they share what they do "
     "has no known derivative",
     "infinite": "its state or its right-hand side is not finite",

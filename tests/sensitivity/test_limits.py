@@ -67,3 +67,14 @@ def test_of_a_dependent_joints_motor_at_its_limit(formulation: str, terms: str, 
         wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
         assert np.abs(wanted).max() > 1e-4, name
         assert np.abs(ours[:, :, k] - wanted).max() <= CLOSE * np.abs(wanted).max(), name
+
+
+def test_a_torque_that_passes_through_infinity_has_no_derivative() -> None:
+    """The DAE goes on where the controller's q stops to be a chart: what is wanted changes its sign there at once."""
+    scene = "tests/sensitivity/loops/torque_pole"
+    tau = simulate(scene, {"solver.output_dt": 1e-3}).tau
+    assert np.abs(np.diff(tau, axis=0)).max() == pytest.approx(2 * np.abs(tau).max())  # from limit to limit
+    found = sensitivities(scene, ["motor.mot_a1.torque_limit"])
+    assert found.run.status == "stopped"
+    assert found.run.t[-1] == pytest.approx(0.7218, abs=1e-3)
+    assert "what is wanted of the motors passes through infinity, and they jump from limit" in found.run.message

@@ -22,7 +22,7 @@ namespace {
 using Rows = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 constexpr const char* changes[] = {"sticks", "slides", "touches", "leaves", "bounces"};
-constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague", "shares"};
+constexpr const char* troubles[] = {"none", "open", "rank", "infinite", "control", "vague", "shares", "pole"};
 constexpr const char* methods[] = {"DOP853", "RK45", "Radau"};
 
 std::unique_ptr<System> system_of(Core& core, Control& control, const nb::dict& table) {

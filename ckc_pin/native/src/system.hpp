@@ -23,6 +23,7 @@ enum class Trouble {
   control,   // a controller has no u
   vague,     // z is not known to the tolerance
   shares,    // how motors at their limits share what they do not reach has no known derivative
+  pole,      // a motor goes from its limit to the other one at once: what is wanted of it passes through infinity
 };
 
 // What becomes of an accepted state.

@@ -80,6 +80,7 @@ void Variation::balance(Matrix& q, Matrix& effort, Matrix& stiffness) {
 bool Variation::start(In v, Matrix& s) {
   written = general = 0;
   waiting_.clear(), held_.resize(0, 0);
+  at_pole_ = false, limits_.clear();
   const Vector here = core_.q_tree, none = Vector::Zero(n), no_force = Vector::Zero(core_.rows.closure.rows);
   s.setZero(2 * n, count);
   compensated_.setZero(core_.d, count);
@@ -122,12 +123,14 @@ bool Variation::start(In v, Matrix& s) {
 bool Variation::what_acts(In v) {
   Joints& joints = core_.joints;
   const Control& control = system_.control;
-  answers_ = control.feedback() || joints.acts();
+  answers_ = control.feedback() || joints.acts(), at_pole_ = false;
   clipped_.resize(0, 0);
   if (!answers_ && !control.acts()) {
     acting_ = control.u_tree;
   } else {
     if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_)) return false;
+    for (size_t k = 0; k < limits_.size(); ++k) at_pole_ |= limits_[k] * limit(static_cast<int>(k)) < 0;
+    if (at_pole_) return false;
     if (control.acts() && control.clipped.any) answers_ = true, clipped_efforts(v);
   }
   if (joints.acts()) {
@@ -137,6 +140,17 @@ bool Variation::what_acts(In v) {
   }
   for (size_t i = 0; i < joints.locked.size(); ++i) acting_(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
   return true;
+}
+
+int Variation::limit(int motor) const {
+  const Control& control = system_.control;
+  return control.limited(motor) ? (control.tau(motor) > 0.0 ? 1 : -1) : 0;
+}
+
+void Variation::accept() {
+  const Control& control = system_.control;
+  limits_.resize(control.acts() && control.feedback() ? static_cast<size_t>(control.tau.size()) : 0);
+  for (size_t k = 0; k < limits_.size(); ++k) limits_[k] = limit(static_cast<int>(k));
 }
 
 // What acts, where it answers to the state.

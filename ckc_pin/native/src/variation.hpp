@@ -75,6 +75,10 @@ class Variation {
   // The same at any state where the terms are written out with their changes; false where they are not, or lose digits.
   bool is_written() const;
   bool written_rates(In q_tree, In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot);
+  // Whether rates were false because a motor has gone from its limit to the other one since the last state that was
+  // accepted. A shorter step tells whether it is between them in between.
+  bool at_pole() const { return at_pole_; }
+  void accept();
   // The same where nothing varies but the start, by eq. 1's derivatives.
   void rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const;
   // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
@@ -95,6 +99,7 @@ class Variation {
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
   void move(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const;  // the places' part of the rates
   void begin_written();
+  int limit(int motor) const;  // that it is at, as in `limits_`
   void direction(const Eigen::Ref<const Matrix>& s, int p, bool acts, Out to);
   bool what_acts(In v);  // acting_, and its slopes where it answers_
   void add_answer(const Eigen::Ref<const Matrix>& s);  // to force_
@@ -133,6 +138,8 @@ class Variation {
     int first, count;
     Matrix directions, changes;
   };
+  bool at_pole_ = false;
+  Indices limits_;  // by motor: which it was at when a state was accepted last, -1, 1, or 0 for none
   std::vector<Along> along_;
   std::vector<Indices> groups_;  // by parameter, of the numbers that the code takes
   struct Gain {

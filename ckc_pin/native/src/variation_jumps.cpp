@@ -69,6 +69,7 @@ std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, c
 // What sticks or touches from here on is brought to rest by what holds it, whenever it comes: a friction that could hold
 // more, or the last of ever smaller bounces, takes a time and a way that vanish with the rate it comes with.
 bool Variation::after_change(In v, In a, Matrix& s) {
+  limits_.clear();  // a velocity that jumps may be answered by other torques at once
   if (!tidy(v, s)) return false;
   s.topRows(n) -= v * delay_.transpose();
   s.bottomRows(n) -= a * delay_.transpose();

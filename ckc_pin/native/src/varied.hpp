@@ -50,6 +50,7 @@ class Varied : public Base, public WithVariation {
     take(y);
     if (!rates(t, y, y_dot)) {
       const Control& control = this->control;
+      if (variation_.at_pole()) return this->fails(Trouble::pole);
       return this->fails(control.clipped.any && control.redundant() ? Trouble::shares : Trouble::infinite);
     }
     s_dot = s_dot_;
@@ -60,7 +61,10 @@ class Varied : public Base, public WithVariation {
   bool at_start(double t, In y) override { return Base::at_start(t, y.head(size_)); }
   bool at_last(double t, In y) override { return Base::at_last(t, y.head(size_)); }
   bool place(In y) override { return Base::place(y.head(size_)); }
-  Accepted accept(double t, Out y, double margin) override { return Base::accept(t, y.head(size_), margin); }
+  Accepted accept(double t, Out y, double margin) override {
+    variation_.accept();
+    return Base::accept(t, y.head(size_), margin);
+  }
   bool own_partition(double t, Out y, bool& changed) override { return Base::own_partition(t, y.head(size_), changed); }
   bool modes(In y, Matrix& jacobian) override { return Base::modes(y.head(size_), jacobian); }
   bool tree_acceleration(In f, Out a) const override { return Base::tree_acceleration(f.head(size_), a); }
