@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
     from ckc_pin.simulation.simulate import simulate
     from ckc_pin.simulation.simulator import Simulator
-    from ckc_pin.simulation.stability import Stability
+    from ckc_pin.simulation.stability_result import Stability
     from ckc_pin.simulation.state import State
     from ckc_pin.view.inline import Figures, Playback
     from ckc_pin.view.server import ViewServer

@@ -15,7 +15,7 @@ from ckc_pin.simulation.scene import Scene, load_scene
 from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
 from ckc_pin.simulation.simulate import simulate
 from ckc_pin.simulation.simulator import Simulator
-from ckc_pin.simulation.stability import Stability
+from ckc_pin.simulation.stability_result import Stability
 from ckc_pin.simulation.state import State
 
 __all__ = [

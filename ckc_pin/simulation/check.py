@@ -33,7 +33,8 @@ from ckc_pin.simulation.runnable import require_runnable
 from ckc_pin.simulation.scene import CHANGES, SUFFIX, Scene, load_scene
 from ckc_pin.simulation.scene_parts import in_samples, scene_actuation, scene_controller, scene_mechanism
 from ckc_pin.simulation.scene_spec import TermsOf
-from ckc_pin.simulation.stability import Stability, stability
+from ckc_pin.simulation.stability import stability
+from ckc_pin.simulation.stability_result import Stability
 from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
 
 __all__ = ["Check", "check", "names_a_scene", "run_warnings"]

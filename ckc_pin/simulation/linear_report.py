@@ -11,7 +11,7 @@ import numpy as np
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.simulation.linear_model import LinearModel, eigenvalues_of
-from ckc_pin.simulation.stability import Stability
+from ckc_pin.simulation.stability_result import Stability
 
 if TYPE_CHECKING:
     from rich.text import Text

@@ -16,7 +16,7 @@ from ckc_pin.simulation.stability_result import Stability
 from ckc_pin.simulation.tracking_stability import tracking_stability
 from ckc_pin.simulation.within_limits import LoopWithinLimits
 
-__all__ = ["Stability", "stability"]
+__all__ = ["stability"]
 
 
 def stability(
