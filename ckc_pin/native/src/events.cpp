@@ -168,12 +168,21 @@ bool Events::sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride
   return true;
 }
 
+// Of a coordinate or a rate, where both ends of the step are known: it begins on the side where the last one ended, unless
+// an impact has taken a rate over its value.
+bool Events::goes_on(int k) const {
+  const Event& event = events_[k];
+  const double here = (event.of == Event::q ? start_.q : start_.v)(event.coordinate) - event.value;
+  return event.sign * here * signs_[k] > 0.0;
+}
+
 bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   halt = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
   wanted_.clear(), sampled_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k)
-    if (active_[k] && !(silent && !events_[k].own) && !(signs_[k] && (ruled_out(events_[k]) || holds_by_far(k))))
+    if (active_[k] && !(silent && !events_[k].own) &&
+        !(signs_[k] && ((ruled_out(events_[k]) && goes_on(k)) || holds_by_far(k))))
       wanted_.push_back(k);
   if (!wanted_.empty()) {
     const bool locked = std::any_of(wanted_.begin(), wanted_.end(), [&](int k) { return events_[k].of == Event::holding; });

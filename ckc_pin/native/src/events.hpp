@@ -82,6 +82,7 @@ class Events {
   };
   // How closed the loops are where an event is looked at.
   enum Closed { only_y, as_y_is, exactly };
+  bool goes_on(int k) const;
   bool ruled_out(const Event& event) const;
   bool holds_by_far(int k);
   // At y_: a coordinate or a rate from y alone where y shows it, what holds with the loops as open as y has them.
