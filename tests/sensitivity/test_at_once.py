@@ -185,3 +185,20 @@ def test_a_start_at_an_equilibrium_beside_others_is_refused(tmp_path: Path) -> N
     changes = {"initial": {"at": "equilibrium"}, "parameters": {"gravity": [0.0, 0.0, 0.0]}, "t_end": 0.1}
     with pytest.raises(NumericalError, match="an equilibrium beside which there are others"):
         sensitivities("five_bar/swing", ["link.link_2.mass"], changes)
+
+
+EVENT = '[[event]]\nof = "q_dot"\ncoordinate = "x"\nvalue = 0.2\nstop = true\n'
+
+
+def test_a_rate_that_an_impact_takes_over_its_value_comes_there_with_it(tmp_path: Path) -> None:
+    """At the stop at once, also where nothing happens in the step from there; with what makes the impact come later."""
+    x, v, stop, pull = 0.25, 1.5, 1.0, -0.8
+    for constant in (0.0, pull):
+        more = joint("x", restitution=0.6) + (force("x", constant) if constant else "")
+        scene = sliders(tmp_path / str(constant), more, q=(x, 0.0), q_dot=(v, 0.0), upper=stop, scene=EVENT)
+        found = sensitivities(scene, ["initial.q.x", "initial.q_dot.x", "joint.x.restitution"], TIGHT)
+        a = constant / 1.3
+        t = (stop - x) / v if not a else (-v + np.sqrt(v**2 + 2 * a * (stop - x))) / a
+        assert found.run.t[-1] == pytest.approx(t, abs=1e-11)
+        assert "by the event" in found.run.message
+        assert found.end_time == pytest.approx(np.array([-1.0, -t, 0.0]) / (v + a * t), abs=1e-9)

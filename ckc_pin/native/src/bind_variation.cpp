@@ -38,11 +38,13 @@ WithVariation& varied(Run& run) {
 // The changes of (q', v') at the present state, a column a parameter.
 Matrix changes(Run& run) { return varied(run).changes(run.loop->y()); }
 
-// How much later with each parameter a coordinate, or its rate, comes to where it is now; none where it rests.
+// How much later with each parameter a coordinate, or its rate, comes to where it is now; none where it rests. A rate that
+// an impact has taken over its value just now comes there when that does.
 nb::object delays(Run& run, int coordinate, bool of_rate) {
   Loop& loop = *run.loop;
   WithVariation& system = varied(run);
   require_indices({coordinate}, run.core->n, "coordinate");
+  if (of_rate && system.impact_at == loop.t()) return nb::cast(system.variation().delay());
   Vector a(run.core->n);
   if (!loop.settle_core() || !loop.system->acceleration(loop.t(), a)) return nb::none();
   const Vector found = system.variation().delay({coordinate, of_rate}, loop.system->velocity, a, system.changes(loop.y()));

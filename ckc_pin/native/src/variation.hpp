@@ -67,6 +67,7 @@ class Variation {
   long written = 0, general = 0;  // how often rates were found by the code that is written out, and by the tree
   // How much later with each parameter what is met comes, where the core moves with v and accelerates with a.
   Vector delay(const System::Met& met, In v, In a, const Matrix& s) const;
+  const Vector& delay() const { return delay_; }  // of the last change of joints
   // From a start in the independent coordinates; false where it is singular.
   bool start(In v, Matrix& s);
   // Of s at the core's state, where it moves with v and accelerates with a under what acts; false where what acts has no

@@ -16,6 +16,7 @@ class WithVariation {
   virtual Variation& variation() = 0;
   virtual Matrix changes(In y) const = 0;  // (2 n, parameters)
   std::optional<Apart> apart;  // why the motion has no derivative from here on
+  double impact_at = std::numeric_limits<double>::quiet_NaN();  // s, the last one: rates jumped when it came
 };
 
 template <class Base>
@@ -37,7 +38,7 @@ class Varied : public Base, public WithVariation {
 
   void start(double t, In q_tree, In v, In w, Out y) override {
     Base::start(t, q_tree, v, w, y.head(size_));
-    apart.reset();
+    apart.reset(), impact_at = std::numeric_limits<double>::quiet_NaN();
     this->core.set(q_tree);
     if (!variation_.start(v, s_)) s_.setConstant(2 * variation_.n, variation_.count, std::nan(""));
     put(y);
@@ -96,10 +97,11 @@ class Varied : public Base, public WithVariation {
   }
 
   bool before_change(double t, In y, const std::vector<System::Met>& met) override {
-    take(y), a_.resize(variation_.n), v_ = this->velocity;
+    take(y), a_.resize(variation_.n), v_ = this->velocity, changes_at_ = t;
     return this->acceleration(t, a_) && variation_.before_change(v_, a_, met, s_);
   }
   bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back) override {
+    impact_at = changes_at_;
     return variation_.at_impact(v_, step, at, responses, x, back, s_);
   }
   bool after_change(double t, Out y, const std::vector<System::Met>& arrived, double rtol, double atol) override {
@@ -152,6 +154,7 @@ class Varied : public Base, public WithVariation {
   Variation variation_;
   Matrix s_, s_dot_, block_, u_, tau_;
   Vector v_, a_;
+  double changes_at_ = 0.0;  // s: when joints do
 };
 
 }  // namespace ckc
