@@ -64,3 +64,17 @@ def test_what_has_come_to_rest_rests_with_every_parameter(rtol: float, more: lis
     assert found.run.status == "done"
     assert np.abs(found.run.v_tree[-1]).max() < 1e-12
     assert np.abs(found.v_tree[-1]).max() < 1e-12
+
+
+@pytest.mark.parametrize("rtol", [1.217382727739662e-08, 1.8464249428955427e-08, 3e-8])
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+def test_a_stop_that_a_joint_leaves_smoothly(rtol: float, formulation: str) -> None:
+    """By rounding it touches and leaves again at that instant, without a speed: that has no time of its own."""
+    changes = {"solver.rtol": rtol, "formulation": formulation}
+    name = "initial.q_dot.j0_1"
+    scene, start = f"{FOLDER}/left_smoothly", 0.4079220041557603
+    found = sensitivities(scene, [name], changes)
+    tight = {"solver.rtol": 1e-12, "formulation": formulation}
+    ahead, behind = (simulate(scene, {**tight, name: start + h}) for h in (1e-5, -1e-5))
+    wanted = np.concatenate([ahead.q_tree[-1] - behind.q_tree[-1], ahead.v_tree[-1] - behind.v_tree[-1]]) / 2e-5
+    assert np.abs(ends(found) - wanted).max() <= 1e-5 * np.abs(wanted).max()

@@ -50,6 +50,7 @@ bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, M
   delay_.setZero();
   if (!tidy(v, s)) return false;
   if (!met.empty()) delay_ = delay(*std::max_element(met.begin(), met.end(), later), v, a, s);
+  if (!delay_.allFinite()) delay_.setZero();  // what neither moves nor is moved has no time of its own
   s.topRows(n) += v * delay_.transpose();
   s.bottomRows(n) += a * delay_.transpose();
   return s.allFinite();
