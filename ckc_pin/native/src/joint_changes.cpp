@@ -17,6 +17,8 @@ constexpr double moves = 1e-12;     // of a joint's response without loops: they
 constexpr double negligible = 1e-6, rounded = 1e-8;  // of what friction alone would accelerate
 constexpr double exactly = 1e-9;    // of the largest acceleration: none
 
+static bool among(const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); }
+
 JointChanges::JointChanges(System& system, double rise, const Tolerance& tolerance)
     : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise), tolerance_(tolerance) {
   const int n = core_.n;
@@ -83,7 +85,7 @@ std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) c
     if (event.of != Event::q || is_into(k)) continue;
     if (!rests(k))
       found.push_back({k, false, near_[k]});
-    else if (std::find(joints_.locked.begin(), joints_.locked.end(), k) == joints_.locked.end())
+    else if (!among(joints_.locked, k))
       found.push_back({k, true});
   }
   return found;
@@ -238,15 +240,16 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
         locked.push_back(k);
         continue;
       }
-      if (!hits(k)) arrived_.push_back({k, true});
-      if (!hits(k) && near_[k]) arrived_.push_back({k, false, near_[k]});
+      if (!hits(k)) {
+        arrived_.push_back({k, true});
+        if (near_[k]) arrived_.push_back({k, false, near_[k]});
+      }
       joints_.touch[k] = 0;
       if (joints_.rubs_at(k)) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
     }
   }
   joints_.lock(locked, coordinates);
   joints_.idle.clear();
-  const auto among = [](const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); };
   for (int k = 0; k < core_.n; ++k) {
     const bool holds = among(locked, k);
     if (joints_.touch[k] && !touch[k]) arrived_.push_back({k, false, joints_.touch[k]});

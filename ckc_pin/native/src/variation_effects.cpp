@@ -152,7 +152,7 @@ void Variation::add_control(In q_tree, In v, Matrix& force) {
       if (of.kind == Effect::gear)
         force.col(p) -= control.tau(k) * of.numbers;
       else if (limited)
-        force.col(p) -= (control.tau(k) > 0.0 ? 1.0 : -1.0) * of.numbers;
+        force.col(p) -= limit(k) * of.numbers;
     }
   if (clipped)
     force.noalias() -= table_.turns.transpose() * clipped_;

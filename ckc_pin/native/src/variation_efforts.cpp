@@ -19,8 +19,7 @@ void Variation::efforts(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   for (int p = 0; p < count; ++p)
     for (const Effect& of : table_.parameters[p].effects) {
       if (of.kind == Effect::gear) geared_.col(p) += control.tau(of.index) * of.numbers;
-      if (of.kind == Effect::torque_limit && control.limited(of.index))
-        tau(of.index, p) += control.tau(of.index) > 0.0 ? 1.0 : -1.0;
+      if (of.kind == Effect::torque_limit) tau(of.index, p) += limit(of.index);
     }
   if (!torques) {
     if (!system_.control.slopes(core_, u_by_q_, u_by_v_, acting_)) {
