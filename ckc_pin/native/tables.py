@@ -102,6 +102,7 @@ def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
         "upper": joints.upper if acts else np.full(n, np.inf),
         "restitution": joints.restitution,
         "reach": mechanism.tree.reach,
+        "size": mechanism.size,
         "smoothing": smoothing or 0.0,
     }
 

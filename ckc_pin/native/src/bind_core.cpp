@@ -84,7 +84,8 @@ namespace {
 
 JointTable joints_of(const nb::dict& table) {
   return {get<Vector>(table, "friction"),    get<Vector>(table, "lower"), get<Vector>(table, "upper"),
-          get<Vector>(table, "restitution"), get<Vector>(table, "reach"), get<double>(table, "smoothing")};
+          get<Vector>(table, "restitution"), get<Vector>(table, "reach"), get<double>(table, "size"),
+          get<double>(table, "smoothing")};
 }
 
 }  // namespace

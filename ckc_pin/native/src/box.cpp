@@ -1,5 +1,9 @@
 #include "box.hpp"
 
+#include <algorithm>
+#include <cmath>
+
+#include <Eigen/QR>
 #include <proxsuite/proxqp/dense/dense.hpp>
 
 namespace ckc {
@@ -9,6 +13,7 @@ namespace qp = proxsuite::proxqp;
 constexpr double exactly = 1e-12;  // of the program, whose numbers are about one
 constexpr double far = 1e8;        // a bound that is never met
 constexpr long most_iterations = 10000;
+constexpr double parallel = 1e-12;  // of a direction whose rows are about one: it does not move along
 
 bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   const auto n = A.rows();
@@ -25,6 +30,55 @@ bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   program.solve();
   x = program.results.x.cwiseMax(lower).cwiseMin(upper);
   return program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED && x.allFinite();
+}
+
+// A linear program in (x, s), at most a few unknowns, from the feasible point x = 0 by an active-set method: go along the
+// working set's null space while s grows, then leave the row with the first negative multiplier (Bland's rule).
+double largest_slack(const Matrix& N, In y, In lower, In upper) {
+  constexpr double infinity = std::numeric_limits<double>::infinity();
+  const Eigen::Index m = N.rows(), size = N.cols() + 1;
+  Matrix rows(2 * m, size);  // rows (x, s) <= limits
+  Vector limits(2 * m);
+  Eigen::Index count = 0;
+  for (Eigen::Index i = 0; i < m; ++i) {
+    if (std::isfinite(upper(i))) rows.row(count) << N.row(i), 1.0, limits(count++) = upper(i) - y(i);
+    if (std::isfinite(lower(i))) rows.row(count) << -N.row(i), 1.0, limits(count++) = y(i) - lower(i);
+  }
+  if (!count) return infinity;
+  Vector point = Vector::Zero(size);
+  Eigen::Index first;
+  point(size - 1) = limits.head(count).minCoeff(&first);
+  std::vector<Eigen::Index> working{first};
+  const Vector objective = Vector::Unit(size, size - 1);
+  const long most = 50 * (count + size);
+  for (long k = 0; k < most; ++k) {
+    Matrix active(size, static_cast<Eigen::Index>(working.size()));
+    for (size_t i = 0; i < working.size(); ++i) active.col(static_cast<Eigen::Index>(i)) = rows.row(working[i]).transpose();
+    const Eigen::ColPivHouseholderQR<Matrix> qr(active);
+    const Vector multipliers = qr.solve(objective);
+    const Vector direction = objective - active * multipliers;
+    if (direction.norm() <= parallel) {
+      size_t leaving = working.size();
+      for (size_t i = 0; i < working.size(); ++i)
+        if (multipliers(static_cast<Eigen::Index>(i)) < -parallel && (leaving == working.size() || working[i] < working[leaving]))
+          leaving = i;
+      if (leaving == working.size()) break;
+      working.erase(working.begin() + static_cast<std::ptrdiff_t>(leaving));
+      continue;
+    }
+    double step = infinity;
+    Eigen::Index blocking = -1;
+    for (Eigen::Index i = 0; i < count; ++i) {
+      const double rate = rows.row(i).dot(direction);
+      if (!(rate > parallel) || std::find(working.begin(), working.end(), i) != working.end()) continue;
+      const double room = std::max(limits(i) - rows.row(i).dot(point), 0.0) / rate;
+      if (room < step) step = room, blocking = i;
+    }
+    if (blocking < 0) return infinity;
+    point += step * direction;
+    working.push_back(blocking);
+  }
+  return point(size - 1);
 }
 
 }  // namespace ckc

@@ -116,6 +116,10 @@ class Core {
   bool eq_1(In force, In correction, Out a);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
   bool responses(const Indices& at, Matrix& columns);
+  // What rounding may make of the accelerations of these coordinates, where the tree accelerates by `a` under `force`.
+  void acceleration_rounding(const Indices& at, const Matrix& columns, In force, In a, Vector& bound);
+  // How far what holds the locked joints is from giving way, after `eq_1`.
+  double holding_margin() { return joints.margin(rounding_); }
   // How the terms change at the core's state, where the tree accelerates under u'; false where nothing tells J^T lambda.
   bool differentiate(In u_tree, In acceleration);
   Derivatives derivatives;
@@ -163,6 +167,7 @@ class Core {
   Eigen::CompleteOrthogonalDecomposition<Matrix> transposed_;
   Matrix square_, by_state_, by_u_, change_, responses_;
   Definite square_factor_;
+  Vector rounding_, effort_bound_;
   Vector turned_, negative_, moved_, small_, small_b_, effort_, lambda_;
 };
 

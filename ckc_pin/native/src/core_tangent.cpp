@@ -11,6 +11,8 @@ namespace ckc {
 constexpr double singular = 1e-12, weak = 1e-3;
 // Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
 constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
+// Of the forces: what rounding makes of them on the way to an acceleration.
+constexpr double acceleration_digits = 1e-14;
 
 // tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
 bool Core::basis_by_partition() {
@@ -172,8 +174,23 @@ bool Core::eq_1(In force, In correction, Out a) {
   if (!dae_acceleration(force, correction, a)) return false;
   if (joints.locked.empty()) return true;
   if (!responses(joints.locked, responses_)) return false;
+  acceleration_rounding(joints.locked, responses_, force, a, rounding_);
   joints.hold(responses_, a);
   return true;
+}
+
+// Generalized forces are rounded as the largest parts that cancel in them: those that would accelerate a joint's own
+// inertia as the fastest coordinate accelerates, as gravity does, or as the velocities turn the bodies.
+void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In force, In a, Vector& bound) {
+  const Vector& reach = joints.table.reach;
+  const double fastest = v_tree.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+  const double pace = std::max({a.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(), fastest * fastest,
+                                tree.field().head<3>().norm() / joints.table.size});
+  const Matrix& D = D_tree();
+  effort_bound_ = force.cwiseAbs();
+  for (int k = 0; k < n; ++k) effort_bound_(k) += D(k, k) * reach(k) * pace;
+  bound.noalias() = columns.cwiseAbs().transpose() * effort_bound_;
+  bound *= joints.patience * acceleration_digits;
 }
 
 bool Core::responses(const Indices& at, Matrix& columns) {

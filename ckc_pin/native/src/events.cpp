@@ -73,8 +73,8 @@ void Events::take_end(End& end, In f) {
 }
 
 double Events::holding() const {
-  Joints& joints = system_.core.joints;
-  return joints.locked.empty() ? std::numeric_limits<double>::quiet_NaN() : joints.margin();
+  Core& core = system_.core;
+  return core.joints.locked.empty() ? std::numeric_limits<double>::quiet_NaN() : core.holding_margin();
 }
 
 void Events::begun() {
@@ -137,7 +137,7 @@ bool Events::value_there(int k, double t, double& gap) {
       break;
     case Event::holding:
       if (!system_.acceleration(t, coordinates_)) return false;
-      gap = core.joints.margin();
+      gap = core.holding_margin();
   }
   gap *= event.sign;
   if (std::isfinite(gap)) return true;

@@ -7,6 +7,7 @@
 #include <Eigen/Eigenvalues>
 
 #include "box.hpp"
+#include "impact.hpp"
 
 namespace ckc {
 
@@ -119,67 +120,65 @@ void JointChanges::scale(const Indices& at) {
     for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
 }
 
-// The velocity nearest to the one before, in the metric of D', that leads no joint into a stop, and off it at
-// `restitution` times the speed it came with. As each lost v'^T D' v' / 2 is (1 - e) of something positive, energy falls.
+// What happens at the stops that joints are at, in the order in which it happens there (impact.hpp). Joints that touch are
+// in it too: what pushes them is an impact. Friction is bounded and has no impulse, so that joints that stick are let go.
 bool JointChanges::impact(double t, Out y) {
   Indices at;
-  bool into = false;
+  bool any = false;
   for (int k = 0; k < core_.n; ++k)
-    if (near_[k]) {
-      at.push_back(k);
-      into |= is_into(k);
-      if (is_into(k)) arrived_.push_back({k, false, near_[k]});
-    }
-  if (!into) return true;
+    if (near_[k]) at.push_back(k), any |= is_into(k);
+  if (!any) return true;
   if (!system_.acceleration(t, held_)) return false;
   joints_.locked.clear();
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
   if (!system_.acceleration(t, a_) || !movable(at)) return false;
-  // Back to the stop, by what holds others before or without it: a bounce that either way rises no further is none.
-  const auto returning = [&](int k) { return std::max(near_[k] * a_(k), near_[k] * held_(k)); };
   const auto m = static_cast<Eigen::Index>(at.size());
   if (!m) return joints_.touch = touched, true;
-  scale(at);
-  b_.resize(m), low_.setConstant(m, -infinity), high_.setConstant(m, infinity);
-  Vector back(m);  // speeds off the stops
+  const Vector& reach = joints_.table.reach;
+  // Back to the stop, by what holds others before or without it: a bounce that either way rises no further is none.
+  const auto returning = [&](int k) { return std::max(near_[k] * a_(k), near_[k] * held_(k)); };
+  const double fastest = v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+  ImpactProblem problem;
+  problem.A.resize(m, m), problem.g.resize(m), problem.restitution.resize(m), problem.at_rest.resize(m), problem.slow.resize(m);
   for (Eigen::Index i = 0; i < m; ++i) {
-    const int k = at[i], side = near_[k];
-    const double speed = std::max(side * v_(k), 0.0), after = joints_.table.restitution(k) * speed;
-    const double towards = returning(k), rise = towards > 0.0 ? after * after / (2 * towards) : infinity;
-    back(i) = rise > rise_ * joints_.table.reach(k) ? after : 0.0;
-    if (towards > 0.0 && back(i) > 0.0) flight = std::min(flight, 2 * after / towards);
-    b_(i) = scale_(i) * (v_(k) + side * back(i));
-    (side < 0 ? low_ : high_)(i) = 0.0;  // a stop pushes
+    const int k = at[i], side = -near_[k];
+    problem.g(i) = side * v_(k);
+    problem.restitution(i) = joints_.table.restitution(k);
+    problem.at_rest(i) = std::isfinite(rest_(k)) ? rest_(k) : rounding * fastest * reach(k);
+    problem.slow(i) = std::sqrt(2 * std::max(returning(k), 0.0) * rise_ * reach(k));
+    for (Eigen::Index j = 0; j < m; ++j) problem.A(i, j) = side * -near_[at[j]] * responses_(k, j);
   }
-  const double size = b_.lpNorm<Eigen::Infinity>();
-  if (!least_in_box(A_, b_ / size, low_, high_, x_)) return false;
-  step_.setZero();
-  double change = 0.0;
-  for (Eigen::Index i = 0; i < m; ++i) {
-    x_(i) *= scale_(i) * size;  // an impulse
-    step_ += x_(i) * responses_.col(i);
-  }
+  std::vector<char> is_hit(at.size(), 0);
+  Vector step = Vector::Zero(core_.n);
+  const auto apply = [&](const Vector& impulses, double restitution) {
+    step_.setZero(), x_.resize(m);
+    for (Eigen::Index i = 0; i < m; ++i) {
+      const int k = at[i];
+      x_(i) = -near_[k] * impulses(i);
+      step_ += x_(i) * responses_.col(i);
+      if (impulses(i) > 0.0 && !is_hit[i] && !touched[k]) arrived_.push_back({k, false, near_[k]});
+      is_hit[i] |= impulses(i) > 0.0;
+    }
+    step += step_;
+    return system_.at_impact(step_, at, responses_, x_, restitution);
+  };
+  Impact impact;
+  if (!resolve_impact(problem, apply, impact)) return false;
+  joints_.impact_loss += impact.energy_loss;
+  const Vector before = v_;
+  system_.push(y, step);
+  if (!take_state(t, y)) return false;
+  rest_ = 10 * rounding * std::max(fastest, step.cwiseQuotient(reach).lpNorm<Eigen::Infinity>()) * reach;
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = at[i];
-    // who is pushed off a stop by what happens at another one, or comes to rest at it
-    const double off = -near_[k] * (v_(k) + step_(k)), towards = returning(k);
-    const bool slow = towards > 0.0 && off * off / (2 * towards) <= rise_ * joints_.table.reach(k);
-    if (slow || off <= exactly * std::max(std::abs(v_(k)), std::abs(step_(k)))) joints_.touch[k] = near_[k];
-    change += x_(i) * (v_(k) + 0.5 * step_(k));
-  }
-  joints_.impact_loss -= change;
-  if (!system_.at_impact(step_, at, responses_, x_, back)) return false;
-  const Vector before = v_;
-  system_.push(y, step_);
-  if (!take_state(t, y)) return false;
-  const Vector& reach = joints_.table.reach;
-  const double fastest = std::max(before.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(),
-                                  step_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>());
-  rest_ = 10 * rounding * fastest * reach;
-  for (int k : at) {
-    if (joints_.touch[k]) rest_(k) = infinity;
-    if (joints_.touch[k] && !touched[k]) note(t, k, JointChange::touches, near_[k]);
-    if (!joints_.touch[k]) note(t, k, touched[k] ? JointChange::leaves : JointChange::bounces, near_[k]);
+    const double towards = returning(k), off = impact.g(i);
+    if (off == 0.0) {
+      joints_.touch[k] = near_[k], rest_(k) = infinity;
+      if (!touched[k]) note(t, k, JointChange::touches, near_[k]);
+    } else if (is_hit[i]) {
+      note(t, k, touched[k] ? JointChange::leaves : JointChange::bounces, near_[k]);
+      if (towards > 0.0) flight = std::min(flight, 2 * off / towards);
+    }
     near_[k] = joints_.touch[k];
   }
   return true;
@@ -217,14 +216,18 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
     for (Eigen::Index i = 0; i < m; ++i) b_(i) = scale_(i) * a_(at[i]);
     double most = 0.0;  // that friction alone would accelerate
     for (Eigen::Index i = 0; i < m; ++i) most = std::max(most, joints_.table.friction(at[i]) / scale_(i));
-    const double size = std::max({b_.lpNorm<Eigen::Infinity>(), negligible * most, 1e-300});
+    // What rounding makes of the accelerations keeps whatever is held.
+    core_.acceleration_rounding(at, responses_, system_.acting(v_), a_, rounding_);
+    rounding_ = rounding_.cwiseProduct(scale_);
+    const double size = std::max({b_.lpNorm<Eigen::Infinity>(), negligible * most, rounding_.maxCoeff(), 1e-300});
     const double weaker = slips_ ? gives : 0.0;
     b_ /= size;
     // Rows that follow from others have accelerations that do, but for rounding, unless they do so here alone.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
     for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k) {
       const double beyond = eigen.eigenvectors().col(k).dot(b_);
-      if (std::abs(beyond) <= std::max(exactly, rounded * most / size)) b_ -= beyond * eigen.eigenvectors().col(k);
+      if (std::abs(beyond) <= std::max({exactly, rounded * most / size, rounding_.norm() / size}))
+        b_ -= beyond * eigen.eigenvectors().col(k);
     }
     for (Eigen::Index i = 0; i < m; ++i) {
       const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
@@ -236,7 +239,7 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
     for (Eigen::Index i = 0; i < m; ++i) {
       const int k = at[i];
       const double room = row(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);  // or it: one of them is zero
-      if (!(std::abs(row(i)) > std::max(exactly, room))) {
+      if (!(std::abs(row(i)) > std::max({exactly, room, rounding_(i) / size}))) {
         locked.push_back(k);
         continue;
       }

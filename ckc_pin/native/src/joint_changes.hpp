@@ -45,7 +45,7 @@ class JointChanges {
   std::vector<System::Met> arrived_;  // what is as it is now because it has come there now
   bool slips_ = false;  // what holds has given way
   Matrix responses_, A_;
-  Vector b_, low_, high_, scale_, x_;
+  Vector b_, low_, high_, scale_, x_, rounding_;
 };
 
 }  // namespace ckc

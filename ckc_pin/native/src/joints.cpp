@@ -3,12 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
-#include <Eigen/LU>
+#include "box.hpp"
 
 namespace ckc {
 
-constexpr double still = 1e-11;      // of a motion that the rows allow: a joint does not take part in it
-constexpr long most_ways = 20000;    // of slipping that are compared
+constexpr double hysteresis = 4.0;  // times the rounding error of a decision: what may be wrong until the next one
 
 Joints::Joints(JointTable table_, int n)
     : table(std::move(table_)),
@@ -104,55 +103,28 @@ void Joints::hold(const Matrix& responses, Out a) {
   for (int k : locked) a(k) = 0.0;  // what is left is rounding
 }
 
-// The rows hold as long as along every motion that they allow to begin, the forces that are needed do less work than
-// those that there are at most. The work left is concave along each edge of the cone where the same joints move the same
-// way, so that it is least on one of its extreme motions, along which all but as few of them rest as can be.
-double Joints::margin() {
+// By how much the forces stay within their bounds, at best: where the joints are held in more than one way, forces that
+// cancel each other may be added. Bounds are widened by what rounding may make of the forces.
+double Joints::margin(In rounding) {
   const Eigen::Index m = root_.rows(), rank = root_.cols();
+  const Matrix inverse_root = eigen_.eigenvalues().tail(rank).cwiseSqrt().cwiseInverse().asDiagonal() *
+                              eigen_.eigenvectors().rightCols(rank).transpose();
+  const Matrix inverse = inverse_root.transpose() * inverse_root;
+  const Vector scaled = hysteresis * (inverse.cwiseAbs() * scale_.cwiseProduct(rounding));
+  Vector force(m), low(m), high(m);  // each measured in what it takes to move its own joint
+  for (Eigen::Index i = 0; i < m; ++i) {
+    force(i) = force_(i) / scale_(i);
+    low(i) = lower_force(locked[i]) / scale_(i) - scaled(i);
+    high(i) = upper_force(locked[i]) / scale_(i) + scaled(i);
+  }
   double least = infinite;
-  if (rank == m) {  // each joint can move alone
-    const Matrix inverse = eigen_.eigenvalues().cwiseSqrt().cwiseInverse().asDiagonal() * eigen_.eigenvectors().transpose();
-    for (Eigen::Index i = 0; i < m; ++i) {
-      const double room = std::min(force_(i) - lower_force(locked[i]), upper_force(locked[i]) - force_(i));
-      least = std::min(least, room / (scale_(i) * inverse.col(i).norm()));
-    }
+  if (rank == m) {
+    for (Eigen::Index i = 0; i < m; ++i)
+      least = std::min(least, std::min(force(i) - low(i), high(i) - force(i)) / inverse_root.col(i).norm());
     return least;
   }
-  std::vector<Eigen::Index> rest(rank - 1);
-  for (Eigen::Index i = 0; i < rank - 1; ++i) rest[i] = i;
-  Matrix rows(rank - 1, rank);
-  Vector direction(rank);
-  for (long ways = 0; ways < most_ways; ++ways) {
-    if (rank == 1) {
-      direction(0) = 1.0;
-    } else {
-      for (Eigen::Index i = 0; i < rank - 1; ++i) rows.row(i) = root_.row(rest[i]);
-      const Eigen::FullPivLU<Matrix> lu(rows);
-      if (lu.rank() < rank - 1)
-        direction.setZero();
-      else
-        direction = lu.kernel().col(0).normalized();
-    }
-    if (!direction.isZero(0)) least = std::min({least, slack(direction), slack(-direction)});
-    Eigen::Index k = rank - 2;  // the next choice of joints that rest
-    while (k >= 0 && rest[k] == m - (rank - 1) + k) --k;
-    if (k < 0) break;
-    ++rest[k];
-    for (Eigen::Index j = k + 1; j < rank - 1; ++j) rest[j] = rest[j - 1] + 1;
-  }
+  least = largest_slack(eigen_.eigenvectors().leftCols(m - rank), force, low, high);
   return std::isfinite(least) ? least : 1.0;
-}
-
-double Joints::slack(In direction) const {
-  const Vector motion = root_ * direction;
-  double work = 0.0;
-  for (Eigen::Index i = 0; i < motion.size(); ++i) {
-    if (std::abs(motion(i)) <= still) continue;
-    const double most = motion(i) > 0 ? lower_force(locked[i]) : upper_force(locked[i]);
-    if (!std::isfinite(most)) return infinite;
-    work += (force_(i) - most) / scale_(i) * motion(i);
-  }
-  return work;
 }
 
 }  // namespace ckc

@@ -19,6 +19,7 @@ constexpr double dependent = 1e-10;  // eigenvalue of the rows' scaled A, of its
 struct JointTable {
   Vector friction, lower, upper, restitution;  // (n); infinite where there is no stop
   Vector reach;                                // (n): what a coordinate is measured in, one radian or the mechanism's size
+  double size = 1.0;                           // the mechanism's, m
   double smoothing = 0.0;                      // rate at which friction that is no event has grown to tanh 1, zero: none
 };
 
@@ -66,7 +67,9 @@ class Joints {
   // d force / d v of friction that is no event, (n).
   void add_slopes(In v, Out slopes) const;
   // How far the forces that `hold` found last are from not being enough: negative where none within their bounds are.
-  double margin();
+  // `rounding`: by locked coordinate, how wrong its acceleration may be.
+  double margin(In rounding);
+  double patience = 1.0;  // times the rounding error: more where joints change their mode again and again at an instant
   // What is to be added to a velocity, or a small displacement, so that x of the locked coordinates vanishes.
   void back(const Matrix& responses, In x, Out step);
 
@@ -79,7 +82,6 @@ class Joints {
   static constexpr double infinite = std::numeric_limits<double>::infinity();
   void factor(const Matrix& responses);
   void least_forces(const Matrix& responses, In x, Vector& force);
-  double slack(In direction) const;  // along a motion that the forces allow
   const bool smooth_;
   double rubbed_ = 0.0;
   Vector since_;  // (n): the coordinates where they were set

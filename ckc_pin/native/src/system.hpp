@@ -108,11 +108,11 @@ class System {
   // --- parameters (varied.hpp) ---
   // Of a coordinate, or of its rate: it comes to what it is; to a stop, -1 for the lower one, that moves with parameters.
   struct Met { int coordinate; bool of_rate; int stop = 0; };
-  // Where joints change what they do, at y where the core is: what comes there at a time of its own; an impact, that adds
-  // `step` to the velocities, by impulses `x` on the coordinates `at`, whose speeds it turns round by `back`; and what has
+  // Where joints change what they do, at y where the core is: what comes there at a time of its own; a round of an
+  // impact, that adds `step` to the velocities by impulses `x` on the coordinates `at`, with a restitution; and what has
   // come to be as it is at that time, to a tolerance. False where that time is not one for all of them.
   virtual bool before_change(double, In, const std::vector<Met>&) { return true; }
-  virtual bool at_impact(In, const Indices&, const Matrix&, In, In) { return true; }
+  virtual bool at_impact(In, const Indices&, const Matrix&, In, double) { return true; }
   virtual bool after_change(double, Out, const std::vector<Met>&, double, double) { return true; }
   // A controller has looked at y, where the core is, or what it found has come to act; false where that is not known.
   // Whether from here on rates of y are others.

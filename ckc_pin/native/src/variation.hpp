@@ -91,7 +91,7 @@ class Variation {
   bool holds() const { return held_.size() && !held_.isZero(0.0); }
   // Where joints change what they do: as the system's. In between s is of the instant that comes with the parameters.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
-  bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s);
+  bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, double restitution, Matrix& s);
   bool after_change(In v, In a, Matrix& s);
   // Of what has come to be as it is, the first with which parameter it has not, if there is one.
   std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol) const;

@@ -78,7 +78,7 @@ bool Variation::after_change(In v, In a, Matrix& s) {
 }
 
 // D' step = J^T mu + x, J step = 0, and the speeds that x turns round go on in that proportion.
-bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, In back, Matrix& s) {
+bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, double restitution, Matrix& s) {
   const int m = core_.rows.closure.rows;
   const Vector none = Vector::Zero(n);
   Vector lambda = Vector::Zero(m), lacking(n);
@@ -104,12 +104,11 @@ bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& respon
     const int k = at[pushed[i]];
     columns.col(i) = responses.col(pushed[i]);
     for (Eigen::Index j = 0; j < few; ++j) A(i, j) = responses(k, pushed[j]);
-    const double again = back(pushed[i]) > 0.0 ? core_.joints.table.restitution(k) : 0.0;
     const double side = x(pushed[i]) > 0.0 ? 1.0 : -1.0;  // off the stop
-    wanted.row(i) = -(1.0 + again) * s.row(n + k) - change_.row(k);
+    wanted.row(i) = -(1.0 + restitution) * s.row(n + k) - change_.row(k);
     for (int p = 0; p < count; ++p)
       for (const Effect& of : table_.parameters[p].effects)
-        if (of.kind == Effect::restitution && of.index == k) wanted(i, p) += side * std::max(-side * v(k), 0.0);
+        if (of.kind == Effect::restitution && of.index == k && restitution == core_.joints.table.restitution(k)) wanted(i, p) += side * std::max(-side * v(k), 0.0);
   }
   s.bottomRows(n) += change_ + columns * A.completeOrthogonalDecomposition().solve(wanted);
   return s.allFinite();

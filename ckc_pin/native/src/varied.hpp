@@ -100,9 +100,11 @@ class Varied : public Base, public WithVariation {
     take(y), a_.resize(variation_.n), v_ = this->velocity, changes_at_ = t;
     return this->acceleration(t, a_) && variation_.before_change(v_, a_, met, s_);
   }
-  bool at_impact(In step, const Indices& at, const Matrix& responses, In x, In back) override {
+  bool at_impact(In step, const Indices& at, const Matrix& responses, In x, double restitution) override {
     impact_at = changes_at_;
-    return variation_.at_impact(v_, step, at, responses, x, back, s_);
+    if (!variation_.at_impact(v_, step, at, responses, x, restitution, s_)) return false;
+    v_ += step;
+    return true;
   }
   bool after_change(double t, Out y, const std::vector<System::Met>& arrived, double rtol, double atol) override {
     apart = variation_.apart(arrived, s_, rtol, atol);

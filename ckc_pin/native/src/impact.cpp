@@ -1,0 +1,138 @@
+#include "impact.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include <Eigen/Eigenvalues>
+
+#include "box.hpp"
+#include "joints.hpp"
+
+namespace ckc {
+
+// Only an elastic body between two others whose masses differ by more than a factor of 1e7, and a jammed mechanism, need
+// more rounds. The projection on the cone of all stops ends these.
+constexpr long max_rounds = 10000;
+
+constexpr double same = 1e-10;  // relative difference of gap velocities
+
+namespace {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+
+// Gap velocities in units in which A has a unit diagonal: all about the square root of an energy.
+class Rounds {
+ public:
+  Rounds(const ImpactProblem& problem, const ImpactRound& apply, Impact& impact)
+      : problem_(problem), apply_(apply), impact_(impact), m_(problem.g.size()) {
+    scale_ = problem.A.diagonal().cwiseSqrt().cwiseInverse();
+    A_ = scale_.asDiagonal() * problem.A * scale_.asDiagonal();
+    g_ = scale_.cwiseProduct(problem.g);
+    at_rest_ = scale_.cwiseProduct(problem.at_rest);
+    slow_ = scale_.cwiseProduct(problem.slow).cwiseMax(at_rest_);
+    impulses_.setZero(m_);
+    if (m_ > 1) project_on_range();
+  }
+
+  bool run() {
+    while (impact_.rounds < max_rounds) {
+      const double restitution = choose_stops();
+      if (stops_.empty()) break;
+      if (!reflect(restitution)) return false;
+    }
+    if (!end()) return false;
+    impact_.g = g_.cwiseQuotient(scale_);
+    return true;
+  }
+
+ private:
+  // Gap velocities of stops that imply each other agree only up to how exactly the loops are closed.
+  void project_on_range() {
+    const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
+    const auto& values = eigen.eigenvalues();
+    for (Eigen::Index k = 0; k < m_ && values(k) <= dependent * values(m_ - 1); ++k)
+      g_ -= eigen.eigenvectors().col(k).dot(g_) * eigen.eigenvectors().col(k);
+  }
+
+  double restitution_of(Eigen::Index i) const {
+    const double e = problem_.restitution(i);
+    return -e * g_(i) > slow_(i) ? e : 0.0;
+  }
+
+  // Those that approach with the smallest restitution; in a plastic round those that rest as well.
+  double choose_stops() {
+    stops_.clear();
+    double restitution = infinity;
+    for (Eigen::Index i = 0; i < m_; ++i)
+      if (g_(i) < -at_rest_(i)) restitution = std::min(restitution, restitution_of(i));
+    if (restitution == infinity) return restitution;
+    for (Eigen::Index i = 0; i < m_; ++i)
+      if (g_(i) < -at_rest_(i) ? restitution_of(i) == restitution : restitution == 0.0 && g_(i) <= at_rest_(i))
+        stops_.push_back(static_cast<int>(i));
+    low_.setZero(static_cast<Eigen::Index>(stops_.size()));
+    return restitution;
+  }
+
+  // A round at `stops_`, whose impulses are at least `low_`.
+  bool reflect(double restitution) {
+    const auto count = static_cast<Eigen::Index>(stops_.size());
+    Matrix A(count, count);
+    Vector g(count), impulses, high = Vector::Constant(count, infinity);
+    for (Eigen::Index i = 0; i < count; ++i) {
+      g(i) = g_(stops_[i]);
+      for (Eigen::Index j = 0; j < count; ++j) A(i, j) = A_(stops_[i], stops_[j]);
+    }
+    const double size = g.lpNorm<Eigen::Infinity>();
+    if (!least_in_box(A, g / size, low_, high, impulses)) return false;
+    impulses *= size;
+    impact_.energy_loss += 0.5 * (1.0 - restitution * restitution) * impulses.dot(A * impulses);
+    impulses_.setZero();
+    for (Eigen::Index i = 0; i < count; ++i) {
+      const double impulse = (1.0 + restitution) * impulses(i);
+      g_ += impulse * A_.col(stops_[i]);
+      impulses_(stops_[i]) = impulse * scale_(stops_[i]);
+    }
+    for (Eigen::Index i = 0; i < count; ++i) {  // exact where rounding alone makes the difference
+      const double reflected = -restitution * g(i);
+      if (std::abs(g_(stops_[i]) - reflected) <= same * size) g_(stops_[i]) = reflected;
+    }
+    ++impact_.rounds;
+    return apply_(impulses_, restitution);
+  }
+
+  // What still approaches is stopped, and bounces that would not rise are taken away, by a projection on one cone.
+  bool end() {
+    for (int attempt = 0; attempt < 3; ++attempt) {
+      stops_.clear();
+      bool any = false;
+      for (Eigen::Index i = 0; i < m_; ++i) stops_.push_back(static_cast<int>(i));
+      low_.setZero(m_);
+      for (Eigen::Index i = 0; i < m_; ++i) {
+        any |= g_(i) < -at_rest_(i) || (g_(i) > at_rest_(i) && g_(i) <= slow_(i));
+        if (g_(i) > at_rest_(i) && g_(i) <= slow_(i)) low_(i) = -infinity;
+      }
+      if (!any) break;
+      if (!reflect(0.0)) return false;
+    }
+    for (Eigen::Index i = 0; i < m_; ++i)
+      if (g_(i) <= at_rest_(i)) g_(i) = 0.0;
+    return true;
+  }
+
+  const ImpactProblem& problem_;
+  const ImpactRound& apply_;
+  Impact& impact_;
+  const Eigen::Index m_;
+  Matrix A_;
+  Vector scale_, g_, at_rest_, slow_, low_, impulses_;
+  Indices stops_;
+};
+
+}  // namespace
+
+bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Impact& impact) {
+  impact = {};
+  return Rounds(problem, round, impact).run();
+}
+
+}  // namespace ckc
