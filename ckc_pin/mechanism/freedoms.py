@@ -11,9 +11,11 @@ from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
 from ckc_pin.mechanism.shared import Shared
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.mechanism.tree import Array, BoolArray, IntArray, Tree
 
 __all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
+
+IMMOBILE = 1e-9  # of a motion of size one: what a coordinate that cannot move takes part in it
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Freedoms(Shared):
         J has a smaller rank at the assembled configuration itself.
     redundant : tuple of (loop, row)
         Rows that the others imply, one admissible choice.
+    immobile : (n,) bool array
+        Coordinates that the loops hold still, here and nearby.
     dependent : (rank,) int array or None
         The best-conditioned choice of z; None when it would split a free root.
     jacobian : (rows, n) array
@@ -41,6 +45,7 @@ class Freedoms(Shared):
     rank: RankReport
     singular: bool
     redundant: tuple[tuple[str, str], ...]
+    immobile: BoolArray
     dependent: IntArray | None
     jacobian: Array
     warnings: tuple[str, ...]
@@ -61,11 +66,17 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     """
     jacobian = _scaled_at(tree, closure, q_tree)
     here = there = rank_of(jacobian)
-    for other in nearby(np.linalg.svd(jacobian, full_matrices=True)[2][here.rank :]):
+    jacobians = [(here.rank, jacobian)]
+    for other in nearby(_directions(jacobian)[here.rank :]):
         candidate = _scaled_at(tree, closure, other)
         report = rank_of(candidate)
+        jacobians.append((report.rank, candidate))
         if report.rank > there.rank:
             there, jacobian = report, candidate
+    immobile = np.full(tree.n, len(jacobians) > 1 or there.rank == tree.n)
+    for rank, candidate in jacobians:
+        if rank == there.rank:
+            immobile &= np.linalg.norm(_directions(candidate)[rank:], axis=0) <= IMMOBILE
     warnings: list[str] = []
     if there.rank > here.rank:
         warnings.append(
@@ -82,6 +93,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
         d=tree.n - there.rank,
         rank=there,
         singular=there.rank > here.rank,
+        immobile=immobile,
         redundant=tuple(closure.names[k] for k in redundant_rows(jacobian, there.rank)),
         dependent=choose_dependent(jacobian, there.rank, blocks),
         jacobian=jacobian,
@@ -112,6 +124,11 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequenc
         motion = np.abs(tangent @ direction)
         names.append(tree.coordinates[int(np.argmax(motion))])
     return list(dict.fromkeys(names))
+
+
+def _directions(jacobian: Array) -> Array:
+    """Right singular vectors of J as rows, the motions that it allows last, (n, n)."""
+    return np.linalg.svd(jacobian, full_matrices=True)[2]
 
 
 def _scaled_at(tree: Tree, closure: Closure, q_tree: Array) -> Array:

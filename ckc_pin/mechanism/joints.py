@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -72,6 +73,14 @@ class Joints:
         model.armature, model.damping, model.friction = armature, damping, self.friction
         self.stopped = np.isfinite(self.lower) | np.isfinite(self.upper)
         self.warnings = _open_limits(tree, (np.isfinite(lower) | np.isfinite(upper)) & ~self.stopped)
+
+    def without(self, immobile: BoolArray) -> Joints:
+        """Return the joints without friction and stops where loops hold them still, shape (n,): they do nothing there."""
+        joints = copy(self)
+        joints.friction = np.where(immobile, 0.0, self.friction)
+        joints.lower, joints.upper = np.where(immobile, -np.inf, self.lower), np.where(immobile, np.inf, self.upper)
+        joints.stopped = self.stopped & ~immobile
+        return joints
 
     def has_events(self, smoothing: float | None) -> bool:
         """Whether joints stick or touch, friction being smoothed or not (None)."""

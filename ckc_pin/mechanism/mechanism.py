@@ -82,6 +82,7 @@ class Mechanism(Shown):
         self.d, self.rank = freedoms.d, freedoms.rank.rank
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
+        self._free_joints()
         self._split(linkage.motors)
         self._actuate(linkage.motors)
 
@@ -165,6 +166,15 @@ class Mechanism(Shown):
         return self.tree.vector(values, names, what, fill)
 
     # --- construction ----------------------------------------------------------------------------
+
+    def _free_joints(self) -> None:
+        """Leave out friction and stops of joints that cannot move: rounding alone would decide what these do."""
+        idle = self.freedoms.immobile & (self.joints.stopped | (self.joints.friction != 0.0))
+        if not idle.any():
+            return
+        self.joints = self.joints.without(idle)
+        names = ", ".join(self.coordinates[k] for k in np.flatnonzero(idle))
+        self.warnings.append(f"friction and stops do nothing where the loops hold a joint still: {names}")
 
     def _split(self, motors: Motors | None) -> None:
         """Choose q and z, or check the choice made."""

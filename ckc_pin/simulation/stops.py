@@ -15,6 +15,8 @@ from ckc_pin.simulation.scene_spec import SolverSpec
 __all__ = ["PAUSE", "Stop", "explain", "why_not_q"]
 
 PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
+INSTANT = 1e-8  # of the time, or s: changes of modes so close to each other are at one instant
+SMOOTHER = "a scene with friction_smoothing has no sticking, and a smaller solver.rtol may tell the joints apart"
 NEARLY = 1e-3  # of |J|: phi_z's least singular value below which a step that cannot be made is put down to it
 
 TROUBLES = {
@@ -72,10 +74,25 @@ def explain(
             )
         case "control":
             return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
-        case "joints":
+        case "chatter":
             return NumericalError(
-                "which joints stick, slide or touch from here on cannot be told: they change again and again at this "
-                "instant, the quadratic program that decides has no solution, or a stop was passed",
+                f"{_changing(loop, mechanism)} change between sticking, sliding and touching again and again at this "
+                f"instant{_held(loop, mechanism)}; {SMOOTHER}",
+                t=loop.t,
+                q_tree=where,
+            )
+        case "contact":
+            return NumericalError(
+                "no forces are found that hold the joints at their stops or at rest here"
+                f"{_held(loop, mechanism)}; {SMOOTHER}",
+                t=loop.t,
+                q_tree=where,
+            )
+        case "beyond_stop":
+            name = mechanism.coordinates[stop.event]
+            return NumericalError(
+                f"{name} has passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
+                "beyond the stop finds the impact",
                 t=loop.t,
                 q_tree=where,
             )
@@ -86,6 +103,23 @@ def explain(
     if not margin <= NEARLY:
         return NumericalError(reason, t=loop.t)
     return NumericalError(f"{why_not_q(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
+
+
+def _changing(loop: Any, mechanism: Mechanism) -> str:
+    """Name the joints whose mode changed last, at one instant."""
+    changes = loop.joint_changes()
+    names = [mechanism.coordinates[k] for t, k, *_ in changes if loop.t - t <= INSTANT * max(1.0, abs(loop.t))]
+    return ", ".join(dict.fromkeys(names)) or "joints"
+
+
+def _held(loop: Any, mechanism: Mechanism) -> str:
+    """Say which joints are held, with which force, and between which bounds that has to be."""
+    held = [
+        f"{mechanism.coordinates[k]} with {force:.6g} of {low:.6g} to {high:.6g} "
+        f"{'N' if mechanism.tree.in_metres[k] else 'N m'}"
+        for k, force, low, high in loop.held_joints()
+    ]
+    return f" (held are {', '.join(held)})" if held else ""
 
 
 def _rest(rhs: float) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.special import ellipk
 
 from ckc_pin import InputError, Run, load, simulate
@@ -121,10 +123,21 @@ def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
     assert run.dissipated is not None
     assert np.all(np.diff(run.dissipated) >= -1e-14)
     assert_close(run.energy + run.dissipated, np.full(len(run.t), 1.5), 1e-12)
-    # the stack meets the wall at t = 1: by the law of one impact, least change of velocity in the masses' metric
+    # the stack meets the wall at t = 1; gaps' rates are differences of the blocks' velocities
+    gaps = np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
     after = run.v_tree[run.t > 1.0][0]
-    assert after[0] >= 0.6 - 1e-12
-    assert np.all(after >= -1e-12)
+    assert_close(after, reflected(gaps @ gaps.T, np.array([-1.0, 0.0, 0.0]), 0.6), 1e-12)
+    assert np.all(after >= 0.0)
+
+
+def reflected(A: np.ndarray[Any, Any], g: np.ndarray[Any, Any], e: float) -> np.ndarray[Any, Any]:
+    """Rates of gaps after the approaching ones were reflected together, again and again, by Lawson and Hanson's NNLS."""
+    while np.any(g < -1e-13):
+        at = np.flatnonzero(g < -1e-13)
+        root = np.linalg.cholesky(A[np.ix_(at, at)])
+        impulses, _ = nnls(root.T, -np.linalg.solve(root, g[at]))
+        g = g + (1 + e) * A[:, at] @ impulses
+    return g
 
 
 def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
@@ -183,6 +196,6 @@ def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path) -
     run = simulate(tmp_path / "two.scene.toml")
     assert run.status == "done"
     assert run.q_tree[-1] == pytest.approx([-0.424, -0.518], abs=1e-9)
-    assert not run.v_tree[-1].any()
+    assert_close(run.v_tree[-1], [0.0, 0.0], 1e-30)
     times = np.array([event["t"] for event in run.events if event["name"].startswith("b ")])
     assert np.diff(times)[-3:] / np.diff(times)[-4:-1] == pytest.approx([0.3] * 3, rel=1e-2)

@@ -15,7 +15,8 @@ namespace ckc {
 using namespace nb::literals;
 
 const char* const reasons[] = {"end",  "event", "pause",   "rhs_budget", "wall_budget", "pace", "min_step", "step",
-                               "rank", "chart", "energy",  "control",    "function",    "output",   "joints", "raised"};
+                               "rank", "chart", "energy",  "control",    "function",    "output",   "chatter", "contact",
+                               "beyond_stop", "raised"};
 
 namespace {
 
@@ -219,6 +220,17 @@ nb::list joint_changes(const Run& run) {
   return found;
 }
 
+// The joints that are held: (coordinate, force, its least, its largest).
+nb::list held_joints(const Run& run) {
+  nb::list held;
+  const Joints& joints = run.core->joints;
+  for (size_t i = 0; i < joints.locked.size() && static_cast<Eigen::Index>(i) < joints.forces().size(); ++i) {
+    const int k = joints.locked[i];
+    held.append(nb::make_tuple(k, joints.forces()(static_cast<Eigen::Index>(i)), joints.lower_force(k), joints.upper_force(k)));
+  }
+  return held;
+}
+
 nb::dict profile(const Run& run) {
   nb::dict found;
   const Profile& profile = run.core->profile;
@@ -284,6 +296,7 @@ void bind_loop(nb::module_& m) {
       .def("stats", &stats)
       .def("met", &met)
       .def("joint_changes", &joint_changes)
+      .def("held_joints", &held_joints)
       .def("forget_met", [](Run& run) { run.loop->events.met.clear(), run.core->joints.changes.clear(); })
       .def("crossings", [](const Run& run) { return run.loop->crossings; })
       .def("profile", &profile)

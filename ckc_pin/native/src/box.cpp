@@ -40,10 +40,13 @@ double largest_slack(const Matrix& N, In y, In lower, In upper) {
   Matrix rows(2 * m, size);  // rows (x, s) <= limits
   Vector limits(2 * m);
   Eigen::Index count = 0;
-  for (Eigen::Index i = 0; i < m; ++i) {
-    if (std::isfinite(upper(i))) rows.row(count) << N.row(i), 1.0, limits(count++) = upper(i) - y(i);
-    if (std::isfinite(lower(i))) rows.row(count) << -N.row(i), 1.0, limits(count++) = y(i) - lower(i);
-  }
+  const auto limit = [&](Eigen::Index i, double side, double room) {
+    if (!std::isfinite(room)) return;
+    rows.row(count) << side * N.row(i), 1.0;
+    limits(count) = room;
+    ++count;
+  };
+  for (Eigen::Index i = 0; i < m; ++i) limit(i, 1.0, upper(i) - y(i)), limit(i, -1.0, y(i) - lower(i));
   if (!count) return infinity;
   Vector point = Vector::Zero(size);
   Eigen::Index first;

@@ -41,14 +41,14 @@ void Joints::add_slopes(In v, Out slopes) const {
   }
 }
 
-double Joints::passed(In q_tree, const Indices& at) const {
-  double most = 0.0;
-  if (stops)
-    for (size_t k = 0; k < at.size(); ++k) {
-      const double x = q_tree(at[k]);
-      most = std::max(most, std::max(table.lower(k) - x, x - table.upper(k)) / table.reach(k));
-    }
-  return most;
+int Joints::beyond_stop(In q_tree, const Indices& at, double tolerance) const {
+  if (!stops) return -1;
+  for (size_t k = 0; k < at.size(); ++k) {
+    const double x = q_tree(at[k]), off = std::max(table.lower(k) - x, x - table.upper(k));
+    if (off > tolerance * table.reach(k) && std::find(locked.begin(), locked.end(), static_cast<int>(k)) == locked.end())
+      return static_cast<int>(k);
+  }
+  return -1;
 }
 
 void Joints::account(In coordinates) { rubbed_ = dissipated(coordinates) - impact_loss, since_ = coordinates; }

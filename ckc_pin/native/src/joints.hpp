@@ -52,8 +52,10 @@ class Joints {
   void add_friction(In v, Out force) const;
   double lower_force(int k) const { return touch[k] > 0 ? -infinite : -table.friction(k); }
   double upper_force(int k) const { return touch[k] < 0 ? infinite : table.friction(k); }
-  // How far beyond a stop a joint is, by its reach; `place`: where coordinates stand in q'.
-  double passed(In q_tree, const Indices& place) const;
+  // The first joint that is further beyond its stop than `tolerance`, in radians or of the mechanism's size, or -1. Joints
+  // that are held are not: they drift within the integration's tolerance between the ends of a step. `at`: where
+  // coordinates stand in q'.
+  int beyond_stop(In q_tree, const Indices& at, double tolerance) const;
   double stop_at(int k, int side) const { return side < 0 ? table.lower(k) : table.upper(k); }
 
   void begin();

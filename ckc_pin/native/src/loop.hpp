@@ -38,11 +38,13 @@ struct Stop {
     control,      // a controller has no u
     function,     // an event's function has no finite value
     output,       // the state has no terms
-    joints,       // which joints slide, stick or touch cannot be told
+    chatter,      // joints change their mode again and again at one instant
+    contact,      // no contact forces or impulses are found there
+    beyond_stop,  // a joint has passed its stop: `which`
     raised,       // a caller's function did
   } why;
   double t = 0.0, value = 0.0;  // when; least singular value, right-hand sides, or what a function gave
-  int which = -1;               // whose function
+  int which = -1;               // whose function, or which coordinate
 };
 
 class Loop {

@@ -8,6 +8,10 @@ namespace ckc {
 
 constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
 constexpr long most_changes = 200;  // of joints at one instant
+// After so many changes at one instant, forces count as zero up to ever larger rounding errors, so that joints stay held:
+// up to 1e-7 of the forces.
+constexpr long impatient_changes = 10, patience_steps = 12;
+constexpr double patience_growth = 4.0;
 constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
 constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
 constexpr double longer = 1.5;      // times the bounce that follows: the step from there
@@ -23,9 +27,12 @@ std::optional<Stop> Loop::change_joints() {
   joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
   if (!joints_often_ && now.t > begin_.t) ++restarts_;
   joints_at_ = now.t;
-  if (joints_often_ > most_changes || !joint_changes_.decide(now.t, now.y, events.changing, within)) {
+  if (joints_often_ > most_changes) return Stop{Stop::chatter, now.t};
+  system->core.joints.patience =
+      std::pow(patience_growth, std::clamp<long>(joints_often_ - impatient_changes, 0, patience_steps));
+  if (!joint_changes_.decide(now.t, now.y, events.changing, within)) {
     const Stop stop = trouble();
-    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::joints, now.t} : stop;
+    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::contact, now.t} : stop;
   }
   events.monitor_joints(joint_changes_.coordinates, system->velocity);
   joints_known_ = true, begun_ = f_known_ = false;
@@ -41,7 +48,8 @@ std::optional<Stop> Loop::keep_joints() {
     if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
     if (changed) f_known_ = false;
   }
-  if (joints.passed(system->core.q_tree, system->core.tree.place) > passed) return Stop{Stop::joints, now.t};
+  const int beyond = joints.beyond_stop(system->core.q_tree, system->core.tree.place, passed);
+  if (beyond >= 0) return Stop{Stop::beyond_stop, now.t, 0.0, beyond};
   const double moving = stirs * system->velocity.lpNorm<Eigen::Infinity>();
   for (int k : joints.idle)
     if (std::abs(system->velocity(k)) > moving) return jump(), std::nullopt;
