@@ -11,6 +11,7 @@ namespace ckc {
 namespace qp = proxsuite::proxqp;
 
 constexpr double exactly = 1e-12;  // of the program, whose numbers are about one
+constexpr double accepted = 1e-11; // of the largest number of x: how far it may be from optimal
 constexpr double far = 1e8;        // a bound that is never met
 constexpr long most_iterations = 10000;
 constexpr double parallel = 1e-12;  // of a direction whose rows are about one: it does not move along
@@ -29,7 +30,11 @@ bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   program.init(A, cost, none, none, none, none, none, low, high);
   program.solve();
   x = program.results.x.cwiseMax(lower).cwiseMin(upper);
-  return program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED && x.allFinite();
+  if (program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED) return x.allFinite();
+  // Where A is badly conditioned x is large, and rounding alone leaves more than the solver is told to.
+  const Vector gradient = A * x + b;
+  const double off = (x - (x - gradient).cwiseMax(lower).cwiseMin(upper)).lpNorm<Eigen::Infinity>();
+  return off <= accepted * std::max(1.0, x.lpNorm<Eigen::Infinity>());
 }
 
 // A linear program in (x, s), at most a few unknowns, from the feasible point x = 0 by an active-set method: go along the

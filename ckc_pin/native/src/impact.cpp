@@ -59,7 +59,8 @@ class Rounds {
     return -e * g_(i) > slow_(i) ? e : 0.0;
   }
 
-  // Those that approach with the smallest restitution; in a plastic round those that rest as well.
+  // Those that approach with the smallest restitution, and of those that rest what does not bounce back when it is pushed:
+  // all of them in a round without restitution, else those that have none.
   double choose_stops() {
     stops_.clear();
     double restitution = infinity;
@@ -67,7 +68,8 @@ class Rounds {
       if (g_(i) < -at_rest_(i)) restitution = std::min(restitution, restitution_of(i));
     if (restitution == infinity) return restitution;
     for (Eigen::Index i = 0; i < m_; ++i)
-      if (g_(i) < -at_rest_(i) ? restitution_of(i) == restitution : restitution == 0.0 && g_(i) <= at_rest_(i))
+      if (g_(i) < -at_rest_(i) ? restitution_of(i) == restitution
+                               : g_(i) <= at_rest_(i) && (restitution == 0.0 || problem_.restitution(i) == 0.0))
         stops_.push_back(static_cast<int>(i));
     low_.setZero(static_cast<Eigen::Index>(stops_.size()));
     return restitution;

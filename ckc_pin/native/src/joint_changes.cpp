@@ -2,8 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
-#include <cstdlib>
 #include <utility>
 
 #include <Eigen/Eigenvalues>
@@ -177,7 +175,7 @@ bool JointChanges::impact(double t, Out y) {
     if (off == 0.0) {
       joints_.touch[k] = near_[k], rest_(k) = infinity;
       if (!touched[k]) note(t, k, JointChange::touches, near_[k]);
-    } else if (is_hit[i]) {
+    } else if (is_hit[i] || touched[k]) {
       note(t, k, touched[k] ? JointChange::leaves : JointChange::bounces, near_[k]);
       if (towards > 0.0) flight = std::min(flight, 2 * off / towards);
     }
@@ -238,11 +236,6 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
     }
     if (!least_in_box(A_, b_, low_, high_, x_)) return false;
     const Vector row = A_ * x_ + b_;  // accelerations
-    if (getenv("DBG")) {
-      fprintf(stderr, "t %.12g size %.3g slips %d weaker %g\n", t, size, slips_, weaker);
-      for (Eigen::Index i = 0; i < m; ++i) fprintf(stderr, "  k %d v %.3g x %.9g low %.9g high %.9g row %.3g b %.3g rounding %.3g near %d\n", at[i], v_(at[i]), x_(i), low_(i), high_(i), row(i), b_(i), rounding_(i)/size, near_[at[i]]);
-      Eigen::SelfAdjointEigenSolver<Matrix> es(A_); fprintf(stderr, "  eig"); for (Eigen::Index i = 0; i < m; ++i) fprintf(stderr, " %.3g", es.eigenvalues()(i)); fprintf(stderr, "\n");
-    }
     for (Eigen::Index i = 0; i < m; ++i) {
       const int k = at[i];
       const double room = row(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);  // or it: one of them is zero
@@ -269,7 +262,6 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
     if (holds && !among(before, k) && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
     if (joints_.rubs_at(k) && !joints_.sign[k] && !holds) joints_.idle.push_back(k);
   }
-  if (getenv("DBG") && !locked.empty()) { system_.acceleration(t, a_); fprintf(stderr, "  margin after %.3g\n", core_.holding_margin()); }
   bool changed;
   if (!locked.empty() && !system_.keep_locked(y, 0.0, changed)) return false;
   if (!take_state(t, y)) return false;
