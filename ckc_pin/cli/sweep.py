@@ -70,6 +70,8 @@ def sweep(
 
         laws_of(task, indices)  # before anything is run
     found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
+    if found.repairs:
+        errors().print(found.repairs)
     if found.status == "done":
         _afterwards(found, out, worst, figures)
         if indices is not None:
@@ -100,7 +102,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
     """Write which variable matters, a row an output and variable, and draw it."""
     from ckc_pin.mechanism.whole_file import write_whole
     from ckc_pin.simulation.ensembles.importance import importance
-    from ckc_pin.simulation.ensembles.store import array_name
+    from ckc_pin.simulation.ensembles.store_layout import array_name
 
     found = importance(task, count, threads)
     rows = ["output,variable,first_order,total_order"]

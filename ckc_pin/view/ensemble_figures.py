@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.simulation.ensembles.store import array_name, units_beside
+from ckc_pin.simulation.ensembles.store_layout import array_name, units_beside
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, say, write
 from ckc_pin.view.labels import plain, symbol, with_unit

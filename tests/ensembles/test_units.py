@@ -15,6 +15,7 @@ from ckc_pin.mechanism.parameters import values_of, with_components
 from ckc_pin.simulation.units import key_unit
 from ckc_pin.view import ensemble_figures
 from scripts.site import keys
+from tests.ensembles.test_damaged_results import convert_to_format_1
 
 URDF = Path(__file__).parents[2] / "urdf" / "slider_crank" / "slider_crank.urdf"
 MECHANISM = """
@@ -152,6 +153,7 @@ def test_variables_and_outputs_have_units_of_their_components(scene: Path, tmp_p
 def test_a_store_that_was_begun_without_units_is_gone_on_with(scene: Path, tmp_path: Path) -> None:
     whole = ensemble(scene, out=tmp_path).load()
     store = tmp_path / "results.zarr"
+    convert_to_format_1(store)
     for file in store.rglob("zarr.json"):
         data = json.loads(file.read_text())
         if file.parent.name not in ("time", store.name):  # these always had them

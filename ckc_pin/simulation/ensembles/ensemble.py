@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
@@ -46,6 +47,7 @@ class Summary:
     failed: int
     wall_s: float
     rate: float
+    repairs: str
     place: Any
     prepared: Members
 
@@ -109,6 +111,11 @@ def ensemble(
         The sweep or its scene cannot be run as written.
     KeyboardInterrupt
         Chunks that were finished are in `out`.
+
+    Warns
+    -----
+    UserWarning
+        Files in `out` were damaged or missing: which members were computed again, and why.
     """
     _require_tables(scene, variables, outputs, changes)
     _require_means(out, threads, workers, scheduler, chunk, progress)
@@ -131,6 +138,8 @@ def ensemble(
         task, None if out is None else Path(out), threads=threads, workers=workers, scheduler=scheduler, chunk=chunk,
         progress=progress,
     )  # fmt: skip
+    if summary.repairs:
+        warnings.warn(summary.repairs, stacklevel=2)
     if summary.status == "interrupted":
         raise KeyboardInterrupt(summary.message)
     if summary.status == "stopped":
@@ -225,7 +234,7 @@ def run_sweep(
     ran = before["pending"] - after["pending"]
     return Summary(
         status, message, count, after["done"], after["stopped"], after["failed"], wall_s, ran / wall_s if ran else 0.0,
-        store.place, members,
+        store.repairs, store.place, members,
     )  # fmt: skip
 
 

@@ -1,30 +1,47 @@
-"""Results on disk: a Zarr group that xarray opens, written chunk by chunk, each of them whole or not there."""
+"""Results on disk: a Zarr group that xarray opens, written chunk by chunk, each of them whole or not there.
+
+Every file has a checksum: a table in the group has those of the chunks, the group's attributes those of all other
+files. A store that is opened again is compared with them. Damaged chunks become pending, other damaged files are
+written again.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from hashlib import sha256
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.units import joined
+from ckc_pin.simulation.ensembles.checksums import ChunkChecksums, read_slices
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Chunk, Members
+from ckc_pin.simulation.ensembles.store_layout import (
+    FORMAT,
+    MESSAGE_NAME,
+    STATUS_NAME,
+    array_name,
+    array_names,
+    convert_files,
+    create_arrays,
+    create_store,
+    identify,
+    read_files_attributes,
+    read_store_attributes,
+    require_free_names,
+    restore_files,
+    set_store_attributes,
+)
 
-__all__ = ["RESULTS", "STAYS", "Store", "array_name", "require_libraries", "units_beside"]
+__all__ = ["RESULTS", "STAYS", "Store", "require_libraries"]
 
 RESULTS = "results.zarr"
-FORMAT = 1
 BLOCK = 2**20  # members whose status is read at once
-STATUS_NAME, MESSAGE_NAME = "status", "message"
+MAX_NAMED_CHUNKS = 3  # damaged chunks that one message names
 STAYS = "what is there stays, and the same command goes on from it"
-UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 
 def require_libraries() -> None:
@@ -55,30 +72,37 @@ class Store:
     Raises
     ------
     InputError
-        The store is of another sweep, is no store, or cannot be written.
+        The store is of another sweep, is no store, is damaged in a way that cannot be repaired, or cannot be written.
 
     Attributes
     ----------
     chunk : int
+    repairs : str
+        One line on what was damaged and is repaired or run again, empty where nothing was.
     """
 
     def __init__(self, path: Path | None, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
         self.path, self.count = path, count
-        _require_free_names(members)
-        sweep = json.loads(json.dumps(sweep))
-        self._identity = sha256(msgspec.json.encode(sweep, order="deterministic")).hexdigest()
-        if path is not None and path.exists():
-            self._group = self._open(path, sweep)
-            with suppress(OSError):  # begun before there were units; what cannot be written can still be read
-                _say_units(self._group, members)
+        require_free_names(members)
+        self._members, self._sweep = members, json.loads(json.dumps(sweep))
+        self.repairs = ""
+        self._checksums: ChunkChecksums | None = None
+        if path is None:
+            self._group, self.chunk = self._create_in_memory(min(chunk, count)), min(chunk, count)
+            return
+        if path.exists():
+            self._open(path)
         else:
-            self._group = self._begin(path, sweep, members, min(chunk, count))
-        self.chunk: int = self._group[STATUS_NAME].chunks[0]
+            self._begin(path, min(chunk, count))
 
     @property
     def place(self) -> Any:
         """What xarray opens."""
-        return self._group.store if self.path is None else self.path
+        if self._checksums is None:
+            return self._group.store
+        from ckc_pin.simulation.ensembles.verified_store import open_verified
+
+        return open_verified(self._checksums, read_files_attributes(self._checksums.path)["files"])
 
     def pending(self) -> Iterator[tuple[int, int]]:
         """Yield the chunks that are not there yet, as first and end of their members."""
@@ -100,7 +124,15 @@ class Store:
         status: Any = self._group[STATUS_NAME]
         step = self.chunk * max(1, BLOCK // self.chunk)
         for first in range(0, self.count, step):
-            yield first, status[first : first + step]
+            for part in read_slices(status, first, min(first + step, self.count), self.chunk):
+                yield first, part
+                first += len(part)
+
+    def _chunk_statuses(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield how the members of each chunk ended."""
+        for _, status in self._statuses():
+            for first in range(0, len(status), self.chunk):
+                yield status[first : first + self.chunk]
 
     def write(self, chunk: Chunk, names: tuple[str, ...]) -> None:
         """Write a chunk; how its members ended comes last, and says that it is whole.
@@ -119,118 +151,79 @@ class Store:
                 group[array_name(name)][at] = values
             if any(chunk.message):
                 group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
+            if self._checksums is not None:
+                self._checksums.write(chunk.first // self.chunk, chunk.status)
             group[STATUS_NAME][at] = chunk.status
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror or error}; {STAYS}") from None
 
-    def _begin(self, path: Path | None, sweep: Mapping[str, Any], members: Members, chunk: int) -> Any:
-        """Make a store beside where it will be, so that it is there whole or not at all."""
+    def _create_in_memory(self, chunk: int) -> Any:
         import zarr
         from zarr.storage import MemoryStore
 
-        if path is None:
-            group = zarr.open_group(MemoryStore(), mode="w", zarr_format=3)
-            self._make(group, sweep, members, chunk)
-            return group
+        group = zarr.open_group(MemoryStore(), mode="w", zarr_format=3)
+        create_arrays(group, self._members, self.count, chunk)
+        set_store_attributes(group, self._sweep)
+        return group
+
+    def _create(self, chunk: int) -> Callable[[Path], None]:
+        """Return the function that creates this store in a folder."""
+        return lambda folder: create_store(folder, self._sweep, self._members, self.count, chunk)
+
+    def _begin(self, path: Path, chunk: int) -> None:
+        """Create a store beside where it will be, so that it is there whole or not at all."""
         begun = path.with_name(f"{path.name}.begun")
         try:
-            self._make(zarr.open_group(begun, mode="w", zarr_format=3), sweep, members, chunk)
+            self._create(chunk)(begun)
             begun.replace(path)
-            return zarr.open_group(path, mode="r+", zarr_format=3)
         except OSError as error:
             rmtree(begun, ignore_errors=True)
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        self._use(path)
 
-    def _open(self, path: Path, sweep: Mapping[str, Any]) -> Any:
-        import zarr
-
-        try:
-            group = zarr.open_group(path, mode="r+", zarr_format=3)
-            attributes = dict(group.attrs)
-        except Exception as error:  # whatever a damaged store makes Zarr raise
-            raise InputError(
-                f"{path}: no results of a sweep ({type(error).__name__}); remove it, or choose another DIR"
-            ) from None
-        if attributes.get("format") != FORMAT or "identity" not in attributes:
-            raise InputError(f"{path}: not begun as results of a sweep; remove it, or choose another DIR")
-        if attributes["identity"] != self._identity:
-            other = json.loads(str(attributes["sweep"]))
-            differs = [key for key in sweep if other.get(key) != sweep[key]]
+    def _open(self, path: Path) -> None:
+        """Open a store that is there, and repair it."""
+        attributes = read_store_attributes(path)
+        if attributes["identity"] != identify(self._sweep):
+            other = json.loads(attributes["sweep"])
+            differs = [key for key in self._sweep if other.get(key) != self._sweep[key]]
             raise InputError(
                 f"{path}: results of another sweep: {', '.join(differs) or 'its content'} differ; choose another "
                 "DIR, or remove it"
             )
-        return group
+        try:
+            if attributes["format"] == FORMAT:
+                found = read_files_attributes(path)
+                restored = restore_files(path, self._create(found["chunk"]), found["files"])
+                checksums = self._use(path)
+                self._repair(checksums, restored, checksums.find_damage(self._chunk_statuses()))
+            else:
+                finish = convert_files(path, self._create)
+                checksums = self._use(path)
+                self._repair(checksums, [], checksums.adopt(self._chunk_statuses()))
+                finish()
+        except OSError as error:
+            raise InputError(f"{path}: is damaged and cannot be written: {error.strerror or error}") from None
 
-    def _make(self, group: Any, sweep: Mapping[str, Any], members: Members, chunk: int) -> None:
-        labels = {name: found for name, found in members.outputs.labels.items() if _is_used(name, members)}
-        for name, found in labels.items():
-            place = group.create_array(name, shape=(len(found),), dtype=str, dimension_names=(name,))
-            place[:] = np.array(found, dtype=np.dtypes.StringDType())
-        if _is_used("time", members):
-            place = group.create_array(
-                "time", shape=(len(members.instants),), dtype="f8", dimension_names=("time",), attributes={"units": "s"}
-            )
-            place[:] = members.instants
-        every = dict.fromkeys(members.names, ((), ())) | members.shapes
-        for name, (dims, shape) in every.items():
-            group.create_array(
-                array_name(name), shape=(self.count, *shape), chunks=(chunk, *shape), dtype="f8", fill_value=np.nan,
-                dimension_names=("member", *dims), attributes={"is": "variable" if name in members.names else "output"},
-            )  # fmt: skip
-        group.create_array(
-            MESSAGE_NAME, shape=(self.count,), chunks=(chunk,), dtype=str, dimension_names=("member",), fill_value=""
-        )
-        _say_units(group, members)
-        flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
-        group.create_array(
-            STATUS_NAME, shape=(self.count,), chunks=(chunk,), dtype="u1", dimension_names=("member",),
-            fill_value=PENDING, attributes=flags,
-        )  # fmt: skip
-        group.attrs.update(
-            {"format": FORMAT, "units": UNITS, "sweep": json.dumps(sweep), "identity": self._identity}
-        )  # last: what has none is no store of a sweep's
+    def _use(self, path: Path) -> ChunkChecksums:
+        import zarr
 
+        self._group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        self.chunk = self._group[STATUS_NAME].chunks[0]
+        checksums = self._checksums = ChunkChecksums(self._group, path, array_names(self._members), self.chunk)
+        return checksums
 
-def _say_units(group: Any, members: Members) -> None:
-    """Give each array its unit; where components differ, a coordinate beside it has each one's."""
-    beside = []
-    for name, units in members.units.items():
-        array = group[array_name(name)]
-        if joined(units) and "units" not in array.attrs:
-            array.attrs["units"] = joined(units)
-        if len(set(units)) > 1:
-            beside.append(units_beside(name))
-            if beside[-1] not in group:
-                dimension = members.shapes[name][0][0]
-                place = group.create_array(beside[-1], shape=(len(units),), dtype=str, dimension_names=(dimension,))
-                place[:] = np.array(units, dtype=np.dtypes.StringDType())
-    if beside and "coordinates" not in group.attrs:
-        group.attrs["coordinates"] = " ".join(beside)  # what xarray takes for coordinates, not data
+    def _repair(self, checksums: ChunkChecksums, restored: list[str], damage: Iterable[tuple[int, str]]) -> None:
+        """Make damaged chunks pending, and say so."""
+        damaged = []
+        for k, says in damage:
+            checksums.remove(k)
+            damaged.append(f"members {k * self.chunk} to {min((k + 1) * self.chunk, self.count) - 1} ({says})")
+        parts = [f"written again: {_join(restored)}"] if restored else []
+        parts += [f"computed again: {_join(damaged)}"] if damaged else []
+        self.repairs = f"{self.path}: {'; '.join(parts)}" if parts else ""
 
 
-def _require_free_names(members: Members) -> None:
-    """Refuse outputs that are called like something else in the store."""
-    taken = {STATUS_NAME, MESSAGE_NAME, "member", "time", *members.outputs.labels, *map(array_name, members.names)}
-    taken |= {units_beside(name) for name, units in members.units.items() if len(set(units)) > 1}
-    for name in members.shapes:
-        key = array_name(name)
-        if key in taken:
-            raise InputError(f"outputs: {name!r} is taken; choose another name")
-        if key in ("", ".", "..", "zarr.json") or key.startswith("__") or "\0" in key:
-            raise InputError(f"outputs: {name!r} can be no array's name in Zarr; choose another name")
-        taken.add(key)
-
-
-def _is_used(dimension: str, members: Members) -> bool:
-    return any(dimension in dims for dims, _ in members.shapes.values())
-
-
-def array_name(name: str) -> str:
-    """Return what a variable or an output is called in the store: a slash would make groups of it."""
-    return name.replace("/", "_")
-
-
-def units_beside(name: str) -> str:
-    """Return what the coordinate with the units of an output's components is called: one word."""
-    return f"{'_'.join(array_name(name).split())}_unit"
+def _join(parts: list[str]) -> str:
+    more = len(parts) - MAX_NAMED_CHUNKS
+    return ", ".join(parts[:MAX_NAMED_CHUNKS]) + (f" and {more} more" if more > 0 else "")

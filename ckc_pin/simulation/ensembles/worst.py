@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation.ensembles.members import DONE, STOPPED, Members
-from ckc_pin.simulation.ensembles.store import array_name
+from ckc_pin.simulation.ensembles.store_layout import array_name
 from ckc_pin.simulation.simulate import simulate
 
 if TYPE_CHECKING:
