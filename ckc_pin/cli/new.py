@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from os.path import exists, isdir
 from pathlib import Path
 from shlex import quote
 
@@ -29,7 +30,7 @@ def new(folder: Path, as_json: bool) -> None:
         raise InputError(f"{name!r}: a name is of letters, digits, - and _, and begins with a letter or a digit")
     templates = sorted(FILES.iterdir())
     paths = [folder / path.name.replace("NAME", name) for path in templates]
-    there = next((path for path in (folder, *paths) if path.exists() and (path != folder or not folder.is_dir())), None)
+    there = next((path for path in (folder, *paths) if exists(path) and (path != folder or not isdir(folder))), None)
     if there is not None:
         raise InputError(f"{there}: is there already; give another name")
     make_folder(folder, "")

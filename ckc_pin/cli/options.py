@@ -25,10 +25,14 @@ class _Path(click.Path):
     """A path; an empty one, as of a variable that is not set, is none, and not the folder where one is."""
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
-        """Return the path (InputError where it is empty)."""
-        if value == "" and parameter is not None:
-            name = parameter.opts[0] if isinstance(parameter, click.Option) else parameter.metavar
-            raise InputError(f"{name} is empty; give a name")
+        """Return the path (InputError where it is empty or not valid)."""
+        from ckc_pin.mechanism.kinds import require_path
+
+        if parameter is not None:
+            name = str(parameter.opts[0] if isinstance(parameter, click.Option) else parameter.metavar)
+            if value == "":
+                raise InputError(f"{name} is empty; give a name")
+            require_path(value, name, "the name of a file or folder")
         return super().convert(value, parameter, context)
 
 

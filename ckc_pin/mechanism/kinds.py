@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from inspect import signature
-from os import PathLike
+from os import PathLike, fsencode, fspath
 from typing import Any
 
 import numpy as np
@@ -60,8 +60,14 @@ def require_kind(given: Any, kinds: type | tuple[type, ...], what: str, takes: s
 
 
 def require_path(given: Any, what: str, takes: str = "a path, as a string or a Path") -> None:
-    """Refuse what is no path; errors are those of `require_kind`."""
+    """Refuse what is no path, or has characters that no path can have; errors are those of `require_kind`."""
     require_kind(given, (str, PathLike), what, takes)
+    try:
+        possible = isinstance(fspath(given), str) and b"\0" not in fsencode(given)
+    except UnicodeEncodeError:
+        possible = False
+    if not possible:
+        raise InputError(f"{what}: {a_kind(fspath(given))} is not a valid path; it takes {takes}")
 
 
 def require_table(given: Any, what: str, takes: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from os.path import lexists
+from os.path import isdir, lexists
 from pathlib import Path
 
 from ckc_pin.errors import InputError, MechanismError
@@ -67,9 +67,11 @@ def resolve(file: str, folder: Path, where: str) -> Path:
     package, _, rest = file.removeprefix(PACKAGE).partition("/")
     if package in ("", ".", ".."):
         raise InputError(f"{where}: {file!r} names no package; write package://PACKAGE/PATH")
+    if "\0" in file:
+        raise InputError(f"{where}: {file!r} is not a valid path; it has a null character")
     for share in _shares():
         base = (share / package).resolve()
-        if base.is_dir():
+        if isdir(base):
             path = (base / rest).resolve()
             if not path.is_relative_to(base):
                 raise InputError(f"{where}: {file!r} leaves its package")

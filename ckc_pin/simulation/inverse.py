@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def inverse_dynamics(
 
 
 def _names_a_run(name: str) -> bool:
-    return name.endswith(".npz") or (Path(name) / "run.npz").is_file()
+    return name.endswith(".npz") or isfile(Path(name) / "run.npz")
 
 
 def _scene_of(run: Run, changes: Mapping[str, Any]) -> Scene:

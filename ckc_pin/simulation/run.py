@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from os.path import isdir, isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -325,11 +326,11 @@ class Run(Shown):
         """
         require_path(path, "Run.load: path", "the path of a run file, or of a folder that holds a run.npz")
         path = Path(path)
-        if path.is_dir():
+        if isdir(path):
             path = path / "run.npz"
-        if not path.is_file():
+        if not isfile(path):
             mode = path.parent / "mode_1.npz"  # a linear model's folder has one for each
-            where = f"; there is {mode}" if mode.is_file() else ""
+            where = f"; there is {mode}" if isfile(mode) else ""
             raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one{where}")
         try:
             coordinates, arrays, meta = read_run(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from os.path import isdir
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
@@ -126,7 +127,7 @@ def file_in_folder(path: str | Path, who: str) -> Path:
     """Return where to write a file (InputError where its folder is not there)."""
     require_path(path, who)
     path = Path(path)
-    if not path.parent.is_dir():
+    if not isdir(path.parent):
         raise InputError(f"{path}: cannot be written: No such file or directory; choose a file in a folder that exists")
     return path
 
@@ -162,7 +163,7 @@ def _drawing(
     if meshes is not None:
         require_path(meshes, "play: meshes", "the mechanism's folder")
     folder = None if meshes is None else Path(meshes)
-    if folder is not None and not folder.is_dir():
+    if folder is not None and not isdir(folder):
         raise InputError(f"play: meshes = {folder}: no such folder; give the one that the mechanism.toml is in")
     drawing = scene(ordered, speed=speed, gap=gap, meshes=folder, forces=forces)
     missing = list(dict.fromkeys(name for run in ordered for name in missing_meshes(run.mechanism, folder)))

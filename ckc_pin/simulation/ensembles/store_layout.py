@@ -75,7 +75,7 @@ def read_store_attributes(path: Path) -> dict[str, Any]:
     """
     attributes = _read_attributes(path, path)
     if "format" not in attributes or "identity" not in attributes:
-        raise InputError(f"{path}: not begun as results of a sweep; {REMOVE}")
+        raise InputError(f"{path / DOCUMENT}: not begun as results of a sweep; remove {path}, or choose another DIR")
     if "checksum" in attributes or attributes["format"] == FORMAT:
         sound = _has_sound_checksum(attributes)
     else:
