@@ -73,7 +73,7 @@ def basin(out: Path, count: int) -> str:
     names = ("initial.q.theta_1", "initial.q.theta_3")
     found = ckc_pin.ensemble(
         "five_bar/set_point", dict.fromkeys(names, grid), {"end": "q_tree", "settled": "settled", "u": "max_abs_u"},
-        changes={"formulation": "reduced", "solver.rtol": 1e-6, "t_end": 10.0},
+        changes={"formulation": "reduced", "initial": {"q": HANGING}, "solver.rtol": 1e-6, "t_end": 10.0},
     )  # fmt: skip
     for name in names:
         found[name].attrs["units"] = "rad"

@@ -36,7 +36,7 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]], bool
                    "joint.theta_4.xyz.x": (0.24, 0.28)}, True),
     "another model": ("five_bar/tracking", {"controller.model": "mechanism.toml", "initial.at": None, **HANGING},
                       {"joint.theta_2.xyz.x": (0.24, 0.26)}, True),
-    "set point": ("five_bar/set_point", {}, {"initial.q.theta_1": (-1.5, -1.3)}, True),
+    "set point": ("five_bar/set_point", {"initial.at": None, **HANGING}, {"initial.q.theta_1": (-1.5, -1.3)}, True),
     "compensated": ("five_bar/set_point", {}, {"link.link_2.mass": (0.1, 0.5)}, False),
     "gains": ("five_bar/tracking", {}, {"controller.K_D": (5, 20)}, False),
     "rotations": ("five_bar/swing", {}, {"joint.theta_2.rpy.z": (-0.1, 0.1)}, False),
@@ -251,6 +251,24 @@ def test_what_is_not_there_is_refused(names: tuple[str, ...], outputs: dict[str,
         Members("five_bar/swing", SWING, names, outputs, 1, 1)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("at", ["equilibrium", "assembled"])
+@pytest.mark.parametrize("name", ["initial.q.theta_1", "initial.q.theta_2"])
+def test_a_start_that_a_run_refuses_is_refused_of_an_ensemble(name: str, at: str) -> None:
+    changes = {**SWING, "initial": {"at": at}}
+    with pytest.raises(ckc_pin.InputError) as of_run:
+        ckc_pin.simulate("five_bar/swing", {**changes, name: -1.2})
+    with pytest.raises(ckc_pin.InputError) as of_ensemble:
+        ckc_pin.ensemble("five_bar/swing", {name: [-1.2]}, {"end": "q_tree"}, changes=changes, progress=False)
+    assert str(of_ensemble.value) == str(of_run.value)
+    assert str(of_run.value) == f'five_bar/swing: initial: give either at = "{at}" or q, not both'
+
+
+def test_whole_numbers_beyond_64_bits_are_taken_as_in_a_run() -> None:
+    members = Members("five_bar/swing", SWING, ("initial.q_dot.theta_1", "solver.max_rhs"), OUTPUTS, 1, 1)
+    assert members.changes_of(np.array([1e20, 200.0]))["initial.q_dot.theta_1"] == 1e20
+    ckc_pin.load_scene("five_bar/swing", members.changes_of(np.array([1e20, 200.0])))
 
 
 def test_an_output_that_raises_fails_its_member_only() -> None:

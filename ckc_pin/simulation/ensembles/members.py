@@ -39,6 +39,7 @@ Statuses = NDArray[np.uint8]
 STATUS = ("pending", "done", "stopped", "failed")
 WORTH = 1_000_000  # right-hand sides a coordinate, from which terms are compiled for a sweep
 END, EVENT = "end", "event"
+MAX_INTEGER = 2.0**63  # the integers that a scene takes
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,6 @@ class Members:
         self.scene: Scene = load_scene(scene, changes)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
-        if self.scene.spec.initial.at is not None and any(name.startswith("initial.q.") for name in names):
-            self._start_from_there()
         self._vectors = check_names(scene, self._changes, self.scene, self.mechanism, names)
         self._outputs = outputs
         self.outputs = Outputs(outputs, self.ready)
@@ -140,7 +139,8 @@ class Members:
                 whole[at] = float(value)
                 changes[of] = whole
             else:
-                changes[name] = float(value) if is_parameter(name) or not float(value).is_integer() else int(value)
+                whole_number = float(value).is_integer() and abs(value) < MAX_INTEGER and not is_parameter(name)
+                changes[name] = int(value) if whole_number else float(value)
         return changes
 
     @property
@@ -246,15 +246,6 @@ class Members:
         return status, message, rhs
 
     # --- what is asked ---------------------------------------------------------------------------
-
-    def _start_from_there(self) -> None:
-        """Where the scene starts at an equilibrium, or as assembled, q is varied from there."""
-        q = self.mechanism.independent_part(self.ready.start.at.q_tree)
-        self._changes["initial.at"] = None
-        self._changes |= {f"initial.q.{name}": float(x) for name, x in zip(self.mechanism.independent, q, strict=True)}
-        self.scene = load_scene(self.scene_name, self._changes)
-        self.ready = prepare(self.scene)
-        self.mechanism = self.ready.mechanism
 
     def _require_one_time(self) -> None:
         """Refuse trajectories at instants that are not the same of all members (InputError)."""

@@ -57,6 +57,7 @@ def _try_key(scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, m
             if name.removeprefix(table) not in names:
                 says = f"variables: {name!r}: no such coordinate; there are {', '.join(names)}"
                 raise InputError(f"{scene.name}: {says}")
+            load_scene(scene_name, {**changes, name: 1.0})  # refused as a single run is: q beside initial.at
             return
     try:
         load_scene(scene_name, {**changes, name: 1})
