@@ -68,7 +68,8 @@ def as_controller(given: Any) -> Controller | TorqueController:
     Raises
     ------
     InputError
-        A class in the place of an object of it, a function of other arguments, anything else.
+        A class in the place of an object of it, a function of other arguments, anything else; an attribute `u`, `tau`
+        or `lyapunov` that is no method as required; attributes of a SetPoint or Tracking that were replaced by others.
     """
     if isinstance(given, type):
         name = given.__name__
@@ -79,10 +80,24 @@ def as_controller(given: Any) -> Controller | TorqueController:
     for name in own or [""]:
         law = getattr(given, name) if name else given
         called = name or getattr(given, "__name__", type(given).__name__)
+        if isinstance(law, type):
+            raise InputError(f"controller: {called}: {a_kind(law)} was given; it takes a function of (t, terms)")
         require_arguments(law, called, "controller")
+    if own:
+        _require_lyapunov(getattr(given, "lyapunov", None))
+    if type(given) is SetPoint or type(given) is Tracking:  # a subclass may have attributes of its own
+        given.require_attributes()
     found: Controller | TorqueController = given if own else FunctionController(given)
     gives_tau(found)
     return found
+
+
+def _require_lyapunov(function: Any) -> None:
+    """Refuse an attribute `lyapunov` that a run could not evaluate (InputError)."""
+    takes = "a function of (t, terms, w) that returns a number, or None"
+    if isinstance(function, type):
+        raise InputError(f"controller: lyapunov: {a_kind(function)} was given; it takes {takes}")
+    require_callable(function, "controller: lyapunov", takes, 3)
 
 
 def gives_tau(controller: Controller | TorqueController) -> bool:
@@ -184,6 +199,13 @@ class SetPoint:
         """Eq. 14."""
         return -self.K_P @ (terms.q - self.q_d) - self.K_V @ terms.q_dot + self.target.h
 
+    def require_attributes(self) -> None:
+        """Refuse attributes that were replaced by values that the law cannot use (InputError)."""
+        require_kind(self.target, Terms, "SetPoint: target", "Terms, those at the target")
+        d = self.target.mechanism.d
+        for name, shape in (("K_P", (d, d)), ("K_V", (d, d)), ("q_d", (d,))):
+            _require_array(getattr(self, name), shape, f"SetPoint: {name}")
+
     def u_rate_gradient(self, t: float, terms: Terms) -> Array:
         """d u / d q_dot, shape (d, d)."""
         return -self.K_V
@@ -235,6 +257,14 @@ class Tracking:
         own = self.model(terms) if self.model else terms
         return own.D @ a + own.C_times(v) + own.h - self.K_D @ r
 
+    def require_attributes(self) -> None:
+        """Refuse attributes that were replaced by values that the law cannot use (InputError)."""
+        d = _dimension(self.desired)
+        for name in ("Lambda", "K_D"):
+            _require_array(getattr(self, name), (d, d), f"Tracking: {name}")
+        if self.model is not None:
+            require_kind(self.model, Model, "Tracking: model", "a Model")
+
     def u_rate_gradient(self, t: float, terms: Terms) -> Array:
         """d u / d q_dot, shape (d, d); C is linear in its velocity and C(x) y = C(y) x."""
         q_d, q_d_dot, _ = self.desired(t)
@@ -250,6 +280,15 @@ class Tracking:
         r = terms.q_dot - q_d_dot + self.Lambda @ error
         on_manifold = 0.5 * r @ terms.D @ r + error @ self.Lambda.T @ self.K_D @ error
         return float(on_manifold + 0.5 * w @ w)
+
+
+def _require_array(given: Any, shape: tuple[int, ...], what: str) -> None:
+    try:
+        array = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{what}: {a_kind(given)} was given; it takes an array of shape {shape} of finite numbers")
 
 
 def _dimension(desired: Any) -> int:

@@ -16,7 +16,7 @@ from ckc_pin.mechanism.lazy import lazy
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 
-__all__ = ["LoopTerms", "controller_call", "event_call"]
+__all__ = ["LoopTerms", "controller_call", "event_call", "require_number"]
 
 NATIVE = ("D_tree", "C_tree", "h_tree", "bias_tree", "potential_energy", "D", "C", "h", "rho_dot")
 
@@ -117,15 +117,26 @@ def event_call(function: Callable[[float, Terms], Any], name: str, mechanism: Me
             value = function(given[2], LoopTerms(mechanism, given))
         except NumericalError as error:
             return str(error)
-        number = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
-        if isinstance(number, bool):
+        if isinstance(value, bool | np.bool_):
             says = "a number that changes sign where it happens is needed, as t - 0.5 is one for t > 0.5"
-            raise InputError(f"the event {name!r} gave {number}; {says}")
-        if not isinstance(number, int | float):
-            raise InputError(f"the event {name!r} gave {value!r:.80}; a number is needed")
-        try:
-            return float(number)
-        except OverflowError:
-            raise InputError(f"the event {name!r} gave an integer too large for a number") from None
+            raise InputError(f"the event {name!r} gave {bool(value)}; {says}")
+        return require_number(value, f"the event {name!r}")
 
     return call
+
+
+def require_number(value: Any, what: str) -> float:
+    """Return what a caller's function gave as a float.
+
+    Raises
+    ------
+    InputError
+        It is no real number, or too large for one.
+    """
+    number = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise InputError(f"{what} gave {value!r:.80}; a number is needed")
+    try:
+        return float(number)
+    except OverflowError:
+        raise InputError(f"{what} gave an integer too large for a number") from None

@@ -19,6 +19,7 @@ from ckc_pin.mechanism.kinds import require_callable, require_flag
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
 from ckc_pin.simulation.events import Event, events_met
+from ckc_pin.simulation.loop_terms import require_number
 from ckc_pin.simulation.prepare import Prepared, prepare
 from ckc_pin.simulation.run import Run, Status
 from ckc_pin.simulation.run_file import MAX_BYTES
@@ -222,7 +223,8 @@ def _lyapunov(ready: Prepared, found: Array, parts: dict[str, Array]) -> Array |
     mechanism = ready.mechanism
     kinematics = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in q_tree]
     every = zip(t, kinematics, v_tree, phi, strict=True)
-    return np.array([function(float(at_t), Terms(mechanism, at, v), w) for at_t, at, v, w in every])
+    values = [(float(at_t), function(float(at_t), Terms(mechanism, at, v), w)) for at_t, at, v, w in every]
+    return np.array([require_number(value, f"controller: lyapunov at t = {at_t:.9g}") for at_t, value in values])
 
 
 def _sentence(error: NumericalError, t: float) -> str:

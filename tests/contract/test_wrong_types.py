@@ -47,6 +47,21 @@ def five_bar() -> ckc_pin.Mechanism:
     return load("five_bar")
 
 
+def with_attributes(given: Any, **attributes: Any) -> Any:
+    for name, value in attributes.items():
+        setattr(given, name, value)
+    return given
+
+
+def own_with(**attributes: Any) -> Own:
+    own: Own = with_attributes(Own(), **attributes)
+    return own
+
+
+def set_point() -> SetPoint:
+    return SetPoint(five_bar(), 10.0, 5.0, Q)
+
+
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "simulate a mechanism": (
         lambda: simulate(five_bar()),
@@ -87,6 +102,43 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a string as a controller": (of("pd"), r"controller: 'pd' was given; it takes an object with one of the methods"),
     "an object as a controller": (of(object()), r"controller: an object was given; .*or a function u\(t, terms\)"),
     "a class that is sampled": (lambda: Sampled(Own, 0.1), "the class Own was given"),
+    "a number as lyapunov": (
+        of(own_with(lyapunov=3)), r"^controller: lyapunov: 3 was given; it takes a function of \(t, terms, w\)"
+    ),
+    "lyapunov of one": (
+        of(own_with(lyapunov=lambda t: t)),
+        r"^controller: lyapunov: a function of other arguments was given; it takes a function of \(t, terms, w\)",
+    ),
+    "a class as lyapunov": (of(own_with(lyapunov=dict)), "^controller: lyapunov: the class dict was given; it takes a"),
+    "lyapunov that is sampled": (lambda: Sampled(own_with(lyapunov="V"), 0.1), "^controller: lyapunov: 'V' was given;"),
+    "a word from lyapunov": (
+        of(own_with(lyapunov=lambda t, terms, w: "V")), "^controller: lyapunov at t = 0 gave 'V'; a number is needed$"
+    ),
+    "nothing from lyapunov": (
+        of(own_with(lyapunov=lambda t, terms, w: None)), "^controller: lyapunov at t = 0 gave None; a number is needed$"
+    ),
+    "an array from lyapunov": (
+        of(own_with(lyapunov=lambda t, terms, w: np.zeros(1))), r"lyapunov at t = 0 gave array\(\[0.\]\); a number is"
+    ),
+    "a class as u": (of(own_with(u=dict)), r"^controller: u: the class dict was given; it takes a function of \(t, "),
+    "a gain that was replaced": (
+        of(with_attributes(set_point(), K_P=20.0)), r"^SetPoint: K_P: 20.0 was given; it takes an array of shape \(2, "
+    ),
+    "a target that was replaced": (
+        of(with_attributes(set_point(), target=None)), "^SetPoint: target: None was given; it takes Terms"
+    ),
+    "a q_d that was replaced": (
+        of(with_attributes(set_point(), q_d=Q)), r"^SetPoint: q_d: a dict was given; it takes an array of shape \(2,\)"
+    ),
+    "a trajectory that was replaced": (
+        of(with_attributes(Tracking(1.0, 1.0, trajectory), desired=3)), "^Tracking: desired: 3 was given; it takes a f"
+    ),
+    "a matrix that was replaced": (
+        of(with_attributes(Tracking(1.0, 1.0, trajectory), Lambda=np.eye(3))), "^Tracking: Lambda: a ndarray was given;"
+    ),
+    "a model that was replaced": (
+        of(with_attributes(Tracking(1.0, 1.0, trajectory), model="five_bar")), "^Tracking: model: 'five_bar' was given;"
+    ),
     "a sensor": (lambda: Sampled(Own(), 0.1, sensor=3), r"Sampled: sensor: 3 was given; .*\[controller.sensor\]"),
     "one event": (lambda: simulate(SWING, SHORT, events=Event(law)), "events: an Event was given; it takes a list of"),
     "progress": (lambda: simulate(SWING, SHORT, progress=True), r"progress: True was given; .* \(t, t_end\)"),
