@@ -2,8 +2,8 @@
 
 XML is parsed strictly by expat, document types (and with them entities) are refused, and what
 Pinocchio would accept in silence is checked here: negative or NaN masses, zero axes, duplicate names,
-unknown parents, two roots. `continuous` joints are loaded as revolute ones without limits, so that
-every joint is one number (Pinocchio would use a cosine and a sine); a `planar` joint is refused since
+unknown parents, two roots, two inertials of a link. `continuous` joints are loaded as revolute ones without limits,
+so that every joint is one number (Pinocchio would use a cosine and a sine); a `planar` joint is refused since
 Pinocchio ignores its axis. An inertial without one of its numbers is refused too: urdfdom, which reads for
 Pinocchio, drops it with a line on stderr and the link has no mass. Several trees become one URDF under a
 common root, stripped to what dynamics need, before Pinocchio sees them.
@@ -17,7 +17,14 @@ from xml.etree import ElementTree
 
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.strict_xml import strict_xml
-from ckc_pin.mechanism.urdf_checks import Mimic, by_name, check_connected, check_inertial, check_joint
+from ckc_pin.mechanism.urdf_checks import (
+    Mimic,
+    by_name,
+    check_connected,
+    check_inertial,
+    check_joint,
+    check_single_elements,
+)
 
 __all__ = ["WORLD", "TreeText", "UrdfTree", "merge", "parse"]
 
@@ -76,6 +83,9 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     links = by_name(root, "link", source)
     joints = by_name(root, "joint", source)
     tree = UrdfTree(root, "")
+    for tag, elements in (("link", links), ("joint", joints)):
+        for name, element in elements.items():
+            check_single_elements(element, f"{source}: {tag} {name!r}")
     for name, link in links.items():
         check_inertial(name, link, source, tree.warnings)
     children: dict[str, str] = {}

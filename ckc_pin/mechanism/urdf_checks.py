@@ -24,6 +24,7 @@ __all__ = [
     "check_inertial",
     "check_joint",
     "check_range",
+    "check_single_elements",
     "floats",
 ]
 
@@ -34,6 +35,11 @@ INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 LIMITS = ("lower", "upper")
 SHORTEST = 1e-9  # an axis that is not zero by mistake
 ROUNDING = 1e-18  # kg m^2: what is left of a zero tensor that was turned about
+SINGLE_ELEMENTS = {
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
+}  # what the URDF format allows once in an element and dynamics need; a reader takes the first of several
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 
 
@@ -81,6 +87,23 @@ def _needed(element: ElementTree.Element, tag: str, where: str) -> ElementTree.E
     if found is None:
         raise InputError(f"{where} has no <{tag}>")
     return found
+
+
+def check_single_elements(element: ElementTree.Element, where: str) -> None:
+    """Refuse elements that the URDF format allows once in a link or joint and that are there several times.
+
+    Raises
+    ------
+    MechanismError
+        Names the element.
+    """
+    for tag in SINGLE_ELEMENTS[element.tag]:
+        count = len(element.findall(tag))
+        if count > 1:
+            raise MechanismError(f"{where}: {count} <{tag}> elements; a URDF has one at most in <{element.tag}>")
+    for inner in element:
+        if inner.tag in SINGLE_ELEMENTS:
+            check_single_elements(inner, f"{where}, <{inner.tag}>")
 
 
 def check_inertial(name: str, link: ElementTree.Element, source: str, warnings: list[str]) -> None:

@@ -119,7 +119,31 @@ BODIES = [
 ]
 
 
-@pytest.mark.parametrize("case", [*XML, *TREE, *JOINTS, *BODIES], ids=lambda case: case.what)
+INERTIAL = '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+TWICE = [
+    _joint(f"two {element.split()[0][1:]}", element, f": 2 <{element.split()[0][1:]}> elements; a URDF has one at most")
+    for element in ('<origin xyz="1 0 0"/>', '<parent link="b"/>', '<child link="a"/>', '<axis xyz="1 0 0"/>')
+]
+TWICE += [
+    _joint(f"two {element.split()[0][1:]}", 2 * element, f": 2 <{element.split()[0][1:]}> elements; a URDF has one at")
+    for element in ('<limit effort="1"/>', '<dynamics damping="1"/>', '<mimic joint="k"/>')
+]
+TWICE += [
+    _pendulum(
+        "two inertial", "</inertial>", f"</inertial>{INERTIAL}", "link 'b': 2 <inertial> elements; a URDF has one"
+    ),
+    _pendulum("two mass", "<mass", '<mass value="2"/><mass', "link 'b', <inertial>: 2 <mass> elements; a URDF has one"),
+    _pendulum("two inertia", "<inertia ", "<inertia/><inertia ", "link 'b', <inertial>: 2 <inertia> elements; a URDF"),
+    _pendulum(
+        "two centres", "<origin", "<origin/><origin", "link 'b', <inertial>: 2 <origin> elements; a URDF has one"
+    ),
+    _joint(
+        "three axes", '<axis xyz="1 0 0"/><axis xyz="0 1 0"/>', ": 3 <axis> elements; a URDF has one at most in <joi"
+    ),
+]
+
+
+@pytest.mark.parametrize("case", [*XML, *TREE, *JOINTS, *BODIES, *TWICE], ids=lambda case: case.what)
 def test_bad_urdf(case: Bad, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
     expect(case, bar)
     assert capfd.readouterr() == ("", ""), "urdfdom writes to the file descriptors themselves"
@@ -130,6 +154,12 @@ HARMLESS = {
     "another encoding's name": '<?xml version="1.0" encoding="utf-16"?>' + PENDULUM,
     "a picture of nonsense": PENDULUM.replace(
         '<link name="a"/>', '<link name="a"><visual><geometry><box size="a b"/></geometry></visual></link>'
+    ),
+    "several pictures": PENDULUM.replace(
+        '<link name="a"/>', f'<link name="a">{2 * "<visual><origin/><origin/></visual><collision/>"}</link>'
+    ),
+    "elements of other programs": PENDULUM.replace(
+        "</joint>", "<hardwareInterface/><hardwareInterface/><safety_controller/></joint>"
     ),
     "a colour of nonsense": PENDULUM.replace('name="p">', 'name="p"><material name="m"><color rgba="x"/></material>'),
     "dynamics that say nothing": PENDULUM.replace("</joint>", "<dynamics/></joint>"),
