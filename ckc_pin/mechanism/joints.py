@@ -86,6 +86,10 @@ class Joints:
         """Whether joints stick or touch, friction being smoothed or not (None)."""
         return bool(self.stopped.any()) or (smoothing is None and bool(self.friction.any()))
 
+    def has_smooth_friction(self, smoothing: float | None) -> bool:
+        """Whether friction is smoothed, so that its work is not part of a run's `dissipated`."""
+        return smoothing is not None and bool(self.friction.any())
+
     def smooth_friction(self, v_tree: Array, smoothing: float) -> Array:
         """Return -F tanh(v / smoothing), N or N m, shape (n,)."""
         return -self.friction * np.tanh(v_tree / smoothing)

@@ -66,7 +66,8 @@ class Run(Shown):
     lyapunov : (m,) array or None
         The controller's Lyapunov function.
     dissipated : (m,) array or None
-        Energy that dry friction and impacts have taken since the start, J.
+        Energy that dry friction and impacts have taken since the start, J. None where there are neither, and with
+        `friction_smoothing`, where friction is a force like a damper's whose work is not counted.
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict

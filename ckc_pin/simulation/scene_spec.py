@@ -158,7 +158,7 @@ class SceneSpec(_Spec, frozen=True):
         controller.
         ``coriolis_velocity = "actual"``
     friction_smoothing : rad/s, m/s
-        Dry friction grows as tanh over such a rate, instead of joints that stick.
+        Dry friction grows as tanh over such a rate, instead of joints that stick; its work is not in `dissipated`.
         ``friction_smoothing = 1e-3``
     parameters : as in the files
         Numbers of the mechanism that are other ones, by name (see "parameters").

@@ -120,6 +120,8 @@ def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: f
     scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
     parts = _parts(ready, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
+    joints, smoothing = mechanism.joints, scene.spec.friction_smoothing
+    accounted = joints.has_events(smoothing) and not joints.has_smooth_friction(smoothing)
     run = Run(
         status=status,
         message=message,
@@ -127,7 +129,7 @@ def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: f
         independent=mechanism.independent,
         actuated=mechanism.actuated,
         lyapunov=_lyapunov(ready, lyapunov, parts),
-        dissipated=dissipated if mechanism.joints.has_events(scene.spec.friction_smoothing) else None,
+        dissipated=dissipated if accounted else None,
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=events_met(ready.events, mechanism, loop),

@@ -176,7 +176,8 @@ def _motion(group: Group) -> Figure:
     """Without control: coordinates, rates, change of energy, closure residual."""
     every = group.runs[0].coordinates
     names = every if len(every) <= ALL_MAX else group.independent
-    damped = group.mechanism.springs.any_damping or group.runs[0].dissipated is not None
+    smooth = group.mechanism.joints.has_smooth_friction(group.runs[0].scene.get("friction_smoothing"))
+    damped = group.mechanism.springs.any_damping or group.runs[0].dissipated is not None or smooth
     slots = _page(group, ["coordinates", "velocities", f"energy {'change' if damped else 'drift'}", "closure residual"])
     panels.coordinates(slots[0], group, names)
     panels.rates(slots[1], group, names)

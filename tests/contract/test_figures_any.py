@@ -20,10 +20,18 @@ def stewart() -> ckc_pin.Run:
     return ckc_pin.simulate("stewart", {"t_end": 0.1})
 
 
-@pytest.mark.parametrize(("damping", "title"), [(0.0, "energy drift"), (0.1, "energy change")])
-def test_what_dampers_take_is_no_drift(damping, title):
+@pytest.mark.parametrize(
+    ("changes", "title"),
+    [
+        ({"joint.crank.damping": 0.0}, "energy drift"),
+        ({"joint.crank.damping": 0.1}, "energy change"),
+        ({"friction_smoothing": 0.1}, "energy drift"),
+        ({"friction_smoothing": 0.1, "joint.crank.friction": 0.1}, "energy change"),
+    ],
+)
+def test_what_dampers_take_is_no_drift(changes, title):
     """Drift is what an integrator does to an energy that should stay."""
-    run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, "joint.crank.damping": damping})
+    run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, **changes})
     titles = [ax.get_title("left") for ax in draw(run)["motion"].axes]
     assert [said for said in titles if "energy" in said] == [f"c)  {title}"]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import brentq, linprog
 
-from ckc_pin import InputError, Run, Terms, as_ivp, load, simulate
+from ckc_pin import InputError, Run, Terms, as_ivp, ensemble, load, simulate
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide
 
@@ -124,6 +124,34 @@ def test_smoothed_friction_is_an_ode(scene_of: Make) -> None:
         (0, 1.2), [1.0, 0.0], "Radau", rtol=1e-10, atol=1e-12, t_eval=run.t,
     )  # fmt: skip
     assert_close(run.q_tree[:, 0], other.y[0], 1e-7)
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+def test_energy_falls_by_the_work_of_smoothed_friction(with_joints: Callable[..., Path], formulation: str) -> None:
+    """The integral of F tanh(v / rate) v by Simpson's rule over close output instants."""
+    F, rate, step = 0.02, 0.3, 1e-3
+    scene = with_joints("five_bar", {name: {"friction": F} for name in ("theta_1", "theta_4")}) / "swing.scene.toml"
+    changes = {"formulation": formulation, "friction_smoothing": rate, "t_end": 1.0}
+    run = simulate(scene, {**changes, "solver.rtol": 1e-10, "solver.output_dt": step})
+    v = run.v_tree[:, [run.coordinates.index(name) for name in ("theta_1", "theta_4")]]
+    work = simpson((F * np.tanh(v / rate) * v).sum(axis=1), dx=step)
+    assert work > 0.01
+    assert_close(run.energy[-1] + work, run.energy[0], 1e-8)
+
+
+def test_dissipated_is_unknown_with_smoothed_friction(with_joints: Callable[..., Path]) -> None:
+    """Also with stops, of which it would have the impacts alone."""
+    limits = {"theta_1": (-2.0, 2.0)}
+    folder = with_joints("five_bar", {"theta_1": {"friction": 0.02, "stops": True}}, limits)
+    scene = folder / "swing.scene.toml"
+    found = ensemble(
+        scene, {"friction_smoothing": [0.1]}, {"end": "dissipated", "most": {"of": "dissipated", "reduce": "max"},
+        "path": {"of": "dissipated", "reduce": "trajectory"}}, changes={"t_end": 0.01}, progress=False,
+    )  # fmt: skip
+    assert simulate(scene, {"t_end": 0.01}).dissipated is not None
+    assert simulate(scene, {"t_end": 0.01, "friction_smoothing": 0.1}).dissipated is None
+    assert found["status"].to_numpy().tolist() == [1]
+    assert all(np.isnan(found[name].to_numpy()).all() for name in ("end", "most", "path"))
 
 
 def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Path]) -> None:

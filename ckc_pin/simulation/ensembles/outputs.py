@@ -147,6 +147,9 @@ class Outputs:
         return self._reduced(name, spec)
 
     def _reduced(self, name: str, spec: OutputSpec) -> Output:
+        joints, smoothing = self._ready.mechanism.joints, self._ready.scene.spec.friction_smoothing
+        if spec.of == "dissipated" and joints.has_smooth_friction(smoothing):  # None in a run
+            return self._unknown(spec)
         columns, dims, wanted = self._quantity(name, spec.of)
         shape = (len(columns),) if dims else ()
         units = self._units_of(spec)
@@ -161,6 +164,12 @@ class Outputs:
         if reduce == "trajectory":
             return Output((*dims, "time"), (*shape, len(self._ready.instants)), units, compute)
         return Output(dims, shape, units, compute)
+
+    def _unknown(self, spec: OutputSpec) -> Output:
+        """Return an output of one number that is NaN."""
+        times = len(self._ready.instants) if spec.reduce == "trajectory" else None
+        dims, shape = ((), ()) if times is None else (("time",), (times,))
+        return Output(dims, shape, self._units_of(spec), lambda recorded: np.full((len(recorded.last), *shape), np.nan))
 
     def _quantity(self, name: str, of: str) -> tuple[list[int], tuple[str, ...], Array | None]:
         """Where a quantity stands in a row, its dimension, and what is taken off it over time."""

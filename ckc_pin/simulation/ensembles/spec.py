@@ -125,9 +125,9 @@ class OutputSpec(_Spec, frozen=True):
     ----------
     of
         A coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
-        ``dissipated``, ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``, ``max_phi``, ``energy_drift`` (largest
-        change), ``settled`` (1 where everything rests at the end, if only to turn round, at q_d if there is one,
-        0 where not), ``event.NAME`` or ``event.K`` (when that was met first).
+        ``dissipated`` (NaN with ``friction_smoothing``), ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``,
+        ``max_phi``, ``energy_drift`` (largest change), ``settled`` (1 where everything rests at the end, if only to
+        turn round, at q_d if there is one, 0 where not), ``event.NAME`` or ``event.K`` (when that was met first).
         ``of = "error"``
     reduce
         What is kept of it over the member's output instants; of those named after ``t`` nothing but themselves.
