@@ -159,6 +159,14 @@ def test_damage_after_the_ensemble_is_an_input_error_when_values_are_read(finish
         assert np.isfinite(found["drift"].to_numpy()).all()
 
 
+def test_a_store_that_cannot_be_repaired_is_refused(finished: Path, tmp_path: Path) -> None:
+    store = copytree(finished, tmp_path / "o") / "results.zarr"
+    delete(store / "end/c/1/0")
+    (store / "end/c/1/0").mkdir()
+    with pytest.raises(InputError, match=r"results.zarr: cannot be repaired or converted: "):
+        ensemble(tmp_path / "o")
+
+
 def test_damaged_members_are_pending_until_they_are_computed(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -200,6 +200,7 @@ def test_the_store_of_another_sweep_is_left_alone(tmp_path: Path) -> None:
         ("[extra]\n", [], "unknown key 'extra'"),
         ('status = "u"\n', [], "'status' is taken"),
         ('member = "t"\n', [], "'member' is taken"),
+        ('checksums = "t"\n', [], "'checksums' is taken"),
         ('"a/b" = "t"\na_b = "t"\n', [], "'a_b' is taken"),
         ('"" = "t"\n', [], "'' can be no array's name"),
         ('"zarr.json" = "t"\n', [], "'zarr.json' can be no array's name"),

@@ -203,7 +203,7 @@ class Store:
                 self._repair(checksums, [], checksums.adopt(self._chunk_statuses()))
                 finish()
         except OSError as error:
-            raise InputError(f"{path}: is damaged and cannot be written: {error.strerror or error}") from None
+            raise InputError(f"{path}: cannot be repaired or converted: {error.strerror or error}") from None
 
     def _use(self, path: Path) -> ChunkChecksums:
         import zarr
