@@ -8,6 +8,8 @@ that system is singular, need no care here.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from scripts.experiments.fuzz.joint_forces import JointForces
@@ -15,10 +17,26 @@ from scripts.experiments.fuzz.read import Frame, Model
 from scripts.experiments.fuzz.spatial import Array, IntArray, apply, cross, dot
 from scripts.experiments.fuzz.state import joint_values, split
 
-__all__ = ["LEAST_GAP", "Motion"]
+__all__ = ["LEAST_GAP", "REDUNDANT", "Equations", "Motion"]
 
 REDUNDANT = 1e-8  # singular values below, against the largest, belong to rows that follow from others
 LEAST_GAP = 1e-5  # between the last one counted and the largest; nearer to a loss of rank there is no right answer
+
+
+class Equations(NamedTuple):
+    """Equations of motion H y = force + G^T (loop forces), G y + gamma = 0 in joint accelerations y (P, n).
+
+    Accelerations of bodies are T_v y + a_0, angular ones T_w y + alpha_0.
+    """
+
+    H: Array  # (P, n, n)
+    force: Array  # (P, n)
+    G: Array  # (P, rows, n)
+    gamma: Array  # (P, rows)
+    T_v: Array  # (P, n, nb + 1, 3)
+    T_w: Array
+    a_0: Array  # (P, nb + 1, 3)
+    alpha_0: Array
 
 
 class Motion:
@@ -179,8 +197,8 @@ class Motion:
             along[:, at] += drive.along(*joint_values(model, Y, self.carrier[at], near[:, at]))
         return push, torque, along
 
-    def accelerations(self, Y: Array, near: Array, drive: JointForces | None = None) -> tuple[Array, Array, Array]:
-        """Accelerations and angular accelerations (P, nb + 1, 3), and each piece's distance from a loss of rank."""
+    def equations(self, Y: Array, near: Array, drive: JointForces | None = None) -> Equations:
+        """The equations of motion in joint accelerations, of all joints and loops."""
         model = self.model
         P, n = len(Y), model.n
         _, R, _, w = split(Y)
@@ -195,7 +213,7 @@ class Motion:
         turned = (T_w[:, :, :-1, None, :] @ I[:, None])[:, :, :, 0].reshape(P, n, -1)
         H = (flat_v * np.repeat(model.mass, 3)) @ np.swapaxes(flat_v, 1, 2) + turned @ np.swapaxes(flat_w, 1, 2)
         force = along + apply(flat_v, push[:, :-1].reshape(P, -1)) + apply(flat_w, torque[:, :-1].reshape(P, -1))
-        gap = np.ones(P)
+        G, gamma = np.zeros((P, 0, n)), np.zeros((P, 0))
         if len(self.body_a) or len(model.couplings):
             e_a, m_a, e_b, m_b, gamma = self.rows(Y)
             a, b = self.body_a, self.body_b
@@ -208,6 +226,13 @@ class Motion:
             )
             G = np.concatenate([loops, np.broadcast_to(model.couplings, (P, *model.couplings.shape))], axis=1)
             gamma = np.concatenate([gamma, np.zeros((P, len(model.couplings)))], axis=1)
+        return Equations(H, force, G, gamma, T_v, T_w, a_0, alpha_0)
+
+    def accelerations(self, Y: Array, near: Array, drive: JointForces | None = None) -> tuple[Array, Array, Array]:
+        """Accelerations and angular accelerations (P, nb + 1, 3), and each piece's distance from a loss of rank."""
+        H, force, G, gamma, T_v, T_w, a_0, alpha_0 = self.equations(Y, near, drive)
+        gap = np.ones(len(Y))
+        if G.shape[1]:
             U, sv, Vt = np.linalg.svd(G)
             if self.rank is None:
                 self.rank = int((sv > REDUNDANT * sv[:, :1]).sum(axis=1).max())
