@@ -2,6 +2,7 @@
 
 ``./scripts/experiment fuzz [--runs N] [--seed S] [--shipped | --random] [--mechanism NAME] [--jobs J] [--out FILE]``
 runs the seeds S ... S + N - 1 and prints a table, with --out writes a CSV; ``--one SEED`` shows one of them at length.
+With ``--contact`` the mechanisms have stops, impacts and dry friction (`contact/`); ``--kind`` chooses one kind.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from itertools import repeat
 from pathlib import Path
 
 from ckc_pin.errors import CkcError
+from scripts.experiments.fuzz.contact import main as contact
+from scripts.experiments.fuzz.contact.record import KINDS
 from scripts.experiments.fuzz.motions import SHIPPED, Motion, random_motion, shipped_motion
 from scripts.experiments.fuzz.record import FIELDS, Record, run_motion
 from scripts.experiments.fuzz.shrink import shrink
@@ -68,7 +71,9 @@ def show(seed: int, kind: str, name: str | None, *, shrunk: bool = False) -> Non
 
 EXAMPLES = """Examples:
   ./scripts/experiment fuzz --runs 200
-  ./scripts/experiment fuzz --one 17 --shipped --shrink"""
+  ./scripts/experiment fuzz --one 17 --shipped --shrink
+  ./scripts/experiment fuzz --contact --seed 1000 --runs 500 --out contact.csv
+  ./scripts/experiment fuzz --contact --kind gripper --runs 200"""
 
 
 def main(arguments: list[str]) -> int:
@@ -83,10 +88,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--shrink", action="store_true", help="with --one: a smaller run that fails alike")
     parser.add_argument("--shipped", action="store_true")
     parser.add_argument("--random", action="store_true")
+    parser.add_argument("--contact", action="store_true", help="stops, impacts and dry friction, in all formulations")
+    parser.add_argument("--kind", choices=sorted(KINDS), help="with --contact: this kind of mechanism only")
     parser.add_argument("--mechanism", choices=sorted(SHIPPED), help="of the shipped ones, this one only")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, metavar="FILE.csv")
     given = parser.parse_args(arguments)
+    if given.contact:
+        return contact.run(given)
     kinds = [kind for kind in ("shipped", "random") if getattr(given, kind)] or ["shipped", "random"]
     kinds = ["shipped"] if given.mechanism else kinds
     if given.one is not None:

@@ -1,0 +1,77 @@
+"""Random mechanisms with stops, impacts and dry friction: one case from a seed, by kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scripts.experiments.fuzz.contact.stops import Contact, with_contacts
+
+__all__ = ["Case", "Draw", "choose_restitutions", "mass_ratio", "with_rate_event"]
+
+SCENE = 'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n\n[initial]\nat = "assembled"\n'
+RTOL = 1e-11
+
+
+@dataclass(frozen=True)
+class Case:
+    """One motion and what is known of it beforehand.
+
+    `texts` are the mechanism's files without stops and friction, which the references read; `contacts` says those.
+    """
+
+    seed: int
+    kind: str
+    texts: dict[str, str]
+    contacts: dict[str, Contact]
+    overrides: dict[str, Any]  # of the scene
+    conservative: bool = True  # nothing but stops and friction changes the energy
+    linear: bool = False  # every link translates: `slides.py` is an exact reference
+    jammed: bool = False  # the stops leave no motion: at rest from the first instant
+    quiet: frozenset[str] = frozenset()  # joints without events after `quiet_after`
+    quiet_after: float = 0.0
+    compares_steps: bool = False  # stops and friction must not change the number of steps
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: Path, *, contacts: bool = True) -> Path:
+        """Write the files to a folder, with stops and friction or without."""
+        folder.mkdir(parents=True, exist_ok=True)
+        files = with_contacts(self.texts, self.contacts) if contacts else self.texts
+        for name, text in {**files, "default.scene.toml": SCENE}.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        return folder
+
+
+Draw = Callable[[int, np.random.Generator], Case]
+
+
+def mass_ratio(random: np.random.Generator, count: int) -> np.ndarray:
+    """Masses: equal, powers of ten or anything, 1 to 1e4 apart."""
+    draw = random.random()
+    if draw < 0.3:
+        return np.full(count, float(random.choice([1.0, 1.0, random.uniform(0.1, 10)])))
+    if draw < 0.5:
+        return 10.0 ** random.integers(0, 5, count)
+    return np.asarray(10 ** random.uniform(0, random.choice([1.0, 4.0]), count))
+
+
+def choose_restitutions(random: np.random.Generator, count: int) -> list[float]:
+    """Restitutions 0 to 1: often 0, 1 or all equal."""
+
+    def choose() -> float:
+        return float(random.choice([0.0, 1.0, 0.5, random.uniform(0, 1)], p=[0.3, 0.2, 0.15, 0.35]))
+
+    if random.random() < 0.5:
+        return [choose()] * count
+    return [choose() for _ in range(count)]
+
+
+def with_rate_event(case: Case, coordinate: str, value: float) -> Case:
+    """The same case with an event on a rate."""
+    event = {"of": "q_dot", "coordinate": coordinate, "value": value}
+    overrides: Mapping[str, Any] = {**case.overrides, "event": [event]}
+    return replace(case, overrides=dict(overrides))

@@ -1,0 +1,80 @@
+"""Records of contact cases as a table by kind, with the seeds of what is wrong."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+from scripts.experiments.fuzz.contact.record import Record
+
+__all__ = ["CATEGORIES", "table"]
+
+CATEGORIES = {
+    "raw": "an exception that is no CkcError",
+    "refused": "a scene that should run is refused",
+    "stopped": "stopped, with joint and reason",
+    "unnamed": "stopped without naming a joint, or at a limit of the solver",
+    "grown": "done, with more energy than at the start",
+    "energy": "done, energy + dissipated is not constant",
+    "dissipated": "dissipated falls",
+    "limits": "a joint beyond its stop, a loop open, or a torque beyond its limit",
+    "rest": "jammed, but moving",
+    "quiet": "events of joints that cannot move or rest on their stops",
+    "slow": "more than three times the steps",
+    "formulations": "formulations differ, in events or states",
+    "reference": "not as the event-driven reference",
+    "stepping": "not as the time-stepping scheme",
+    "rate event": "an event on a rate is not met at the impact that jumps over its value",
+}
+WIDTH = {name: max(6, len(name)) for name in CATEGORIES}
+MOST_SEEDS = 12
+
+
+def table(records: Sequence[Record]) -> str:
+    """The whole report as text."""
+    lines = [
+        f"{'kind':15s} {'cases':>5s} {'runs':>6s} {'ok':>5s} {'events':>7s} {'agreed':>7s} {'magn':>5s} {'ref':>5s} "
+        + " ".join(f"{name:>{WIDTH[name]}s}" for name in CATEGORIES)
+        + f" {'s/case':>7s}"
+    ]
+    for kind in sorted({record.kind for record in records}):
+        lines.append(_line(kind, [record for record in records if record.kind == kind]))
+    lines += [_line("all", records), ""]
+    for category, meaning in CATEGORIES.items():
+        lines += _category(category, meaning, records)
+    return "\n".join(lines)
+
+
+def _line(kind: str, records: Sequence[Record]) -> str:
+    count = Counter(category for record in records for category in {x.category for x in record.findings})
+    compared = [record for record in records if record.compared]
+    agreed = sum(not any(x.category == "formulations" for x in record.findings) for record in compared)
+    share = f"{100 * agreed / len(compared):.1f}%" if compared else "-"
+    return (
+        f"{kind:15s} {len(records):5d} {sum(r.runs for r in records):6d} {sum(not r.findings for r in records):5d}"
+        f" {sum(r.events for r in records):7d} {share:>7s} {sum(r.magnified for r in records):5d}"
+        f" {sum(r.referenced for r in records):5d} "
+        + " ".join(f"{count[name]:>{WIDTH[name]}d}" for name in CATEGORIES)
+        + f" {sum(r.seconds for r in records) / max(1, len(records)):7.2f}"
+    )
+
+
+def _category(category: str, meaning: str, records: Sequence[Record]) -> list[str]:
+    found = [(record, x) for record in records for x in record.findings if x.category == category]
+    if not found:
+        return []
+    seeds = sorted({record.seed for record, _ in found})
+    lines = [
+        f"{category}: {meaning}",
+        f"  {len(seeds)} seeds: {' '.join(map(str, seeds[:40]))}{' ...' if len(seeds) > 40 else ''}",
+    ]
+    texts: dict[str, list[tuple[Record, str, str]]] = {}
+    for record, x in found:
+        texts.setdefault(re.sub(r"-?\d[\d.e+-]*", "#", f"{record.kind}: {x.text}")[:70], []).append(
+            (record, x.formulation, x.text)
+        )
+    for alike in sorted(texts.values(), key=len, reverse=True)[:MOST_SEEDS]:
+        record, formulation, text = alike[0]
+        lines.append(f"  {len(alike):4d}  seed {record.seed} {record.kind} ({formulation}): {text[:230]}")
+    return [*lines, ""]

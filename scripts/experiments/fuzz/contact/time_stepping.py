@@ -1,0 +1,84 @@
+"""Moreau and Jean's time-stepping scheme for closed chains with stops and dry friction: first order, no events.
+
+Each step of length h goes half way, answers the stops that are reached by the impact law, and takes momentum on over h
+with friction and contact as bounded impulses; then it goes the other half. Loops are closed at the level of velocities,
+which leaves them open by O(h^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from scripts.experiments.fuzz.contact.law import answer_impact
+from scripts.experiments.fuzz.contact.stops import Contact, contacts_of
+from scripts.experiments.fuzz.motion import REDUNDANT, Motion
+from scripts.experiments.fuzz.read import Model
+from scripts.experiments.fuzz.spatial import Array
+from scripts.experiments.fuzz.state import state
+
+__all__ = ["TimeStepping"]
+
+
+@dataclass
+class TimeStepping:
+    """The scheme for one mechanism whose joints have one freedom each."""
+
+    model: Model
+    contacts: Mapping[str, Contact]
+
+    def __post_init__(self) -> None:
+        self.motion = Motion(self.model)
+        self.stops = contacts_of(self.model.labels, self.contacts)
+        self.columns = np.array([stop.column for stop in self.stops], int)
+        self.signs = np.array([stop.sign for stop in self.stops], float)
+        self.limits = np.array([stop.limit for stop in self.stops])
+        self.e = np.array([stop.restitution for stop in self.stops])
+        self.friction = np.array([self.contacts[x].friction if x in self.contacts else 0.0 for x in self.model.labels])
+        self.rubbing = np.flatnonzero(self.friction)
+        self.rank: int | None = None
+
+    def run(self, q: Array, v: Array, t_end: float, steps: int, seen: int) -> Array:
+        """Coordinates at `seen` instants, evenly spaced, (seen, n)."""
+        h, rows = t_end / steps, []
+        for k in range(1, steps + 1):
+            middle = q + 0.5 * h * v
+            v = self.step(middle, v, h)
+            q = middle + 0.5 * h * v
+            if k % (steps // seen) == 0:
+                rows.append(q)
+        return np.array(rows)
+
+    def step(self, q: Array, v: Array, h: float) -> Array:
+        """The velocity after a step whose middle is q."""
+        Y = state(self.model, q[None], v[None])
+        H, force, G, gamma, *_ = (x[0] for x in self.motion.equations(Y, q[None]))
+        Z, bias = np.eye(len(q)), np.zeros(len(q))
+        if len(G):
+            U, sv, Vt = np.linalg.svd(G)
+            if self.rank is None:
+                self.rank = int((sv > REDUNDANT * sv[0]).sum())
+            r = self.rank
+            Z, bias = Vt[r:].T, -Vt[:r].T @ (U[:, :r].T @ gamma / sv[:r])
+        D = Z.T @ H @ Z
+        L = np.linalg.cholesky(D)
+        u = np.linalg.solve(D, Z.T @ (H @ v))  # what the loops leave of it
+        reached = self.signs * (q[self.columns] - self.limits) <= 0.0
+        N = (self.signs[:, None] * Z[self.columns])[reached]
+        if reached.any():
+            u = answer_impact(D, N, u, self.e[reached]).v
+        u = u + h * np.linalg.solve(D, Z.T @ (force - H @ bias))
+        rows = np.vstack([N, Z[self.rubbing]])
+        moving = np.linalg.norm(rows, axis=1) > 1e-9
+        if moving.any():
+            most = h * self.friction[self.rubbing]
+            low, high = np.r_[np.zeros(len(N)), -most][moving], np.r_[np.full(len(N), np.inf), most][moving]
+            held = np.linalg.solve(L, rows[moving].T)
+            scale, target = np.linalg.norm(held, axis=0), L.T @ u
+            size = max(float(np.linalg.norm(target)), 1e-300)
+            x = lsq_linear(held / scale, -target / size, (low * scale / size, high * scale / size), "bvls", tol=1e-14).x
+            u = np.linalg.solve(L.T, target + held / scale @ x * size)
+        return np.asarray(Z @ u)

@@ -1,0 +1,170 @@
+"""The fuzz suite for contact: its references against closed forms, and what its judges see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ckc_pin
+from scripts.experiments.fuzz.contact import judges
+from scripts.experiments.fuzz.contact.cases import Case
+from scripts.experiments.fuzz.contact.law import answer_impact
+from scripts.experiments.fuzz.contact.record import Record, draw, judge_seed
+from scripts.experiments.fuzz.contact.slides import Slides
+from scripts.experiments.fuzz.contact.stops import Contact
+from scripts.experiments.fuzz.contact.table import table
+from scripts.experiments.fuzz.contact.time_stepping import TimeStepping
+from scripts.experiments.fuzz.read import read
+from scripts.experiments.fuzz.spatial import Array
+from tests.conftest import assert_close
+
+G = 9.81
+
+
+def stack(masses: list[float], gravity: float = 0.0) -> dict[str, str]:
+    """Slides one on another along x, pulled back by gravity."""
+    parts, above = ['<link name="base"/>'], "base"
+    for k, mass in enumerate(masses):
+        parts.append(
+            f'<link name="b{k}"><inertial><mass value="{mass!r}"/>'
+            '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<joint name="x{k}" type="prismatic"><parent link="{above}"/><child link="b{k}"/>'
+            '<axis xyz="1 0 0"/></joint>'
+        )
+        above = f"b{k}"
+    mechanism = f'name = "m"\nurdf = "m.urdf"\ngravity = [{-gravity!r}, 0.0, 0.0]\n'
+    return {"mechanism.toml": mechanism, "m.urdf": f'<robot name="m">{"".join(parts)}</robot>'}
+
+
+def law(masses: list[float], rates: list[float], e: list[float]) -> tuple[Array, float]:
+    """World velocities after the impact of a stack whose gaps are all closed, and the energy lost."""
+    bodies = np.tril(np.ones((len(masses), len(masses))))
+    impact = answer_impact(bodies.T @ np.diag(masses) @ bodies, np.eye(len(masses)), np.array(rates), np.array(e))
+    return bodies @ impact.v, impact.lost
+
+
+def test_the_law_answers_a_cradle_body_by_body() -> None:
+    """Equal masses in contact between walls far away: the last one leaves at the speed of the first."""
+    after, lost = law([1.0] * 4, [0.0, 0.0, 0.0, -1.0], [1.0] * 4)
+    # the last body flies in from above, the first one bounces off the ground, and the last one leaves again
+    assert_close(after, [0.0, 0.0, 0.0, 1.0], 1e-14)
+    assert lost == 0.0
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_law_leaves_no_stop_approaching_and_loses_what_it_says(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    n, m = int(random.integers(1, 6)), int(random.integers(1, 7))
+    root = random.normal(size=(n, n)) * 10 ** random.uniform(-2, 2, n)
+    D, N, v = root @ root.T + 1e-3 * np.eye(n), random.normal(size=(m, n)), random.normal(size=n)
+    e = random.choice([0.0, 0.5, 1.0, 0.9], m)
+    for rechoose in (False, True):
+        impact = answer_impact(D, N, v, e, rechoose=rechoose)
+        size = np.sqrt(v @ D @ v)
+        assert np.all(
+            N @ impact.v >= -1e-9 * size * np.linalg.norm(np.linalg.solve(np.linalg.cholesky(D), N.T), axis=0)
+        )
+        assert impact.lost >= 0.0
+        assert_close(0.5 * impact.v @ D @ impact.v + impact.lost, 0.5 * size**2, 1e-9 * size**2)
+
+
+def test_one_stop_alone_obeys_newton() -> None:
+    random = np.random.default_rng(3)
+    root = random.normal(size=(3, 3))
+    D, n, v = root @ root.T, random.normal(size=(1, 3)), random.normal(size=3)
+    v = v if (n @ v)[0] < 0 else -v
+    impact = answer_impact(D, n, v, np.array([0.3]))
+    assert_close(n @ impact.v, -0.3 * n @ v, 1e-12)
+    assert_close(impact.lost, 0.5 * (1 - 0.09) * (n @ v) ** 2 / (n @ np.linalg.solve(D, n.T)), 1e-12)
+
+
+@pytest.mark.parametrize(("k", "count"), [(0, 3), (1, 31), (2, 314)])
+def test_the_slides_count_pi(k: int, count: int) -> None:
+    """A unit mass between a wall and one of 100^k: floor(pi 10^k) impacts."""
+    model = read(stack([1.0, 100.0**k]))
+    elastic = Contact(lower=0.0, restitution=1.0)
+    history = Slides(model, {"x0": elastic, "x1": elastic}).run(np.array([1.0, 1.0]), np.array([0.0, -1.0]), 20.0)
+    assert len(history.impacts) == count
+
+
+def test_a_slide_bounces_sticks_and_slides_as_in_closed_form() -> None:
+    model = read(stack([2.0], G))
+    history = Slides(model, {"x0": Contact(lower=0.0, restitution=0.5)}).run(np.array([1.0]), np.zeros(1), 2.0)
+    flight = np.sqrt(2 / G)
+    ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 30)])
+    found = [t for t, _ in history.impacts]
+    assert len(found) > 10
+    assert_close(found, ends[: len(found)], 1e-12)
+    rubbing = Slides(model, {"x0": Contact(friction=30.0)}).run(np.zeros(1), np.array([3.0]), 2.0)
+    stops_after = 3.0 / (G + 15.0)  # 30 N on 2 kg, which hold it then
+    q, v = rubbing.at(np.array([stops_after + 0.1]))
+    assert_close(q[0, 0], 1.5 * stops_after, 1e-12)
+    assert_close(v[0, 0], 0.0, 0.0)
+
+
+def test_the_time_stepping_scheme_converges_to_the_slides() -> None:
+    model = read(stack([1.0, 3.0], G))
+    contacts = {"x0": Contact(0.7, 0.0, np.inf, 0.6), "x1": Contact(2.0, 0.0, np.inf, 0.3)}
+    q, v, end = np.array([0.05, 0.1]), np.array([-0.4, 0.2]), 0.15
+    history = Slides(model, contacts).run(q, v, end)
+    assert history.certain_until > end
+    assert [joints for _, joints in history.impacts] == [("x0",), ("x1",)]
+    exact, _ = history.at(end * np.arange(1, 11) / 10)
+    errors = [np.abs(TimeStepping(model, contacts).run(q, v, end, n, 10) - exact).mean() for n in (400, 1600)]
+    assert errors[0] < 1e-3
+    assert errors[1] < errors[0] / 2  # first order, if not evenly: impacts are rounded to a step
+
+
+def bouncing(tmp_path: Path) -> tuple[Case, ckc_pin.Run]:
+    contacts = {"x0": Contact(0.0, 0.0, np.inf, 0.5), "x1": Contact(0.0, 0.0, np.inf, 0.8)}
+    overrides = {
+        "t_end": 0.4,
+        "solver.rtol": 1e-11,
+        "initial": {"q": {"x0": 0.1, "x1": 0.1}, "q_dot": {"x0": 0.0, "x1": 0.0}},
+    }
+    case = Case(0, "stack", stack([1.0, 2.0], G), contacts, overrides, linear=True)
+    return case, ckc_pin.simulate(case.write(tmp_path / "case"), overrides)
+
+
+def test_the_judges_accept_a_right_run_and_see_wrong_ones(tmp_path: Path) -> None:
+    case, run = bouncing(tmp_path)
+    model = read(case.texts)
+    assert len(run.events) >= 2
+    assert judges.energy_fault(run, model, case) == ("", "")
+    assert judges.limits_fault(run, case) == ""
+    assert judges.compare_with_slides(run, model, case) == ("", "")
+    other = replace(case, contacts={**case.contacts, "x1": Contact(0.0, 0.0, np.inf, 0.81)})
+    assert judges.compare_with_slides(run, model, other)[0] == "reference"
+    faster = replace(run, v_tree=run.v_tree * np.linspace(1, 1.001, len(run.t))[:, None])
+    assert judges.energy_fault(faster, model, case)[0] in ("grown", "energy")
+    assert run.dissipated is not None
+    assert judges.energy_fault(replace(run, dissipated=-run.dissipated), model, case)[0] == "dissipated"
+    assert judges.limits_fault(replace(run, q_tree=run.q_tree - 1e-6), case).startswith("x0 is 1e-06 beyond")
+    assert judges.compare(run, run, model).fault == ""
+    assert judges.compare(run, faster, model).fault.startswith("states")
+    later = [{**event, "t": event["t"] + 1e-6} for event in run.events]
+    assert "bounces" in judges.compare(run, replace(run, events=later), model).fault
+    assert "no event" in judges.compare(run, replace(run, events=run.events[:1]), model).fault
+
+
+@pytest.mark.parametrize("kind", ["pendulums", "closed"])
+def test_drawn_chains_are_right(kind: str) -> None:
+    record = judge_seed(1, kind)
+    assert record.findings == [], record
+    assert record.runs >= 3
+
+
+def test_a_seed_is_one_case() -> None:
+    for seed in range(4):
+        assert draw(seed) == draw(seed)
+
+
+def test_the_table_names_the_seeds() -> None:
+    record = Record(17, "stack", runs=3, compared=True)
+    record.add("grown", "dae", "energy grows by 0.1 of the largest")
+    text = table([record, Record(18, "stack", runs=3, compared=True)])
+    assert "1 seeds: 17" in text
+    assert "seed 17 stack (dae): energy grows by 0.1" in text
