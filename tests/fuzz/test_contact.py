@@ -17,6 +17,7 @@ from scripts.experiments.fuzz.contact.slides import Slides
 from scripts.experiments.fuzz.contact.stops import Contact
 from scripts.experiments.fuzz.contact.table import table
 from scripts.experiments.fuzz.contact.time_stepping import TimeStepping
+from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.read import read
 from scripts.experiments.fuzz.spatial import Array
 from tests.conftest import assert_close
@@ -118,6 +119,19 @@ def test_the_time_stepping_scheme_converges_to_the_slides() -> None:
     assert errors[1] < errors[0] / 2  # first order, if not evenly: impacts are rounded to a step
 
 
+def test_the_time_stepping_scheme_converges_to_smooth_closed_chains() -> None:
+    """Without contact it integrates what the suite's judge does."""
+    model = read(dict(ckc_pin.load("five_bar").sources.texts))
+    at = ckc_pin.load("five_bar").assembled
+    order = [ckc_pin.load("five_bar").coordinates.index(label) for label in model.labels]
+    q, v = at.q_tree[order], (at.rho @ np.array([1.0, -2.0]))[order]
+    end = Judge(model).pieces(q[None], v[None], np.array([0.2]), 1e-9)
+    assert end.resolved.all()
+    errors = [np.abs(TimeStepping(model, {}).run(q, v, 0.2, n, 1)[-1] - end.q[0]).max() for n in (50, 200)]
+    assert errors[0] < 1e-2
+    assert errors[1] < errors[0] / 3
+
+
 def bouncing(tmp_path: Path) -> tuple[Case, ckc_pin.Run]:
     contacts = {"x0": Contact(0.0, 0.0, np.inf, 0.5), "x1": Contact(0.0, 0.0, np.inf, 0.8)}
     overrides = {
@@ -136,18 +150,21 @@ def test_the_judges_accept_a_right_run_and_see_wrong_ones(tmp_path: Path) -> Non
     assert judges.energy_fault(run, model, case) == ("", "")
     assert judges.limits_fault(run, case) == ""
     assert judges.compare_with_slides(run, model, case) == ("", "")
+    bouncier = {**case.contacts, "x0": Contact(0.0, 0.0, np.inf, 0.6)}
     other = replace(case, contacts={**case.contacts, "x1": Contact(0.0, 0.0, np.inf, 0.81)})
     assert judges.compare_with_slides(run, model, other)[0] == "reference"
+    assert judges.compare_with_steps(run, model, case) == ("", "")
+    assert judges.compare_with_steps(run, model, replace(case, contacts=bouncier))[0] == "stepping"
     faster = replace(run, v_tree=run.v_tree * np.linspace(1, 1.001, len(run.t))[:, None])
     assert judges.energy_fault(faster, model, case)[0] in ("grown", "energy")
     assert run.dissipated is not None
     assert judges.energy_fault(replace(run, dissipated=-run.dissipated), model, case)[0] == "dissipated"
     assert judges.limits_fault(replace(run, q_tree=run.q_tree - 1e-6), case).startswith("x0 is 1e-06 beyond")
-    assert judges.compare(run, run, model).fault == ""
-    assert judges.compare(run, faster, model).fault.startswith("states")
+    assert judges.compare(run, run, model, 1e-8).fault == ""
+    assert judges.compare(run, faster, model, 1e-8).fault.startswith("states")
     later = [{**event, "t": event["t"] + 1e-6} for event in run.events]
-    assert "bounces" in judges.compare(run, replace(run, events=later), model).fault
-    assert "no event" in judges.compare(run, replace(run, events=run.events[:1]), model).fault
+    assert "bounces" in judges.compare(run, replace(run, events=later), model, 1e-8).fault
+    assert "no event" in judges.compare(run, replace(run, events=run.events[:1]), model, 1e-8).fault
 
 
 @pytest.mark.parametrize("kind", ["pendulums", "closed"])

@@ -117,7 +117,7 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
     """Give the joints of a mechanism stops near where they are, at it in a fifth, and friction."""
     mechanism = _loaded(texts)
     if mechanism is None:
-        return Case(seed, kind, texts, {}, {"t_end": 0.01, "initial": {"at": "assembled"}})
+        return Case(seed, kind, texts, {}, {"t_end": 0.01, "solver.rtol": RTOL, "initial": {"at": "assembled"}})
     tree, reach = mechanism.tree, mechanism.tree.reach
     numbers = tree.to_coordinates(mechanism.q_tree)
     size = np.abs(ckc_pin.Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)).h_tree)

@@ -193,20 +193,22 @@ def _compare_formulations(case: Case, scene: Path, runs: dict[str, Run], model: 
         return
     record.compared = True
     (name, one), *others = done.items()
-    agreements = {other: judges.compare(one, run, model) for other, run in others}
+    allowed = judges.agreement_allowed(case)
+    agreements = {other: judges.compare(one, run, model, allowed) for other, run in others}
     if not any(found.fault for found in agreements.values()):
         return
-    rtol = case.overrides.get("solver.rtol", 1e-6)
-    coarse = _simulate(scene, case, name, Record(case.seed, case.kind), **{"solver.rtol": min(1e-3, COARSER * rtol)})
+    rtol = min(1e-3, COARSER * case.overrides["solver.rtol"])
+    coarse = _simulate(scene, case, name, Record(case.seed, case.kind), **{"solver.rtol": rtol})
     own = judges.compare(one, coarse, model, np.inf) if coarse is not None else None
     for other, found in agreements.items():
         if not found.fault:
             continue
-        if own is not None:
-            allowed = max(judges.AGREE, own.off)
-            if not judges.compare(one, done[other], model, allowed, own.until).fault:
-                record.magnified = True
-                continue
+        magnified = own is not None and not judges.compare(
+            one, done[other], model, max(allowed, own.off), own.until
+        ).fault  # fmt: skip
+        if magnified:
+            record.magnified = True
+            continue
         record.add("formulations", f"{name}, {other}", found.fault)
 
 

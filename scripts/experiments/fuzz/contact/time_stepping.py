@@ -55,22 +55,21 @@ class TimeStepping:
     def step(self, q: Array, v: Array, h: float) -> Array:
         """The velocity after a step whose middle is q."""
         Y = state(self.model, q[None], v[None])
-        H, force, G, gamma, *_ = (x[0] for x in self.motion.equations(Y, q[None]))
-        Z, bias = np.eye(len(q)), np.zeros(len(q))
+        H, force, G, *_ = (x[0] for x in self.motion.equations(Y, q[None]))
+        Z = np.eye(len(q))
         if len(G):
-            U, sv, Vt = np.linalg.svd(G)
+            _, sv, Vt = np.linalg.svd(G)
             if self.rank is None:
                 self.rank = int((sv > REDUNDANT * sv[0]).sum())
-            r = self.rank
-            Z, bias = Vt[r:].T, -Vt[:r].T @ (U[:, :r].T @ gamma / sv[:r])
+            Z = Vt[self.rank :].T
         D = Z.T @ H @ Z
         L = np.linalg.cholesky(D)
-        u = np.linalg.solve(D, Z.T @ (H @ v))  # what the loops leave of it
+        u = np.linalg.solve(D, Z.T @ (H @ v))  # the projection onto what the loops allow here has their bias in it
         reached = self.signs * (q[self.columns] - self.limits) <= 0.0
         N = (self.signs[:, None] * Z[self.columns])[reached]
         if reached.any():
             u = answer_impact(D, N, u, self.e[reached]).v
-        u = u + h * np.linalg.solve(D, Z.T @ (force - H @ bias))
+        u = u + h * np.linalg.solve(D, Z.T @ force)
         rows = np.vstack([N, Z[self.rubbing]])
         moving = np.linalg.norm(rows, axis=1) > 1e-9
         if moving.any():
