@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from scripts.experiments.fuzz.build import Builder, toml
 from scripts.experiments.fuzz.contact.cases import RTOL, Case, choose_restitutions, mass_ratio
@@ -146,16 +147,19 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
     conservative = True
     if not mechanism.rooted and not mechanism.splits_root and random.random() < 0.12:
         texts = _with_motors(texts, mechanism, random, size)
-        overrides["controller"] = _controller(mechanism, random, numbers, size)
+        overrides["controller"] = _controller(mechanism, random, size)
         conservative = False
     return Case(seed, kind, texts, contacts, overrides, conservative=conservative)
 
 
-def _controller(mechanism: Mechanism, random: np.random.Generator, numbers: Array, size: Array) -> dict[str, Any]:
+def _controller(mechanism: Mechanism, random: np.random.Generator, size: Array) -> dict[str, Any]:
     """A set-point controller, its torques mostly at their limits."""
-    target = {
-        name: float(numbers[mechanism.tree.index[name]] + random.uniform(-1, 1)) for name in mechanism.independent
-    }
+    here = mechanism.independent_part(mechanism.q_tree)
+    for attempt in range(12):  # nearer and nearer
+        there = here + random.uniform(-0.5, 0.5, mechanism.d) * 0.6**attempt
+        if sigma(mechanism, there).verdict == "converged":
+            break
+    target = dict(zip(mechanism.independent, there.tolist(), strict=True))
     gain = float(size.max() * 10 ** random.uniform(-1, 1))
     controller: dict[str, Any] = {"type": "set_point", "q_d": target, "K_P": gain, "K_V": 0.1 * gain}
     controller["torque_limit"] = float(size.max() * 10 ** random.uniform(-1, 0.3))

@@ -48,16 +48,19 @@ def project(L: Array, N: Array, v: Array) -> tuple[Array, Array]:
     return v + outward, -outward
 
 
-def answer_impact(D: Array, N: Array, v: Array, e: Array, *, rechoose: bool = False) -> Impact:
+def answer_impact(
+    D: Array, N: Array, v: Array, e: Array, *, rechoose: bool = False, max_rounds: int = MAX_ROUNDS
+) -> Impact:
     """Apply the law to the stops with gap zero: N (stops, n) are their gap velocities' rows, e their restitutions.
 
     `rechoose`: the stops of a round's later groups are those that approach when their turn comes. Otherwise they are
-    those that approached when the round began. The law leaves this open, and both readings lose energy alike.
+    those that approached when the round began. The law leaves this open, and both readings lose energy alike. After
+    `max_rounds` the projection ends it, and the answer is not certain.
     """
     L = np.asarray(np.linalg.cholesky(D), float)
     out = Impact(v.copy())
     weight: Array = np.linalg.norm(np.linalg.solve(L, N.T), axis=0)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(max_rounds):
         fine = ROUNDING * float(np.linalg.norm(L.T @ out.v)) * weight
         speeds = N @ out.v
         approaching = speeds < -fine

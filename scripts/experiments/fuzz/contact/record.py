@@ -38,6 +38,8 @@ FORMULATIONS = ("dae", "reduced", "spf")
 BUDGET = {"solver.max_rhs": 200_000, "solver.max_wall_s": 5.0}
 COARSER = 100.0  # times rtol: a run that says how errors grow
 STEPPED = 12  # every so many seeds of chains are compared with the time-stepping scheme
+BESIDE_IMPACT = 1e-9  # s
+LEAST_JUMP = 1e-3  # of a rate at an impact, relative
 MORE_STEPS = 3.0  # times those without stops and friction
 
 
@@ -235,17 +237,18 @@ def _check_rate_event(case: Case, scene: Path, run: Run, record: Record) -> None
     hits = [event for event in judges.jumps(run) if event["t"] > 0]
     if not hits:
         return
-    t, name = float(hits[0]["t"]), str(hits[0]["coordinate"])
-    k, at = run.column(name), int(np.searchsorted(run.t, float(hits[0]["t"])))
-    if not 0 < at < len(run.t) - 1:
+    hit = hits[int(random.integers(len(hits)))]
+    t, name = float(hit["t"]), str(hit["coordinate"])
+    sides = []
+    for end in (t - BESIDE_IMPACT, t + BESIDE_IMPACT):
+        beside = _simulate(scene, case, "dae", Record(case.seed, case.kind), t_end=end)
+        if beside is None or beside.status != "done":
+            return
+        sides.append(float(beside.v_tree[-1, beside.column(name)]))
+    before, after = sides
+    if abs(after - before) < LEAST_JUMP * max(1.0, abs(before)):
         return
-    side = 1.0 if hits[0]["direction"] < 0 else -1.0
-    rates = run.v_tree[max(0, at - 1) : at + 2, k]
-    after = float(max(side * rates)) * side
-    before = float(min(side * rates)) * side
-    if side * before > -1e-3 or side * after < 1e-3:
-        return
-    value = float(random.uniform(0.2, 0.8) * (before if random.random() < 0.5 else after))
+    value = before + float(random.uniform(0.1, 0.9)) * (after - before)
     for formulation in FORMULATIONS[:1] if run.mechanism.splits_root else FORMULATIONS:
         event = {"of": "q_dot", "coordinate": name, "value": value}
         again = _simulate(scene, case, formulation, record, event=[event])

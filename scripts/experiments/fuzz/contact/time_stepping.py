@@ -22,6 +22,8 @@ from scripts.experiments.fuzz.state import state
 
 __all__ = ["TimeStepping"]
 
+MAX_ROUNDS = 50  # of an impact; what is left then is small beside a step
+
 
 @dataclass
 class TimeStepping:
@@ -67,9 +69,11 @@ class TimeStepping:
         u = np.linalg.solve(D, Z.T @ (H @ v))  # the projection onto what the loops allow here has their bias in it
         reached = self.signs * (q[self.columns] - self.limits) <= 0.0
         N = (self.signs[:, None] * Z[self.columns])[reached]
-        if reached.any():
-            u = answer_impact(D, N, u, self.e[reached]).v
-        u = u + h * np.linalg.solve(D, Z.T @ force)
+        pushed = Z.T @ force
+        moves = np.linalg.norm(L.T @ u) > 1e-12 * h * np.linalg.norm(np.linalg.solve(L, pushed))
+        if reached.any() and moves:
+            u = answer_impact(D, N, u, self.e[reached], max_rounds=MAX_ROUNDS).v
+        u = u + h * np.linalg.solve(D, pushed)
         rows = np.vstack([N, Z[self.rubbing]])
         moving = np.linalg.norm(rows, axis=1) > 1e-9
         if moving.any():
