@@ -97,29 +97,32 @@ def draw_gripper(seed: int, random: np.random.Generator) -> Case:
         parent = f"arm{k}"
     mass, at = float(10 ** random.uniform(-2.5, -0.5)), np.array([0.0, 0.0, 0.06])
     names = [f"f{k}" for k in range(count)]
+    flips = random.choice([1.0, 1.0, -1.0], count)  # an axis that points to closed: the finger rests on its upper stop
     for k, name in enumerate(names):
-        angle = 2 * np.pi * k / count
+        turn, axis = np.array([0.0, 0.0, 2 * np.pi * k / count]), np.array([0.0, flips[k], 0.0])
         parts.append(_link(f"finger{k}", zero, mass, 1e-4 * mass))
-        parts.append(
-            _joint(name, "prismatic", parent, f"finger{k}", at, np.array([0.0, 0.0, angle]), np.array([0.0, 1.0, 0.0]))
-        )
-    opens = random.choice([-1, 1]) if coupled and not pressed else 1  # closed is the lower end, or the upper one
+        parts.append(_joint(name, "prismatic", parent, f"finger{k}", at, turn, axis))
     mechanism = f'name = "gripper"\nurdf = "gripper.urdf"\ngravity = {toml(random.normal(size=3) * 6)}\n'
     independent = [f"a{k}" for k in range(moved)] + (names[:1] if coupled else names)
     mechanism += f"independent = {toml(independent)}\n"
-    if coupled:
-        for name in names[1:]:
-            mechanism += f'[[coupling]]\njoint = "{name}"\nother = "{names[0]}"\nratio = 1.0\n'
-        if count == 3 and random.random() < 0.4:  # follows from the others
-            mechanism += f'[[coupling]]\njoint = "{names[2]}"\nother = "{names[1]}"\nratio = 1.0\n'
+    couplings = [(k, 0) for k in range(1, count)] if coupled else []
+    if len(couplings) == 2 and random.random() < 0.4:
+        couplings.append((2, 1))  # follows from the others
+    for k, of in couplings:
+        ratio = float(flips[k] * flips[of])
+        mechanism += f'[[coupling]]\njoint = "{names[k]}"\nother = "{names[of]}"\nratio = {ratio}\n'
     if pressed:
-        for name in names if not coupled or random.random() < 0.5 else names[:1]:
-            mechanism += f'[[force]]\njoint = "{name}"\nvalue = {-mass * random.uniform(400, 4000)!r}\n'
+        for k in range(count) if not coupled or random.random() < 0.5 else range(1):
+            force = float(-flips[k] * mass * random.uniform(400, 4000))
+            mechanism += f'[[force]]\njoint = "{names[k]}"\nvalue = {force!r}\n'
     e = choose_restitutions(random, count)
+    opens = float(random.choice([-1, 1])) if not pressed else 1.0  # nothing presses: rests at the open end as well
     stopped = [k for k in range(count) if not coupled or random.random() < 0.8] or [0]
     contacts = {}
     for k in range(count):
-        limits = ((0.0, 0.04) if opens > 0 else (-0.04, 0.0)) if k in stopped else (-np.inf, np.inf)
+        limits = (-np.inf, np.inf)
+        if k in stopped:
+            limits = (0.0, 0.04) if opens * flips[k] > 0 else (-0.04, 0.0)
         rubs = float(mass * random.uniform(0.1, 10)) if random.random() < 0.2 else 0.0
         if k in stopped or rubs:
             contacts[names[k]] = Contact(rubs, *limits, e[k])

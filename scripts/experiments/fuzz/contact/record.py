@@ -169,7 +169,7 @@ def _judge_run(case: Case, name: str, run: Run, model: Model, record: Record) ->
         if case.quiet:
             record.add("quiet", name, judges.quiet_fault(run, case))
         if case.jammed:
-            record.add("rest", name, judges.rest_fault(run, model))
+            record.add("rest", name, judges.rest_fault(run, model, case))
     if not case.conservative and "torque_limit" in case.overrides["controller"]:
         limit = case.overrides["controller"]["torque_limit"]
         if np.abs(run.tau).max(initial=0.0) > limit * (1 + 1e-12):
