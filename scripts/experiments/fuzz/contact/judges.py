@@ -158,8 +158,9 @@ def compare(one: Run, other: Run, model: Model, allowed: float, until: float = n
             if first >= end - BESIDE_EVENT:
                 break
             late = abs(a - b) if max(a, b) < np.inf else np.inf
-            if late <= allowed * (OF_LAST_BOUNCE if name.endswith("touches") else 1.0):
-                off = max(off, late)
+            factor = OF_LAST_BOUNCE if name.endswith("touches") else 1.0
+            if late <= allowed * factor:
+                off = max(off, late / factor)
                 continue
             if first < until:
                 fault, until = f"{name} at {a:.9g} and {b:.9g}", first

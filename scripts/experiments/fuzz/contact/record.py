@@ -36,7 +36,9 @@ KINDS: dict[str, tuple[Draw, float]] = {
 }
 FORMULATIONS = ("dae", "reduced", "spf")
 BUDGET = {"solver.max_rhs": 200_000, "solver.max_wall_s": 5.0}
-COARSER = 100.0  # times rtol: a run that says how errors grow
+COARSER = (10.0, 100.0)  # times rtol: runs that say how errors grow
+LARGEST_SPREAD = 1e-5  # s, and relative: where such runs are further apart, formulations are not compared
+MAGNIFIED = 3.0  # times what such runs are off
 STEPPED = 12  # every so many seeds of chains are compared with the time-stepping scheme
 BESIDE_IMPACT = 1e-9  # s
 LEAST_JUMP = 1e-3  # of a rate at an impact, relative
@@ -189,29 +191,38 @@ def _compare_steps(case: Case, folder: Path, runs: dict[str, Run], record: Recor
 
 
 def _compare_formulations(case: Case, scene: Path, runs: dict[str, Run], model: Model, record: Record) -> None:
-    """Compare formulations event by event; where they differ, by how much a run at another tolerance does."""
+    """Compare formulations event by event; where they differ, by how much each does at other tolerances."""
     done = {name: run for name, run in runs.items() if run.status == "done"}
     if len(done) < 2:
         return
     record.compared = True
     (name, one), *others = done.items()
     allowed = judges.agreement_allowed(case)
-    agreements = {other: judges.compare(one, run, model, allowed) for other, run in others}
-    if not any(found.fault for found in agreements.values()):
-        return
-    rtol = min(1e-3, COARSER * case.overrides["solver.rtol"])
-    coarse = _simulate(scene, case, name, Record(case.seed, case.kind), **{"solver.rtol": rtol})
-    own = judges.compare(one, coarse, model, np.inf) if coarse is not None else None
-    for other, found in agreements.items():
+    spread: dict[str, tuple[float, float]] = {}
+    for other, run in others:
+        found = judges.compare(one, run, model, allowed)
         if not found.fault:
             continue
-        magnified = own is not None and not judges.compare(
-            one, done[other], model, max(allowed, own.off), own.until
-        ).fault  # fmt: skip
-        if magnified:
+        for of in (name, other):
+            if of not in spread:
+                spread[of] = _spread(case, scene, of, done[of], model)
+        off, until = max(spread[name][0], spread[other][0]), min(spread[name][1], spread[other][1])
+        if judges.compare(one, run, model, max(allowed, MAGNIFIED * off), until).fault:
+            record.add("formulations", f"{name}, {other}", found.fault)
+        else:
             record.magnified = True
-            continue
-        record.add("formulations", f"{name}, {other}", found.fault)
+
+
+def _spread(case: Case, scene: Path, formulation: str, run: Run, model: Model) -> tuple[float, float]:
+    """How far runs at other tolerances are off one, and until when they are off by no more than LARGEST_SPREAD."""
+    off, until = 0.0, float(run.t[-1])
+    for times in COARSER:
+        rtol = min(1e-3, times * case.overrides["solver.rtol"])
+        coarse = _simulate(scene, case, formulation, Record(case.seed, case.kind), **{"solver.rtol": rtol})
+        if coarse is not None:
+            found = judges.compare(run, coarse, model, LARGEST_SPREAD)
+            off, until = max(off, found.off if found.off <= LARGEST_SPREAD else 0.0), min(until, found.until)
+    return off, until
 
 
 def _compare_with_references(case: Case, run: Run, model: Model, record: Record) -> None:
