@@ -10,9 +10,9 @@
 
 namespace ckc {
 
-// Only an elastic body between two others whose masses differ by more than a factor of 1e7, and a jammed mechanism, need
+// Only an elastic body between two others whose masses differ by more than a factor of 1e6, and a jammed mechanism, need
 // more rounds. The projection on the cone of all stops ends these.
-constexpr long max_rounds = 10000;
+constexpr long max_rounds = 4000;
 
 constexpr double same = 1e-10;  // relative difference of gap velocities
 
