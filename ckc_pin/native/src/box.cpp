@@ -12,9 +12,43 @@ namespace qp = proxsuite::proxqp;
 
 constexpr double exactly = 1e-12;  // of the program, whose numbers are about one
 constexpr double accepted = 1e-11; // of the largest number of x: how far it may be from optimal
+constexpr double at_bound = 1e-9;  // of the largest number of x: so close to its bound a number is at it
 constexpr double far = 1e8;        // a bound that is never met
 constexpr long most_iterations = 10000;
 constexpr double parallel = 1e-12;  // of a direction whose rows are about one: it does not move along
+
+namespace {
+
+// How far x is from what a step along the gradient makes of it within the box: zero at the minimum.
+double residual(const Matrix& A, In b, In lower, In upper, const Vector& x) {
+  const Vector gradient = A * x + b;
+  return (x - (x - gradient).cwiseMax(lower).cwiseMin(upper)).lpNorm<Eigen::Infinity>();
+}
+
+// Solve for the numbers that are off their bounds once more, to rounding: the smallest ones, or those next to x.
+void polish(const Matrix& A, In b, In lower, In upper, Vector& x) {
+  const double apart = at_bound * std::max(1.0, x.lpNorm<Eigen::Infinity>());
+  Indices inside;
+  Vector bound = x;
+  for (Eigen::Index i = 0; i < x.size(); ++i)
+    if (x(i) - lower(i) > apart && upper(i) - x(i) > apart) inside.push_back(static_cast<int>(i)), bound(i) = 0.0;
+  if (inside.empty()) return;
+  Eigen::CompleteOrthogonalDecomposition<Matrix> factors;
+  factors.setThreshold(parallel);
+  factors.compute(A(inside, inside));
+  for (const Vector& from : {bound, x}) {
+    const Vector gradient = A * from + b;
+    Vector polished = from;
+    polished(inside) -= factors.solve(gradient(inside));
+    polished = polished.cwiseMax(lower).cwiseMin(upper);
+    if (residual(A, b, lower, upper, polished) <= std::max(residual(A, b, lower, upper, x), exactly)) {
+      x = polished;
+      return;
+    }
+  }
+}
+
+}  // namespace
 
 bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   const auto n = A.rows();
@@ -30,11 +64,10 @@ bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   program.init(A, cost, none, none, none, none, none, low, high);
   program.solve();
   x = program.results.x.cwiseMax(lower).cwiseMin(upper);
-  if (program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED) return x.allFinite();
-  // Where A is badly conditioned x is large, and rounding alone leaves more than the solver is told to.
-  const Vector gradient = A * x + b;
-  const double off = (x - (x - gradient).cwiseMax(lower).cwiseMin(upper)).lpNorm<Eigen::Infinity>();
-  return off <= accepted * std::max(1.0, x.lpNorm<Eigen::Infinity>());
+  if (!x.allFinite()) return false;
+  polish(A, b, lower, upper, x);
+  const bool solved = program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED;
+  return solved || residual(A, b, lower, upper, x) <= accepted * std::max(1.0, x.lpNorm<Eigen::Infinity>());
 }
 
 // A linear program in (x, s), at most a few unknowns, from the feasible point x = 0 by an active-set method: go along the

@@ -224,17 +224,24 @@ bool JointChanges::grip(double t, Out y, const Indices& before) {
     b_ /= size;
     // Rows that follow from others have accelerations that do, but for rounding, unless they do so here alone.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
-    for (Eigen::Index k = 0; k < m && eigen.eigenvalues()(k) <= dependent * eigen.eigenvalues()(m - 1); ++k) {
-      const double beyond = eigen.eigenvectors().col(k).dot(b_);
-      if (std::abs(beyond) <= std::max({exactly, rounded * most / size, rounding_.norm() / size}))
-        b_ -= beyond * eigen.eigenvectors().col(k);
-    }
+    const auto& values = eigen.eigenvalues();
+    const auto project = [&](double tolerance) {
+      for (Eigen::Index k = 0; k < m && values(k) <= dependent * values(m - 1); ++k) {
+        const double beyond = eigen.eigenvectors().col(k).dot(b_);
+        if (std::abs(beyond) <= tolerance) b_ -= beyond * eigen.eigenvectors().col(k);
+      }
+    };
+    project(std::max({exactly, rounded * most / size, rounding_.norm() / size}));
     for (Eigen::Index i = 0; i < m; ++i) {
       const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
       const double less = std::min(weaker, 0.5 * (high - low));
       low_(i) = low + less, high_(i) = high - less;
     }
-    if (!least_in_box(A_, b_, low_, high_, x_)) return false;
+    // Without a solution, stops push against each other: the nearest accelerations that all of them allow are taken.
+    if (!least_in_box(A_, b_, low_, high_, x_)) {
+      project(infinity);
+      if (!least_in_box(A_, b_, low_, high_, x_)) return false;
+    }
     const Vector row = A_ * x_ + b_;  // accelerations
     for (Eigen::Index i = 0; i < m; ++i) {
       const int k = at[i];

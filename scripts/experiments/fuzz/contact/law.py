@@ -4,8 +4,9 @@ One instant is answered in rounds. All stops that approach (gap velocity < 0) ar
 
     v+ = v_p - e v_o,   v_p = projection of v- onto {gap velocities >= 0} in the metric of D,   v_o = v- - v_p.
 
-Where their restitutions differ, groups of equal restitution follow one another, the smallest restitution first. In a
-group with e = 0 the stops that rest (gap velocity 0) belong to the cone too. Rounds follow until no stop approaches.
+Where their restitutions differ, the group with the smallest one is a round of its own. Stops that rest (gap velocity 0)
+belong to the cone too where they do not throw back: those with e = 0 in every round, all of them in a round with e = 0.
+Rounds follow until no stop approaches.
 By Moreau's decomposition v_p and v_o are orthogonal in the metric of D, so a reflection loses (1 - e^2)/2 |v_o|^2 >= 0.
 Friction has no impulse.
 """
@@ -70,7 +71,7 @@ def answer_impact(
         groups = np.unique(e[approaching])
         for restitution in groups[:1] if rechoose else groups:
             members = approaching & (e == restitution)
-            cone = members | ((e == 0) & (np.abs(N @ out.v) <= fine)) if restitution == 0 else members
+            cone = members | ((np.abs(N @ out.v) <= fine) & ((e == 0) | (restitution == 0)))
             nearest, outward = project(L, N[cone], out.v)
             out.v = nearest - restitution * outward
             out.lost += 0.5 * (1 - restitution**2) * float(np.sum((L.T @ outward) ** 2))
