@@ -2,6 +2,8 @@
 
 A crossing is a change of sign of (function - value). A run that starts on the value has not crossed
 it; touching the value and turning back is no crossing; reaching it at the very end of a run is one.
+A jump over the value at an impact is one crossing. A joint that comes to rest on the value has crossed
+it, once.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ class Event:
     Parameters
     ----------
     function : callable
-        (t, terms) to a number, smooth or at least continuous; `terms` are the mechanism's at that state.
+        (t, terms) to a number, smooth or at least continuous in the state; `terms` are the mechanism's at that state.
     direction : -1, 0 or 1
         1: only where it rises through zero; -1: only where it falls; 0: both.
     stop : bool

@@ -6,6 +6,7 @@
 namespace ckc {
 
 constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
+constexpr double time_tolerance = 2e-12;  // s: two functions that cross zero at once are found no further apart
 
 Events::Events(System& system, Step& step, std::vector<Event> events)
     : system_(system), step_(step), events_(std::move(events)), places_(walk_places()) {
@@ -36,16 +37,22 @@ void Events::add_own() {
 void Events::begin() {
   met.clear(), changing.clear();
   signs_.assign(events_.size(), 0), active_.assign(events_.size(), 1);
+  crossed_at_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN()), largest_.assign(events_.size(), 0.0);
+  resting_.assign(events_.size(), 0), joints_changed_ = false;
   jump();
 }
 
 // What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located.
-void Events::monitor_joints(In coordinates, In velocity) {
+void Events::monitor_joints(In coordinates, In velocity, double within) {
   const Joints& joints = system_.core.joints;
   changing.clear();
+  joints_changed_ = true, change_time_tolerance_ = within;
   for (size_t i = 0; i < events_.size(); ++i) {
     Event& event = events_[i];
-    if (!event.own) continue;
+    if (!event.own) {
+      last_[i] = std::numeric_limits<double>::quiet_NaN();
+      continue;
+    }
     const int k = event.coordinate;
     double here = 0.0;
     if (event.of == Event::q_dot) {
@@ -99,17 +106,24 @@ bool Events::at(Interpolant& motion, double t) {
 bool Events::place(double t, Closed wanted) {
   if (closed_ >= wanted) return true;
   closed_ = wanted;
-  return wanted == exactly ? system_.exact(t, y_) : system_.as_is(t, y_);
+  if (wanted == as_y_is) return system_.as_is(t, y_);
+  if (!system_.exact(t, y_)) return false;
+  bool changed = wanted == at_rest && !system_.core.joints.locked.empty();
+  for (int k = 0; k < 2 && changed; ++k)  // twice: moving a joint to its place changes the rates
+    if (!system_.keep_locked(y_, 0.0, changed) || !system_.exact(t, y_)) return false;
+  return true;
 }
 
 bool Events::value(int k, double t, double& gap) {
   const Event& event = events_[k];
   if (event.of <= Event::q_dot && system_.shows(y_, event.coordinate, event.of == Event::q_dot, gap))
     return gap = event.sign * (gap - event.value), true;
-  return place(t, event.of == Event::holding ? as_y_is : exactly) && value_there(k, t, gap);
+  return event.of == Event::holding ? place(t, as_y_is) && value_there(k, t, gap) : exact_value(k, t, gap);
 }
 
-bool Events::exact_value(int k, double t, double& gap) { return place(t, exactly) && value_there(k, t, gap); }
+bool Events::exact_value(int k, double t, double& gap) {
+  return place(t, events_[k].of == Event::function ? at_rest : exactly) && value_there(k, t, gap);
+}
 
 bool Events::value_there(int k, double t, double& gap) {
   const Event& event = events_[k];
@@ -179,11 +193,17 @@ bool Events::goes_on(int k) const {
 bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
   halt = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
-  wanted_.clear(), sampled_.clear();
-  for (int k = 0; k < static_cast<int>(events_.size()); ++k)
-    if (active_[k] && !(silent && !events_[k].own) &&
-        !(signs_[k] && ((ruled_out(events_[k]) && goes_on(k)) || holds_by_far(k))))
+  wanted_.clear(), sampled_.clear(), found_.clear();
+  for (int k = 0; k < static_cast<int>(events_.size()); ++k) {
+    const Event& event = events_[k];
+    if (!active_[k] || (silent && !event.own)) continue;
+    if (is_held(event)) {
+      const double gap = held_value(event);
+      if (joints_changed_) report_arrival(k, std::abs(gap) <= event.floor ? 0 : gap > 0 ? 1 : -1, halt);
+    } else if (!(signs_[k] && ((ruled_out(event) && goes_on(k)) || holds_by_far(k)))) {
       wanted_.push_back(k);
+    }
+  }
   if (!wanted_.empty()) {
     const bool locked = std::any_of(wanted_.begin(), wanted_.end(), [&](int k) { return events_[k].of == Event::holding; });
     if (!sample(motion, 0, locked ? 2 : 1)) return false;
@@ -191,6 +211,8 @@ bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
     wanted_.erase(std::remove_if(wanted_.begin(), wanted_.end(), [&](int k) { return holds(k); }), wanted_.end());
     if (!wanted_.empty() && !((!locked || sample(motion, 1, 2)) && find(motion, last, halt))) return false;
   }
+  if (!wanted_.empty() || !found_.empty()) report(halt);
+  joints_changed_ = joints_changed_ && silent;
   values_at_ = step_.t_new;
   std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
   known_ = !std::isfinite(halt);
@@ -204,43 +226,63 @@ bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
 }
 
 bool Events::find(Interpolant& motion, bool last, double& halt) {
-  found_.clear();
+  const bool resting = !system_.core.joints.locked.empty();
   for (int k : wanted_) {
     const auto value_at = [&](double t, double& there) { return at(motion, t) && value(k, t, there); };
     const auto exact_at = [&](double t, double& there) { return at(motion, t) && exact_value(k, t, there); };
-    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate nothing
+    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate rest_tolerance
     const Event& event = events_[k];
     const bool rough = event.of <= Event::q_dot || event.of == Event::holding;
     Walk& walked = walks_[k];
-    if (!walk(gap, step_.t, step_.t_new, values_.col(k), signs_[k], event.floor, walked, rough ? &exact : nullptr)) return false;
-    if (last && walked.on_zero && walked.sign && !events_[k].own) walked.found.emplace_back(step_.t_new, -walked.sign);
+    double floor = event.floor;
+    if (!event.own) {
+      largest_[k] = std::max(largest_[k], values_.col(k).cwiseAbs().maxCoeff());
+      if (event.of == Event::function && resting) floor = function_rounding * std::max(1.0, largest_[k]);
+      // A function that was on zero until joints changed, or has just come there, counts as zero where the step begins.
+      const double first = std::abs(values_(0, k));
+      const bool was_zero = signs_[k] ? has_just_crossed(k) : resting_[k] != 0;
+      if (joints_changed_ && was_zero && first <= zero_tolerance * largest_[k]) floor = std::max(floor, 2.0 * first);
+    }
+    if (!walk(gap, step_.t, step_.t_new, values_.col(k), signs_[k], floor, walked, rough ? &exact : nullptr)) return false;
+    if (!event.own && stays_on_value(k)) {
+      walked.found.clear(), walked.sign = signs_[k];
+      if (joints_changed_) report_arrival(k, 0, halt), walked.sign = signs_[k];
+      continue;
+    }
+    if (last && walked.on_zero && walked.sign && !event.own) walked.found.emplace_back(step_.t_new, -walked.sign);
     for (const auto& [t, direction] : walked.found) {
-      if (events_[k].direction != 0 && events_[k].direction != direction) continue;
+      if (event.direction != 0 && event.direction != direction) continue;
       found_.push_back({t, k, direction});
-      if (events_[k].stop) halt = std::min(halt, t);
+      if (event.stop) halt = std::min(halt, t);
     }
   }
+  return true;
+}
+
+// Report the events until the step is halted. If joints change at that time, an event that is found a rounding later belongs
+// to the same instant: the motion behind it is never made.
+void Events::report(double halt) {
   std::sort(found_.begin(), found_.end(), [](const Crossed& a, const Crossed& b) {
     return a.t != b.t ? a.t < b.t : a.event < b.event;
   });
   changing.clear(), halted_ = false;
+  const bool changes = std::any_of(found_.begin(), found_.end(), [&](const Crossed& crossed) {
+    return crossed.t == halt && events_[crossed.event].own;
+  });
+  const double until = changes ? halt + time_tolerance : halt;
   for (const Crossed& crossed : found_) {
-    if (crossed.t > halt) break;
     const Event& event = events_[crossed.event];
+    if (crossed.t > (event.own ? halt : until)) continue;
     if (event.own)
       changing.push_back(event);
     else
-      met.push_back(crossed), halted_ |= event.stop;
+      met.push_back({std::min(crossed.t, halt), crossed.event, crossed.direction}), halted_ |= event.stop;
   }
   for (int k : wanted_) {
-    if (!std::isfinite(halt)) {
-      signs_[k] = walks_[k].sign;
-      continue;
-    }
+    if (!std::isfinite(halt)) signs_[k] = walks_[k].sign;
     for (const auto& [t, direction] : walks_[k].found)  // the sign that a function goes on with from there
-      if (t <= halt) signs_[k] = direction;
+      if (t <= (events_[k].own ? halt : until)) signs_[k] = direction, crossed_at_[k] = std::min(t, halt);
   }
-  return true;
 }
 
 }  // namespace ckc

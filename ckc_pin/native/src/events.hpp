@@ -34,6 +34,9 @@ struct Crossed {
   int event, direction;
 };
 
+constexpr double zero_tolerance = 1e-7;      // of a function's largest value: the solver's tolerances may take it so far off zero
+constexpr double function_rounding = 1e-12;  // absolute, or of its largest value: rounding of a function while joints are at rest
+
 using Points = std::vector<std::pair<double, double>>;  // (t, value), increasing in t
 
 // Sign changes of a function within a step, and what was needed to find them.
@@ -41,6 +44,7 @@ struct Walk {
   std::vector<std::pair<double, int>> found;  // (t, direction), in order
   int sign = 0;                               // at the end, or the last one it had; 0 while it has had none
   bool on_zero = false;                       // at the end
+  bool always_on_zero = false;                // from one end to the other
   Points points, tips;
   Vector curve, exact_values;
 };
@@ -65,8 +69,12 @@ class Events {
   // motion ends with this step; `silent`: only the loop's own are looked for. False where a function has no value:
   // `failed` and the system's problem say which.
   bool check(Interpolant& motion, bool last, bool silent, double& halt);
-  // Joints slide, stick and touch as they do from now on; where they are, and how they move.
-  void monitor_joints(In coordinates, In velocity);
+  // Find the sign of each event that has had none, at (t, y), before joints change there: a jump over the value is seen by
+  // that sign. False where a function has no value, as `check`.
+  bool learn_signs_before_change(double t, In y);
+  // Joints slide, stick and touch as they do from now on; where they are, and how they move. `within`: s, how closely the
+  // time of that is known.
+  void monitor_joints(In coordinates, In velocity, double within);
 
   std::vector<Crossed> met;
   std::vector<Event> changing;  // the loop's own that were met where the last check halted
@@ -80,8 +88,8 @@ class Events {
     Vector q, v, a;
     bool accelerated = false;
   };
-  // How closed the loops are where an event is looked at.
-  enum Closed { only_y, as_y_is, exactly };
+  // How closed the loops are where an event is looked at; `at_rest`: and joints that stick or touch are exactly at rest.
+  enum Closed { only_y, as_y_is, exactly, at_rest };
   bool goes_on(int k) const;
   bool ruled_out(const Event& event) const;
   bool holds_by_far(int k);
@@ -96,7 +104,21 @@ class Events {
   bool sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride);
   bool holds(int k) const;  // by the values at every second place
   bool find(Interpolant& motion, bool last, double& halt);
+  void report(double halt);
   void add_own();
+
+  // --- joints at rest (events_at_rest.cpp) ---
+  // Whether a joint that sticks or touches holds the event's coordinate.
+  bool is_held(const Event& event) const;
+  double held_value(const Event& event) const;
+  // Whether the event changed its sign at the time where the step begins.
+  bool has_just_crossed(int k) const;
+  // Give an event the sign that it has from the step's begin on. Where the sign before was another one, the event occurs there.
+  void report_arrival(int k, int sign, double& halt);
+  // Whether an event's function stays on its value throughout the step. If so, crossings that the walk found are rounding.
+  bool stays_on_value(int k);
+  bool is_still(int k) const;
+  bool can_move(int coordinate, double t, In y);  // whether the loops and the joints at rest let a coordinate move
 
   System& system_;
   Step& step_;
@@ -105,6 +127,11 @@ class Events {
   std::vector<char> active_;
   const Vector& places_;
   End start_, end_;
+  std::vector<double> crossed_at_;      // by event: when its sign changed last, s; NaN where it has not
+  std::vector<double> largest_;         // by event: the largest value that was sampled in this motion
+  std::vector<char> resting_;           // by event: whether it came to its value and stayed there
+  bool joints_changed_ = false;         // joints changed at the time where the next step begins
+  double change_time_tolerance_ = 0.0;  // s: how closely that time is known
   bool halted_ = false;
   bool known_ = false;        // whether start_ is that of the step
   double end_holds_ = 0.0;    // what holds at its end, NaN where that is not known
@@ -116,7 +143,8 @@ class Events {
   Vector y_, coordinates_;
   Closed closed_ = only_y;    // how the core is at y_
   Eigen::JacobiSVD<Matrix> svd_J_, svd_phi_z_;
-  Matrix phi_z_;
+  Matrix phi_z_, responses_;
+  Vector unit_, product_;
 };
 
 }  // namespace ckc

@@ -27,6 +27,7 @@ std::optional<Stop> Loop::change_joints() {
   joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
   if (!joints_often_ && now.t > begin_.t) ++restarts_;
   joints_at_ = now.t;
+  if (!silent_ && !events.learn_signs_before_change(now.t, now.y)) return event_failure();
   if (joints_often_ > most_changes) return Stop{Stop::chatter, now.t};
   system->core.joints.patience =
       std::pow(patience_growth, std::clamp<long>(joints_often_ - impatient_changes, 0, patience_steps));
@@ -34,7 +35,7 @@ std::optional<Stop> Loop::change_joints() {
     const Stop stop = trouble();
     return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::contact, now.t} : stop;
   }
-  events.monitor_joints(joint_changes_.coordinates, system->velocity);
+  events.monitor_joints(joint_changes_.coordinates, system->velocity, within);
   joints_known_ = true, begun_ = f_known_ = false;
   // A step that is far longer than what happens next would not see that.
   now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);

@@ -20,6 +20,8 @@ class Recorder {
   // Record the state at (t, y), unless that instant is recorded already; false where the state has no terms.
   bool add(System& system, double t, In y);
   void passed() { ++next_; }
+  // Remove the last row if it is of time t, so that another state can be recorded there.
+  void drop_row_at(double t) { filled -= filled && rows_[(filled - 1) * width] >= t; }
 
   Eigen::Index filled = 0;
 

@@ -165,11 +165,11 @@ bool walk(const Gap& gap, double from, double to, In values, int sign, double fl
       if (!(*exact)(k + 1 == places.size() ? to : from + (to - from) * places(k), exact_values(k))) return false;
     return walk(*exact, from, to, exact_values, sign, floor, walked);
   }
-  walked.found.clear(), walked.sign = sign, walked.on_zero = false;
+  walked.found.clear(), walked.sign = sign, walked.on_zero = false, walked.always_on_zero = true;
   auto last = points.front();
   for (const auto& point : points) {
     const int now = std::abs(point.second) <= zero ? 0 : point.second > 0 ? 1 : -1;
-    walked.on_zero = now == 0;
+    walked.on_zero = now == 0, walked.always_on_zero &= now == 0;
     if (now && walked.sign && walked.sign != now) {
       double t;
       if (!root(gap, last, point, t)) return false;
