@@ -274,7 +274,7 @@ def _compile(
     library: Path,
     on_written: Callable[[float], None] | None,
 ) -> None:
-    import subprocess
+    from ckc_pin.generated.program import run_program
 
     try:
         from ckc_pin.generated.code import Code
@@ -287,11 +287,9 @@ def _compile(
         on_written(len(written) * PER_LETTER)
     try:
         text.write_text(written, encoding="ascii")
-        done = subprocess.run(
-            [compiler.path, *compiler.flags, "-o", str(library), str(text), "-lm"],
-            capture_output=True, text=True, errors="replace", timeout=PATIENCE, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
+        command = [compiler.path, *compiler.flags, "-o", str(library), str(text), "-lm"]
+        done = run_program(command, PATIENCE, temporary=text.parent)
+    except TimeoutError:
         raise InputError(f"{mechanism.name}: the C compiler took more than {PATIENCE:g} s for its terms") from None
     except OSError as error:
         raise InputError(f"{mechanism.name}: its terms cannot be compiled: {error.strerror}") from error
