@@ -12,21 +12,21 @@ Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from ckc_pin.control.controllers import Controller, SetPoint, Tracking
-from ckc_pin.control.sampled import Sampled
-from ckc_pin.dynamics.terms import Terms, terms
-from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
-from ckc_pin.kinematics import load
-from ckc_pin.kinematics.point import Point
-from ckc_pin.mechanism import Mechanism
-
+TYPE_CHECKING = False  # importing `typing`, NumPy or Pinocchio here would delay the signal handlers of `ckc`
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+    from typing import Any
+
+    from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+    from ckc_pin.control.sampled import Sampled
+    from ckc_pin.dynamics.terms import Terms, terms
+    from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.generated.symbolic import Symbolic
+    from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
+    from ckc_pin.kinematics.point import Point
+    from ckc_pin.mechanism import Mechanism
     from ckc_pin.simulation.check import Check, check
     from ckc_pin.simulation.ensembles.ensemble import ensemble
     from ckc_pin.simulation.events import Event
@@ -92,15 +92,35 @@ __all__ = [
 __version__ = "0.1.0"
 
 
+MODULES = {  # of the names that do without simulation
+    "CkcError": "errors",
+    "Controller": "control.controllers",
+    "InputError": "errors",
+    "Mechanism": "mechanism",
+    "MechanismError": "errors",
+    "NumericalError": "errors",
+    "Point": "kinematics.point",
+    "Sampled": "control.sampled",
+    "SetPoint": "control.controllers",
+    "Terms": "dynamics.terms",
+    "Tracking": "control.controllers",
+    "load": "kinematics",
+    "terms": "dynamics.terms",
+}
+FOLDERS = ("control", "dynamics", "errors", "kinematics", "mechanism", "simulation")
+
+
 def __getattr__(name: str) -> Any:
-    """Load simulation when something of it is used first: terms and mechanisms do without."""
+    """Import the module of a public name when the name is used first."""
     from importlib import import_module
 
-    if name == "simulation":
-        return import_module("ckc_pin.simulation")
-    if name in __all__:  # the others are here
-        return getattr(import_module("ckc_pin.simulation"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in FOLDERS:
+        return import_module(f"ckc_pin.{name}")
+    if name not in __all__:  # the others are here
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"ckc_pin.{MODULES.get(name, 'simulation')}"), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

@@ -1,5 +1,5 @@
 """``python -m ckc_pin.cli`` is ``ckc``."""
 
-from ckc_pin.cli.app import main
+from ckc_pin.cli import main
 
 main()

@@ -6,13 +6,13 @@ import io
 import os
 import sys
 from importlib import import_module
-from typing import NoReturn
 
 import click
 
 import ckc_pin
-from ckc_pin.cli.exits import DONE, STOPPED, WRONG_INPUT, interrupted, interrupts
-from ckc_pin.cli.output import errors, print_json
+from ckc_pin.cli.exits import DONE, STOPPED, WRONG_INPUT, interrupted
+from ckc_pin.cli.output import errors, forget_answer, has_answered, print_json
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, NumericalError
 
 __all__ = ["ckc", "main"]
@@ -68,6 +68,14 @@ class _Commands(click.Group):
         command: click.Command = getattr(import_module(f"ckc_pin.cli.{module}"), function)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Import the module of a command; only then may a signal raise KeyboardInterrupt."""
+        found = super().resolve_command(ctx, args)
+        interrupts.start_command()
+        return found
+
 
 @click.group(
     "ckc",
@@ -84,36 +92,59 @@ def ckc(context: click.Context) -> None:
         print(context.get_help())
 
 
-def main() -> NoReturn:
-    """Entry point of the `ckc` command."""
+def main() -> int:
+    """Run the command line of this process and return the exit code."""
     if COMPLETE in os.environ:
         from click.shell_completion import shell_complete
 
-        sys.exit(shell_complete(ckc, {}, "ckc", COMPLETE, os.environ[COMPLETE]))
+        return int(shell_complete(ckc, {}, "ckc", COMPLETE, os.environ[COMPLETE]))
     as_json = "--json" in sys.argv
-    interrupts.install()
+    forget_answer()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a name that the terminal cannot show is no error
-    code = DONE
+    try:
+        code = _run(as_json)
+        interrupts.finish()
+    except BaseException as error:
+        stop = _interrupt_behind(error)
+        if stop is None:
+            raise
+        interrupts.finish()
+        _fail(f"by {str(stop) or 'Ctrl-C'}", as_json, status="interrupted")
+        return interrupted(str(stop))
+    return code
+
+
+def _run(as_json: bool) -> int:
+    """Run the command line; say what was wrong with it, and return the exit code."""
     try:
         with ckc.make_context("ckc", sys.argv[1:]) as context:
             ckc.invoke(context)
         sys.stdout.flush()
     except click.exceptions.Exit as exit_:
-        code = exit_.exit_code
-    except click.ClickException as error:
-        _fail(_usage(error), WRONG_INPUT, as_json)
-    except NumericalError as error:
-        _fail(str(error), STOPPED, as_json, status="stopped")
-    except CkcError as error:
-        _fail(str(error), WRONG_INPUT, as_json)
-    except KeyboardInterrupt as stop:
-        _fail(f"by {str(stop) or 'Ctrl-C'}", interrupted(str(stop)), as_json, status="interrupted")
+        return exit_.exit_code
     except BrokenPipeError:  # the reader went away; nothing is wrong
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT, as_json)
-    sys.exit(code)
+    except (click.ClickException, CkcError, OSError) as error:
+        if _interrupt_behind(error) is not None:
+            raise
+        stopped = isinstance(error, NumericalError)
+        _fail(_message(error), as_json, status="stopped" if stopped else "error")
+        return STOPPED if stopped else WRONG_INPUT
+    return DONE
+
+
+def _interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
+    """Return the KeyboardInterrupt that an error is, or that a library has turned into this error."""
+    return error if isinstance(error, KeyboardInterrupt) else interrupts.pending
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, click.ClickException):
+        return _usage(error)
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _usage(error: click.ClickException) -> str:
@@ -126,8 +157,7 @@ def _usage(error: click.ClickException) -> str:
     return f"{path}: {what if what.endswith(('.', '?')) else f'{what}.'} {choices}"
 
 
-def _fail(message: str, code: int, as_json: bool, status: str = "error") -> NoReturn:
+def _fail(message: str, as_json: bool, status: str) -> None:
     errors().print(f"{status}: {message}")
-    if as_json:
+    if as_json and not has_answered():
         print_json({"status": status, "message": message})
-    sys.exit(code)

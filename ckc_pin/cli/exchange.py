@@ -9,6 +9,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.output import Working, errors, print_card, print_json
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.formats import exporting, importing
 from ckc_pin.simulation.report import check_plain
 
@@ -29,7 +30,8 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
     """Take a robot from another format. Writes a mechanism.toml and a URDF, and says what was guessed and left out."""
     with Working(f"reading {file.name}"):
         draft = importing.read(file)
-    written = importing.write(draft, out or Path(draft.name), overwrite)
+    with interrupts.deferred():  # both files or none
+        written = importing.write(draft, out or Path(draft.name), overwrite)
     found, problem = None, ""
     try:
         found = ckc_pin.check(written[0])

@@ -10,8 +10,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
+from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_table
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes
@@ -59,9 +60,10 @@ def inverse(what: str, changes: tuple[str, ...], out: Path | None, figures: bool
 
 def _write(found: ckc_pin.MotionForces, out: Path, figures: bool) -> None:
     """Save the forces, whatever signals come, then draw them if that is asked for."""
-    with interrupts.deferred(), ExitStack() as stack:
-        stack.enter_context(alone_in(out))
-        found.save(out / "inverse.npz")
+    with ExitStack() as stack:
+        with interrupts.deferred():
+            stack.enter_context(alone_in(out))
+            found.save(out / "inverse.npz")
         if not figures:
             return
         try:

@@ -11,8 +11,8 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.exits import interrupts
 from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes, read_table
@@ -117,15 +117,16 @@ def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out:
     """
     from ckc_pin.simulation.sway import sways
 
-    with interrupts.deferred(), ExitStack() as stack:
-        stack.enter_context(alone_in(out))
-        for path in out.iterdir():
-            if OF_MODEL.fullmatch(path.name) and path.is_file():
-                path.unlink()
-        save_linear(model, out / "linear.npz")
-        runs = sways(model)
-        for number, run in runs.items():
-            run.save(out / f"mode_{number}.npz")
+    runs = sways(model)
+    with ExitStack() as stack:
+        with interrupts.deferred():
+            stack.enter_context(alone_in(out))
+            for path in out.iterdir():
+                if OF_MODEL.fullmatch(path.name) and path.is_file():
+                    path.unlink()
+            save_linear(model, out / "linear.npz")
+            for number, run in runs.items():
+                run.save(out / f"mode_{number}.npz")
         locus = None
         try:
             locus = ckc_pin.gain_locus(what, changes=read_changes("--set", changes))

@@ -11,6 +11,7 @@ import click
 
 from ckc_pin.cli import options
 from ckc_pin.cli.output import make_folder, print_json
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import write_whole
 
@@ -33,9 +34,10 @@ def new(folder: Path, as_json: bool) -> None:
     there = next((path for path in (folder, *paths) if exists(path) and (path != folder or not isdir(folder))), None)
     if there is not None:
         raise InputError(f"{there}: is there already; give another name")
-    make_folder(folder, "")
-    for path, template in zip(paths, templates, strict=True):
-        write_whole(path, template.read_text(encoding="utf-8").replace("NAME", name))
+    with interrupts.deferred():  # all files or none
+        make_folder(folder, "")
+        for path, template in zip(paths, templates, strict=True):
+            write_whole(path, template.read_text(encoding="utf-8").replace("NAME", name))
     if as_json:
         print_json({"status": "done", "written": [str(path) for path in paths]})
         return

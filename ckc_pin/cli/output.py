@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from ckc_pin.mechanism.card import Card
 
-__all__ = ["LONG", "ProgressBar", "Working", "errors", "kept", "make_folder", "on_terminal", "print_card", "print_json",
-           "print_table"]  # fmt: skip
+__all__ = ["LONG", "ProgressBar", "Working", "errors", "forget_answer", "has_answered", "kept", "make_folder",
+           "on_terminal", "print_card", "print_json", "print_table"]  # fmt: skip
 
 
 LONG = 10.0  # s: what may take longer says so before
@@ -42,9 +42,23 @@ def on_terminal() -> bool:
     return sys.stderr.isatty() and errors().is_terminal
 
 
+_answers: list[str] = []  # the object of --json, once its printing has begun
+
+
 def print_json(data: dict[str, Any]) -> None:
     """Print the one object of --json."""
-    print(to_json(data))
+    _answers.append(to_json(data))
+    print(_answers[-1])
+
+
+def has_answered() -> bool:
+    """Return whether printing the object of --json has begun."""
+    return bool(_answers)
+
+
+def forget_answer() -> None:
+    """Begin another command line in this process."""
+    _answers.clear()
 
 
 def print_table(table: RenderableType) -> None:

@@ -14,8 +14,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
+from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import LONG, ProgressBar, errors, kept, make_folder, on_terminal, print_json, print_table
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
@@ -118,12 +119,12 @@ def _mjcf(mechanism: ckc_pin.Mechanism) -> tuple[str, list[str]]:
 
 
 def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], out: Path) -> list[Path]:
-    """Write page, rows and figures, whatever signals come."""
-    from ckc_pin.analysis.precision import precision_csv, precision_markdown
-
+    """Write page and rows, whatever signals come; then draw figures, and write the page with them."""
     written, figures = list[Path](), dict[int, str]()
-    with interrupts.deferred(), ExitStack() as stack:
-        stack.enter_context(alone_in(out))
+    with ExitStack() as stack:
+        with interrupts.deferred():
+            stack.enter_context(alone_in(out))
+            _write_texts(every, figures, out)
         for k, (found, data) in enumerate(zip(every, plain, strict=True)):
             if found.reference is None:
                 continue
@@ -135,10 +136,16 @@ def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], o
                 figures[k] = f"{stem}.png"
             except InputError as error:  # matplotlib is an extra
                 errors().print(f"no figure: {error}")
-        for name, text in (("report.md", precision_markdown(every, figures)), ("rows.csv", precision_csv(every))):
-            write_whole(out / name, text)
-            written.insert(0, out / name)
-    return written
+        return [*_write_texts(every, figures, out), *written]
+
+
+def _write_texts(every: Sequence[WorkPrecision], figures: dict[int, str], out: Path) -> list[Path]:
+    from ckc_pin.analysis.precision import precision_csv, precision_markdown
+
+    texts = {"rows.csv": precision_csv(every), "report.md": precision_markdown(every, figures)}
+    for name, text in texts.items():
+        write_whole(out / name, text)
+    return [out / name for name in texts]
 
 
 def _as_file(scene: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,11 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.exits import DONE, STOPPED, interrupted, interrupts
+from ckc_pin.cli.exits import DONE, STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_card, print_json
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.whole_file import alone_in, write_whole
 from ckc_pin.simulation.arguments import read_changes
 from ckc_pin.simulation.check import run_warnings
@@ -75,8 +77,10 @@ def run(
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
         code = _report(finished, out, figures, profile, as_json)
         if view is not None and finished.status != "interrupted":
-            with suppress(KeyboardInterrupt):
+            try:
                 view.finish(finished, stay=True)
+            except KeyboardInterrupt as stop:
+                acknowledge(stop)
     if code != DONE:
         raise click.exceptions.Exit(code)
 
@@ -124,8 +128,7 @@ def _write(finished: ckc_pin.Run, out: Path, figures: bool) -> KeyboardInterrupt
                 with Working("drawing"):
                     _draw(finished, out)
     except KeyboardInterrupt as stop:
-        by = f" by {stop}" if str(stop) else ""
-        errors().print(f"interrupted{by}; the run is saved{', without figures' if figures else ''}")
+        errors().print(f"interrupted{acknowledge(stop)}; the run is saved{', without figures' if figures else ''}")
         return stop
     return None
 

@@ -10,8 +10,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.exits import STOPPED, interrupted, interrupts
+from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_card, print_json
+from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.whole_file import alone_in
 from ckc_pin.simulation.arguments import read_changes
@@ -63,10 +64,11 @@ def sensitivities(
 
 def _write(found: ckc_pin.Sensitivities, out: Path, figures: bool) -> None:
     """Save them and the run, whatever signals come, then draw them if that is asked for."""
-    with interrupts.deferred(), ExitStack() as stack:
-        stack.enter_context(alone_in(out))
-        found.save(out / "sensitivities.npz")
-        found.run.save(out / "run.npz")
+    with ExitStack() as stack:
+        with interrupts.deferred():
+            stack.enter_context(alone_in(out))
+            found.save(out / "sensitivities.npz")
+            found.run.save(out / "run.npz")
         if not figures:
             return
         try:

@@ -15,6 +15,7 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.interrupt import interrupt_again
 from ckc_pin.mechanism.card import Card, Shown
 from ckc_pin.mechanism.kinds import a_kind, is_number
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -249,7 +250,7 @@ def _miss(run: Run, period: float) -> float:
         Too much for a periodic one.
     """
     if run.status == "interrupted":
-        raise KeyboardInterrupt(run.message)
+        raise interrupt_again(run.message)
     if run.status != "done" or run.t[-1] < period * (1 - 1e-12):
         raise NumericalError(f"floquet: the motion does not reach the end of its period: {run.message}")
     tree, largest = run.mechanism.tree, 0.0

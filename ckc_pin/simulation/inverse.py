@@ -23,6 +23,7 @@ from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.kinds import require_callable, require_table
 from ckc_pin.mechanism.linear import one_blas_thread
@@ -149,8 +150,7 @@ def _along(
     except KeyboardInterrupt as signal:
         if not rows:
             raise
-        by = f" by {signal}" if str(signal) else ""
-        status, message = "interrupted", f"interrupted at t = {rows[-1]['t']:.6g} s{by}"
+        status, message = "interrupted", f"interrupted at t = {rows[-1]['t']:.6g} s{acknowledge(signal)}"
     return collected(rows, mechanism, actuation.limit, name, status, message)
 
 

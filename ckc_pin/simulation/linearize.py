@@ -18,6 +18,7 @@ from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import Library
+from ckc_pin.interrupt import interrupt_again
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import nearest, shortest, sigma
 from ckc_pin.mechanism.findings import beyond_stops
@@ -318,7 +319,7 @@ def _run_to(scene: Scene, t: float) -> Run:
     changes = {"t_end": max(t, min(MOMENT, t_end))}
     run = simulate(make_scene(with_changes(scene.plain(), changes), scene.name, scene.sources))
     if run.status == "interrupted":
-        raise KeyboardInterrupt(run.message)
+        raise interrupt_again(run.message)
     if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):
         return run
     says = f"t = {t:.15g} s is outside the run of {scene.name}, which ends at t = {run.t[-1]:.9g} s: {run.message}"

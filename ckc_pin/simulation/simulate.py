@@ -15,6 +15,7 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.generated.library import compiled
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.kinds import require_callable, require_flag
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.tree import Array
@@ -80,6 +81,8 @@ def simulate(
         The scene cannot be run as written; known before the first step.
     NumericalError
         It cannot even start, because its initial state is singular.
+    KeyboardInterrupt
+        It was interrupted before the first output instant was recorded.
     """
     scene = as_scene(scene, changes, "simulate")
     require_callable(progress, "simulate: progress", "a function of (t, t_end)")
@@ -176,16 +179,17 @@ def _drive(
             if stop.why != "pause":
                 break
     except KeyboardInterrupt as signal:
-        by = f" by {signal}" if str(signal) else ""
+        if not loop.filled:  # not even a first row: in the first call of a caller's controller, say
+            raise
         status: Status = "interrupted"
-        message = f"interrupted at t = {loop.t:.6g} s{by}"
+        message = f"interrupted at t = {loop.t:.6g} s{acknowledge(signal)}"
     else:
         error = explain(stop, loop, ready.mechanism, solver, ready.events)
         if not filled:  # not even a first row
             raise error
         status, message = "stopped", _sentence(error, loop.t)
-    filled = max(filled, loop.record_now())  # where not even that state has terms, the last output instant is the end
-    return status, message, filled
+    loop.record_now()  # where not even that state has terms, the last output instant is the end
+    return status, message, loop.filled
 
 
 def _compile(ready: Prepared) -> None:

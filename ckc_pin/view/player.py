@@ -11,6 +11,7 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.kinds import is_number, require_flag, require_kind, require_path
 from ckc_pin.mechanism.whole_file import write_whole
 from ckc_pin.simulation.run import Run
@@ -92,7 +93,8 @@ def play(
         try:
             print(f"{server.url}  (Ctrl-C ends)", flush=True)
             Event().wait()
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
+            acknowledge(stop)
             print()
     return None
 

@@ -16,6 +16,7 @@ from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move,
 from ckc_pin.analysis.precision.reference import Reference, find_reference
 from ckc_pin.analysis.precision.settings import changed, off_manifold, settings
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.scene import Scene, load_scene
@@ -109,8 +110,8 @@ def work_precision(
     try:
         _compare(found, scene, ready.mechanism, budget, mjcf, progress or (lambda part: None))
     except KeyboardInterrupt as stop:
-        by = f" by {stop}" if str(stop) else ""
-        found.status, found.message = "interrupted", f"interrupted{by} after {len(found.rows)} settings"
+        found.status = "interrupted"
+        found.message = f"interrupted{acknowledge(stop)} after {len(found.rows)} settings"
     if found.reference is not None:
         found.advice = advise(found.rows, found.reference.accuracy)
     found.seconds = perf_counter() - began

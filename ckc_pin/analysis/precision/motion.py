@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.errors import CkcError
+from ckc_pin.interrupt import interrupt_again
 from ckc_pin.mechanism.tree import Array, Tree
 from ckc_pin.simulation.prepare import prepare
 from ckc_pin.simulation.run import Run
@@ -152,7 +153,7 @@ def move(scene: Scene, limit: float, *, fewest: int = 1, most: int = REPEATS) ->
         while True:
             run = run_prepared(ready)
             if run.status == "interrupted":  # the comparison is, not only this run
-                raise KeyboardInterrupt(*(["SIGTERM"] if "SIGTERM" in run.message else []))
+                raise interrupt_again(run.message)
             walls.append(float(run.stats["wall_s"]))
             enough = len(walls) >= fewest and sum(walls) > min(ENOUGH, limit)
             if run.status != "done" or enough or len(walls) >= most:

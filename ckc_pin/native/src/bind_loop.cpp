@@ -287,7 +287,7 @@ void bind_loop(nb::module_& m) {
       .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("step", &step, "u"_a, "of_motors"_a, "until"_a, "pause"_a)
       .def("record", &record, "instants"_a, "rows"_a)
-      .def("record_now", [](Run& run) { return run.loop->record_now() ? run.loop->recorder.filled : -1; })
+      .def("record_now", [](Run& run) { run.loop->record_now(); })
       .def("write", &write, "library"_a)
       .def("pause_at", [](Run& run, long rhs) { run.loop->pause_at = rhs; }, "rhs"_a)
       .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)
@@ -305,6 +305,7 @@ void bind_loop(nb::module_& m) {
       .def("seconds", &seconds, "states"_a, "rounds"_a, "of_jacobian"_a = false)
       .def_prop_ro("t", [](const Run& run) { return run.loop->t(); })
       .def_prop_ro("y", [](const Run& run) { return Vector(run.loop->y()); })
+      .def_prop_ro("filled", [](const Run& run) { return run.loop->recorder.filled; })
       .def_prop_ro("width", [](const Run& run) { return run.loop->recorder.width; });
   bind_parts(m, loop);
   bind_variation(loop);

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.kinds import a_kind, require_flag, require_kind, require_path, require_table
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.simulation.ensembles.members import Chunk, Members
@@ -228,7 +229,7 @@ def run_sweep(
         except InputError as error:
             status, message = "stopped", str(error)
         except KeyboardInterrupt as signal:
-            by = f" by {signal}" if str(signal) else ""
+            by = acknowledge(signal)
             status, message = "interrupted", f"interrupted{by}; what is there stays, the same command goes on from it"
     wall_s, after = perf_counter() - started, store.counts()
     ran = before["pending"] - after["pending"]

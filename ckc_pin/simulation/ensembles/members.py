@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.generated.library import Library, compiled, find, too_large
 from ckc_pin.generated.varied import Varied
+from ckc_pin.interrupt import interrupt_again
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native import _core
@@ -207,8 +209,10 @@ class Members:
         if not len(which):
             return 0
 
+        cancelled = Event()
+
         def one(k: int) -> int:
-            status[k], message[k], rhs = self._single(values[k], k, outputs)
+            status[k], message[k], rhs = self._single(values[k], k, outputs, cancelled)
             return rhs
 
         if self._threads == 1 or len(which) == 1:
@@ -217,18 +221,24 @@ class Members:
             try:
                 return sum(pool.map(one, [int(k) for k in which]))
             except BaseException:
+                cancelled.set()
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def _single(self, values: Array, k: int, outputs: dict[str, Array]) -> tuple[int, str, int]:
+    def _single(self, values: Array, k: int, outputs: dict[str, Array], cancelled: Event) -> tuple[int, str, int]:
         """Run one member and enter its outputs: its output instants and its q_d may be its own."""
+
+        def require_not_cancelled(t: float, t_end: float) -> None:
+            if cancelled.is_set():
+                raise KeyboardInterrupt
+
         try:
             ready = prepare(load_scene(self.scene_name, self.changes_of(values)))
-            rows, ended, message = run_rows(ready)
+            rows, ended, message = run_rows(ready, require_not_cancelled)
         except CkcError as error:
             return FAILED, str(error), 0
         if ended == "interrupted":
-            raise KeyboardInterrupt
+            raise interrupt_again(message)
         own = Outputs(self._outputs, ready)
         for name, value in own.compute(own.recorded(rows)).items():
             outputs[name][k] = value[0]

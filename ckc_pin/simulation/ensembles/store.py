@@ -176,9 +176,11 @@ class Store:
         try:
             self._create(chunk)(begun)
             begun.replace(path)
-        except OSError as error:
+        except BaseException as error:  # an interrupt, too
             rmtree(begun, ignore_errors=True)
-            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+            if isinstance(error, OSError):
+                raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+            raise
         self._use(path)
 
     def _open(self, path: Path) -> None:

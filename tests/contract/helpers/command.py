@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 from unittest import mock
 
-from ckc_pin import cli
+from ckc_pin.cli import app
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Outcome:
 
 def ckc(*words: str) -> Outcome:
     """Run `ckc WORDS...`."""
-    return called(cli.main, "ckc", *words)
+    return called(lambda: sys.exit(app.main()), "ckc", *words)
 
 
 def called(main: Callable[[], object], *line: str) -> Outcome:
