@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Interrupts", "interrupts"]
 
 RETRY_PERIOD_S, IMPORT_PATIENCE_S = 0.03, 0.5
+EXIT_PATIENCE_S = 0.5  # for the exit functions after an interrupt: Dask's waits 10 s for a cluster that is half begun
 IMPORT_SYSTEM = "<frozen importlib._bootstrap>"  # the file name of its frames
 COMMAND = "ckc_pin.cli.app"  # the module that calls a command's function
 
@@ -98,6 +99,9 @@ class Interrupts:
     def exit(self, code: int) -> NoReturn:
         """Run the exit functions and end the process, so that no signal meets an interpreter that is half gone."""
         self.finish()
+        if code in (INTERRUPTED, TERMINATED):
+            signal.signal(signal.SIGALRM, lambda number, frame: os._exit(code))
+            signal.setitimer(signal.ITIMER_REAL, EXIT_PATIENCE_S)
         atexit._run_exitfuncs()
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):  # closed, or none at all

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ckc_pin.errors import InputError
@@ -39,6 +42,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         Dask is not installed; the scheduler does not answer.
     """
     try:
+        import dask
         from dask.distributed import Client, LocalCluster
     except ModuleNotFoundError:
         says = (
@@ -46,23 +50,31 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         )
         raise InputError(says) from None
     if scheduler is None:
-        try:
-            cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
-                silence_logs=logging.ERROR,  # of tasks that are cancelled, as by Ctrl-C
-            )
-        except (OSError, RuntimeError) as error:
-            raise InputError(
-                f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
-                '`if __name__ == "__main__":`, since each process reads the script again'
-            ) from None
-        with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
-            yield client
+        with (
+            TemporaryDirectory(prefix="ckc_pin-", ignore_cleanup_errors=True) as folder,
+            dask.config.set({"temporary-directory": folder}),
+        ):
+            try:
+                cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
+                    silence_logs=logging.CRITICAL,  # of tasks that are cancelled and workers that are killed, by Ctrl-C
+                )
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
+                    '`if __name__ == "__main__":`, since each process reads the script again'
+                ) from None
+            with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+                try:
+                    yield client
+                except BaseException:
+                    _kill_workers(cluster)
+                    raise
         return
     try:
         # no default: one that does not answer would be asked for all that the process computes by Dask afterwards
@@ -82,6 +94,15 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     finally:
         for log, level in zip(logs, before, strict=True):
             log.setLevel(level)
+
+
+def _kill_workers(cluster: Any) -> None:
+    """Kill the processes of a cluster, which would otherwise finish their chunks before they end."""
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        if nanny.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(nanny.pid, signal.SIGKILL)
 
 
 def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:

@@ -212,25 +212,26 @@ def run_sweep(
     there = count - before["pending"]
     started, message = perf_counter(), ""
     status: Literal["done", "stopped", "interrupted"] = "done"
-    with ExitStack() as own:
-        pending = store.pending()
-        if workers or scheduler:
-            from ckc_pin.simulation.ensembles.cluster import chunks_by, client_of
+    try:
+        with ExitStack() as own:
+            pending = store.pending()
+            if workers or scheduler:
+                from ckc_pin.simulation.ensembles.cluster import chunks_by, client_of
 
-            client = own.enter_context(client_of(scheduler, workers))
-            hands = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-            chunks: Iterator[Chunk] = chunks_by(client, task, pending, hands)
-        else:
-            chunks = _here(members, task, pending)
-        shown = own.enter_context(bar(members.scene.name, there) if progress else nullcontext(None))
-        started = perf_counter()
-        try:
-            _collect(store, chunks, members, shown, there)
-        except InputError as error:
-            status, message = "stopped", str(error)
-        except KeyboardInterrupt as signal:
-            by = acknowledge(signal)
-            status, message = "interrupted", f"interrupted{by}; what is there stays, the same command goes on from it"
+                client = own.enter_context(client_of(scheduler, workers))
+                hands = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+                chunks: Iterator[Chunk] = chunks_by(client, task, pending, hands)
+            else:
+                chunks = _here(members, task, pending)
+            shown = own.enter_context(bar(members.scene.name, there) if progress else nullcontext(None))
+            started = perf_counter()
+            try:
+                _collect(store, chunks, members, shown, there)
+            except InputError as error:
+                status, message = "stopped", str(error)
+    except KeyboardInterrupt as signal:
+        by = acknowledge(signal)
+        status, message = "interrupted", f"interrupted{by}; what is there stays, the same command goes on from it"
     wall_s, after = perf_counter() - started, store.counts()
     ran = before["pending"] - after["pending"]
     return Summary(
