@@ -10,11 +10,12 @@
 
 namespace ckc {
 
-// Only an elastic body between two others whose masses differ by more than a factor of 1e6, and a jammed mechanism, need
-// more rounds. The projection on the cone of all stops ends these.
+// Only an elastic body between two others whose masses differ by more than a factor of 1e6 needs more rounds. The
+// projection on the cone of all stops ends them.
 constexpr long max_rounds = 4000;
 
-constexpr double same = 1e-10;  // relative difference of gap velocities
+constexpr double same = 1e-10;    // relative difference of gap velocities
+constexpr double pushed = 1e-6;  // of the largest force: what takes part
 
 namespace {
 
@@ -31,7 +32,8 @@ class Rounds {
     at_rest_ = scale_.cwiseProduct(problem.at_rest);
     slow_ = scale_.cwiseProduct(problem.slow).cwiseMax(at_rest_);
     impulses_.setZero(m_);
-    if (m_ > 1) project_on_range();
+    jammed_.assign(static_cast<size_t>(m_), 0);
+    if (m_ > 1) use_rank();
   }
 
   bool run() {
@@ -46,16 +48,31 @@ class Rounds {
   }
 
  private:
-  // Gap velocities of stops that imply each other agree only up to how exactly the loops are closed.
-  void project_on_range() {
+  void use_rank() {
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
     const auto& values = eigen.eigenvalues();
+    // Gap velocities of stops that imply each other agree only up to how exactly the loops are closed.
     for (Eigen::Index k = 0; k < m_ && values(k) <= dependent * values(m_ - 1); ++k)
       g_ -= eigen.eigenvectors().col(k).dot(g_) * eigen.eigenvectors().col(k);
+    if (values(0) <= dependent * values(m_ - 1)) find_jammed();
+  }
+
+  // Stops that push against each other, so that none of them can be left: forces y >= 0 on them that do nothing, A y = 0.
+  // They have no restitution. Each program looks for y with a force on stops that are not known to be jammed.
+  void find_jammed() {
+    const Vector low = Vector::Zero(m_), high = Vector::Constant(m_, infinity);
+    for (Eigen::Index attempt = 0; attempt < m_; ++attempt) {
+      Vector others(m_), forces;
+      for (Eigen::Index i = 0; i < m_; ++i) others(i) = jammed_[i] ? 0.0 : 1.0;
+      if (!least_in_box(A_ + others * others.transpose(), -others, low, high, forces)) return;
+      const double sum = others.dot(forces);
+      if (!(forces.dot(A_ * forces) <= dependent * sum * sum)) return;
+      for (Eigen::Index i = 0; i < m_; ++i) jammed_[i] |= forces(i) > pushed * forces.maxCoeff();
+    }
   }
 
   double restitution_of(Eigen::Index i) const {
-    const double e = problem_.restitution(i);
+    const double e = jammed_[i] ? 0.0 : problem_.restitution(i);
     return -e * g_(i) > slow_(i) ? e : 0.0;
   }
 
@@ -128,6 +145,7 @@ class Rounds {
   Matrix A_;
   Vector scale_, g_, at_rest_, slow_, low_, impulses_;
   Indices stops_;
+  std::vector<char> jammed_;
 };
 
 }  // namespace
