@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from scripts.experiments.fuzz.contact import judges
+from scripts.experiments.fuzz.contact import comparisons, judges
 from scripts.experiments.fuzz.contact.cases import Case
 from scripts.experiments.fuzz.contact.law import answer_impact
 from scripts.experiments.fuzz.contact.record import Record, draw, judge_seed
@@ -18,6 +18,7 @@ from scripts.experiments.fuzz.contact.stops import Contact
 from scripts.experiments.fuzz.contact.table import table
 from scripts.experiments.fuzz.contact.time_stepping import TimeStepping
 from scripts.experiments.fuzz.judge import Judge
+from scripts.experiments.fuzz.main import main
 from scripts.experiments.fuzz.read import read
 from scripts.experiments.fuzz.spatial import Array
 from tests.conftest import assert_close
@@ -149,22 +150,22 @@ def test_the_judges_accept_a_right_run_and_see_wrong_ones(tmp_path: Path) -> Non
     assert len(run.events) >= 2
     assert judges.energy_fault(run, model, case) == ("", "")
     assert judges.limits_fault(run, case) == ""
-    assert judges.compare_with_slides(run, model, case) == ("", "")
+    assert comparisons.compare_with_slides(run, model, case) == ("", "")
     bouncier = {**case.contacts, "x0": Contact(0.0, 0.0, np.inf, 0.6)}
     other = replace(case, contacts={**case.contacts, "x1": Contact(0.0, 0.0, np.inf, 0.81)})
-    assert judges.compare_with_slides(run, model, other)[0] == "reference"
-    assert judges.compare_with_steps(run, model, case) == ("", "")
-    assert judges.compare_with_steps(run, model, replace(case, contacts=bouncier))[0] == "stepping"
+    assert comparisons.compare_with_slides(run, model, other)[0] == "reference"
+    assert comparisons.compare_with_steps(run, model, case) == ("", "")
+    assert comparisons.compare_with_steps(run, model, replace(case, contacts=bouncier))[0] == "stepping"
     faster = replace(run, v_tree=run.v_tree * np.linspace(1, 1.001, len(run.t))[:, None])
     assert judges.energy_fault(faster, model, case)[0] in ("grown", "energy")
     assert run.dissipated is not None
     assert judges.energy_fault(replace(run, dissipated=-run.dissipated), model, case)[0] == "dissipated"
     assert judges.limits_fault(replace(run, q_tree=run.q_tree - 1e-6), case).startswith("x0 is 1e-06 beyond")
-    assert judges.compare(run, run, model, 1e-8).fault == ""
-    assert judges.compare(run, faster, model, 1e-8).fault.startswith("states")
+    assert comparisons.compare(run, run, model, 1e-8).fault == ""
+    assert comparisons.compare(run, faster, model, 1e-8).fault.startswith("states")
     later = [{**event, "t": event["t"] + 1e-6} for event in run.events]
-    assert "bounces" in judges.compare(run, replace(run, events=later), model, 1e-8).fault
-    assert "inf" in judges.compare(run, replace(run, events=run.events[:1]), model, 1e-8).fault
+    assert "bounces" in comparisons.compare(run, replace(run, events=later), model, 1e-8).fault
+    assert "inf" in comparisons.compare(run, replace(run, events=run.events[:1]), model, 1e-8).fault
 
 
 @pytest.mark.parametrize("kind", ["pendulums", "closed"])
@@ -185,3 +186,13 @@ def test_the_table_names_the_seeds() -> None:
     text = table([record, Record(18, "stack", runs=3, compared=True)])
     assert "1 seeds: 17" in text
     assert "seed 17 stack (dae): energy grows by 0.1" in text
+
+
+def test_the_command_runs_seeds_and_writes_their_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = tmp_path / "rows.csv"
+    assert main(["--contact", "--kind", "truss", "--seed", "2000", "--runs", "2", "--out", str(rows)]) == 0
+    assert "formulations agree in 100.00 % of 2 cases" in capsys.readouterr().out
+    assert [line.split(",")[:2] for line in rows.read_text().splitlines()[1:]] == [
+        ["2000", "trusses"],
+        ["2001", "trusses"],
+    ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from scripts.experiments.fuzz.contact.stops import Contact, with_contacts
 
-__all__ = ["Case", "Draw", "choose_restitutions", "mass_ratio", "with_rate_event"]
+__all__ = ["Case", "Draw", "choose_restitutions", "mass_ratio"]
 
 SCENE = 'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n\n[initial]\nat = "assembled"\n'
 RTOL = 1e-11
@@ -35,7 +35,6 @@ class Case:
     quiet: frozenset[str] = frozenset()  # joints without events after `quiet_after`
     quiet_after: float = 0.0
     compares_steps: bool = False  # stops and friction must not change the number of steps
-    extra: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path, *, contacts: bool = True) -> Path:
         """Write the files to a folder, with stops and friction or without."""
@@ -68,10 +67,3 @@ def choose_restitutions(random: np.random.Generator, count: int) -> list[float]:
     if random.random() < 0.5:
         return [choose()] * count
     return [choose() for _ in range(count)]
-
-
-def with_rate_event(case: Case, coordinate: str, value: float) -> Case:
-    """The same case with an event on a rate."""
-    event = {"of": "q_dot", "coordinate": coordinate, "value": value}
-    overrides: Mapping[str, Any] = {**case.overrides, "event": [event]}
-    return replace(case, overrides=dict(overrides))

@@ -16,11 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from scripts.experiments.fuzz.spatial import Array
 
-__all__ = ["Impact", "answer_impact", "project"]
+__all__ = ["Impact", "answer_impact", "project", "push_within_bounds"]
 
 MAX_ROUNDS = 500
 ROUNDING = 1e-12  # of |v|_D: slower gap velocities are zero
@@ -81,3 +81,14 @@ def answer_impact(
     out.lost += 0.5 * float(np.sum((L.T @ outward) ** 2))
     out.v, out.certain = nearest, False
     return out
+
+
+def push_within_bounds(L: Array, rows: Array, u: Array, low: Array, high: Array) -> Array:
+    """Add impulses along rows (or forces, u an acceleration) that leave the least energy, D = L L^T, within bounds."""
+    if not len(rows):
+        return u
+    roots, target = np.linalg.solve(L, rows.T), L.T @ u
+    scale, size = np.linalg.norm(roots, axis=0), max(float(np.linalg.norm(target)), 1e-300)
+    bounds = (low * scale / size, high * scale / size)
+    impulses = lsq_linear(roots / scale, -target / size, bounds, "bvls", tol=1e-15).x
+    return np.asarray(np.linalg.solve(L.T, target + roots / scale @ impulses * size))

@@ -15,10 +15,10 @@ import numpy as np
 import ckc_pin
 from ckc_pin.errors import CkcError
 from ckc_pin.simulation import Run
-from scripts.experiments.fuzz.contact import judges
+from scripts.experiments.fuzz.contact import comparisons, judges
 from scripts.experiments.fuzz.contact.cases import Case, Draw
 from scripts.experiments.fuzz.contact.draw_chains import draw_closed, draw_jammed, draw_pendulums
-from scripts.experiments.fuzz.contact.draw_held import draw_gripper, draw_truss
+from scripts.experiments.fuzz.contact.draw_resting import draw_gripper, draw_truss
 from scripts.experiments.fuzz.contact.draw_slides import draw_racks, draw_stack, draw_tree
 from scripts.experiments.fuzz.read import Model, NoJudge, read
 
@@ -197,17 +197,17 @@ def _compare_formulations(case: Case, scene: Path, runs: dict[str, Run], model: 
         return
     record.compared = True
     (name, one), *others = done.items()
-    allowed = judges.agreement_allowed(case)
+    allowed = judges.allowed_error(case, judges.AGREE)
     spread: dict[str, tuple[float, float]] = {}
     for other, run in others:
-        found = judges.compare(one, run, model, allowed)
+        found = comparisons.compare(one, run, model, allowed)
         if not found.fault:
             continue
         for of in (name, other):
             if of not in spread:
                 spread[of] = _spread(case, scene, of, done[of], model)
         off, until = max(spread[name][0], spread[other][0]), min(spread[name][1], spread[other][1])
-        if judges.compare(one, run, model, max(allowed, MAGNIFIED * off), until).fault:
+        if comparisons.compare(one, run, model, max(allowed, MAGNIFIED * off), until).fault:
             record.add("formulations", f"{name}, {other}", found.fault)
         else:
             record.magnified = True
@@ -220,7 +220,7 @@ def _spread(case: Case, scene: Path, formulation: str, run: Run, model: Model) -
         rtol = min(1e-3, times * case.overrides["solver.rtol"])
         coarse = _simulate(scene, case, formulation, Record(case.seed, case.kind), **{"solver.rtol": rtol})
         if coarse is not None:
-            found = judges.compare(run, coarse, model, LARGEST_SPREAD)
+            found = comparisons.compare(run, coarse, model, LARGEST_SPREAD)
             off, until = max(off, found.off if found.off <= LARGEST_SPREAD else 0.0), min(until, found.until)
     return off, until
 
@@ -228,14 +228,14 @@ def _spread(case: Case, scene: Path, formulation: str, run: Run, model: Model) -
 def _compare_with_references(case: Case, run: Run, model: Model, record: Record) -> None:
     try:
         if case.linear and case.conservative and not case.jammed:
-            category, text = judges.compare_with_slides(run, model, case)
+            category, text = comparisons.compare_with_slides(run, model, case)
             record.referenced = category != "unjudged"
             if category == "reference":
                 record.add(category, "dae", text)
         chains = case.kind in ("pendulums", "closed chains") and case.conservative
         if chains and case.seed % STEPPED == 0 and "F" not in model.kind and case.contacts:
             record.referenced = True
-            record.add(*_with("dae", judges.compare_with_steps(run, model, case)))
+            record.add(*_with("dae", comparisons.compare_with_steps(run, model, case)))
     except np.linalg.LinAlgError:
         record.referenced = False
 

@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
-from scripts.experiments.fuzz.contact.law import answer_impact
+from scripts.experiments.fuzz.contact.law import answer_impact, push_within_bounds
 from scripts.experiments.fuzz.contact.stops import Contact, contacts_of
 from scripts.experiments.fuzz.motion import REDUNDANT, Motion
 from scripts.experiments.fuzz.read import Model
@@ -27,6 +26,7 @@ LEAST_RISE = 1e-10  # m: a bounce that rises less is none
 DOUBTFUL_RISE = 1e-8  # m: nearer to the last bounce than this, the end of a sequence is the program's own
 AT_REST = 1e-11  # of the largest velocity or acceleration
 SAME_TIME = 1e-9  # s: events nearer to each other may be one instant or two
+NO_ACCELERATION = 1e-9  # of the largest
 MAX_EVENTS = 5000
 
 
@@ -59,7 +59,7 @@ class History:
         q, v, a = np.array(self.q)[k], np.array(self.v)[k], np.array(self.a)[k]
         return q + s * v + 0.5 * s**2 * a, v + s * a
 
-    def doubt(self, t: float) -> None:
+    def limit_certainty(self, t: float) -> None:
         """Note that what follows a time is not certain."""
         self.certain_until = min(self.certain_until, t)
 
@@ -92,18 +92,18 @@ class Slides:
             v = self._impacts(t, q, v, out)
             if t >= out.certain_until:
                 return out
-            a, held = self._accelerations(q, v)
-            v = np.where(held, 0.0, v)
+            a, stays = self._accelerations(q, v)
+            v = np.where(stays, 0.0, v)
             out.add(t, q, v, a)
-            wait = self._next(q, v, a, held, out, t)
+            wait = self._next(q, v, a, stays, out, t)
             if t + wait > t_end:
                 return out
             if wait < SAME_TIME:
-                out.doubt(t)
+                out.limit_certainty(t)
                 return out
             q, v, t = q + wait * v + 0.5 * wait**2 * a, v + wait * a, t + wait
             q = self._exact(q)
-        out.doubt(t)
+        out.limit_certainty(t)
         return out
 
     def _exact(self, q: Array) -> Array:
@@ -119,7 +119,7 @@ class Slides:
         closed = gaps <= SAME_PLACE
         u = self.Z.T @ v if len(self.Z) else v
         if np.any((gaps > SAME_PLACE) & (gaps < DOUBTFUL_GAP) & (self.N @ u < 0)):
-            out.doubt(t)
+            out.limit_certainty(t)
         if not closed.any():
             return v
         at, e = np.flatnonzero(closed), self.e[closed].copy()
@@ -133,79 +133,61 @@ class Slides:
             rise = np.where(back > 0, speeds**2 / (2 * np.where(back > 0, back, 1.0)), np.inf)
             bounced = np.array([k in impact.hit for k in range(len(at))]) & (speeds > 0)
             if np.any(bounced & (rise < DOUBTFUL_RISE)):
-                out.doubt(t)
+                out.limit_certainty(t)
             none = bounced & (rise < LEAST_RISE) & (e > 0)
             if not none.any():
                 break
             e[none] = 0.0
         if not impact.certain:
-            out.doubt(t)
+            out.limit_certainty(t)
         out.lost += impact.lost
         hit = {self.model.labels[self.stops[at[k]].column] for k in impact.hit}
         out.impacts.append((t, tuple(sorted(hit))))
         return after
 
     def _accelerations(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Accelerations, and which joints are held at rest, by friction or at a stop."""
-        size = np.abs(v).max(initial=0.0)
-        rests = np.abs(v) <= AT_REST * size
-        gaps, columns = self.gaps(q), [stop.column for stop in self.stops]
+        """Accelerations, and which joints stay at rest, by friction or at a stop."""
+        rests = np.abs(v) <= AT_REST * np.abs(v).max(initial=0.0)
         force = self.force - self.Z.T @ np.where(rests, 0.0, self.friction * np.sign(v))
-        rows, low, high, joints = [], [], [], []
-        for k in np.flatnonzero(rests & self.movable):
-            below = any(
-                gap <= SAME_PLACE and c == k and s.sign > 0 for gap, c, s in zip(gaps, columns, self.stops, strict=True)
-            )
-            above = any(
-                gap <= SAME_PLACE and c == k and s.sign < 0 for gap, c, s in zip(gaps, columns, self.stops, strict=True)
-            )
-            if below or above or self.friction[k] > 0:
-                rows.append(self.Z[k])
-                low.append(-np.inf if above else -self.friction[k])
-                high.append(np.inf if below else self.friction[k])
-                joints.append(k)
-        free = np.linalg.solve(self.D, force)
-        held = np.zeros(self.model.n, bool)
-        if rows:
+        free = np.asarray(np.linalg.solve(self.D, force), float)
+        stays = np.zeros(self.model.n, bool)
+        low, high = self._bounds(q)
+        joints = np.flatnonzero(rests & self.movable & (low < high))
+        if len(joints):
             L = np.linalg.cholesky(self.D)
-            G = np.linalg.solve(L, np.array(rows).T)
-            target = L.T @ free
-            scale = np.linalg.norm(G, axis=0)
-            size = max(float(np.linalg.norm(target)), 1e-300)
-            found = lsq_linear(
-                G / scale,
-                -target / size,
-                (np.array(low) * scale / size, np.array(high) * scale / size),
-                "bvls",
-                tol=1e-15,
-            )
-            free = np.linalg.solve(L.T, target + G / scale @ found.x * size)
-            a = self.Z @ free
-            held[joints] = np.abs(a[joints]) <= 1e-9 * max(
-                float(np.abs(a).max()), float(np.abs(self.Z @ np.linalg.solve(self.D, force)).max())
-            )
-            if held.any():  # exactly at rest
-                rows_held = self.Z[held]
-                _, sv, Vt = np.linalg.svd(rows_held)
-                inner = Vt[int((sv > 1e-9 * sv[0]).sum()) :].T
-                free = inner @ np.linalg.solve(inner.T @ self.D @ inner, inner.T @ self.D @ free)
+            left = push_within_bounds(L, self.Z[joints], free, low[joints], high[joints])
+            largest = max(np.abs(self.Z @ free).max(), np.abs(self.Z @ left).max())
+            stays[joints] = np.abs(self.Z[joints] @ left) <= NO_ACCELERATION * largest
+            if stays.any():  # exactly
+                _, sv, Vt = np.linalg.svd(self.Z[stays])
+                inner = Vt[int((sv > REDUNDANT * sv[0]).sum()) :].T
+                left = inner @ np.linalg.solve(inner.T @ self.D @ inner, inner.T @ self.D @ left)
+            free = left
         a = self.Z @ free
-        a[held] = 0.0
-        return a, held
+        a[stays] = 0.0
+        return a, stays
 
-    def _next(self, q: Array, v: Array, a: Array, held: np.ndarray, out: History, t: float) -> float:
+    def _bounds(self, q: Array) -> tuple[Array, Array]:
+        """The least and the largest force of friction and stops by joint."""
+        low, high = -self.friction, self.friction.copy()
+        for stop, gap in zip(self.stops, self.gaps(q), strict=True):
+            if gap <= SAME_PLACE:
+                (high if stop.sign > 0 else low)[stop.column] = stop.sign * np.inf
+        return low, high
+
+    def _next(self, q: Array, v: Array, a: Array, stays: np.ndarray, out: History, t: float) -> float:
         """Time until a gap closes or a joint that friction acts on turns."""
         times = [np.inf]
         for stop, gap in zip(self.stops, self.gaps(q), strict=True):
-            if not held[stop.column]:
+            if not stays[stop.column]:
                 times.append(_closes(max(gap, 0.0), stop.sign * v[stop.column], stop.sign * a[stop.column]))
         size = np.abs(v).max(initial=0.0)
-        for k in np.flatnonzero((self.friction > 0) & ~held & self.movable):
+        for k in np.flatnonzero((self.friction > 0) & ~stays & self.movable):
             if abs(v[k]) > AT_REST * size and v[k] * a[k] < 0:
                 times.append(-v[k] / a[k])
         ahead = np.sort(times)
         if len(ahead) > 1 and np.isfinite(ahead[1]) and 1e-12 < ahead[1] - ahead[0] < SAME_TIME:
-            out.doubt(t + ahead[0])
+            out.limit_certainty(t + ahead[0])
         return float(ahead[0])
 
 

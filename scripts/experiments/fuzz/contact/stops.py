@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Contact", "Stop", "contacts_of", "with_contacts"]
+__all__ = ["Contact", "JointStop", "contacts_of", "with_contacts"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Stop:
+class JointStop:
     """One end of a joint's range: the gap is sign (q - limit)."""
 
     column: int
@@ -38,7 +38,7 @@ class Stop:
 FAR = 1e4  # rad, m: a limit that is not there
 
 
-def contacts_of(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[Stop]:
+def contacts_of(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[JointStop]:
     """All stops, by coordinate."""
     stops = []
     for column, label in enumerate(labels):
@@ -46,9 +46,9 @@ def contacts_of(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[
         if contact is None:
             continue
         if np.isfinite(contact.lower):
-            stops.append(Stop(column, 1, contact.lower, contact.restitution))
+            stops.append(JointStop(column, 1, contact.lower, contact.restitution))
         if np.isfinite(contact.upper):
-            stops.append(Stop(column, -1, contact.upper, contact.restitution))
+            stops.append(JointStop(column, -1, contact.upper, contact.restitution))
     return stops
 
 

@@ -40,10 +40,24 @@ def table(records: Sequence[Record]) -> str:
     ]
     for kind in sorted({record.kind for record in records}):
         lines.append(_line(kind, [record for record in records if record.kind == kind]))
-    lines += [_line("all", records), ""]
+    lines += [_line("all", records), "", _summary(records), ""]
     for category, meaning in CATEGORIES.items():
         lines += _category(category, meaning, records)
     return "\n".join(lines)
+
+
+def _summary(records: Sequence[Record]) -> str:
+    """The shares that are asked for: runs that stopped, that gained energy, and formulations that agree."""
+    runs = sum(record.runs for record in records)
+    count = Counter(x.category for record in records for x in record.findings)
+    stopped = count["stopped"] + count["unnamed"]
+    compared = [record for record in records if record.compared]
+    agreed = sum(not any(x.category == "formulations" for x in record.findings) for record in compared)
+    return (
+        f"{runs} runs: {stopped} stopped ({100 * stopped / max(1, runs):.2f} %), {count['unnamed']} of them naming"
+        f" none; {count['raw']} raw exceptions; {count['grown']} done with energy grown; formulations agree in"
+        f" {100 * agreed / max(1, len(compared)):.2f} % of {len(compared)} cases"
+    )
 
 
 def _line(kind: str, records: Sequence[Record]) -> str:

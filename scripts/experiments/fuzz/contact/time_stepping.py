@@ -11,9 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
-from scripts.experiments.fuzz.contact.law import answer_impact
+from scripts.experiments.fuzz.contact.law import answer_impact, push_within_bounds
 from scripts.experiments.fuzz.contact.stops import Contact, contacts_of
 from scripts.experiments.fuzz.motion import REDUNDANT, Motion
 from scripts.experiments.fuzz.read import Model
@@ -74,14 +73,8 @@ class TimeStepping:
         if reached.any() and moves:
             u = answer_impact(D, N, u, self.e[reached], max_rounds=MAX_ROUNDS).v
         u = u + h * np.linalg.solve(D, pushed)
-        rows = np.vstack([N, Z[self.rubbing]])
-        moving = np.linalg.norm(rows, axis=1) > 1e-9
-        if moving.any():
-            most = h * self.friction[self.rubbing]
-            low, high = np.r_[np.zeros(len(N)), -most][moving], np.r_[np.full(len(N), np.inf), most][moving]
-            held = np.linalg.solve(L, rows[moving].T)
-            scale, target = np.linalg.norm(held, axis=0), L.T @ u
-            size = max(float(np.linalg.norm(target)), 1e-300)
-            x = lsq_linear(held / scale, -target / size, (low * scale / size, high * scale / size), "bvls", tol=1e-14).x
-            u = np.linalg.solve(L.T, target + held / scale @ x * size)
+        rows, most = np.vstack([N, Z[self.rubbing]]), h * self.friction[self.rubbing]
+        low, high = np.r_[np.zeros(len(N)), -most], np.r_[np.full(len(N), np.inf), most]
+        movable = np.linalg.norm(rows, axis=1) > 1e-9
+        u = push_within_bounds(L, rows[movable], u, low[movable], high[movable])
         return np.asarray(Z @ u)
