@@ -83,7 +83,7 @@ def energy_fault(run: Run, model: Model, case: Case) -> tuple[str, str]:
     """Category and text of what is wrong with energy and what is dissipated."""
     total, largest = energies(run, model)
     if run.dissipated is None:
-        acts = case.kind != "truss" and any(contact.stops or contact.friction for contact in case.contacts.values())
+        acts = case.kind != "trusses" and any(contact.stops or contact.friction for contact in case.contacts.values())
         return ("energy", "`dissipated` is missing") if acts else ("", "")
     allowed = allowed_error(case, ENERGY)
     least = float(np.diff(run.dissipated).min(initial=0.0))
