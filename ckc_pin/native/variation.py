@@ -16,10 +16,11 @@ import pinocchio as pin
 
 from ckc_pin.generated.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.tree import Array, BoolArray, Tree
 from ckc_pin.native.tables import core_table, packed
 
-__all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "variation_table"]
+__all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "separate_parts", "variation_table"]
 
 Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b", "reported"]
 
@@ -106,6 +107,8 @@ class Varying:
     q_dot : (d,) array or None
     places : tuple of Effect
         What places the joints, and the points that are only reported.
+    assembled_at : int
+        A coordinate: the start is assembled at its stop, which the number moves, and goes along one way only; or -1.
     """
 
     name: str
@@ -113,6 +116,7 @@ class Varying:
     q: Array | None = None
     q_dot: Array | None = None
     places: tuple[Effect, ...] = ()
+    assembled_at: int = -1
 
 
 # --- where terms are written out ---------------------------------------------------------------------
@@ -207,12 +211,13 @@ def variation_table(
     *,
     at_equilibrium: bool,
     target: Array,
+    controlled: bool,
 ) -> dict[str, Any]:
     """Describe what varies.
 
     `directions`: as of `directions_of`, where compiled terms can take them. `at_equilibrium`: the start is where
     the mechanism rests, which moves with it. `target`: q' where a controller compensates what this mechanism needs
-    there; none where it compensates another one's.
+    there; none where it compensates another one's. `controlled`: a controller acts, which may look at every joint.
     """
     tree = mechanism.tree
     locks = _Locks([effect for x in varying for effect in x.effects if effect.lock is not None])
@@ -274,11 +279,44 @@ def variation_table(
         "turns": np.asfortranarray(mechanism.motors.turns),
         "parameters": [
             ([crossing(effect) for effect in x.effects], np.zeros(tree.n) if x.q is None else x.q,
-             np.zeros(mechanism.d) if x.q_dot is None else x.q_dot)
+             np.zeros(mechanism.d) if x.q_dot is None else x.q_dot, x.assembled_at)
             for x in varying
         ],
+        "part": [0] * tree.n if controlled else separate_parts(mechanism),
         "directions": np.zeros((0, len(varying))) if directions is None else np.asfortranarray(directions),
     }  # fmt: skip
+
+
+def separate_parts(mechanism: Mechanism) -> list[int]:
+    """Number, by coordinate, the parts of a mechanism that no body, loop, coupling or spring connects."""
+    model, frames, spec = mechanism.tree.model, mechanism.frames, mechanism.spec
+    part = list(range(model.njoints))  # by joint; the world connects nothing
+
+    def connect(*joints: int) -> None:
+        numbers = {part[joint] for joint in joints if joint}
+        for joint in range(1, model.njoints):
+            if part[joint] in numbers:
+                part[joint] = min(numbers)
+
+    def carrier(frame: str | FrameSpec | None) -> int:
+        name = frame if isinstance(frame, str) else "world" if frame is None else frame.link
+        return frames.find(name, "parameters").joint
+
+    for joint in range(1, model.njoints):
+        connect(joint, model.parents[joint])
+    for loop in spec.loop:
+        connect(carrier(loop.frame_a), carrier(loop.frame_b))
+    for spring in spec.spring:
+        if spring.joint is None:
+            connect(carrier(spring.frame_a), carrier(spring.frame_b))
+    for coupling in spec.coupling:
+        connect(model.getJointId(coupling.joint), model.getJointId(coupling.other))
+    of_joint = {number: k for k, number in enumerate(dict.fromkeys(part[1:]))}
+    found = [0] * model.nv
+    for joint in range(1, model.njoints):
+        first = model.joints[joint].idx_v
+        found[first : first + model.joints[joint].nv] = [of_joint[part[joint]]] * model.joints[joint].nv
+    return found
 
 
 class _Locks:

@@ -36,7 +36,13 @@ from ckc_pin.simulation.scene_parts import (
     scene_controller,
     scene_mechanism,
 )
-from ckc_pin.simulation.varying import compensated_at, require_known_motion, require_movable, varying_of
+from ckc_pin.simulation.varying import (
+    at_assembled_stop,
+    compensated_at,
+    require_known_motion,
+    require_movable,
+    varying_of,
+)
 
 __all__ = ["Prepared", "prepare"]
 
@@ -147,12 +153,14 @@ def prepare(
         varying = varying_of(mechanism, scene, law, actuation, parameters, changed, start.at.q_tree)
         require_known_motion(mechanism, scene, controller, varying)
         require_movable(mechanism, scene.spec.parameters, varying, changed)
+        if scene.spec.initial.at == "assembled":
+            varying = [at_assembled_stop(mechanism, scene.spec.parameters, x, changed) for x in varying]
         changing, directions = directions_of(mechanism, varying) or (None, None)
         library = changing_library(mechanism, terms, changing)
         changing = changing if library is None else None
         formulation["variation"] = variation_table(
             mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
-            target=compensated_at(mechanism, law),
+            target=compensated_at(mechanism, law), controlled=controller is not None or free,
         )  # fmt: skip
     with scene.sources.naming():
         control = control_table(

@@ -194,7 +194,8 @@ def sensitivities(
     ------
     InputError
         An unknown parameter, or a scene whose motion has no known derivatives: with a sensor or a drive, an SPF off
-        phi = 0, a caller's controller that looks at terms which change with the parameters.
+        phi = 0, a caller's controller that looks at terms which change with the parameters; a stop that holds a start
+        `at = "assembled"` back from q_guess.
     NumericalError
         A start that is singular; two joints that change what they do at the same instant.
     MechanismError
@@ -232,9 +233,20 @@ def _apart(ready: Prepared) -> str | None:
     found = ready.loop.apart()
     if found is None:
         return None
-    coordinate, of_rate, parameter = found
+    coordinate, of_rate, parameter, together = found
     joint, name, t = ready.mechanism.coordinates[coordinate], ready.varying[parameter].name, float(ready.loop.t)
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
+    if t == 0.0 and ready.varying[parameter].assembled_at == coordinate:
+        return (
+            f"stopped {where}: {joint} is assembled at its stop, and with another {name} it starts elsewhere one way "
+            "only, so that the motion has no derivative"
+        )
+    if together:
+        return (
+            f"stopped {where}: {joint} and joints that move only with it are thrown back by their stops at once, and "
+            f"with another {name} by one of them alone: either way the motion goes on differently, so that it has no "
+            "derivative"
+        )
     what = f"{joint} begins to move from rest" if of_rate else f"{joint} comes to its stop"
     there = "at rest" if of_rate else "there"
     return (

@@ -7,6 +7,7 @@ controller's gains and the start are the scene's.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -34,9 +35,11 @@ from ckc_pin.native.variation import Effect, Varying
 from ckc_pin.simulation.effects import effects_of
 from ckc_pin.simulation.scene import Scene
 
-__all__ = ["compensated_at", "require_known_motion", "require_movable", "varying_of"]
+__all__ = ["at_assembled_stop", "compensated_at", "require_known_motion", "require_movable", "varying_of"]
 
 OTHERWISE = 1e-3  # rad, or of the mechanism's size: another value, to see whether it moves with that too
+NEARBY = 1e-7  # the same: how far a stop is moved to see whether the assembled start follows
+FARTHER = 1e-4  # the same where the start is at the stop
 SCENE_ROOTS = ("controller", "initial")
 
 
@@ -147,6 +150,49 @@ def require_movable(
                 f"sensitivities: {x.name}: with another value the rows of {mechanism.name} that follow from others, "
                 f"{', '.join(mechanism.redundant)}, no longer do, and it does not move as it did"
             )
+
+
+def at_assembled_stop(
+    mechanism: Mechanism, given: Changes, x: Varying, changed: Callable[[Changes], Mechanism]
+) -> Varying:
+    """Mark a stop that a mechanism is assembled at: the start goes along where the stop pushes it, and else stays.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    given : mapping
+        The scene's own changes of its numbers.
+    x : Varying
+    changed : callable
+        Makes the mechanism of other changes.
+
+    Raises
+    ------
+    InputError
+        The start is held beyond q_guess by that stop: it follows it both ways.
+    """
+    stop = next((effect for effect in x.effects if effect.kind in ("lower", "upper")), None)
+    if stop is None:
+        return x
+    k, reach = stop.index, mechanism.tree.reach
+    value = float(getattr(mechanism.joints, stop.kind)[k])
+    at_stop = abs(float(mechanism.tree.to_coordinates(mechanism.q_tree)[k]) - value) <= NEARBY * reach[k]
+    step = FARTHER if at_stop else NEARBY  # an assembly may leave a joint beyond its stop by a little
+
+    def follows(by: float) -> bool:
+        try:
+            there = changed({**given, x.name: value + by * float(reach[k])})
+        except CkcError:
+            return True
+        return bool(np.abs(there.tree.difference(mechanism.q_tree, there.q_tree) / reach).max() > 0.1 * step)
+
+    ways = [follows(by) for by in (-step, step)]
+    if all(ways):
+        raise InputError(
+            f"sensitivities: {x.name}: q_guess leads beyond this stop, and how the configuration that is assembled "
+            "at it moves with it is not known; give initial.q"
+        )
+    return replace(x, assembled_at=k) if any(ways) else x
 
 
 def _moved(value: tuple[float, float, float], k: int, step: float) -> Value:

@@ -114,19 +114,6 @@ def test_a_start_without_a_derivative_is_named(
     assert sensitivities(scene, ["link.one.mass"]).run.status == "done"  # of which it has one
 
 
-def test_two_joints_that_turn_round_at_once(tmp_path: Path) -> None:
-    """With what moves both alike they still do; with what moves one, the other's friction turns at another time."""
-    more = "".join(joint(name, friction=0.5) + force(name, -3.0) for name in ("x", "y"))
-    scene = sliders(tmp_path, more, q_dot=(1.0, 1.0), masses=(1.0, 1.0))
-    alike = sensitivities(scene, ["initial.q.x"], TIGHT)
-    assert last(alike, "initial.q.x") == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-9)
-    found = sensitivities(scene, ["initial.q.x", "initial.q_dot.x"], TIGHT)
-    assert found.run.status == "stopped"
-    assert "begins to move from rest, and with another initial.q_dot.x" in found.run.message
-    assert found.run.t[-1] == pytest.approx(1.0 / 3.5, abs=1e-8)
-    assert found.q_tree[-1, :, 1] == pytest.approx([1.0 / 3.5, 0.0], abs=1e-8)  # what there is so far
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_joints_that_only_move_together_turn_round_together(seed: int) -> None:
     """Whatever the tolerance is: a loop of one freedom that rubs in three of its joints has a derivative everywhere."""

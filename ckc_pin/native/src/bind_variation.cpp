@@ -24,7 +24,7 @@ Effect effect_of(const nb::tuple& row) {
 }
 
 Parameter parameter_of(const nb::tuple& row) {
-  Parameter found{{}, nb::cast<Vector>(row[1]), nb::cast<Vector>(row[2])};
+  Parameter found{{}, nb::cast<Vector>(row[1]), nb::cast<Vector>(row[2]), nb::cast<int>(row[3])};
   for (const auto& effect : nb::cast<nb::list>(row[0])) found.effects.push_back(effect_of(nb::cast<nb::tuple>(effect)));
   return found;
 }
@@ -44,18 +44,19 @@ nb::object delays(Run& run, int coordinate, bool of_rate) {
   Loop& loop = *run.loop;
   WithVariation& system = varied(run);
   require_indices({coordinate}, run.core->n, "coordinate");
-  if (of_rate && system.impact_at == loop.t()) return nb::cast(system.variation().delay());
+  if (of_rate && system.impact_at == loop.t()) return nb::cast(system.variation().delay(coordinate));
   Vector a(run.core->n);
   if (!loop.settle_core() || !loop.system->acceleration(loop.t(), a)) return nb::none();
   const Vector found = system.variation().delay({coordinate, of_rate}, loop.system->velocity, a, system.changes(loop.y()));
   return found.allFinite() ? nb::cast(found) : nb::none();
 }
 
-// Where a joint has no one time to change what it does: (coordinate, whether it is at rest there, parameter); else none.
+// Where a joint has no one time to change what it does: (coordinate, whether it is at rest there, parameter, whether others
+// that move only with it are thrown back otherwise); else none.
 nb::object apart(Run& run) {
   const auto& found = varied(run).apart;
   if (!found) return nb::none();
-  return nb::make_tuple(found->met.coordinate, found->met.of_rate, found->parameter);
+  return nb::make_tuple(found->met.coordinate, found->met.of_rate, found->parameter, found->together);
 }
 
 // The same states' velocity and acceleration of the tree, (2 n).
@@ -81,6 +82,7 @@ VariationTable variation_of(const nb::dict& table) {
                        get<bool>(table, "at_equilibrium"),
                        get<Vector>(table, "target"),
                        get<Matrix>(table, "turns"),
+                       get<Indices>(table, "part"),
                        {},
                        get<Matrix>(table, "directions")};
   for (const auto& row : nb::cast<nb::list>(table["parameters"]))

@@ -25,7 +25,8 @@ Variation::Variation(System& system, VariationTable table)
       derivatives_(tree_, table_.closure, table_.springs) {
   const int m = core_.rows.closure.rows;
   q_.setZero(tree_.nq), v_.setZero(tree_.n), a_.setZero(tree_.n), of_tree_.setZero(tree_.n);
-  back_.setZero(n), delay_.setZero(count), acting_.setZero(n), lacking_.setZero(n), lambda_.setZero(m);
+  delay_.setZero(1 + *std::max_element(table_.part.begin(), table_.part.end()), count), largest_.setZero(count);
+  back_.setZero(n), acting_.setZero(n), lacking_.setZero(n), lambda_.setZero(m);
   force_.setZero(n, count), row_.setZero(m, count), change_.setZero(n, count);
   for (const Parameter& of : table_.parameters)
     acting_varies_ |= std::any_of(of.effects.begin(), of.effects.end(), is_acting);
@@ -80,6 +81,7 @@ void Variation::balance(Matrix& q, Matrix& effort, Matrix& stiffness) {
 bool Variation::start(In v, Matrix& s) {
   written = general = 0;
   waiting_.clear(), held_.resize(0, 0);
+  largest_.setZero(), delay_.setZero(), begins_ = true;
   at_pole_ = false, limits_.clear();
   const Vector here = core_.q_tree, none = Vector::Zero(n), no_force = Vector::Zero(core_.rows.closure.rows);
   s.setZero(2 * n, count);

@@ -38,6 +38,7 @@ struct Effect {
 struct Parameter {
   std::vector<Effect> effects;
   Vector q, q_dot;  // (n), (d): how the start's independent coordinates, tangent, and their rates change with it
+  int assembled_at;  // coordinate: the start is assembled at its stop, which the parameter moves; else -1
 };
 
 struct VariationTable {
@@ -49,6 +50,7 @@ struct VariationTable {
   bool at_equilibrium;
   Vector target;  // q' where a controller compensates what this mechanism needs to stay, or none
   Matrix turns;   // (motors, n)
+  Indices part;   // (n): parts of the mechanism that nothing connects, from 0
   std::vector<Parameter> parameters;
   Matrix directions;  // (numbers that the written-out code takes, parameters); none where it does not take them
 };
@@ -57,6 +59,7 @@ struct VariationTable {
 struct Apart {
   System::Met met;
   int parameter;
+  bool together = false;  // its stop throws it back together with joints that move only with it, by other restitutions
 };
 
 class Variation {
@@ -67,7 +70,7 @@ class Variation {
   long written = 0, general = 0;  // how often rates were found by the code that is written out, and by the tree
   // How much later with each parameter what is met comes, where the core moves with v and accelerates with a.
   Vector delay(const System::Met& met, In v, In a, const Matrix& s) const;
-  const Vector& delay() const { return delay_; }  // of the last change of joints
+  Vector delay(int coordinate) const { return delay_.row(table_.part[coordinate]); }  // of the last change of joints
   // From a start in the independent coordinates; false where it is singular.
   bool start(In v, Matrix& s);
   // Of s at the core's state, where it moves with v and accelerates with a under what acts; false where what acts has no
@@ -80,6 +83,7 @@ class Variation {
   // accepted. A shorter step tells whether it is between them in between.
   bool at_pole() const { return at_pole_; }
   void accept();
+  void measure(const Eigen::Ref<const Matrix>& s);  // remember how large each parameter's column has been
   // The same where nothing varies but the start, by eq. 1's derivatives.
   void rates_of_start(In v, const Matrix& by_q, const Matrix& by_v, const Matrix& s, Matrix& s_dot) const;
   // How eq. 6's force and the motors' torques change, (d, parameters) and (motors, parameters), at the core's state with
@@ -90,11 +94,13 @@ class Variation {
   bool sampled(const Matrix& s, const Sampling& clock, bool& changed);
   bool holds() const { return held_.size() && !held_.isZero(0.0); }
   // Where joints change what they do: as the system's. In between s is of the instant that comes with the parameters.
+  // An impact may have several rounds, each with the velocity v that it begins with.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
   bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, double restitution, Matrix& s);
-  bool after_change(In v, In a, Matrix& s);
-  // Of what has come to be as it is, the first with which parameter it has not, if there is one.
-  std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol) const;
+  bool tidy(In v, Matrix& s);
+  // Of what has come to be as it is, the first with which parameter it has not, if there is one: of s as `tidy` leaves it.
+  std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol);
+  void after_change(In v, In a, Matrix& s);
 
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
@@ -115,7 +121,6 @@ class Variation {
   void add_gravity(const Effect& of, Out force);
   void add_spring(const Effect& of, Out force);
   void closure_changes(In v, Matrix& place, Matrix& rate) const;
-  bool tidy(In v, Matrix& s);
   void close(const Matrix& open, Matrix& x);
   void balance(Matrix& q, Matrix& effort, Matrix& stiffness);
   const Matrix& wanted(In q_tree, In v);  // how a controller's u changes with the parameters, (d, parameters)
@@ -125,6 +130,10 @@ class Variation {
   void add_state(const Matrix& s);
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
   Vector from_stop(const System::Met& met, const Matrix& s) const;  // how far with each parameter a joint is
+  bool is_known(int coordinate, bool of_rate, In v, In a) const;  // when it comes: it moves by more than rounding
+  bool has_changed(const System::Met& met) const;  // what the joint does, since before_change
+  void add_delayed(In v, In a, double sign, Matrix& s) const;
+  double size(const Eigen::Ref<const Matrix>& s, int p) const;  // of a column, by the joints' reach
 
   System& system_;
   Core& core_;
@@ -151,7 +160,13 @@ class Variation {
   std::deque<Matrix> waiting_;  // of samples that do not act yet
   Matrix held_;
   Vector acting_, back_, direction_, of_group_, of_tree_, lambda_, lacking_;
-  Vector q_, v_, a_, delay_, q_own_, q_dot_own_, more_;
+  Vector q_, v_, a_, q_own_, q_dot_own_, more_;
+  Matrix delay_;    // (parts, parameters)
+  Vector largest_;  // by parameter: the size of its column so far
+  bool begins_ = true;        // no change of joints was there yet
+  Indices sign_, touch_;      // what joints did before the change
+  std::vector<std::pair<int, Vector>> missed_;  // rates that impacts ask of a joint and cannot give it, by parameter
+  std::vector<char> locked_, struck_;  // (n): those that were held before it, those that impacts of it are at
 };
 
 }  // namespace ckc

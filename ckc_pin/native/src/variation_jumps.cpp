@@ -9,6 +9,7 @@
 namespace ckc {
 
 constexpr double least = 1e-7, most = 1e-2, times = 100.0;  // relative, at least, at most, and of the tolerances: none
+constexpr double rounding = 1e-9;  // of the fastest coordinate: one that does not move, but for rounding
 
 Vector Variation::delay(const System::Met& met, In v, In a, const Matrix& s) const {
   const int k = met.coordinate;
@@ -40,41 +41,90 @@ bool Variation::tidy(In v, Matrix& s) {
   return true;
 }
 
-// What is met stays met. Of several the one that comes fastest tells when, a stop before what comes to rest.
+double Variation::size(const Eigen::Ref<const Matrix>& s, int p) const {
+  const Vector& reach = core_.joints.table.reach;
+  return std::max(s.col(p).head(n).cwiseQuotient(reach).lpNorm<Eigen::Infinity>(),
+                  s.col(p).tail(n).cwiseQuotient(reach).lpNorm<Eigen::Infinity>());
+}
+
+void Variation::measure(const Eigen::Ref<const Matrix>& s) {
+  for (int p = 0; p < count; ++p) largest_(p) = std::max(largest_(p), size(s, p));
+}
+
+bool Variation::is_known(int coordinate, bool of_rate, In v, In a) const {
+  const Vector& reach = core_.joints.table.reach;
+  const Vector moves = (of_rate ? a : v).cwiseQuotient(reach).cwiseAbs();
+  return moves(coordinate) > rounding * moves.maxCoeff();
+}
+
+void Variation::add_delayed(In v, In a, double sign, Matrix& s) const {
+  for (int k = 0; k < n; ++k) {
+    s.row(k) += sign * v(k) * delay_.row(table_.part[k]);
+    s.row(n + k) += sign * a(k) * delay_.row(table_.part[k]);
+  }
+}
+
+// What is met stays met. Of several the one that comes fastest tells when, a stop before what comes to rest. Parts of the
+// mechanism that nothing connects have times of their own: the order in which they change makes no difference.
 bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s) {
   const Vector& reach = core_.joints.table.reach;
   const auto speed = [&](const System::Met& of) { return std::abs((of.of_rate ? a : v)(of.coordinate)) / reach(of.coordinate); };
   const auto later = [&](const System::Met& x, const System::Met& y) {
     return x.of_rate == y.of_rate ? speed(x) < speed(y) : x.of_rate;
   };
+  sign_ = core_.joints.sign, touch_ = core_.joints.touch;
+  locked_.assign(n, 0), struck_.assign(n, 0), missed_.clear();
+  for (int k : core_.joints.locked) locked_[k] = 1;
   delay_.setZero();
   if (!tidy(v, s)) return false;
-  if (!met.empty()) delay_ = delay(*std::max_element(met.begin(), met.end(), later), v, a, s);
-  if (!delay_.allFinite()) delay_.setZero();  // what neither moves nor is moved has no time of its own
-  s.topRows(n) += v * delay_.transpose();
-  s.bottomRows(n) += a * delay_.transpose();
+  measure(s);
+  for (Eigen::Index part = 0; part < delay_.rows(); ++part) {
+    const System::Met* first = nullptr;
+    for (const System::Met& of : met)
+      if (table_.part[of.coordinate] == part && is_known(of.coordinate, of.of_rate, v, a) && (!first || later(*first, of)))
+        first = &of;
+    if (first) delay_.row(part) = delay(*first, v, a, s);
+  }
+  add_delayed(v, a, 1.0, s);
   return s.allFinite();
 }
 
-std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol,
-                                      double atol) const {
+// Of a joint that is at rest where another one changes what it does, as one that has just turned round, nothing changes.
+bool Variation::has_changed(const System::Met& met) const {
+  const Joints& joints = core_.joints;
+  const int k = met.coordinate;
+  const bool locked = std::find(joints.locked.begin(), joints.locked.end(), k) != joints.locked.end();
+  return begins_ || struck_[k] || locked != static_cast<bool>(locked_[k]) || joints.sign[k] != sign_[k] ||
+         joints.touch[k] != touch_[k];
+}
+
+// Each parameter is judged by its own column, as large as it has been: what that has lost in digits stays lost.
+std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol) {
   const double relative = std::clamp(times * rtol, least, most);
-  for (const System::Met& met : arrived) {
-    const Vector off = met.of_rate ? Vector(s.row(n + met.coordinate)) : from_stop(met, s);
+  measure(s);
+  for (const auto& [k, missed] : missed_)
     for (int p = 0; p < count; ++p)
-      if (!(std::abs(off(p)) <= relative * s.col(p).lpNorm<Eigen::Infinity>() + times * atol)) return Apart{met, p};
+      if (!(std::abs(missed(p)) <= core_.joints.table.reach(k) * (relative * largest_(p) + times * atol)))
+        return Apart{{k, false}, p, true};
+  if (begins_)
+    for (int p = 0; p < count; ++p)
+      if (const int k = table_.parameters[p].assembled_at; k >= 0) return Apart{{k, false}, p};
+  for (const System::Met& met : arrived) {
+    if (!has_changed(met)) continue;
+    const double reach = core_.joints.table.reach(met.coordinate);
+    const Vector off = (met.of_rate ? Vector(s.row(n + met.coordinate)) : from_stop(met, s)) / reach;
+    for (int p = 0; p < count; ++p)
+      if (!(std::abs(off(p)) <= relative * largest_(p) + times * atol)) return Apart{met, p};
   }
   return {};
 }
 
 // What sticks or touches from here on is brought to rest by what holds it, whenever it comes: a friction that could hold
 // more, or the last of ever smaller bounces, takes a time and a way that vanish with the rate it comes with.
-bool Variation::after_change(In v, In a, Matrix& s) {
+void Variation::after_change(In v, In a, Matrix& s) {
   limits_.clear();  // a velocity that jumps may be answered by other torques at once
-  if (!tidy(v, s)) return false;
-  s.topRows(n) -= v * delay_.transpose();
-  s.bottomRows(n) -= a * delay_.transpose();
-  return true;
+  begins_ = false;
+  add_delayed(v, a, -1.0, s);
 }
 
 // D' step = J^T mu + x, J step = 0, and the speeds that x turns round go on in that proportion.
@@ -88,7 +138,11 @@ bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& respon
   for (size_t i = 0; i < at.size(); ++i) {
     const auto k = static_cast<Eigen::Index>(i);
     lacking(at[i]) -= x(k);
-    if (x(k) != 0.0) pushed.push_back(static_cast<int>(i));
+    struck_[at[i]] = 1;
+    // Either a stop pushes, or the joint goes off it faster than it is thrown back; the other one is rounding.
+    const double faster = std::abs(std::abs(v(at[i]) + step(at[i])) - back(k));
+    const double rounded = rounding * (std::abs(v(at[i])) + std::abs(step(at[i])));
+    if (faster <= std::max(std::abs(x(k)) * responses(at[i], k), rounded)) pushed.push_back(static_cast<int>(i));
   }
   core_.multipliers(lacking, lambda);
   compute(none, step, lambda, true);
@@ -100,17 +154,26 @@ bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& respon
   if (!core_.respond(-force_, row_, change_)) return false;
   const auto few = static_cast<Eigen::Index>(pushed.size());
   Matrix A(few, few), wanted(few, count), columns(n, few);
+  Vector scale(few);
   for (Eigen::Index i = 0; i < few; ++i) {
     const int k = at[pushed[i]];
     columns.col(i) = responses.col(pushed[i]);
     for (Eigen::Index j = 0; j < few; ++j) A(i, j) = responses(k, pushed[j]);
-    const double side = x(pushed[i]) > 0.0 ? 1.0 : -1.0;  // off the stop
+    scale(i) = 1.0 / std::sqrt(A(i, i));
+    const double side = x(pushed[i]) > 0.0 || (x(pushed[i]) == 0.0 && v(k) < 0.0) ? 1.0 : -1.0;  // off the stop
     wanted.row(i) = -(1.0 + restitution) * s.row(n + k) - change_.row(k);
     for (int p = 0; p < count; ++p)
       for (const Effect& of : table_.parameters[p].effects)
         if (of.kind == Effect::restitution && of.index == k && restitution == core_.joints.table.restitution(k)) wanted(i, p) += side * std::max(-side * v(k), 0.0);
   }
-  s.bottomRows(n) += change_ + columns * A.completeOrthogonalDecomposition().solve(wanted);
+  A = scale.asDiagonal() * A * scale.asDiagonal(), wanted = scale.asDiagonal() * wanted;
+  Eigen::CompleteOrthogonalDecomposition<Matrix> solver(few, few);
+  solver.setThreshold(dependent).compute(A);
+  const Matrix impulse = solver.solve(wanted);
+  s.bottomRows(n) += change_ + columns * scale.asDiagonal() * impulse;
+  // Joints that move only together, each thrown back by its own stop: with another restitution one of them takes over.
+  const Matrix missed = scale.cwiseInverse().asDiagonal() * (A * impulse - wanted);
+  for (Eigen::Index i = 0; i < few; ++i) missed_.emplace_back(at[pushed[i]], missed.row(i));
   return s.allFinite();
 }
 

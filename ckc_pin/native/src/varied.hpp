@@ -64,6 +64,7 @@ class Varied : public Base, public WithVariation {
   bool place(In y) override { return Base::place(y.head(size_)); }
   Accepted accept(double t, Out y, double margin) override {
     variation_.accept();
+    if (this->core.joints.any()) variation_.measure(Eigen::Map<const Matrix>(y.data() + size_, rows(), variation_.count));
     return Base::accept(t, y.head(size_), margin);
   }
   bool own_partition(double t, Out y, bool& changed) override { return Base::own_partition(t, y.head(size_), changed); }
@@ -107,8 +108,9 @@ class Varied : public Base, public WithVariation {
     return true;
   }
   bool after_change(double t, Out y, const std::vector<System::Met>& arrived, double rtol, double atol) override {
-    apart = variation_.apart(arrived, s_, rtol, atol);
-    if (apart || !this->acceleration(t, a_) || !variation_.after_change(this->velocity, a_, s_)) return false;
+    if (!this->acceleration(t, a_) || !variation_.tidy(this->velocity, s_)) return false;
+    if ((apart = variation_.apart(arrived, s_, rtol, atol))) return false;
+    variation_.after_change(this->velocity, a_, s_);
     put(y);
     return true;
   }
