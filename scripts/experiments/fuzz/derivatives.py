@@ -24,7 +24,7 @@ from ckc_pin.mechanism.parameters import values_of, with_components
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array
 
-__all__ = ["Column", "Draw", "columns_of", "columns_table", "draw", "is_wrong", "judge_columns"]
+__all__ = ["Draw", "JudgedColumn", "columns_of", "columns_table", "draw", "is_wrong", "judge_columns"]
 
 RTOL, RTOL_RUNS = 1e-10, 1e-12  # of the sensitivities, and of the runs that differences are taken of
 INSTANTS = 40
@@ -53,7 +53,7 @@ class Draw:
 
 
 @dataclass(frozen=True)
-class Column:
+class JudgedColumn:
     """One parameter of one scene.
 
     Attributes
@@ -173,23 +173,23 @@ def _parameters(random: np.random.Generator, mechanism: Mechanism, initial: Mapp
 # --- the suite ---------------------------------------------------------------------------------------
 
 
-def columns_of(seed: int) -> list[Column]:
+def columns_of(seed: int) -> list[JudgedColumn]:
     """Draw a seed's scene and judge its columns; an exception that is none of the package's is a wrong column too."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             return judge_columns(draw(seed, Path(folder) / "mechanism"))
         except CkcError as error:
-            return [Column(seed, "", "", "", f"refused: {error}", "undecided")]
+            return [JudgedColumn(seed, "", "", "", f"refused: {error}", "undecided")]
         except Exception as error:
-            return [Column(seed, "", "", "", RAW, "undecided", note=f"{type(error).__name__}: {error}")]
+            return [JudgedColumn(seed, "", "", "", RAW, "undecided", note=f"{type(error).__name__}: {error}")]
 
 
-def is_wrong(column: Column) -> bool:
+def is_wrong(column: JudgedColumn) -> bool:
     """Whether sensitivities and differences contradict each other."""
     return column.verdict == RAW or column.result in WRONG
 
 
-def columns_table(columns: Sequence[Column]) -> str:
+def columns_table(columns: Sequence[JudgedColumn]) -> str:
     """Counts by kind of mechanism, the reasons of what is undecided, and every wrong column."""
     head = ("right", *WRONG, "undecided")
     lines = [f"{'mechanism':18s} {'columns':>8s}" + "".join(f" {name:>12s}" for name in head) + f" {'none':>6s}"]
@@ -214,7 +214,7 @@ def columns_table(columns: Sequence[Column]) -> str:
 # --- judging -----------------------------------------------------------------------------------------
 
 
-def judge_columns(drawn: Draw) -> list[Column]:
+def judge_columns(drawn: Draw) -> list[JudgedColumn]:
     """Ask for each parameter by itself and for all together, and compare with differences."""
     if not drawn.parameters:
         return []
@@ -229,11 +229,11 @@ def judge_columns(drawn: Draw) -> list[Column]:
     return [*columns, *_together(drawn, columns)]
 
 
-def _column(drawn: Draw, name: str, verdict: str, judged: str = "undecided", **more: Any) -> Column:
-    return Column(drawn.seed, drawn.kind, drawn.changes["formulation"], name, verdict, judged, **more)
+def _column(drawn: Draw, name: str, verdict: str, judged: str = "undecided", **more: Any) -> JudgedColumn:
+    return JudgedColumn(drawn.seed, drawn.kind, drawn.changes["formulation"], name, verdict, judged, **more)
 
 
-def _together(drawn: Draw, columns: Sequence[Column]) -> list[Column]:
+def _together(drawn: Draw, columns: Sequence[JudgedColumn]) -> list[JudgedColumn]:
     """Whether the verdict about all parameters is that about the first of them that has none."""
     alone = [column.verdict for column in columns]
     if any(verdict not in ("derivative", "none") for verdict in alone):
@@ -265,7 +265,7 @@ def _scale(mechanism: Mechanism) -> tuple[Array, Sequence[int]]:
     return np.concatenate([reach, reach / np.sqrt(mechanism.size)]), joints
 
 
-def _judge(drawn: Draw, name: str, run: ckc_pin.Run) -> Column:
+def _judge(drawn: Draw, name: str, run: ckc_pin.Run) -> JudgedColumn:
     try:
         found = ckc_pin.sensitivities(drawn.scene, [name], {**drawn.changes, "solver.rtol": RTOL})
     except CkcError as error:

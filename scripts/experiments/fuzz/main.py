@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from ckc_pin.errors import CkcError
 from scripts.experiments.fuzz.contact import main as contact
 from scripts.experiments.fuzz.contact.record import KINDS
-from scripts.experiments.fuzz.derivatives import Column, columns_of, columns_table, is_wrong
+from scripts.experiments.fuzz.derivatives import JudgedColumn, columns_of, columns_table, is_wrong
 from scripts.experiments.fuzz.motions import SHIPPED, Motion, random_motion, shipped_motion
 from scripts.experiments.fuzz.record import FIELDS, Record, run_motion
 from scripts.experiments.fuzz.shrink import shrink
@@ -135,7 +135,7 @@ def _derivatives(seeds: Sequence[int], given: argparse.Namespace) -> int:
     columns = [column for found in by_seed for column in found]
     print(columns_table(columns))
     if given.out:
-        names = [x.name for x in fields(Column)]
+        names = [x.name for x in fields(JudgedColumn)]
         _write_csv(given.out, [*names, "result"], [asdict(x) | {"result": x.result} for x in columns])
     return 1 if any(map(is_wrong, columns)) else 0
 
