@@ -116,7 +116,7 @@ class Rounds {
       if (std::abs(g_(stops_[i]) - reflected) <= same * size) g_(stops_[i]) = reflected;
     }
     ++impact_.rounds;
-    return apply_(impulses_, restitution);
+    return apply_(stops_, impulses_, restitution);
   }
 
   // What still approaches is stopped, and bounces that would not rise are taken away, by a projection on one cone.

@@ -31,9 +31,9 @@ struct Impact {
   long rounds = 0;
 };
 
-// Called after each round with its impulses, (m), not negative but where they take away a slow bounce, and with the
-// restitution that it used.
-using ImpactRound = std::function<bool(const Vector& impulses, double restitution)>;
+// Called after each round with the stops that took part, the impulses of all of them, (m), not negative but where they
+// take away a slow bounce, and the restitution of the round.
+using ImpactRound = std::function<bool(const Indices& stops, const Vector& impulses, double restitution)>;
 
 // False where a quadratic program fails, or `round` returned false.
 bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Impact& impact);

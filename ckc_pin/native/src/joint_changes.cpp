@@ -150,17 +150,21 @@ bool JointChanges::impact(double t, Out y) {
   }
   std::vector<char> is_hit(at.size(), 0);
   Vector step = Vector::Zero(core_.n);
-  const auto apply = [&](const Vector& impulses, double restitution) {
-    step_.setZero(), x_.resize(m);
-    for (Eigen::Index i = 0; i < m; ++i) {
-      const int k = at[i];
-      x_(i) = -near_[k] * impulses(i);
-      step_ += x_(i) * responses_.col(i);
+  const auto apply = [&](const Indices& stops, const Vector& impulses, double restitution) {
+    const auto count = static_cast<Eigen::Index>(stops.size());
+    Indices struck;
+    Vector x(count);
+    step_.setZero();
+    for (Eigen::Index j = 0; j < count; ++j) {
+      const int i = stops[j], k = at[i];
+      struck.push_back(k);
+      x(j) = -near_[k] * impulses(i);
+      step_ += x(j) * responses_.col(i);
       if (impulses(i) > 0.0 && !is_hit[i] && !touched[k]) arrived_.push_back({k, false, near_[k]});
       is_hit[i] |= impulses(i) > 0.0;
     }
     step += step_;
-    return system_.at_impact(step_, at, responses_, x_, restitution);
+    return system_.at_impact(step_, struck, responses_(Eigen::all, stops), x, restitution);
   };
   Impact impact;
   if (!resolve_impact(problem, apply, impact)) return false;

@@ -139,10 +139,12 @@ bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& respon
     const auto k = static_cast<Eigen::Index>(i);
     lacking(at[i]) -= x(k);
     struck_[at[i]] = 1;
-    // Either a stop pushes, or the joint goes off it faster than it is thrown back; the other one is rounding.
-    const double faster = std::abs(std::abs(v(at[i]) + step(at[i])) - back(k));
-    const double rounded = rounding * (std::abs(v(at[i])) + std::abs(step(at[i])));
-    if (faster <= std::max(std::abs(x(k)) * responses(at[i], k), rounded)) pushed.push_back(static_cast<int>(i));
+    // Either a stop pushes, or the joint goes off it faster than it is thrown back; the other one is rounding. A joint that
+    // is turned round may leave the push to others that move only with it.
+    const double before = v(at[i]), after = before + step(at[i]), faster = std::abs(after + restitution * before);
+    const bool turned = is_known(at[i], false, v, v) && before * step(at[i]) < 0.0;
+    if (std::abs(x(k)) * responses(at[i], k) > faster || (turned && faster <= rounding * std::abs(before)))
+      pushed.push_back(static_cast<int>(i));
   }
   core_.multipliers(lacking, lambda);
   compute(none, step, lambda, true);
@@ -164,7 +166,8 @@ bool Variation::at_impact(In v, In step, const Indices& at, const Matrix& respon
     wanted.row(i) = -(1.0 + restitution) * s.row(n + k) - change_.row(k);
     for (int p = 0; p < count; ++p)
       for (const Effect& of : table_.parameters[p].effects)
-        if (of.kind == Effect::restitution && of.index == k && restitution == core_.joints.table.restitution(k)) wanted(i, p) += side * std::max(-side * v(k), 0.0);
+        if (of.kind == Effect::restitution && of.index == k && restitution == core_.joints.table.restitution(k))
+          wanted(i, p) += side * std::max(-side * v(k), 0.0);
   }
   A = scale.asDiagonal() * A * scale.asDiagonal(), wanted = scale.asDiagonal() * wanted;
   Eigen::CompleteOrthogonalDecomposition<Matrix> solver(few, few);

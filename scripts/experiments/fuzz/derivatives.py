@@ -318,7 +318,7 @@ def _sides(drawn: Draw, name: str, at: float, run: ckc_pin.Run) -> tuple[_Side, 
     here = _states(run, run.mechanism)
     unit = abs(at) if name.startswith("link.") and at else max(abs(at), 0.1)
     moved = _difference(drawn, name, at, 1e-4 * unit, run) * 1e-4 * unit
-    change = float(np.median(np.abs(moved).max(axis=1)))
+    change = float(np.quantile(np.abs(moved).max(axis=1), 0.95))  # some instants are beside an event
     size = max(1.0, np.abs(here).max())
     h = 1e-4 * unit * np.clip(WANTED_CHANGE * size / max(change, 1e-300), SMALLEST_STEP / 1e-4, LARGEST_STEP / 1e-4)
     return _side(drawn, name, at, h, run), _side(drawn, name, at, -h, run)
