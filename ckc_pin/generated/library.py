@@ -18,10 +18,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.generated.arguments import numbers, present, values
+from ckc_pin.kinematics.loading import build
+from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
+from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array, BoolArray
 from ckc_pin.mechanism.whole_file import written_whole
 
@@ -122,7 +125,7 @@ def compiled(
     compiler = _compiler(subject.changes)
     if compiler is None:
         raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
-    return _make(mechanism, subject, compiler, on_written)
+    return _make(_with_numbers_of_files(mechanism, subject), subject, compiler, on_written)
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,21 @@ class _Subject:
         given = numbers(mechanism)
         which = which or present(given)
         return cls(_key(mechanism, which, changes), values(given, which), which, changes)
+
+
+def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism:
+    """Return the mechanism with the numbers of its files, if it has the same library; otherwise the mechanism itself.
+
+    The order of elimination then does not depend on which masses the library was first asked for with.
+    """
+    sources = mechanism.sources
+    if MECHANISM_FILE not in sources.texts:
+        return mechanism
+    try:
+        unchanged = build(sources.texts[MECHANISM_FILE], Sources(sources.name, sources.folder, sources.texts))
+    except (InputError, MechanismError):  # numbers with which it cannot be assembled
+        return mechanism
+    return unchanged if _key(unchanged, subject.which, subject.changes) == subject.key else mechanism
 
 
 @dataclass(frozen=True)
@@ -260,7 +278,7 @@ def _make(
     with tempfile.TemporaryDirectory(prefix="ckc_pin-", dir=place) as made:
         library = Path(made) / "terms.so"
         _compile(mechanism, subject, compiler, Path(made) / "terms.c", library, on_written)
-        require_equal(mechanism, Library(str(library), subject.parameters))
+        require_equal(mechanism, Library(str(library), values(numbers(mechanism), subject.which)))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
         return Library(str(_put(name, content)), subject.parameters)
