@@ -76,7 +76,8 @@ class Run(Shown):
         touches a stop, leaves it or bounces off it (of "stop").
     stats : dict
         rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (of a
-        caller's controller and events), terms (at the end), rhs_by_terms, wall_s.
+        caller's controller and events), terms (at the end), rhs_by_terms ("pinocchio", "generated", or
+        "general": compiled terms, but the general elimination because theirs rounds too much), wall_s.
     scene : dict
         The scene as resolved.
     texts : dict of str to str

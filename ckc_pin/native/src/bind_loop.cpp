@@ -193,7 +193,8 @@ nb::dict stats(const Run& run) {
     if (loop.steps[k]) by_method[methods[k]] = loop.steps[k];
   }
   found["terms"] = run.core->written ? "generated" : "pinocchio";
-  if (run.core->written) by_terms["generated"] = loop.work.rhs - run.rhs_before;
+  if (run.core->written) by_terms["generated"] = loop.work.rhs - run.rhs_before - counts.pivoted;
+  if (counts.pivoted) by_terms["general"] = counts.pivoted;
   if (run.rhs_before || !run.core->written) by_terms["pinocchio"] = run.core->written ? run.rhs_before : loop.work.rhs;
   found["rhs_by_terms"] = by_terms;
   found["rhs"] = loop.work.rhs, found["steps"] = steps, found["rejected"] = loop.work.rejected;

@@ -112,7 +112,16 @@ class Core {
   void particular(In residual, Out x);
   // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // The same where the locked joints rest.
+  // What compiled elimination of eq. 1 is off by at the core's state, whether it may be used or not, relative to the accelerations
+  // that the forces give: off what projection gives. Zero where one of them does not exist. And what projection is off by where
+  // masses are very unequal. How later accelerations round does not change.
+  double rounding_of_elimination(In u_tree);
+  double rounding_of_projection(In u_tree);
+  // Whether masses are so unequal that projection may lose digits; it is then done by levels of masses, where that is asked for.
+  bool has_uneven_masses() const;
+  void use_levels(bool used) { uses_levels_ = used; }
+  bool uses_levels() const { return uses_levels_; }
+  // The same as `dae_acceleration` where the locked joints rest.
   bool eq_1(In force, In correction, Out a);
   // What a unit force on each of some coordinates adds to the acceleration, as columns; false where J has lost rank.
   bool responses(const Indices& at, Matrix& columns);
@@ -149,12 +158,19 @@ class Core {
   bool tangent_basis(In residual, double least);  // tangent_, and x_: J x = -residual
   void tangent_inertia();                         // factorized
   void with_force(In force, Out x);               // x_ with what a force makes of the tangent directions
+  struct Components;                              // of the bodies' velocities
+  void components(Components& of);
+  bool basis_for_check();                         // tangent_ and x_ by pivoting, forgotten again
+  void project(In u_tree, Out a);                 // eq. 1 where tangent_ and x_ are known
+  bool project_by_levels(In u_tree, Out a);       // the same; false where a motion moves no mass
+  double off(In a, In right);                     // relative, after `project`
   bool basis_by_partition();
   bool basis_by_pivoting(double least);
   double steepness() const;
   void repartition();
 
   bool dense_;          // whether D' is
+  bool uses_levels_ = false;
   unsigned here_ = 0;  // parts that are those of q_tree and v_tree
   Matrix C_tree_, D_written_, D_rho_, tangent_, D_tangent_;
   Indices free_;  // the coordinates that the tangent basis' columns are of

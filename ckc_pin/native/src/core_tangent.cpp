@@ -1,6 +1,8 @@
 // The tangent space of the closure: eq. 1's acceleration by projection on it, and steps that close the loops.
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <numeric>
 
 #include "core.hpp"
 #include "written.hpp"
@@ -163,11 +165,63 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   bias();
   residual_ = J_dot_v + correction;
   if (!tangent_basis(residual_, singular)) return false;
+  if (!uses_levels_ || !project_by_levels(u_tree, acceleration)) project(u_tree, acceleration);
+  return true;
+}
+
+void Core::project(In u_tree, Out a) {
   tangent_inertia();
   D_times(x_, y_);
   y_ = u_tree - bias_tree - y_ + damping_tree;
-  with_force(y_, acceleration);
+  with_force(y_, a);
+}
+
+bool Core::basis_for_check() {
+  jacobian(), bias();
+  negative_ = -J_dot_v, x_.setZero();
+  basis_at_ = -1;  // that of the partition is made anew where it is asked for
+  if (rows.closure.rows) return basis_by_pivoting(singular);
+  tangent_.setIdentity();
+  std::iota(free_.begin(), free_.end(), 0);
   return true;
+}
+
+// Relative to what the forces would give where none cancels another one: near an equilibrium accelerations are rounding.
+double Core::off(In a, In right) {
+  const Vector& units = scales.columns;
+  double largest = right.cwiseQuotient(units).lpNorm<Eigen::Infinity>();
+  for (int k = 0; k < n - rank; ++k) {
+    const auto along = tangent_.col(k);
+    const double inertia = along.cwiseAbs2().dot(D_tree().diagonal());
+    const double alone = inertia > 0.0 ? along.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
+    largest = std::max(largest, alone * along.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
+  }
+  const double difference = (a - right).cwiseQuotient(units).lpNorm<Eigen::Infinity>();
+  if (!std::isfinite(difference)) return std::numeric_limits<double>::infinity();
+  return difference > 0.0 ? difference / largest : 0.0;
+}
+
+double Core::rounding_of_elimination(In u_tree) {
+  Vector compiled(n), right(n);
+  residual_.setZero();
+  if (!written->eliminate(q_tree, v_tree, u_tree, residual_, compiled) || !basis_for_check()) return 0.0;
+  project(u_tree, right);
+  if (!uses_levels_) return off(compiled, right);
+  Vector by_levels(n);
+  const Vector forces = y_;
+  if (project_by_levels(u_tree, by_levels)) right = by_levels;
+  y_ = forces;
+  return off(compiled, right);
+}
+
+double Core::rounding_of_projection(In u_tree) {
+  Vector plain(n), right(n);
+  if (!basis_for_check()) return 0.0;
+  project(u_tree, plain);
+  const Vector forces = y_;
+  if (!project_by_levels(u_tree, right)) return 0.0;
+  y_ = forces;
+  return off(plain, right);
 }
 
 bool Core::eq_1(In force, In correction, Out a) {

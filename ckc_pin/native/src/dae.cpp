@@ -23,7 +23,10 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), unforced_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
 }
 
-void Dae::start(double, In q_tree, In v, In, Out y) { y << q_tree, v; }
+void Dae::start(double, In q_tree, In v, In, Out y) {
+  elimination.start(core);
+  y << q_tree, v;
+}
 
 void Dae::set(In q_tree, bool with_inertia) {
   core.set(q_tree, with_inertia);
@@ -54,6 +57,9 @@ bool Dae::rhs(double t, In y, Out y_dot) {
       core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
       return finite(y_dot) || fails(Trouble::infinite);
     }
+    ++counts.pivoted;
+  } else if (core.written && !core.written->eliminates()) {
+    ++counts.pivoted;
   }
   place(y);
   return rate(t, v, y_dot);
@@ -210,9 +216,16 @@ bool Dae::exact(double, In y) {
   return true;
 }
 
+bool Dae::at_start(double t, In y) {
+  if (!exact(t, y)) return false;
+  elimination.begin(core, v_tree);
+  return true;
+}
+
 bool Dae::at_last(double, In y) {
   place(y);
   velocity = v_tree = y.tail(core.n);
+  if (elimination.is_due()) elimination.remember(core.q_tree, v_tree, acting(v_tree));
   return true;
 }
 
@@ -235,6 +248,7 @@ void Dae::put_exact(Out y) const {
 
 Accepted Dae::accept(double, Out y, double) {
   const int n = core.n;
+  elimination.accept(core);
   if (!projects_) return Accepted::kept;
   place(y);
   residual_.noalias() = core.rows.J * y.tail(n);

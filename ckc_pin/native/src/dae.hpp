@@ -13,6 +13,7 @@ class Dae : public System {
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override;
+  bool at_start(double t, In y) override;
   bool at_last(double t, In y) override;
   bool as_is(double t, In y) override;
   bool shows(In y, int k, bool rate, double& value) const override;

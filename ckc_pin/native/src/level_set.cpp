@@ -31,6 +31,7 @@ LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   if (core.q != own_.q) core.split(own_.q, own_.z);
   refusals_ = 0, balance_ = 0.0, closing_.expected = 0;
+  elimination.start(core);
   t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
   core.set(q_tree);
   core.reduce();
@@ -82,10 +83,18 @@ bool LevelSet::state(double t, In y, double tolerance) {
   return true;
 }
 
+bool LevelSet::at_start(double t, In y) {
+  if (!exact(t, y)) return false;
+  arrived_ = core.q_tree;
+  elimination.begin(core, v_tree);
+  return true;
+}
+
 // A state next to where phi_z is singular has to be closed exactly, or nothing after it can be.
 bool LevelSet::at_last(double t, In y) {
   if (margin() < poor && !exact(t, y)) return false;
   arrived_ = core.q_tree;
+  if (elimination.is_due()) elimination.remember(core.q_tree, v_tree, acting(v_tree));
   return true;
 }
 
@@ -115,10 +124,14 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
     chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
   // On the manifold eq. 6 is eq. 1 at rho q_dot.
   const Vector& force = acting(v_tree);
-  const bool locked = !core.joints.locked.empty();
-  if (locked && !eq_1(v_tree, uncorrected_, a_tree_)) return false;
-  written_ = locked || (on_manifold_ && core.written_acceleration(core.q_tree, v_tree, force, uncorrected_, a_tree_));
-  if (written_)
+  const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.written && !locked;
+  of_tree_ = compiled && core.written_acceleration(core.q_tree, v_tree, force, uncorrected_, a_tree_);
+  if (compiled && !of_tree_) ++counts.pivoted;
+  if (!of_tree_ && (locked || (on_manifold_ && core.uses_levels()))) {
+    if (!eq_1(v_tree, uncorrected_, a_tree_)) return false;
+    of_tree_ = true;
+  }
+  if (of_tree_)
     for (int k = 0; k < d; ++k) y_dot(d + k) = a_tree_(core.q[k]);
   else if (actual_ && !on_manifold_)
     core.actual_acceleration(force, q_dot, y_dot.tail(d));
@@ -178,7 +191,7 @@ void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
 bool LevelSet::tree_acceleration(In f, Out a) const {
   if (!on_manifold_) return false;
   const auto q_ddot = f.tail(core.d);
-  if (!written_) return core.tree_acceleration(q_ddot, a), true;
+  if (!of_tree_) return core.tree_acceleration(q_ddot, a), true;
   a = a_tree_;  // at another q_ddot than f's, which an implicit method asks for
   for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
   return true;
@@ -237,6 +250,7 @@ void LevelSet::add_rounding(In x, Out scale) const {
 // Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.
 Accepted LevelSet::accept(double t, Out y, double here) {
   anchor_ = arrived_;
+  elimination.accept(core);
   if (balance_ == 0.0) length_ = t - accepted_;
   if (length_ > 0.0) balance_ = std::max(0.0, balance_ - (t - accepted_) / length_);
   accepted_ = t;

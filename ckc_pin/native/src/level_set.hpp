@@ -16,7 +16,7 @@ class LevelSet : public System {
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool rhs(double t, In y, Out y_dot) override;
   bool exact(double t, In y) override { return state(t, y, tolerance_); }
-  bool at_start(double t, In y) override { return exact(t, y) && (arrived_ = core.q_tree, true); }
+  bool at_start(double t, In y) override;
   bool at_last(double t, In y) override;
   bool shows(In y, int k, bool rate, double& value) const override;
   double margin() override { return phi_z_margin(); }
@@ -65,7 +65,7 @@ class LevelSet : public System {
   Closing closing_;
   Vector anchor_, arrived_;  // configurations of the last accepted state, and of the one that may be next
   Vector w0_, q_tree_, residual_, z_, step_;
-  bool written_ = false;  // whether a_tree_ is that of the last right-hand side
+  bool of_tree_ = false;  // whether a_tree_ is that of the last right-hand side
   Vector a_tree_, unit_;
   Matrix rho_dot_;
 };

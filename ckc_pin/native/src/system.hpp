@@ -2,6 +2,7 @@
 #pragma once
 
 #include "control.hpp"
+#include "elimination_check.hpp"
 #include "spectrum.hpp"
 
 namespace ckc {
@@ -12,6 +13,7 @@ constexpr double chart_margin = 1e-5;
 struct Counts {
   long newton = 0, factorizations = 0, switches = 0;
   long differences = 0;  // Jacobians that were not exact
+  long pivoted = 0;      // right-hand sides for which the compiled elimination was not good enough
 };
 
 // Why a right-hand side does not exist.
@@ -131,6 +133,7 @@ class System {
   Control& control;
   int size;               // of y
   Counts counts;
+  EliminationCheck elimination;
   bool crosses = false;     // positions where J loses rank are passed
   bool may_switch = false;  // q may become other coordinates
   Vector velocity;          // of the tree, (n)

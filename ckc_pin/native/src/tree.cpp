@@ -122,6 +122,13 @@ Matrix6 Tree::spatial_inertia(int joint) const {
   return joint ? own->data.oMi[joint].act(own->model.inertias[joint]).matrix() : Matrix6(Matrix6::Zero());
 }
 
+Tree::Body Tree::body(int joint) const {
+  const pin::Inertia there = own->data.oMi[joint].act(own->model.inertias[joint]);
+  return {there.mass(), there.lever(), there.inertia().matrix()};
+}
+
+const Vector& Tree::armature() const { return own->model.armature; }
+
 Vector6 Tree::field() const { return own->model.gravity.toVector(); }
 
 static Eigen::Quaterniond turned(In q, Tree::Root root) {

@@ -60,6 +60,9 @@ class Tree {
   Vector6 motion_rate(int joint) const;   // its rate, without gravity
   Matrix6 spatial_inertia(int joint) const;
   Vector6 field() const;                  // gravity
+  struct Body { double mass; Vector3 centre; Matrix3 inertia; };
+  Body body(int joint) const;             // in the world's axes, its inertia about its centre
+  const Vector& armature() const;
 
   // On q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
   void normalize(Out q) const;

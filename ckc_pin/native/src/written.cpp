@@ -112,6 +112,7 @@ static bool same(In a, const Vector& b) {
 }
 
 bool Written::state(In q, In v, In u_tree) const {
+  if (!eliminates_) return false;
   return q_.size() && same(q, q_) && same(v, v_) && same(u_tree, u_) ? sound_ : find_state(q, v, u_tree);
 }
 
@@ -153,7 +154,7 @@ void Written::varied(int group, In varied, Out more) const {
   varied_[static_cast<size_t>(group)](from, to, nullptr, nullptr, 0);
 }
 
-bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
+bool Written::eliminate(In q, In v, In u_tree, In correction, Out acceleration) const {
   if (state_ && correction.isZero(0)) {  // what its change needs too is most of it
     if (!find_state(q, v, u_tree)) return false;
     acceleration = acceleration_at_;
@@ -167,6 +168,7 @@ bool Written::acceleration(In q, In v, In u_tree, In correction, Out acceleratio
 }
 
 bool Written::closing_step(In q, In residual, Out x) const {
+  if (!eliminates_) return false;
   double sound = 0.0;
   const double* from[] = {q.data(), trig(q), residual.data(), numbers_.data()};
   double* to[] = {x.data(), &sound};
@@ -175,7 +177,7 @@ bool Written::closing_step(In q, In residual, Out x) const {
 }
 
 bool Written::jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const {
-  if (!jacobian_) return false;
+  if (!jacobian_ || !eliminates_) return false;
   const auto size = q.size() + v.size();
   by_state.resize(size, size), by_u.resize(v.size(), v.size());
   double sound = 0.0;

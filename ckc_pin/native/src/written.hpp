@@ -27,8 +27,15 @@ class Written {
   void coriolis(In q, In v, In x, Out product) const;
   bool has_coriolis() const { return coriolis_; }
   double potential_energy(In q) const;
+  // Whether what is eliminated below may be used: in the numbers in use it may round too much (elimination_check.hpp). Where it
+  // may not, all of it says false; `eliminate` is the acceleration all the same.
+  void allow_elimination(bool allowed) { eliminates_ = allowed; }
+  bool eliminates() const { return eliminates_; }
   // Eq. 1 by elimination without pivoting; false where it would have to pivot.
-  bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const;
+  bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
+    return eliminates_ && eliminate(q, v, u_tree, correction, acceleration);
+  }
+  bool eliminate(In q, In v, In u_tree, In correction, Out acceleration) const;
   // How that changes: at a state, and then along a direction, a step of q', a change of v', and `more`: of u', and of
   // J v'_dot by the rows that are kept; or along as many at a time as there are lanes, a row each, where there are more
   // than one. Only of a library made for it. False as above, and no changes there are known.
@@ -67,6 +74,7 @@ class Written {
   mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
   mutable std::vector<Line> known_;             // and what is known there
   mutable bool sound_ = false;
+  bool eliminates_ = true;
   int lanes_ = 1, directions_ = 0;
   Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
   Code state_, change_, changes_, groups_;
