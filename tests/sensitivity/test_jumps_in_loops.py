@@ -40,10 +40,11 @@ def ends(found: Sensitivities) -> np.ndarray:
 def test_bounces_of_a_joint_while_another_touches(rtol: float) -> None:
     """What holds a joint takes the rest of its speed, and the loops go on: changes follow them there.
 
-    The differences know bounces to where they are taken to be over.
+    The differences know bounces to where they are taken to be over. Those of runs at 1e-8 meet another order of events.
     """
     changes = {"solver.rtol": rtol, "solver.method": "Radau"}
-    found, wanted = ends(sensitivities(f"{FOLDER}/two_stops", [HEIGHT], changes)), differentiated("two_stops", changes)
+    found = ends(sensitivities(f"{FOLDER}/two_stops", [HEIGHT], changes))
+    wanted = differentiated("two_stops", {**changes, "solver.rtol": 1e-12})
     assert np.abs(found - wanted).max() <= 1e-3 * np.abs(wanted).max()
 
 

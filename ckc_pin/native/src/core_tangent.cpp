@@ -244,7 +244,10 @@ void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In fo
   effort_bound_ = force.cwiseAbs();
   for (int k = 0; k < n; ++k) effort_bound_(k) += D(k, k) * reach(k) * pace;
   bound.noalias() = columns.cwiseAbs().transpose() * effort_bound_;
-  bound *= joints.patience * acceleration_digits;
+  bound *= acceleration_digits;
+  for (size_t i = 0; i < at.size(); ++i)  // a body that rests but for rounding turns at that rate
+    bound(static_cast<Eigen::Index>(i)) += reach(at[i]) * joints.rate_rounding * joints.rate_rounding;
+  bound *= joints.patience;
 }
 
 bool Core::responses(const Indices& at, Matrix& columns) {

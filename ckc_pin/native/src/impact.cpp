@@ -14,6 +14,7 @@ namespace ckc {
 // projection on the cone of all stops ends them.
 constexpr long max_rounds = 4000;
 
+constexpr int max_endings = 3;   // projections that end an impact
 constexpr double same = 1e-10;    // relative difference of gap velocities
 constexpr double pushed = 1e-6;  // of the largest force: what takes part
 
@@ -104,7 +105,6 @@ class Rounds {
     const double size = g.lpNorm<Eigen::Infinity>();
     if (!least_in_box(A, g / size, low_, high, impulses)) return false;
     impulses *= size;
-    impact_.energy_loss += 0.5 * (1.0 - restitution * restitution) * impulses.dot(A * impulses);
     impulses_.setZero();
     for (Eigen::Index i = 0; i < count; ++i) {
       const double impulse = (1.0 + restitution) * impulses(i);
@@ -119,16 +119,17 @@ class Rounds {
     return apply_(stops_, impulses_, restitution);
   }
 
-  // What still approaches is stopped, and bounces that would not rise are taken away, by a projection on one cone.
+  // What still approaches is stopped, and bounces that would not rise are taken away, by a projection on one cone. Stops
+  // that rest are held for it: to let go of one where another is taken back would go on and on.
   bool end() {
-    for (int attempt = 0; attempt < 3; ++attempt) {
+    for (int attempt = 0; attempt < max_endings; ++attempt) {
       stops_.clear();
       bool any = false;
-      for (Eigen::Index i = 0; i < m_; ++i) stops_.push_back(static_cast<int>(i));
       low_.setZero(m_);
       for (Eigen::Index i = 0; i < m_; ++i) {
+        stops_.push_back(static_cast<int>(i));
         any |= g_(i) < -at_rest_(i) || (g_(i) > at_rest_(i) && g_(i) <= slow_(i));
-        if (g_(i) > at_rest_(i) && g_(i) <= slow_(i)) low_(i) = -infinity;
+        if (g_(i) >= -at_rest_(i) && g_(i) <= slow_(i)) low_(i) = -infinity;
       }
       if (!any) break;
       if (!reflect(0.0)) return false;

@@ -27,7 +27,6 @@ struct ImpactProblem {
 
 struct Impact {
   Vector g;                  // (m), after it; zero where a stop rests
-  double energy_loss = 0.0;  // J
   long rounds = 0;
 };
 

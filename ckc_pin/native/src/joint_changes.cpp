@@ -69,7 +69,12 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
       if (joints_.rubs_at(k) && !rests(k)) joints_.sign[k] = v_(k) > 0.0 ? 1 : -1;
   if (!system_.before_change(t, y, arriving(met))) return false;
   joints_.sign = sign;
-  if (!impact(t, y) || !grip(t, y, held)) return false;
+  joints_.rate_rounding = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+  const double energy = kinetic_energy();
+  bool any = false;
+  if (!impact(t, y, any) || !grip(t, y, held)) return false;
+  // What the rounds took, with the rates up to rounding that are taken from joints which rest after it.
+  if (any) joints_.impact_loss += energy - kinetic_energy();
   known_ = true;
   return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
 }
@@ -90,6 +95,12 @@ std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) c
       found.push_back({k, true});
   }
   return found;
+}
+
+double JointChanges::kinetic_energy() {
+  core_.tree_inertia();
+  core_.D_times(v_, step_);
+  return 0.5 * v_.dot(step_);
 }
 
 bool JointChanges::hits(int k) const {
@@ -122,9 +133,8 @@ void JointChanges::scale(const Indices& at) {
 
 // What happens at the stops that joints are at, in the order in which it happens there (impact.hpp). Joints that touch are
 // in it too: what pushes them is an impact. Friction is bounded and has no impulse, so that joints that stick are let go.
-bool JointChanges::impact(double t, Out y) {
+bool JointChanges::impact(double t, Out y, bool& any) {
   Indices at;
-  bool any = false;
   for (int k = 0; k < core_.n; ++k)
     if (near_[k]) at.push_back(k), any |= is_into(k);
   if (!any) return true;
@@ -168,7 +178,6 @@ bool JointChanges::impact(double t, Out y) {
   };
   Impact impact;
   if (!resolve_impact(problem, apply, impact)) return false;
-  joints_.impact_loss += impact.energy_loss;
   const Vector before = v_;
   system_.push(y, step);
   if (!take_state(t, y)) return false;

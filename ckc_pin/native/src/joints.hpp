@@ -71,6 +71,7 @@ class Joints {
   // How far the forces that `hold` found last are from not being enough: negative where none within their bounds are.
   // `rounding`: by locked coordinate, how wrong its acceleration may be.
   double margin(In rounding);
+  double rate_rounding = 0.0;  // 1/s: what rounding made of rates, by reach, at the last change of modes
   double patience = 1.0;  // times the rounding error: more where joints change their mode again and again at an instant
   // What is to be added to a velocity, or a small displacement, so that x of the locked coordinates vanishes.
   void back(const Matrix& responses, In x, Out step);
