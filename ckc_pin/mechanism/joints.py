@@ -75,7 +75,7 @@ class Joints:
         self.warnings = _open_limits(tree, (np.isfinite(lower) | np.isfinite(upper)) & ~self.stopped)
 
     def without(self, immobile: BoolArray) -> Joints:
-        """Return the joints without friction and stops where loops hold them still, shape (n,): they do nothing there."""
+        """Return the joints without friction and stops where a mask, shape (n,), says that loops hold them still."""
         joints = copy(self)
         joints.friction = np.where(immobile, 0.0, self.friction)
         joints.lower, joints.upper = np.where(immobile, -np.inf, self.lower), np.where(immobile, np.inf, self.upper)

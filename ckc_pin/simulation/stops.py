@@ -77,14 +77,14 @@ def explain(
         case "chatter":
             return NumericalError(
                 f"{_changing(loop, mechanism)} change between sticking, sliding and touching again and again at this "
-                f"instant{_held(loop, mechanism)}; {SMOOTHER}",
+                f"instant{_holding_forces(loop, mechanism)}; {SMOOTHER}",
                 t=loop.t,
                 q_tree=where,
             )
         case "contact":
             return NumericalError(
                 "no forces are found that hold the joints at their stops or at rest here"
-                f"{_held(loop, mechanism)}; {SMOOTHER}",
+                f"{_holding_forces(loop, mechanism)}; {SMOOTHER}",
                 t=loop.t,
                 q_tree=where,
             )
@@ -112,14 +112,14 @@ def _changing(loop: Any, mechanism: Mechanism) -> str:
     return ", ".join(dict.fromkeys(names)) or "joints"
 
 
-def _held(loop: Any, mechanism: Mechanism) -> str:
+def _holding_forces(loop: Any, mechanism: Mechanism) -> str:
     """Say which joints are held, with which force, and between which bounds that has to be."""
-    held = [
-        f"{mechanism.coordinates[k]} with {force:.6g} of {low:.6g} to {high:.6g} "
-        f"{'N' if mechanism.tree.in_metres[k] else 'N m'}"
-        for k, force, low, high in loop.held_joints()
+    forces = [
+        f"{mechanism.coordinates[k]} {force:.6g} {'N' if mechanism.tree.in_metres[k] else 'N m'}, "
+        f"{low:.6g} to {high:.6g} being possible"
+        for k, force, low, high in loop.locked_joints()
     ]
-    return f" (held are {', '.join(held)})" if held else ""
+    return f" (forces on the joints at rest: {'; '.join(forces)})" if forces else ""
 
 
 def _rest(rhs: float) -> str:

@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "cli", "control", "dynamics", "formats",
+PARTS = {"__init__.py", "__main__.py", "errors.py", "interrupt.py", "py.typed", "analysis", "cli", "control", "dynamics", "formats",
          "generated", "kinematics", "mechanism", "native", "simulation", "urdf", "view"}  # fmt: skip
 
 

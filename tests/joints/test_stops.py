@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from scipy.optimize import nnls
 from scipy.special import ellipk
 
 from ckc_pin import InputError, Run, load, simulate
+from ckc_pin.simulation.scene_spec import SolverSpec
+from ckc_pin.simulation.stops import Stop, explain
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide
@@ -131,7 +134,7 @@ def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
 
 
 def reflected(A: np.ndarray[Any, Any], g: np.ndarray[Any, Any], e: float) -> np.ndarray[Any, Any]:
-    """Rates of gaps after the approaching ones were reflected together, again and again, by Lawson and Hanson's NNLS."""
+    """Gap rates after rounds that reflect all approaching ones together, by Lawson and Hanson's NNLS."""
     while np.any(g < -1e-13):
         at = np.flatnonzero(g < -1e-13)
         root = np.linalg.cholesky(A[np.ix_(at, at)])
@@ -206,3 +209,54 @@ def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path, r
     assert thrown_off == (restitution > 0.0)
     if not thrown_off:
         assert np.diff(times)[-3:] / np.diff(times)[-4:-1] == pytest.approx([0.3] * 3, rel=1e-2)
+
+
+def test_stops_of_a_run_at_contacts_name_joints_and_forces() -> None:
+    """The reasons themselves do not come about by any known scene; what they say is taken from the loop."""
+    bar = load("five_bar")
+    told = SimpleNamespace(
+        t=0.5, trouble=lambda: ("none", "", np.zeros(2), 1.0, 1.0, bar.q_tree, [0, 2], [1, 3]),
+        joint_changes=lambda: [(0.1, 3, "slides", 1), (0.5, 0, "sticks", 0), (0.5, 2, "slides", 1)],
+        locked_joints=lambda: [(0, 2.5, -2.0, 2.0)],
+    )  # fmt: skip
+    chatter, contact, beyond = (
+        str(explain(Stop(why, 0.5, 0.0, 2, 1), told, bar, SolverSpec(), []))
+        for why in ("chatter", "contact", "beyond_stop")
+    )
+    assert "theta_1, theta_3 change between sticking, sliding and touching again and again at this instant" in chatter
+    for message in (chatter, contact):
+        assert "(forces on the joints at rest: theta_1 2.5 N m, -2 to 2 being possible); a scene with" in message
+    assert "theta_3 has passed its stop within a step; a solver.max_step shorter than" in beyond
+
+
+def test_joints_that_loops_hold_still_have_no_events(tmp_path: Path) -> None:
+    """A triangle of rods whose pins cannot turn; at a dead centre a joint rests for an instant only."""
+    parts = LINK.format(name="a", x=0.1, y=0.0, m=1.0) + LINK.format(name="b", x=0.1, y=0.0, m=1.0)
+    parts = '<link name="ground"/>' + LINK.format(name="wheel", x=0.2, y=0.0, m=1.0) + parts
+    parts += HINGE.format(name="turn", on="ground", to="wheel", x=0.0, low=-9, high=9)
+    parts += HINGE.format(name="pin_a", on="wheel", to="a", x=0.0, low=1.0471975511965976, high=2.0)
+    parts += HINGE.format(name="pin_b", on="wheel", to="b", x=1.0, low=0.0, high=3.0)
+    (tmp_path / "truss.urdf").write_text(f'<robot name="truss">{parts}</robot>')
+    truss = (
+        'name = "truss"\nurdf = "truss.urdf"\nindependent = ["turn"]\nq_guess = { pin_a = 1.05, pin_b = 2.1 }\n'
+        "{joints}"
+        '[[loop]]\nname = "top"\ntype = "hinge"\nframe_a = { link = "a", xyz = [1, 0, 0] }\n'
+        'frame_b = { link = "b", xyz = [1, 0, 0] }\n'
+    )
+    (tmp_path / "s.scene.toml").write_text(
+        'mechanism = "truss.toml"\nformulation = "dae"\nt_end = 1.0\n'
+        'initial.at = "assembled"\ninitial.q_dot = { turn = 3.0 }\n'
+    )
+    runs = []
+    for joints in ("", stop("pin_a", 0.5) + '[[joint]]\nname = "pin_b"\nfriction = 0.7\n'):
+        (tmp_path / "truss.toml").write_text(truss.replace("{joints}", joints))
+        runs.append(simulate(tmp_path / "s.scene.toml"))
+    free, held = runs
+    assert held.events == []
+    assert held.stats["rhs"] == free.stats["rhs"]
+    assert_close(held.q_tree, free.q_tree, 0)
+    assert any(
+        "do nothing where the loops hold a joint still: pin_a, pin_b" in text for text in held.mechanism.warnings
+    )
+    assert not load("andrews").freedoms.immobile.any()
+    assert not load("slider_crank_spatial").freedoms.immobile.any()

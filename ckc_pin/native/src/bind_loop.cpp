@@ -222,14 +222,14 @@ nb::list joint_changes(const Run& run) {
 }
 
 // The joints that are held: (coordinate, force, its least, its largest).
-nb::list held_joints(const Run& run) {
-  nb::list held;
+nb::list locked_joints(const Run& run) {
+  nb::list locked;
   const Joints& joints = run.core->joints;
   for (size_t i = 0; i < joints.locked.size() && static_cast<Eigen::Index>(i) < joints.forces().size(); ++i) {
     const int k = joints.locked[i];
-    held.append(nb::make_tuple(k, joints.forces()(static_cast<Eigen::Index>(i)), joints.lower_force(k), joints.upper_force(k)));
+    locked.append(nb::make_tuple(k, joints.forces()(static_cast<Eigen::Index>(i)), joints.lower_force(k), joints.upper_force(k)));
   }
-  return held;
+  return locked;
 }
 
 nb::dict profile(const Run& run) {
@@ -297,7 +297,7 @@ void bind_loop(nb::module_& m) {
       .def("stats", &stats)
       .def("met", &met)
       .def("joint_changes", &joint_changes)
-      .def("held_joints", &held_joints)
+      .def("locked_joints", &locked_joints)
       .def("forget_met", [](Run& run) { run.loop->events.met.clear(), run.core->joints.changes.clear(); })
       .def("crossings", [](const Run& run) { return run.loop->crossings; })
       .def("profile", &profile)
