@@ -251,12 +251,12 @@ def test_joints_that_loops_hold_still_have_no_events(tmp_path: Path) -> None:
     for joints in ("", stop("pin_a", 0.5) + '[[joint]]\nname = "pin_b"\nfriction = 0.7\n'):
         (tmp_path / "truss.toml").write_text(truss.replace("{joints}", joints))
         runs.append(simulate(tmp_path / "s.scene.toml"))
-    free, held = runs
-    assert held.events == []
-    assert held.stats["rhs"] == free.stats["rhs"]
-    assert_close(held.q_tree, free.q_tree, 0)
+    free, locked = runs
+    assert locked.events == []
+    assert locked.stats["rhs"] == free.stats["rhs"]
+    assert_close(locked.q_tree, free.q_tree, 0)
     assert any(
-        "do nothing where the loops hold a joint still: pin_a, pin_b" in text for text in held.mechanism.warnings
+        "do nothing where the loops hold a joint still: pin_a, pin_b" in text for text in locked.mechanism.warnings
     )
     assert not load("andrews").freedoms.immobile.any()
     assert not load("slider_crank_spatial").freedoms.immobile.any()

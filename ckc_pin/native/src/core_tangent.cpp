@@ -14,7 +14,7 @@ constexpr double singular = 1e-12, weak = 1e-3;
 // Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
 constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
 // Of the forces: what rounding makes of them on the way to an acceleration.
-constexpr double acceleration_digits = 1e-14;
+constexpr double acceleration_digits = 1e-13;
 
 // tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
 bool Core::basis_by_partition() {

@@ -5,6 +5,7 @@
 
 namespace ckc {
 
+constexpr double place_rounding = 1e-15;  // rad, or of the mechanism's size
 constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
 constexpr double time_tolerance = 2e-12;  // s: two functions that cross zero at once are found no further apart
 
@@ -64,6 +65,8 @@ void Events::monitor_joints(In coordinates, In velocity, double within) {
       signs_[i] = 1, active_[i] = !joints.locked.empty();
     }
     event.floor = here * signs_[i] > least_known ? 0.0 : 2.0 * std::abs(here);
+    // A joint that leaves its stop from rest may move into it first, by what rounding made of its rate.
+    if (event.of == Event::q) event.floor = std::max(event.floor, place_rounding * joints.table.reach(k));
   }
 }
 

@@ -16,6 +16,7 @@ constexpr double rounding = 1e-11;  // of the largest velocity: a joint is at re
 constexpr double gives = 1e-6;      // of the largest force: what holds no more is taken to be so much weaker
 constexpr double moves = 1e-12;     // of a joint's response without loops: they let it move
 constexpr double negligible = 1e-6, rounded = 1e-8;  // of what friction alone would accelerate
+constexpr double seen = 4.0;        // times how far a joint is off its stop
 constexpr double exactly = 1e-9;    // of the largest acceleration: none
 
 static bool among(const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); }
@@ -155,7 +156,9 @@ bool JointChanges::impact(double t, Out y, bool& any) {
     problem.g(i) = side * v_(k);
     problem.restitution(i) = joints_.table.restitution(k);
     problem.at_rest(i) = std::isfinite(rest_(k)) ? rest_(k) : rounding * fastest * reach(k);
-    problem.slow(i) = std::sqrt(2 * std::max(returning(k), 0.0) * rise_ * reach(k));
+    // A bounce has to rise higher than the joint is off its stop, or it is not seen to come back.
+    const double rise = std::max(rise_ * reach(k), seen * std::abs(coordinates(k) - joints_.stop_at(k, near_[k])));
+    problem.slow(i) = std::sqrt(2 * std::max(returning(k), 0.0) * rise);
     for (Eigen::Index j = 0; j < m; ++j) problem.A(i, j) = side * -near_[at[j]] * responses_(k, j);
   }
   std::vector<char> is_hit(at.size(), 0);
