@@ -6,7 +6,7 @@
 namespace ckc {
 
 constexpr double place_rounding = 1e-15;  // rad, or of the mechanism's size
-constexpr double least_known = 1e-9;  // rad, m and their rates: what is nearer to zero where a motion begins may be zero
+constexpr double least_known = 1e-9;  // rad/s, m/s: a rate that is nearer to zero where a motion begins may be zero
 constexpr double time_tolerance = 2e-12;  // s: two functions that cross zero at once are found no further apart
 
 Events::Events(System& system, Step& step, std::vector<Event> events)
@@ -43,7 +43,8 @@ void Events::begin() {
   jump();
 }
 
-// What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located.
+// What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located. A joint
+// that is off its stop is known to be, however little that is.
 void Events::monitor_joints(In coordinates, In velocity, double within) {
   const Joints& joints = system_.core.joints;
   changing.clear();
@@ -64,7 +65,7 @@ void Events::monitor_joints(In coordinates, In velocity, double within) {
     } else {
       signs_[i] = 1, active_[i] = !joints.locked.empty();
     }
-    event.floor = here * signs_[i] > least_known ? 0.0 : 2.0 * std::abs(here);
+    event.floor = here * signs_[i] > (event.of == Event::q ? 0.0 : least_known) ? 0.0 : 2.0 * std::abs(here);
     // A joint that leaves its stop from rest may move into it first, by what rounding made of its rate.
     if (event.of == Event::q) event.floor = std::max(event.floor, place_rounding * joints.table.reach(k));
   }
