@@ -214,13 +214,13 @@ def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path, r
 def test_stops_of_a_run_at_contacts_name_joints_and_forces() -> None:
     """The reasons themselves do not come about by any known scene; what they say is taken from the loop."""
     bar = load("five_bar")
-    told = SimpleNamespace(
+    loop = SimpleNamespace(
         t=0.5, trouble=lambda: ("none", "", np.zeros(2), 1.0, 1.0, bar.q_tree, [0, 2], [1, 3]),
         joint_changes=lambda: [(0.1, 3, "slides", 1), (0.5, 0, "sticks", 0), (0.5, 2, "slides", 1)],
         locked_joints=lambda: [(0, 2.5, -2.0, 2.0)],
     )  # fmt: skip
     chatter, contact, beyond = (
-        str(explain(Stop(why, 0.5, 0.0, 2, 1), told, bar, SolverSpec(), []))
+        str(explain(Stop(why, 0.5, 0.0, 2, 1), loop, bar, SolverSpec(), []))
         for why in ("chatter", "contact", "beyond_stop")
     )
     assert "theta_1, theta_3 change between sticking, sliding and touching again and again at this instant" in chatter
