@@ -91,9 +91,10 @@ def require_known_motion(
             "its own; give initial.q"
         )
     if not spec.friction_smoothing:
-        rubs = mechanism.joints.friction
+        # joints that cannot move do not turn round
+        frictionless = (mechanism.joints.friction == 0) & ~mechanism.freedoms.immobile
         for x in varying:
-            if any(effect.kind == "friction" and rubs[effect.index] == 0 for effect in x.effects):
+            if any(effect.kind == "friction" and frictionless[effect.index] for effect in x.effects):
                 raise InputError(
                     f"sensitivities: {x.name}: it is 0, and where the joint turns round is not looked for then; give a "
                     f"small one, {x.name} = 1e-6 in [parameters], or friction_smoothing"
@@ -176,6 +177,8 @@ def at_assembled_stop(
         return x
     k, reach = stop.index, mechanism.tree.reach
     value = float(getattr(mechanism.joints, stop.kind)[k])
+    if not np.isfinite(value):  # the stop of a joint that cannot move
+        return x
     at_stop = abs(float(mechanism.tree.to_coordinates(mechanism.q_tree)[k]) - value) <= NEARBY * reach[k]
     step = FARTHER if at_stop else NEARBY  # an assembly may leave a joint beyond its stop by a little
 

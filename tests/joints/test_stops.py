@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.special import ellipk
 
-from ckc_pin import InputError, Run, load, simulate
+from ckc_pin import InputError, Run, load, sensitivities, simulate
 from ckc_pin.simulation.scene_spec import SolverSpec
 from ckc_pin.simulation.stops import Stop, explain
 from tests.analytic.five_bar import FIVE_BAR
@@ -258,5 +258,8 @@ def test_joints_that_loops_hold_still_have_no_events(tmp_path: Path) -> None:
     assert any(
         "do nothing where the loops hold a joint still: pin_a, pin_b" in text for text in locked.mechanism.warnings
     )
+    unmoved = sensitivities(tmp_path / "s.scene.toml", ["joint.pin_b.friction", "joint.pin_a.lower"])
+    assert unmoved.run.status == "done"
+    assert not unmoved.q_tree.any()
     assert not load("andrews").freedoms.immobile.any()
     assert not load("slider_crank_spatial").freedoms.immobile.any()
