@@ -49,6 +49,13 @@ void EliminationCheck::accept(Core& core) {
     check(core);
 }
 
+bool EliminationCheck::give_up(Core& core) {
+  if (!core.written || !active_) return false;
+  core.written->allow_elimination(false);
+  active_ = false;
+  return true;
+}
+
 void EliminationCheck::check(Core& core) {
   known_ = false;
   const double limit = ordinary * core.n;

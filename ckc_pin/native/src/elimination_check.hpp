@@ -23,6 +23,8 @@ class EliminationCheck {
   void remember(In q_tree, In v, In u_tree) { q_tree_ = q_tree, v_ = v, u_tree_ = u_tree, known_ = true; }
   // A state was accepted. Where the check is due, the core is left at the configuration remembered.
   void accept(Core& core);
+  // Take the general core's elimination for the rest of the run; false where that is done already, or nothing is compiled.
+  bool give_up(Core& core);
 
  private:
   void check(Core& core);

@@ -214,7 +214,10 @@ void LevelSet::go_on(double t, Out y) {
 
 bool LevelSet::return_to_accepted() {
   ++refusals_, balance_ += weight;
-  if (balance_ > patience) return fails(Trouble::vague);
+  if (balance_ > patience) {
+    if (!elimination.give_up(core)) return fails(Trouble::vague);
+    balance_ = 0.0;  // by the other elimination the steps may be good
+  }
   alarm_ = std::numeric_limits<double>::infinity();
   predict_from_accepted();
   return true;
