@@ -9,7 +9,7 @@ namespace ckc {
 constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
 constexpr long most_changes = 200;  // of joints at one instant
 // After so many changes at one instant, forces count as zero up to ever larger rounding errors, so that joints stay held:
-// up to 1e-7 of the forces.
+// up to 1e-6 of the forces.
 constexpr long impatient_changes = 10, patience_steps = 12;
 constexpr double patience_growth = 4.0;
 constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
