@@ -234,7 +234,7 @@ bool Events::find(Interpolant& motion, bool last, double& halt) {
   for (int k : wanted_) {
     const auto value_at = [&](double t, double& there) { return at(motion, t) && value(k, t, there); };
     const auto exact_at = [&](double t, double& there) { return at(motion, t) && exact_value(k, t, there); };
-    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate rest_tolerance
+    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate nothing
     const Event& event = events_[k];
     const bool rough = event.of <= Event::q_dot || event.of == Event::holding;
     Walk& walked = walks_[k];

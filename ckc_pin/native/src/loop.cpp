@@ -84,7 +84,7 @@ Stop Loop::advance(double until, bool final, double pause, double budget) {
     if (changed) begun_ = false, jump();
   }
   reaches_ = !final && !control->law && !events.any();
-  double ahead = reaches_ ? static_cast<double>(unchanged_ - 1) * (until - from) : 0.0;  // as far as rest_tolerance has changed for
+  double ahead = reaches_ ? static_cast<double>(unchanged_ - 1) * (until - from) : 0.0;  // as far as nothing has changed for
   for (;;) {
     const double near = control->sampling ? control->sampling->near(now.t) : 0.0;
     if (control->sampling && control->sampling->instant() <= now.t + near)
@@ -255,7 +255,7 @@ std::optional<Stop> Loop::across(double met, double left, double bound, bool las
   energy_.from(*system);
   const RankMonitor::Rank after = monitor_.at(*system);
   events.jump();
-  const bool ends = last && now.t_new == bound;  // right there, perhaps: rest_tolerance has to go on from it
+  const bool ends = last && now.t_new == bound;  // right there, perhaps: nothing has to go on from it
   if (!ends && !RankMonitor::kept(after)) return Stop{Stop::rank, now.t_new, after.value};
   if (!ends && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return trouble();
   if (!ends) events.arrived();

@@ -57,7 +57,7 @@ class Loop {
   // Let a u act from now on, constant; or torques of the motors.
   void hold(In u, bool of_motors);
   // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
-  // Where it does not end, and rest_tolerance has changed for some advances, a step may reach beyond; the present state is
+  // Where it does not end, and nothing has changed for some advances, a step may reach beyond; the present state is
   // then within it, and the step is made again from there should something change.
   Stop advance(double until, bool final, double pause, double budget);
   // The present state.
@@ -139,7 +139,7 @@ class Loop {
   double joints_at_ = 0.0;    // when that was found last,
   long joints_often_ = 0;     // and how often within what events are located to
   bool jumped_ = false;       // something has changed since the start that a second try would not know
-  bool silent_ = false;       // rest_tolerance is recorded, no event is looked for
+  bool silent_ = false;       // nothing is recorded, no event is looked for
   long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never
   long paced_ = 0;            // right-hand sides when the pace was looked at last,
   double paced_at_ = 0.0;     // and where that was
