@@ -13,9 +13,8 @@ namespace ckc {
 // Only an elastic body between two others whose masses differ by more than a factor of 1e6 needs more rounds. The
 // projection on the cone of all stops ends them.
 constexpr long max_rounds = 4000;
-
 constexpr int max_endings = 3;   // projections that end an impact
-constexpr double same = 1e-10;    // relative difference of gap velocities
+constexpr double same = 1e-10;   // relative difference of gap velocities
 constexpr double pushed = 1e-6;  // of the largest force: what takes part
 
 namespace {
@@ -25,8 +24,8 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 // Gap velocities in units in which A has a unit diagonal: all about the square root of an energy.
 class Rounds {
  public:
-  Rounds(const ImpactProblem& problem, const ImpactRound& apply, Impact& impact)
-      : problem_(problem), apply_(apply), impact_(impact), m_(problem.g.size()) {
+  Rounds(const ImpactProblem& problem, const ImpactRound& apply)
+      : problem_(problem), apply_(apply), m_(problem.g.size()) {
     scale_ = problem.A.diagonal().cwiseSqrt().cwiseInverse();
     A_ = scale_.asDiagonal() * problem.A * scale_.asDiagonal();
     g_ = scale_.cwiseProduct(problem.g);
@@ -37,14 +36,14 @@ class Rounds {
     if (m_ > 1) use_rank();
   }
 
-  bool run() {
-    while (impact_.rounds < max_rounds) {
+  bool run(Vector& g) {
+    for (long round = 0; round < max_rounds; ++round) {
       const double restitution = choose_stops();
       if (stops_.empty()) break;
       if (!reflect(restitution)) return false;
     }
     if (!end()) return false;
-    impact_.g = g_.cwiseQuotient(scale_);
+    g = g_.cwiseQuotient(scale_);
     return true;
   }
 
@@ -96,14 +95,10 @@ class Rounds {
   // A round at `stops_`, whose impulses are at least `low_`.
   bool reflect(double restitution) {
     const auto count = static_cast<Eigen::Index>(stops_.size());
-    Matrix A(count, count);
-    Vector g(count), impulses, high = Vector::Constant(count, infinity);
-    for (Eigen::Index i = 0; i < count; ++i) {
-      g(i) = g_(stops_[i]);
-      for (Eigen::Index j = 0; j < count; ++j) A(i, j) = A_(stops_[i], stops_[j]);
-    }
+    const Vector g = g_(stops_), high = Vector::Constant(count, infinity);
     const double size = g.lpNorm<Eigen::Infinity>();
-    if (!least_in_box(A, g / size, low_, high, impulses)) return false;
+    Vector impulses;
+    if (!least_in_box(A_(stops_, stops_), g / size, low_, high, impulses)) return false;
     impulses *= size;
     impulses_.setZero();
     for (Eigen::Index i = 0; i < count; ++i) {
@@ -115,7 +110,6 @@ class Rounds {
       const double reflected = -restitution * g(i);
       if (std::abs(g_(stops_[i]) - reflected) <= same * size) g_(stops_[i]) = reflected;
     }
-    ++impact_.rounds;
     return apply_(stops_, impulses_, restitution);
   }
 
@@ -141,7 +135,6 @@ class Rounds {
 
   const ImpactProblem& problem_;
   const ImpactRound& apply_;
-  Impact& impact_;
   const Eigen::Index m_;
   Matrix A_;
   Vector scale_, g_, at_rest_, slow_, low_, impulses_;
@@ -151,9 +144,8 @@ class Rounds {
 
 }  // namespace
 
-bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Impact& impact) {
-  impact = {};
-  return Rounds(problem, round, impact).run();
+bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Vector& g) {
+  return Rounds(problem, round).run(g);
 }
 
 }  // namespace ckc

@@ -25,16 +25,12 @@ struct ImpactProblem {
   Vector slow;         // (m): a stop that is left at a lower speed is not left
 };
 
-struct Impact {
-  Vector g;                  // (m), after it; zero where a stop rests
-  long rounds = 0;
-};
-
 // Called after each round with the stops that took part, the impulses of all of them, (m), not negative but where they
 // take away a slow bounce, and the restitution of the round.
 using ImpactRound = std::function<bool(const Indices& stops, const Vector& impulses, double restitution)>;
 
-// False where a quadratic program fails, or `round` returned false.
-bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Impact& impact);
+// Find the gap velocities after the impact, (m), zero where a stop rests. False where a quadratic program fails, or `round`
+// returned false.
+bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Vector& g);
 
 }  // namespace ckc

@@ -71,11 +71,10 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   if (!system_.before_change(t, y, arriving(met))) return false;
   joints_.sign = sign;
   joints_.rate_rounding = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
-  const double energy = kinetic_energy();
-  bool any = false;
-  if (!impact(t, y, any) || !grip(t, y, held)) return false;
-  // What the rounds took, with the rates up to rounding that are taken from joints which rest after it.
-  if (any) joints_.impact_loss += energy - kinetic_energy();
+  std::optional<double> energy;
+  if (!impact(t, y, energy) || !grip(t, y, held)) return false;
+  // The loss of the rounds, and of the rates up to rounding that are taken from joints at rest after them.
+  if (energy) joints_.impact_loss += *energy - kinetic_energy();
   known_ = true;
   return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
 }
@@ -134,11 +133,13 @@ void JointChanges::scale(const Indices& at) {
 
 // What happens at the stops that joints are at, in the order in which it happens there (impact.hpp). Joints that touch are
 // in it too: what pushes them is an impact. Friction is bounded and has no impulse, so that joints that stick are let go.
-bool JointChanges::impact(double t, Out y, bool& any) {
+bool JointChanges::impact(double t, Out y, std::optional<double>& energy) {
   Indices at;
+  bool any = false;
   for (int k = 0; k < core_.n; ++k)
     if (near_[k]) at.push_back(k), any |= is_into(k);
   if (!any) return true;
+  energy = kinetic_energy();
   if (!system_.acceleration(t, held_)) return false;
   joints_.locked.clear();
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
@@ -179,15 +180,14 @@ bool JointChanges::impact(double t, Out y, bool& any) {
     step += step_;
     return system_.at_impact(step_, struck, responses_(Eigen::all, stops), x, restitution);
   };
-  Impact impact;
-  if (!resolve_impact(problem, apply, impact)) return false;
-  const Vector before = v_;
+  Vector gap_rates;
+  if (!resolve_impact(problem, apply, gap_rates)) return false;
   system_.push(y, step);
   if (!take_state(t, y)) return false;
   rest_ = 10 * rounding * std::max(fastest, step.cwiseQuotient(reach).lpNorm<Eigen::Infinity>()) * reach;
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = at[i];
-    const double towards = returning(k), off = impact.g(i);
+    const double towards = returning(k), off = gap_rates(i);
     if (off == 0.0) {
       joints_.touch[k] = near_[k], rest_(k) = infinity;
       if (!touched[k]) note(t, k, JointChange::touches, near_[k]);

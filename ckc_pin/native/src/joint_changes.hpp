@@ -2,6 +2,8 @@
 // metric of D', over velocities and over accelerations.
 #pragma once
 
+#include <optional>
+
 #include "events.hpp"
 
 namespace ckc {
@@ -22,7 +24,7 @@ class JointChanges {
   bool take_state(double t, Out y);  // and close it in y
   // What comes to a stop, or to rest, where that was met.
   std::vector<System::Met> arriving(const std::vector<Event>& met) const;
-  bool impact(double t, Out y, bool& any);  // `any`: whether there was one
+  bool impact(double t, Out y, std::optional<double>& energy);  // the kinetic energy before it, J; none without an impact
   double kinetic_energy();  // J, at v_
   bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.

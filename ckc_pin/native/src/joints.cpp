@@ -73,10 +73,8 @@ void Joints::factor(const Matrix& responses) {
     for (Eigen::Index j = 0; j < m; ++j)
       A_(i, j) = 0.5 * scale_(i) * scale_(j) * (responses(locked[i], j) + responses(locked[j], i));
   eigen_.compute(A_);
-  Eigen::Index rank = 0;
   const auto& values = eigen_.eigenvalues();
-  while (rank < m && values(m - 1 - rank) > dependent * values(m - 1)) ++rank;
-  root_ = eigen_.eigenvectors().rightCols(rank) * values.tail(rank).cwiseSqrt().asDiagonal();
+  for (rank_ = 0; rank_ < m && values(m - 1 - rank_) > dependent * values(m - 1);) ++rank_;
 }
 
 // The least forces, each measured in what it takes to move its own joint, that make the rows x.
@@ -85,9 +83,8 @@ void Joints::least_forces(const Matrix& responses, In x, Vector& force) {
   const auto m = static_cast<Eigen::Index>(locked.size());
   wanted_.resize(m);
   for (Eigen::Index i = 0; i < m; ++i) wanted_(i) = -scale_(i) * x(locked[i]);
-  const Eigen::Index rank = root_.cols();
-  const auto vectors = eigen_.eigenvectors().rightCols(rank);
-  const Vector along = (vectors.transpose() * wanted_).cwiseQuotient(eigen_.eigenvalues().tail(rank));
+  const auto vectors = eigen_.eigenvectors().rightCols(rank_);
+  const Vector along = (vectors.transpose() * wanted_).cwiseQuotient(eigen_.eigenvalues().tail(rank_));
   force.noalias() = vectors * along;
   for (Eigen::Index i = 0; i < m; ++i) force(i) *= scale_(i);
 }
@@ -106,9 +103,9 @@ void Joints::hold(const Matrix& responses, Out a) {
 // By how much the forces stay within their bounds, at best: where the joints are held in more than one way, forces that
 // cancel each other may be added. Bounds are widened by what rounding may make of the forces.
 double Joints::margin(In rounding) {
-  const Eigen::Index m = root_.rows(), rank = root_.cols();
-  const Matrix inverse_root = eigen_.eigenvalues().tail(rank).cwiseSqrt().cwiseInverse().asDiagonal() *
-                              eigen_.eigenvectors().rightCols(rank).transpose();
+  const Eigen::Index m = A_.rows();
+  const Matrix inverse_root = eigen_.eigenvalues().tail(rank_).cwiseSqrt().cwiseInverse().asDiagonal() *
+                              eigen_.eigenvectors().rightCols(rank_).transpose();
   const Matrix inverse = inverse_root.transpose() * inverse_root;
   const Vector scaled = hysteresis * (inverse.cwiseAbs() * scale_.cwiseProduct(rounding));
   Vector force(m), low(m), high(m);  // each measured in what it takes to move its own joint
@@ -118,12 +115,12 @@ double Joints::margin(In rounding) {
     high(i) = upper_force(locked[i]) / scale_(i) + scaled(i);
   }
   double least = infinite;
-  if (rank == m) {
+  if (rank_ == m) {
     for (Eigen::Index i = 0; i < m; ++i)
       least = std::min(least, std::min(force(i) - low(i), high(i) - force(i)) / inverse_root.col(i).norm());
     return least;
   }
-  least = largest_slack(eigen_.eigenvectors().leftCols(m - rank), force, low, high);
+  least = largest_slack(eigen_.eigenvectors().leftCols(m - rank_), force, low, high);
   return std::isfinite(least) ? least : 1.0;
 }
 

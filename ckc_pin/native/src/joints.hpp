@@ -88,9 +88,10 @@ class Joints {
   const bool smooth_;
   double rubbed_ = 0.0;
   Vector since_;  // (n): the coordinates where they were set
-  // Of the scaled matrix A = G D^-1 G^T of the locked rows: its root, (locked, rank), and the least forces that hold.
+  // The scaled matrix A = G D^-1 G^T of the locked rows, its rank, and the minimum-norm forces that hold.
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;
-  Matrix A_, root_;
+  Eigen::Index rank_ = 0;
+  Matrix A_;
   Vector scale_, force_, wanted_, back_;
 };
 
