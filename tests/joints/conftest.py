@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import pytest
 
 from ckc_pin.mechanism.library import library
+from scripts.experiments.fuzz.contact.stops import with_limits
 
 FORMULATIONS = ("dae", "reduced", "spf")
 
@@ -52,7 +52,7 @@ def with_joints(tmp_path: Path) -> Callable[..., Path]:
             text = path.read_text() if path.is_file() else ""
             for joint, (lower, upper) in (limits or {}).items():
                 if path.suffix == ".urdf":
-                    text = limited(text, joint, lower, upper)
+                    text = with_limits(text, joint, lower, upper)
             if path.name == "mechanism.toml":
                 text += "".join(
                     f'\n[[joint]]\nname = "{joint}"\n'
@@ -64,13 +64,3 @@ def with_joints(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return make
-
-
-def limited(urdf: str, joint: str, lower: float, upper: float) -> str:
-    """Give a joint of a URDF limits, if it is there."""
-    before, found, after = urdf.partition(f'<joint name="{joint}"')
-    if not found:
-        return urdf
-    own, end, rest = after.partition("</joint>")
-    own = re.sub(r"<limit[^>]*/>", "", own).replace('type="continuous"', 'type="revolute"')
-    return f'{before}{found}{own}<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>{end}{rest}'

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ckc_pin import Terms, load, simulate
+from scripts.experiments.fuzz.contact.stops import with_limits
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.conftest import assert_close
-from tests.joints.conftest import limited
 
 # 0, 13, 41: a row that follows from others at one instant alone; 12, 19: joints that loops leave no way;
 # 28, 54: many bounces that die out together
@@ -35,7 +35,9 @@ def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
         if random.random() < 0.4:
             below, above = random.uniform(0.02, 0.4, 2) * reach[k]
             for path in folder.glob("*.urdf"):
-                path.write_text(limited(path.read_text(), name, float(numbers[k] - below), float(numbers[k] + above)))
+                path.write_text(
+                    with_limits(path.read_text(), name, float(numbers[k] - below), float(numbers[k] + above))
+                )
             text += f"stops = true\nrestitution = {float(random.choice([0.0, 0.5, 0.8]))!r}\n"
     (folder / "mechanism.toml").write_text(text)
     pace = np.sqrt(mechanism.size)

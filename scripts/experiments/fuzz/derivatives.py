@@ -21,6 +21,7 @@ from ckc_pin import Terms
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import values_of, with_components
+from scripts.experiments.fuzz.contact.stops import with_limits
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array
 
@@ -115,7 +116,7 @@ def draw(seed: int, folder: Path) -> Draw:
             room = random.uniform(0.02, 0.4, 2) * reach[k]
             if random.random() < 0.25:  # at its stop from the start
                 room[int(random.integers(2))] = 0.0
-            urdf = _with_limits(urdf, name, float(numbers[k] - room[0]), float(numbers[k] + room[1]))
+            urdf = with_limits(urdf, name, float(numbers[k] - room[0]), float(numbers[k] + room[1]))
             text += f"stops = true\nrestitution = {float(random.choice([0.0, 0.0, 0.3, 0.5, 0.9, 1.0]))!r}\n"
     (folder / "mechanism.toml").write_text(text)
     (folder / "tree.urdf").write_text(urdf)
@@ -138,13 +139,6 @@ def draw(seed: int, folder: Path) -> Draw:
         changes["initial"]["q"] = dict(zip(mechanism.independent, start, strict=True))
     parameters = _parameters(random, mechanism, changes["initial"]) if _scale(mechanism)[1] else {}
     return Draw(seed, made.kind, folder, changes, parameters)
-
-
-def _with_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
-    before, found, after = urdf.partition(f'<joint name="{joint}"')
-    own, end, rest = after.partition("</joint>")
-    own = own.replace('type="continuous"', 'type="revolute"')
-    return f'{before}{found}{own}<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>{end}{rest}'
 
 
 def _parameters(random: np.random.Generator, mechanism: Mechanism, initial: Mapping[str, Any]) -> dict[str, float]:

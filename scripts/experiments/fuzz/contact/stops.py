@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Contact", "JointStop", "contacts_of", "with_contacts"]
+__all__ = ["Contact", "JointStop", "contacts_of", "with_contacts", "with_limits"]
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,13 @@ def with_contacts(texts: Mapping[str, str], contacts: Mapping[str, Contact]) -> 
             table += f"stops = true\nrestitution = {contact.restitution!r}\n"
             lower, upper = max(contact.lower, -FAR), min(contact.upper, FAR)
             for file in [file for file in made if file.endswith(".urdf")]:
-                made[file] = _limited(made[file], name, lower, upper)
+                made[file] = with_limits(made[file], name, lower, upper)
         made["mechanism.toml"] += table
     return made
 
 
-def _limited(urdf: str, joint: str, lower: float, upper: float) -> str:
+def with_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
+    """Give a joint of a URDF limits, if it is there."""
     before, found, after = urdf.partition(f'<joint name="{joint}"')
     if not found:
         return urdf
