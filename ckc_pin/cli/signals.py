@@ -67,12 +67,12 @@ class Interrupts:
                 signal.signal(number, self._handle)
 
     def start_command(self) -> None:
-        """Raise KeyboardInterrupt for signals from here on."""
+        """Raise KeyboardInterrupt for every later signal; the imports are done."""
         self._loading = False
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Complete the body; a signal that arrives meanwhile raises KeyboardInterrupt afterwards."""
+        """Defer signals until the body is complete, then raise KeyboardInterrupt if one arrived."""
         self._deferring = True
         try:
             yield

@@ -156,7 +156,7 @@ def require_movable(
 def at_assembled_stop(
     mechanism: Mechanism, given: Changes, x: Varying, changed: Callable[[Changes], Mechanism]
 ) -> Varying:
-    """Mark a stop that a mechanism is assembled at: the start goes along where the stop pushes it, and else stays.
+    """Mark the parameter of a stop that the assembled start touches: the start then follows the stop one way only.
 
     Parameters
     ----------

@@ -112,9 +112,8 @@ class Core {
   void particular(In residual, Out x);
   // Eq. 1, written out or by projection on the tangent space of the closure; false where J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // What compiled elimination of eq. 1 is off by at the core's state, whether it may be used or not, relative to the accelerations
-  // that the forces give: off what projection gives. Zero where one of them does not exist. And what projection is off by where
-  // masses are very unequal. How later accelerations round does not change.
+  // Relative rounding errors of eq. 1's acceleration at the core's state: of the compiled elimination against projection, even
+  // where elimination is not allowed, and of projection against projection by levels. Zero where either does not exist.
   double rounding_of_elimination(In u_tree);
   double rounding_of_projection(In u_tree);
   // Whether masses are so unequal that projection may lose digits; it is then done by levels of masses, where that is asked for.

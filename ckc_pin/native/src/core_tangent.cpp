@@ -179,7 +179,7 @@ void Core::project(In u_tree, Out a) {
 bool Core::basis_for_check() {
   jacobian(), bias();
   negative_ = -J_dot_v, x_.setZero();
-  basis_at_ = -1;  // that of the partition is made anew where it is asked for
+  basis_at_ = -1;  // the partition's basis is computed again when it is needed
   if (rows.closure.rows) return basis_by_pivoting(singular);
   tangent_.setIdentity();
   std::iota(free_.begin(), free_.end(), 0);

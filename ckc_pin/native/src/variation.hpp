@@ -97,8 +97,8 @@ class Variation {
   // An impact may have several rounds, each with the velocity v that it begins with.
   bool before_change(In v, In a, const std::vector<System::Met>& met, Matrix& s);
   bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, double restitution, Matrix& s);
-  bool tidy(In v, Matrix& s);
-  // Of what has come to be as it is, the first with which parameter it has not, if there is one: of s as `tidy` leaves it.
+  bool project_sensitivities(In v, Matrix& s);
+  // The first arrival whose time depends on a parameter in another way than the instant's, for projected s; none if all agree.
   std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol);
   void after_change(In v, In a, Matrix& s);
 
@@ -131,7 +131,7 @@ class Variation {
   void put(Out force) const;  // of_tree_'s part of the mechanism's coordinates
   Vector from_stop(const System::Met& met, const Matrix& s) const;  // how far with each parameter a joint is
   bool is_known(int coordinate, bool of_rate, In v, In a) const;  // when it comes: it moves by more than rounding
-  bool has_changed(const System::Met& met) const;  // what the joint does, since before_change
+  bool has_changed(const System::Met& met) const;  // whether a joint's mode has changed since `before_change`
   void add_delayed(In v, In a, double sign, Matrix& s) const;
   double size(const Eigen::Ref<const Matrix>& s, int p) const;  // of a column, by the joints' reach
 

@@ -19,7 +19,7 @@ Vector Variation::delay(const System::Met& met, In v, In a, const Matrix& s) con
 
 // Bring the changes back to what loops and locked joints allow, by what is least in the metric of D': they
 // drift within the tolerances, and joints that move only together would come to rest at times of their own.
-bool Variation::tidy(In v, Matrix& s) {
+bool Variation::project_sensitivities(In v, Matrix& s) {
   const int m = core_.rows.closure.rows;
   const Vector none = Vector::Zero(n), no_force = Vector::Zero(m);
   const bool locked = !core_.joints.locked.empty();
@@ -76,7 +76,7 @@ bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, M
   locked_.assign(n, 0), struck_.assign(n, 0), missed_.clear();
   for (int k : core_.joints.locked) locked_[k] = 1;
   delay_.setZero();
-  if (!tidy(v, s)) return false;
+  if (!project_sensitivities(v, s)) return false;
   measure(s);
   for (Eigen::Index part = 0; part < delay_.rows(); ++part) {
     const System::Met* first = nullptr;

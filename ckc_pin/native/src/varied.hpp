@@ -108,7 +108,7 @@ class Varied : public Base, public WithVariation {
     return true;
   }
   bool after_change(double t, Out y, const std::vector<System::Met>& arrived, double rtol, double atol) override {
-    if (!this->acceleration(t, a_) || !variation_.tidy(this->velocity, s_)) return false;
+    if (!this->acceleration(t, a_) || !variation_.project_sensitivities(this->velocity, s_)) return false;
     if ((apart = variation_.apart(arrived, s_, rtol, atol))) return false;
     variation_.after_change(this->velocity, a_, s_);
     put(y);

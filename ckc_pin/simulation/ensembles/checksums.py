@@ -30,7 +30,7 @@ def checksum(data: bytes) -> bytes:
 
 
 def checksum_file(path: Path) -> bytes:
-    """Return the checksum of a file; that of a file that does not exist is `NO_FILE`."""
+    """Return the checksum of a file, or `NO_FILE` if the file does not exist."""
     try:
         return checksum(path.read_bytes())
     except (FileNotFoundError, NotADirectoryError):
@@ -100,7 +100,7 @@ class ChunkChecksums:
         return np.concatenate(list(read_slices(self._table, 0, self._table.shape[0], 1)))
 
     def find_damage(self, statuses: Iterable[Statuses]) -> Iterator[tuple[int, str]]:
-        """Yield the chunks that are not as they were written, each with a sentence on the first such file.
+        """Yield damaged chunks, each with a sentence about its first damaged file.
 
         Parameters
         ----------

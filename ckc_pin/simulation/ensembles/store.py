@@ -171,7 +171,7 @@ class Store:
         return lambda folder: create_store(folder, self._sweep, self._members, self.count, chunk)
 
     def _begin(self, path: Path, chunk: int) -> None:
-        """Create a store beside where it will be, so that it is there whole or not at all."""
+        """Create a store in a temporary folder and move it into place, so that no partial store is visible."""
         begun = path.with_name(f"{path.name}.begun")
         try:
             self._create(chunk)(begun)

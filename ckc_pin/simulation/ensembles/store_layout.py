@@ -134,7 +134,7 @@ def _has_sound_sweep(attributes: Mapping[str, Any]) -> bool:
 
 
 def _checksum_attributes(attributes: Mapping[str, Any]) -> str:
-    """Return the checksum of the attributes that are this program's; other programs may add some."""
+    """Return the checksum of the attributes written by this program, ignoring attributes that others added."""
     own = {
         key: attributes.get(key) for key in ("format", "units", "sweep", "identity", "coordinates", "chunk", "files")
     }
@@ -243,7 +243,7 @@ def create_arrays(group: Any, members: Members, count: int, chunk: int) -> None:
 
 
 def _say_units(group: Any, members: Members) -> None:
-    """Give each array its unit; where components differ, a coordinate beside it has each one's."""
+    """Set the unit of each array; arrays with mixed units get a coordinate that has one for each component."""
     beside = []
     for name, units in members.units.items():
         array = group[array_name(name)]
