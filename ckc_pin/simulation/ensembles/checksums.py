@@ -119,7 +119,7 @@ class ChunkChecksums:
                     key = self.key(k, int(wrong[0]))
                     yield k, f"{key} {describe_damage(self.path / key)}"
 
-    def adopt(self, statuses: Iterable[Statuses]) -> Iterator[tuple[int, str]]:
+    def add_missing_checksums(self, statuses: Iterable[Statuses]) -> Iterator[tuple[int, str]]:
         """Write the rows of chunks that have none yet; yield chunks that cannot be read, as `find_damage` does.
 
         Parameters
@@ -151,7 +151,7 @@ class ChunkChecksums:
                 return key
         return ""
 
-    def remove(self, k: int) -> None:
+    def remove_chunk(self, k: int) -> None:
         """Remove the files of a chunk, its status first: its members are pending from then on."""
         keys = [self.key(k, column) for column in range(len(self.names))]
         for key in (*keys, self.table_key(k)):

@@ -202,7 +202,7 @@ class Store:
             else:
                 finish = convert_files(path, self._create)
                 checksums = self._use(path)
-                self._repair(checksums, [], checksums.adopt(self._chunk_statuses()))
+                self._repair(checksums, [], checksums.add_missing_checksums(self._chunk_statuses()))
                 finish()
         except OSError as error:
             raise InputError(f"{path}: cannot be repaired or converted: {error.strerror or error}") from None
@@ -219,7 +219,7 @@ class Store:
         """Make damaged chunks pending, and say so."""
         damaged = []
         for k, says in damage:
-            checksums.remove(k)
+            checksums.remove_chunk(k)
             damaged.append(f"members {k * self.chunk} to {min((k + 1) * self.chunk, self.count) - 1} ({says})")
         parts = [f"written again: {_join(restored)}"] if restored else []
         parts += [f"computed again: {_join(damaged)}"] if damaged else []
