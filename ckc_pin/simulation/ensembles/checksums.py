@@ -167,5 +167,5 @@ def read_slices(array: Any, first: int, end: int, step: int) -> Iterator[NDArray
         for at in range(first, end, step):
             try:
                 yield array[at : min(at + step, end)]
-            except Exception:
+            except Exception:  # as above: this chunk is one of the damaged ones
                 yield np.full((min(step, end - at), *array.shape[1:]), array.fill_value, array.dtype)
