@@ -73,6 +73,7 @@ class Core {
   void solve_z(In b, Out x) { phi_z.solve(b, x); }
   void z_step(In residual, Out x);  // the x with J x = -residual that moves z alone; phi_z is factorized
   void D_times(In x, Out product) const;  // D' x
+  double inertia_alone(int k) const { return D_tree()(k, k); }  // of a coordinate that moves without the loops
   double potential_energy();
   Energy energy(In v, Out momentum);
 

@@ -144,7 +144,6 @@ class Events {
   Closed closed_ = only_y;    // how the core is at y_
   Eigen::JacobiSVD<Matrix> svd_J_, svd_phi_z_;
   Matrix phi_z_, responses_;
-  Vector unit_, product_;
 };
 
 }  // namespace ckc

@@ -35,8 +35,7 @@ bool Events::learn_signs_before_change(double t, In y) {
 }
 
 bool Events::is_held(const Event& event) const {
-  const Indices& locked = system_.core.joints.locked;
-  return !event.own && event.of <= Event::q_dot && std::find(locked.begin(), locked.end(), event.coordinate) != locked.end();
+  return !event.own && event.of <= Event::q_dot && system_.core.joints.is_locked(event.coordinate);
 }
 
 double Events::held_value(const Event& event) const {
@@ -97,11 +96,7 @@ bool Events::can_move(int coordinate, double t, In y) {
   if (!system_.exact(t, y) || !core.responses(at, responses_)) return true;
   const auto m = static_cast<Eigen::Index>(at.size()), last = m - 1;
   Vector scale(m);
-  unit_.setZero(core.n), product_.setZero(core.n);
-  for (Eigen::Index i = 0; i < m; ++i) {
-    unit_.setUnit(core.n, at[i]), core.D_times(unit_, product_);
-    scale(i) = std::sqrt(product_(at[i]));
-  }
+  for (Eigen::Index i = 0; i < m; ++i) scale(i) = std::sqrt(core.inertia_alone(at[i]));
   Matrix A(m, m);  // responses to unit forces, relative to those of joints without loops
   for (Eigen::Index i = 0; i < m; ++i)
     for (Eigen::Index j = 0; j < m; ++j) A(i, j) = scale(i) * scale(j) * responses_(at[i], j);

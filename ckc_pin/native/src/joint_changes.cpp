@@ -24,7 +24,7 @@ static bool among(const Indices& list, int k) { return std::find(list.begin(), l
 JointChanges::JointChanges(System& system, double rise, const Tolerance& tolerance)
     : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise), tolerance_(tolerance) {
   const int n = core_.n;
-  for (Vector* x : {&coordinates, &v_, &a_, &held_, &rest_, &step_, &unit_}) x->setZero(n);
+  for (Vector* x : {&coordinates, &v_, &a_, &held_, &rest_, &step_}) x->setZero(n);
   near_.assign(n, 0);
 }
 
@@ -74,7 +74,7 @@ bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double
   std::optional<double> energy;
   if (!impact(t, y, energy) || !grip(t, y, held)) return false;
   // The loss of the rounds, and of the rates up to rounding that are taken from joints at rest after them.
-  if (energy) joints_.impact_loss += *energy - kinetic_energy();
+  if (energy) joints_.impact_loss += *energy - core_.energy(v_, step_).kinetic;
   known_ = true;
   return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
 }
@@ -91,16 +91,10 @@ std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) c
     if (event.of != Event::q || is_into(k)) continue;
     if (!rests(k))
       found.push_back({k, false, near_[k]});
-    else if (!among(joints_.locked, k))
+    else if (!joints_.is_locked(k))
       found.push_back({k, true});
   }
   return found;
-}
-
-double JointChanges::kinetic_energy() {
-  core_.tree_inertia();
-  core_.D_times(v_, step_);
-  return 0.5 * v_.dot(step_);
 }
 
 bool JointChanges::hits(int k) const {
@@ -113,8 +107,7 @@ bool JointChanges::movable(Indices& at) {
   for (size_t i = 0; i < at.size(); ++i) {
     const int k = at[i];
     const auto column = static_cast<Eigen::Index>(i);
-    unit_.setUnit(k), core_.D_times(unit_, step_);
-    if (!(responses_(k, column) * step_(k) > moves)) continue;
+    if (!(responses_(k, column) * core_.inertia_alone(k) > moves)) continue;
     at[left] = k;
     if (left != column) responses_.col(left) = responses_.col(column);
     ++left;
@@ -139,7 +132,7 @@ bool JointChanges::impact(double t, Out y, std::optional<double>& energy) {
   for (int k = 0; k < core_.n; ++k)
     if (near_[k]) at.push_back(k), any |= is_into(k);
   if (!any) return true;
-  energy = kinetic_energy();
+  energy = core_.energy(v_, step_).kinetic;
   if (!system_.acceleration(t, held_)) return false;
   joints_.locked.clear();
   const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));

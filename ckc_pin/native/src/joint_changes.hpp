@@ -25,7 +25,6 @@ class JointChanges {
   // What comes to a stop, or to rest, where that was met.
   std::vector<System::Met> arriving(const std::vector<Event>& met) const;
   bool impact(double t, Out y, std::optional<double>& energy);  // the kinetic energy before it, J; none without an impact
-  double kinetic_energy();  // J, at v_
   bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
   // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
   bool movable(Indices& at);
@@ -43,7 +42,7 @@ class JointChanges {
   const double rise_;
   const Tolerance& tolerance_;
   bool known_ = false;  // whether a decision was made since the begin
-  Vector v_, a_, held_, rest_, step_, unit_;
+  Vector v_, a_, held_, rest_, step_;
   Indices near_;        // (n): the stop that a joint is at, as `touch`
   std::vector<System::Met> arrived_;  // what is as it is now because it has come there now
   bool slips_ = false;  // what holds has given way

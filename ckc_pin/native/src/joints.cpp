@@ -45,8 +45,7 @@ int Joints::beyond_stop(In q_tree, const Indices& at, double tolerance) const {
   if (!stops) return -1;
   for (size_t k = 0; k < at.size(); ++k) {
     const double x = q_tree(at[k]), off = std::max(table.lower(k) - x, x - table.upper(k));
-    if (off > tolerance * table.reach(k) && std::find(locked.begin(), locked.end(), static_cast<int>(k)) == locked.end())
-      return static_cast<int>(k);
+    if (off > tolerance * table.reach(k) && !is_locked(static_cast<int>(k))) return static_cast<int>(k);
   }
   return -1;
 }

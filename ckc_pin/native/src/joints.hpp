@@ -6,6 +6,7 @@
 // the instants where something changes.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include <Eigen/Eigenvalues>
@@ -46,6 +47,7 @@ class Joints {
   Indices sign;    // (n): which way a joint with friction slides, zero where it does not
   Indices touch;   // (n): -1 at the lower stop, 1 at the upper, zero at none
   Indices locked;  // coordinates that stick or touch
+  bool is_locked(int k) const { return std::find(locked.begin(), locked.end(), k) != locked.end(); }
   Indices idle;    // with friction, but the loops leave them no way to move from where they are
   Vector place;    // (n): where those are
   // Of sliding, the others' motion being v.

@@ -93,7 +93,7 @@ bool Variation::before_change(In v, In a, const std::vector<System::Met>& met, M
 bool Variation::has_changed(const System::Met& met) const {
   const Joints& joints = core_.joints;
   const int k = met.coordinate;
-  const bool locked = std::find(joints.locked.begin(), joints.locked.end(), k) != joints.locked.end();
+  const bool locked = joints.is_locked(k);
   return begins_ || struck_[k] || locked != static_cast<bool>(locked_[k]) || joints.sign[k] != sign_[k] ||
          joints.touch[k] != touch_[k];
 }
