@@ -233,7 +233,7 @@ def _apart(ready: Prepared) -> str | None:
     found = ready.loop.apart()
     if found is None:
         return None
-    coordinate, of_rate, parameter, together = found
+    coordinate, of_rate, parameter, reason = found
     joint, name, t = ready.mechanism.coordinates[coordinate], ready.varying[parameter].name, float(ready.loop.t)
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
     if t == 0.0 and ready.varying[parameter].assembled_at == coordinate:
@@ -241,7 +241,12 @@ def _apart(ready: Prepared) -> str | None:
             f"stopped {where}: {joint} is assembled at its stop, and with another {name} it starts elsewhere one way "
             "only, so that the motion has no derivative"
         )
-    if together:
+    if reason == "let_go":
+        return (
+            f"stopped {where}: the force that holds {joint} is at its limit, and with another {name} {joint} is let go "
+            "one way only, so that the motion has no derivative"
+        )
+    if reason == "restitution":
         return (
             f"stopped {where}: {joint} and joints that move only with it are thrown back by their stops at once, and "
             f"with another {name} by one of them alone: either way the motion goes on differently, so that it has no "

@@ -163,3 +163,24 @@ def test_bounces_that_die_out_end_without_a_verdict(rtol: float) -> None:
     j4 = found.run.coordinates.index("j4")
     expected = one_sided(f"{LOOPS}/bounces_die_out", "joint.j4.friction", 0.036806215917608125, 1e-6)[j4]
     assert end(found, "joint.j4.friction")[j4] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+@pytest.mark.parametrize("of", ["force", "friction"])
+def test_a_joint_held_by_a_force_at_its_limit_has_no_derivative(of: str, formulation: str, tmp_path: Path) -> None:
+    """Nothing presses it on its stop, or friction is just enough: with a little more of a force it moves."""
+    if of == "force":
+        parameter, more = "gravity.x", joint("x", restitution=0.5)
+    else:
+        parameter, more = "joint.x.friction", joint("x", friction=2.0) + force("x", 2.0)
+    scene = sliders(tmp_path, more, upper=0.0, q_dot=(0.0, 1.0))
+    changes = {**TIGHT, "formulation": formulation}
+    found = sensitivities(scene, [parameter], changes)
+    assert found.run.status == "stopped"
+    assert f"the force that holds x is at its limit, and with another {parameter}" in found.run.message
+    value = 0.0 if of == "force" else 2.0
+    above, below = (one_sided(scene, parameter, value, h) for h in (1e-5, -1e-5))
+    assert np.abs(above - below).max() > 0.3
+    assert end(sensitivities(scene, ["gravity.y", "initial.q_dot.y"], changes), "initial.q_dot.y") == pytest.approx(
+        [0.0, 1.0, 0.0, 1.0], abs=1e-9
+    )

@@ -51,12 +51,12 @@ nb::object delays(Run& run, int coordinate, bool of_rate) {
   return found.allFinite() ? nb::cast(found) : nb::none();
 }
 
-// Where a joint has no one time to change what it does: (coordinate, whether it is at rest there, parameter, whether others
-// that move only with it are thrown back otherwise); else none.
+// Why the motion has no derivative from here on: (coordinate, whether it is at rest there, parameter, reason); else none.
 nb::object apart(Run& run) {
   const auto& found = varied(run).apart;
   if (!found) return nb::none();
-  return nb::make_tuple(found->met.coordinate, found->met.of_rate, found->parameter, found->together);
+  static constexpr const char* reasons[] = {"time", "restitution", "let_go"};
+  return nb::make_tuple(found->met.coordinate, found->met.of_rate, found->parameter, reasons[found->reason]);
 }
 
 // The same states' velocity and acceleration of the tree, (2 n).

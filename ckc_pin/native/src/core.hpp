@@ -129,6 +129,7 @@ class Core {
   void acceleration_rounding(const Indices& at, const Matrix& columns, In force, In a, Vector& bound);
   // How far what holds the locked joints is from giving way, after `eq_1`.
   double holding_margin() { return joints.margin(rounding_); }
+  Indices at_limit() const { return joints.at_limit(rounding_); }  // of the locked joints, there
   // How the terms change at the core's state, where the tree accelerates under u'; false where nothing tells J^T lambda.
   bool differentiate(In u_tree, In acceleration);
   Derivatives derivatives;

@@ -99,14 +99,35 @@ void Joints::hold(const Matrix& responses, Out a) {
   for (int k : locked) a(k) = 0.0;  // what is left is rounding
 }
 
+Matrix Joints::inverse_root() const {
+  return eigen_.eigenvalues().tail(rank_).cwiseSqrt().cwiseInverse().asDiagonal() *
+         eigen_.eigenvectors().rightCols(rank_).transpose();
+}
+
+Vector Joints::force_rounding(const Matrix& inverse_root, In rounding) const {
+  const Matrix inverse = inverse_root.transpose() * inverse_root;
+  return hysteresis * (inverse.cwiseAbs() * scale_.cwiseProduct(rounding));
+}
+
+// Joints that are held in several ways have forces that may be others, and are left out.
+Indices Joints::at_limit(In rounding) const {
+  Indices at;
+  if (rank_ < A_.rows()) return at;
+  const Vector bound = force_rounding(inverse_root(), rounding);
+  for (Eigen::Index i = 0; i < A_.rows(); ++i) {
+    const int k = locked[i];
+    if (std::min(force_(i) - lower_force(k), upper_force(k) - force_(i)) <= bound(i) * scale_(i))
+      at.push_back(static_cast<int>(i));
+  }
+  return at;
+}
+
 // By how much the forces stay within their bounds, at best: where the joints are held in more than one way, forces that
 // cancel each other may be added. Bounds are widened by what rounding may make of the forces.
 double Joints::margin(In rounding) {
   const Eigen::Index m = A_.rows();
-  const Matrix inverse_root = eigen_.eigenvalues().tail(rank_).cwiseSqrt().cwiseInverse().asDiagonal() *
-                              eigen_.eigenvectors().rightCols(rank_).transpose();
-  const Matrix inverse = inverse_root.transpose() * inverse_root;
-  const Vector scaled = hysteresis * (inverse.cwiseAbs() * scale_.cwiseProduct(rounding));
+  const Matrix inverse_root = this->inverse_root();
+  const Vector scaled = force_rounding(inverse_root, rounding);
   Vector force(m), low(m), high(m);  // each measured in what it takes to move its own joint
   for (Eigen::Index i = 0; i < m; ++i) {
     force(i) = force_(i) / scale_(i);

@@ -73,10 +73,13 @@ class Joints {
   // How far the forces that `hold` found last are from not being enough: negative where none within their bounds are.
   // `rounding`: by locked coordinate, how wrong its acceleration may be.
   double margin(In rounding);
+  // Which locked coordinates, by number in `locked`, only rounding keeps from being let go: their force is at its limit.
+  Indices at_limit(In rounding) const;
   double rate_rounding = 0.0;  // 1/s: what rounding made of rates, by reach, at the last change of modes
   double patience = 1.0;  // times the rounding error: more where joints change their mode again and again at an instant
   // What is to be added to a velocity, or a small displacement, so that x of the locked coordinates vanishes.
   void back(const Matrix& responses, In x, Out step);
+  const Vector& back_forces() const { return back_; }  // by locked coordinate, that `back` has added last
 
   // --- what they have done ---
   std::vector<JointChange> changes;
@@ -87,6 +90,8 @@ class Joints {
   static constexpr double infinite = std::numeric_limits<double>::infinity();
   void factor(const Matrix& responses);
   void least_forces(const Matrix& responses, In x, Vector& force);
+  Matrix inverse_root() const;  // (rank, m), R with R^T R the pseudoinverse of A
+  Vector force_rounding(const Matrix& inverse_root, In rounding) const;  // of forces, each as A measures it
   const bool smooth_;
   double rubbed_ = 0.0;
   Vector since_;  // (n): the coordinates where they were set

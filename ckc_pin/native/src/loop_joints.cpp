@@ -48,6 +48,7 @@ std::optional<Stop> Loop::keep_joints() {
     bool changed;
     if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
     if (changed) f_known_ = false;
+    if (!system->stays_locked(tolerance_.atol)) return trouble();
   }
   const int beyond = joints.beyond_stop(system->core.q_tree, system->core.tree.place, passed);
   if (beyond >= 0) return Stop{Stop::beyond_stop, now.t, 0.0, beyond};

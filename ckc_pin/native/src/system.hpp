@@ -116,6 +116,8 @@ class System {
   virtual bool before_change(double, In, const std::vector<Met>&) { return true; }
   virtual bool at_impact(In, const Indices&, const Matrix&, In, double) { return true; }
   virtual bool after_change(double, Out, const std::vector<Met>&, double, double) { return true; }
+  // At the end of an accepted step with locked joints: whether they stay locked with parameters on both sides of theirs.
+  virtual bool stays_locked(double) { return true; }
   // A controller has looked at y, where the core is, or what it found has come to act; false where that is not known.
   // Whether from here on rates of y are others.
   virtual bool sampled(In, bool&) { return true; }

@@ -162,7 +162,12 @@ void Variation::add_answer(const Eigen::Ref<const Matrix>& s) {
 }
 
 void Variation::add_back(Matrix& change) {
-  for (int p = 0; p < count; ++p) core_.joints.back(responses_, change.col(p), back_), change.col(p) += back_;
+  free_ = change;
+  back_forces_.resize(static_cast<Eigen::Index>(core_.joints.locked.size()), count);
+  for (int p = 0; p < count; ++p) {
+    core_.joints.back(responses_, change.col(p), back_);
+    change.col(p) += back_, back_forces_.col(p) = core_.joints.back_forces();
+  }
 }
 
 bool Variation::rates(In v, In a, const Matrix& s, Matrix& s_dot) {

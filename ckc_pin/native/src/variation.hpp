@@ -55,11 +55,16 @@ struct VariationTable {
   Matrix directions;  // (numbers that the written-out code takes, parameters); none where it does not take them
 };
 
-// A joint that with a parameter comes to what it does at another time than others, or not at all.
+// A joint whose motion has no derivative with respect to a parameter.
 struct Apart {
+  enum Reason {
+    time,         // it comes to what it does at another time than others, or not at all
+    restitution,  // its stop throws it back together with joints that move only with it, by other restitutions
+    let_go,       // only rounding keeps it locked, and on one side of the parameter's value it is not
+  };
   System::Met met;
   int parameter;
-  bool together = false;  // its stop throws it back together with joints that move only with it, by other restitutions
+  Reason reason = time;
 };
 
 class Variation {
@@ -101,6 +106,9 @@ class Variation {
   // The first arrival whose time depends on a parameter in another way than the instant's, for projected s; none if all agree.
   std::optional<Apart> apart(const std::vector<System::Met>& arrived, const Matrix& s, double rtol, double atol);
   void after_change(In v, In a, Matrix& s);
+  // A joint that nothing but rounding keeps locked since the step before, at the state of the last rates, and a parameter
+  // that changes the force on it: with a little more or less of it, the joint is let go. None if there is none.
+  std::optional<Apart> let_go(double atol);
 
  private:
   void compute(In v, In a, In lambda, bool impulsive);  // of the whole tree
@@ -110,7 +118,7 @@ class Variation {
   void direction(const Eigen::Ref<const Matrix>& s, int p, bool acts, Out to);
   bool what_acts(In v);  // acting_, and its slopes where it answers_
   void add_answer(const Eigen::Ref<const Matrix>& s);  // to force_
-  void add_back(Matrix& change);  // what holds the joints that are locked
+  void add_back(Matrix& change);  // what holds the joints that are locked, with `back_forces_`
   // What each parameter adds to the forces that are lacking, and to J a; `impulsive` as there.
   void add_parameters(In v, In a, In lambda, bool impulsive, Matrix& force, Matrix& row);
   void add_effect(const Effect& of, In a, In lambda, bool impulsive, Out force, Out row);
@@ -166,6 +174,8 @@ class Variation {
   bool begins_ = true;        // no change of joints was there yet
   Indices sign_, touch_;      // what joints did before the change
   std::vector<std::pair<int, Vector>> missed_;  // rates that impacts ask of a joint and cannot give it, by parameter
+  Matrix free_, back_forces_;  // changes of accelerations without what holds joints, and of that, by parameter
+  std::vector<char> at_limit_;  // (n): joints that only rounding kept locked at the end of the step before
   std::vector<char> locked_, struck_;  // (n): those that were held before it, those that impacts of it are at
 };
 

@@ -105,7 +105,7 @@ std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, c
   for (const auto& [k, missed] : missed_)
     for (int p = 0; p < count; ++p)
       if (!(std::abs(missed(p)) <= core_.joints.table.reach(k) * (relative * largest_(p) + times * atol)))
-        return Apart{{k, false}, p, true};
+        return Apart{{k, false}, p, Apart::restitution};
   if (begins_)
     for (int p = 0; p < count; ++p)
       if (const int k = table_.parameters[p].assembled_at; k >= 0) return Apart{{k, false}, p};
@@ -119,9 +119,33 @@ std::optional<Apart> Variation::apart(const std::vector<System::Met>& arrived, c
   return {};
 }
 
+std::optional<Apart> Variation::let_go(double atol) {
+  const Joints& joints = core_.joints;
+  std::vector<char> before(n, 0);
+  std::swap(before, at_limit_);
+  before.resize(n, 0);
+  std::optional<Apart> first;
+  for (int i : core_.at_limit()) {
+    const int k = joints.locked[i];
+    at_limit_[k] = 1;
+    if (!before[k] || first) continue;
+    const Vector& reach = joints.table.reach;
+    for (int p = 0; p < count && !first; ++p) {
+      const double largest = free_.col(p).cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+      const double side = joints.touch[k] ? joints.touch[k] : std::copysign(1.0, joints.forces()(i));
+      double room = -side * back_forces_(i, p);  // how the distance from the limit changes, N or N m
+      for (const Effect& of : table_.parameters[p].effects)
+        if (of.kind == Effect::friction && of.index == k) room += 1.0;
+      if (std::abs(responses_(k, i) * room) > reach(k) * (least * largest + times * atol)) first = Apart{{k, true, joints.touch[k]}, p, Apart::let_go};
+    }
+  }
+  return first;
+}
+
 // What sticks or touches from here on is brought to rest by what holds it, whenever it comes: a friction that could hold
 // more, or the last of ever smaller bounces, takes a time and a way that vanish with the rate it comes with.
 void Variation::after_change(In v, In a, Matrix& s) {
+  at_limit_.clear();
   limits_.clear();  // a velocity that jumps may be answered by other torques at once
   begins_ = false;
   add_delayed(v, a, -1.0, s);

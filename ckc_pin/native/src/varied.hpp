@@ -114,6 +114,7 @@ class Varied : public Base, public WithVariation {
     put(y);
     return true;
   }
+  bool stays_locked(double atol) override { return !(apart = variation_.let_go(atol)); }
   bool sampled(In y, bool& changed) override {
     if (!this->control.sampling->holds) return true;
     take(y);
