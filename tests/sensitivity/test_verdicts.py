@@ -167,7 +167,7 @@ def test_bounces_that_die_out_end_without_a_verdict(rtol: float) -> None:
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("of", ["force", "friction"])
-def test_a_joint_held_by_a_force_at_its_limit_has_no_derivative(of: str, formulation: str, tmp_path: Path) -> None:
+def test_joints_locked_by_a_force_at_its_limit_have_no_derivative(of: str, formulation: str, tmp_path: Path) -> None:
     """Nothing presses it on its stop, or friction is just enough: with a little more of a force it moves."""
     if of == "force":
         parameter, more = "gravity.x", joint("x", restitution=0.5)
