@@ -8,7 +8,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import pytest
+
+import ckc_pin
+from ckc_pin.simulation.ensembles import members, worst
+from ckc_pin.simulation.ensembles.ensemble import run_sweep, sweep_task
 from tests.ensembles.test_sweep import results, written
 
 
@@ -28,3 +34,34 @@ def test_ctrl_c_keeps_what_is_there(tmp_path: Path) -> None:
     assert "the same command goes on from it" in errors
     assert "Traceback" not in errors
     assert 10 <= found["done"] == int((results(out)["status"] == 1).sum()) < 2000
+
+
+def interrupted_rows(*_: Any) -> tuple[None, str, str]:
+    return None, "interrupted", "interrupted at t = 0.1 s by SIGTERM"
+
+
+def test_an_interrupt_of_the_run_that_measures_the_work_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(members, "run_rows", interrupted_rows)
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        run_sweep(sweep_task(written(tmp_path)), tmp_path / "o")
+
+
+def test_an_interrupt_of_the_run_that_finds_shapes_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(members, "run_rows", interrupted_rows)
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        ckc_pin.ensemble(
+            "five_bar/swing", {"initial.q.theta_1": [-1.5]}, {"end": lambda run: run.t[-1]},
+            changes={"solver.terms": "pinocchio"},
+        )  # fmt: skip
+
+
+def test_an_interrupted_run_of_a_worst_member_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    summary = run_sweep(sweep_task(written(tmp_path, 4)), tmp_path / "o")
+    run = ckc_pin.simulate("five_bar/swing", {"t_end": 0.1})
+    object.__setattr__(run, "status", "interrupted")
+    monkeypatch.setattr(worst, "simulate", lambda *_: run)
+    with pytest.raises(KeyboardInterrupt):
+        worst.save_worst(summary.prepared, results(tmp_path / "o"), "drift", tmp_path / "o")
+    assert not list((tmp_path / "o").glob("worst_*"))

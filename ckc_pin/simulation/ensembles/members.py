@@ -271,6 +271,8 @@ class Members:
         if not self.outputs.functions:
             return shapes
         rows, status, message = run_rows(self.ready)
+        if status == "interrupted":
+            raise interrupt_again(message)
         run = run_of(self.ready, rows, status, message, 0.0)
         for name, function in self.outputs.functions.items():
             try:
@@ -302,9 +304,11 @@ class Members:
     def work(self) -> int:
         """Right-hand sides of the scene itself."""
         try:
-            run_rows(self.ready)
+            _, status, message = run_rows(self.ready)
         except CkcError:
             return 0
+        if status == "interrupted":
+            raise interrupt_again(message)
         return int(self.ready.loop.stats()["rhs"])
 
     def _can_be_batched(self) -> bool:

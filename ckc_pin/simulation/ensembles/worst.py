@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ckc_pin.errors import CkcError
+from ckc_pin.interrupt import interrupt_again
 from ckc_pin.simulation.ensembles.members import DONE, STOPPED, Members
 from ckc_pin.simulation.ensembles.store_layout import array_name
 from ckc_pin.simulation.simulate import simulate
@@ -41,6 +42,8 @@ def save_worst(members: Members, results: xr.Dataset, name: str, out: Path, most
             run = simulate(members.scene_name, members.changes_of(values))
         except CkcError:
             continue
+        if run.status == "interrupted":
+            raise interrupt_again(run.message)
         folder.mkdir(parents=True, exist_ok=True)
         run.save(folder / "run.npz")
         folders.append(folder)
