@@ -26,7 +26,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.mechanism.whole_file import temporary_folder, written_whole
 
 __all__ = ["Library", "cache_folder", "compiled", "find", "too_large"]
 
@@ -275,9 +275,9 @@ def _make(
     place = next((folder for folder in places if folder.is_dir() and _executes(folder)), None)
     if place is None:
         raise InputError(f"compiled terms cannot be loaded: neither {places[0]} nor {places[1]} allows programs")
-    with tempfile.TemporaryDirectory(prefix="ckc_pin-", dir=place) as made:
-        library = Path(made) / "terms.so"
-        _compile(mechanism, subject, compiler, Path(made) / "terms.c", library, on_written)
+    with temporary_folder(place) as folder:
+        library = folder / "terms.so"
+        _compile(mechanism, subject, compiler, folder / "terms.c", library, on_written)
         require_equal(mechanism, Library(str(library), values(numbers(mechanism), subject.which)))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"

@@ -18,7 +18,7 @@ from uuid import uuid4
 
 from ckc_pin.errors import InputError
 
-__all__ = ["alone_in", "write_whole", "written_whole"]
+__all__ = ["alone_in", "temporary_folder", "write_whole", "written_whole"]
 
 UNFINISHED = ".unfinished"
 PATIENCE = 10.0  # s
@@ -52,6 +52,23 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text as UTF-8 (InputError where that cannot be)."""
     with written_whole(path) as file:
         file.write(text.encode())
+
+
+@contextmanager
+def temporary_folder(place: Path | None = None) -> Iterator[Path]:
+    """Create a folder in `place` (absent: the system's temporary directory) and remove it with its content afterwards.
+
+    `tempfile.TemporaryDirectory` leaves the folder behind if an interrupt arrives while it is created.
+    """
+    import shutil
+    import tempfile
+
+    folder = (Path(tempfile.gettempdir()) if place is None else place) / f"ckc_pin-{uuid4().hex}"
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

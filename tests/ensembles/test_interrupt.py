@@ -6,14 +6,18 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import ckc_pin
-from ckc_pin.simulation.ensembles import members, worst
+from ckc_pin.mechanism.whole_file import temporary_folder
+from ckc_pin.simulation.ensembles import members, store_layout, worst
 from ckc_pin.simulation.ensembles.ensemble import run_sweep, sweep_task
 from tests.ensembles.test_sweep import results, written
 
@@ -34,6 +38,50 @@ def test_ctrl_c_keeps_what_is_there(tmp_path: Path) -> None:
     assert "the same command goes on from it" in errors
     assert "Traceback" not in errors
     assert 10 <= found["done"] == int((results(out)["status"] == 1).sum()) < 2000
+
+
+def interrupt_first(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function, with a SIGINT to the main thread at the beginning of each call."""
+
+    def interrupted(*arguments: Any) -> Any:
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        time.sleep(0.1)
+        return function(*arguments)
+
+    return interrupted
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The directory for temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def test_a_temporary_folder_is_removed_when_its_creation_is_interrupted(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mkdir = Path.mkdir
+
+    def interrupted(self: Path, mode: int = 0o777) -> None:
+        mkdir(self, mode)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "mkdir", interrupted)
+    with pytest.raises(KeyboardInterrupt), temporary_folder():
+        pass
+    assert not list(temporary.iterdir())
+
+
+def test_a_store_that_is_interrupted_while_created_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The files are written in another thread, which must not go on after the removal."""
+    monkeypatch.setattr(store_layout, "create_arrays", interrupt_first(store_layout.create_arrays))
+    out = tmp_path / "o"
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(sweep_task(written(tmp_path)), out)
+    assert not list(out.iterdir())
 
 
 def interrupted_rows(*_: Any) -> tuple[None, str, str]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -18,7 +18,7 @@ import numpy as np
 
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.units import joined
-from ckc_pin.mechanism.whole_file import written_whole
+from ckc_pin.mechanism.whole_file import temporary_folder, written_whole
 from ckc_pin.simulation.ensembles.checksums import CHECKSUMS, ChunkChecksums, checksum, checksum_file, describe_damage
 from ckc_pin.simulation.ensembles.members import PENDING, STATUS, Members
 
@@ -38,6 +38,13 @@ UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 def create_store(folder: Path, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
     """Create a store in a folder; one without attributes is not finished."""
+    # Python raises KeyboardInterrupt in the main thread only. Zarr writes files in a thread of its own, and would go on
+    # with it after an interrupt, while the caller removes the folder.
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(_write_store, folder, sweep, members, count, chunk).result()
+
+
+def _write_store(folder: Path, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
     import zarr
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
@@ -162,12 +169,12 @@ def restore_files(path: Path, create: Callable[[Path], None], files: Mapping[str
     if not damaged:
         return []
     said = [f"{key} {describe_damage(path / key)}" for key in damaged]
-    with TemporaryDirectory() as folder:
-        create(Path(folder))
+    with temporary_folder() as folder:
+        create(folder)
         for key, says in zip(damaged, said, strict=True):
-            if checksum_file(Path(folder, key)).hex() != files[key]:
+            if checksum_file(folder / key).hex() != files[key]:
                 raise InputError(f"{path}/{says}; remove {path}, or choose another DIR")
-        _copy(Path(folder), path, damaged)
+        _copy(folder, path, damaged)
     return said
 
 
@@ -195,11 +202,11 @@ def convert_files(path: Path, create: Callable[[int], Callable[[Path], None]]) -
         raise InputError(
             f"{file}: cannot be read ({type(error).__name__}); remove {path}, or choose another DIR"
         ) from None
-    with TemporaryDirectory() as folder:
-        create(chunk)(Path(folder))
-        document = (Path(folder) / DOCUMENT).read_bytes()
-        files = read_files_attributes(Path(folder))["files"]
-        _copy(Path(folder), path, [*files, f"{CHECKSUMS}/{DOCUMENT}"])
+    with temporary_folder() as folder:
+        create(chunk)(folder)
+        document = (folder / DOCUMENT).read_bytes()
+        files = read_files_attributes(folder)["files"]
+        _copy(folder, path, [*files, f"{CHECKSUMS}/{DOCUMENT}"])
 
     def finish() -> None:
         with written_whole(path / DOCUMENT) as file:
