@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin.mechanism.whole_file import temporary_folder
-from ckc_pin.simulation.ensembles import members, store_layout, worst
+from ckc_pin.simulation.ensembles import cluster, members, store_layout, worst
 from ckc_pin.simulation.ensembles.ensemble import run_sweep, sweep_task
 from tests.ensembles.test_sweep import results, written
 
@@ -113,3 +114,23 @@ def test_an_interrupted_run_of_a_worst_member_is_not_saved(tmp_path: Path, monke
     with pytest.raises(KeyboardInterrupt):
         worst.save_worst(summary.prepared, results(tmp_path / "o"), "drift", tmp_path / "o")
     assert not list((tmp_path / "o").glob("worst_*"))
+
+
+def test_a_cluster_that_is_interrupted_while_it_starts_leaves_nothing(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_start", interrupt_first(cluster._start))
+    with pytest.raises(KeyboardInterrupt), cluster.client_of(None, 1):
+        pass
+    assert not multiprocessing.active_children()
+    assert not list(temporary.iterdir())
+
+
+def sigint_is_blocked() -> bool:
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_ctrl_c_does_not_reach_workers() -> None:
+    with cluster.client_of(None, 1) as client:
+        assert list(client.run(sigint_is_blocked).values()) == [True]
+    assert not sigint_is_blocked()

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Set
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from itertools import islice
-from tempfile import TemporaryDirectory
+from multiprocessing import active_children, resource_tracker
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.whole_file import temporary_folder
 from ckc_pin.simulation.ensembles.members import Chunk, Members
 from ckc_pin.simulation.ensembles.store import STAYS
 from ckc_pin.simulation.ensembles.task import SweepTask
 
 __all__ = ["chunks_by", "client_of"]
 
+WORKER = "Dask Worker process"  # how the names of Dask's worker processes begin
+KILL_PERIOD_S = 0.02
 PATIENCE = 10.0  # s, for a scheduler to answer
 AHEAD = 3  # chunks a worker that are waiting or under way: none of them idles, and memory is bounded
 
@@ -43,7 +47,7 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """
     try:
         import dask
-        from dask.distributed import Client, LocalCluster
+        from dask.distributed import Client
     except ModuleNotFoundError:
         says = (
             "processes and machines are run by dask.distributed, which is not installed: pip install ckc_pin[cluster]"
@@ -51,30 +55,12 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         raise InputError(says) from None
     if scheduler is None:
         with (
-            TemporaryDirectory(prefix="ckc_pin-", ignore_cleanup_errors=True) as folder,
-            dask.config.set({"temporary-directory": folder}),
+            temporary_folder() as folder,
+            dask.config.set({"temporary-directory": str(folder)}),
+            _silenced("distributed"),  # of tasks that are cancelled and workers that are killed, by an interrupt
+            _local_cluster(workers) as client,
         ):
-            try:
-                cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
-                    silence_logs=logging.CRITICAL,  # of tasks that are cancelled and workers that are killed, by Ctrl-C
-                )
-            except (OSError, RuntimeError) as error:
-                raise InputError(
-                    f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
-                    '`if __name__ == "__main__":`, since each process reads the script again'
-                ) from None
-            with cluster, Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
-                try:
-                    yield client
-                except BaseException:
-                    _kill_workers(cluster)
-                    raise
+            yield client
         return
     try:
         # no default: one that does not answer would be asked for all that the process computes by Dask afterwards
@@ -84,25 +70,101 @@ def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
             "`dask scheduler` and `dask worker ADDRESS`, or leave it out for processes on this machine"
         ) from None
-    logs = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
+    # they have tracebacks of a scheduler that is lost, of which a message tells
+    with _silenced("distributed", "distributed.client"), client:
+        yield client
+
+
+@contextmanager
+def _silenced(*names: str) -> Iterator[None]:
+    """Show nothing of logs below CRITICAL."""
+    logs = [logging.getLogger(name) for name in names]
     before = [log.level for log in logs]
-    for log in logs:  # they have tracebacks of a scheduler that is lost, of which a message tells
+    for log in logs:
         log.setLevel(logging.CRITICAL)
     try:
-        with client:
-            yield client
+        yield
     finally:
         for log, level in zip(logs, before, strict=True):
             log.setLevel(level)
 
 
-def _kill_workers(cluster: Any) -> None:
-    """Kill the processes of a cluster, which would otherwise finish their chunks before they end."""
-    for nanny in cluster.workers.values():
-        nanny.auto_restart = False
-        if nanny.pid is not None:
-            with suppress(ProcessLookupError):
-                os.kill(nanny.pid, signal.SIGKILL)
+@contextmanager
+def _local_cluster(workers: int | None) -> Iterator[Any]:
+    """Start a cluster of processes on this machine, and connect to it; an interrupt kills the processes.
+
+    Python raises KeyboardInterrupt in the main thread only. Dask cannot close a cluster whose construction was
+    interrupted, so the cluster is constructed in another thread.
+    """
+    others = set(active_children())
+    with ThreadPoolExecutor(1, initializer=_block_sigint) as pool:
+        starting = pool.submit(_start, workers)
+        try:
+            try:
+                _, client = starting.result()
+            except (OSError, RuntimeError) as error:
+                raise InputError(
+                    f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
+                    '`if __name__ == "__main__":`, since each process reads the script again'
+                ) from None
+            yield client
+        except BaseException:
+            closing = pool.submit(_close, starting)
+            while not closing.done():
+                _kill_workers(others)  # again and again: Dask starts a killed worker anew until the cluster is closing
+                wait([closing], KILL_PERIOD_S)
+            raise
+        pool.submit(_close, starting).result()
+
+
+def _block_sigint() -> None:
+    """Block SIGINT in this thread, and by that in all threads and processes that are started from it.
+
+    Ctrl-C sends SIGINT to the workers, too. They are killed by the process that started them.
+    """
+    resource_tracker.ensure_running()  # which unblocks SIGINT when `multiprocessing` starts it later
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+
+def _start(workers: int | None) -> tuple[Any, Any]:
+    """Start a cluster and connect to it."""
+    from dask.distributed import Client, LocalCluster
+
+    cluster = LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
+        silence_logs=logging.CRITICAL,
+    )
+    try:
+        return cluster, Client(cluster, set_as_default=False)  # type: ignore[no-untyped-call]
+    except BaseException:
+        cluster.close()
+        raise
+
+
+def _close(starting: Future[tuple[Any, Any]]) -> None:
+    """Close a cluster if it could be started."""
+    if starting.exception() is None:
+        cluster, client = starting.result()
+        client.close()
+        cluster.close()
+
+
+def _kill_workers(others: Set[BaseProcess]) -> None:
+    """Kill the processes of a cluster, which would otherwise finish their chunks before they end.
+
+    Parameters
+    ----------
+    others : set of processes
+        Child processes from before the cluster.
+    """
+    for process in set(active_children()) - others:
+        if process.name.startswith(WORKER):
+            process.kill()
 
 
 def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
