@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
@@ -28,6 +29,8 @@ __all__ = ["export", "import_"]
 @options.as_json
 def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> None:
     """Take a robot from another format. Writes a mechanism.toml and a URDF, and says what was guessed and left out."""
+    # MuJoCo imports GLFW for its windows. GLFW starts a Python process, which prints a traceback on Ctrl-C.
+    os.environ.setdefault("MUJOCO_GL", "disable")
     with Working(f"reading {file.name}"):
         draft = importing.read(file)
     with interrupts.deferred():  # both files or none

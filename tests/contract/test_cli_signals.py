@@ -306,3 +306,23 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+NO_PROCESSES = """
+import sys
+import ckc_pin.cli
+
+def refuse(event, arguments):
+    if event == "subprocess.Popen":
+        raise SystemExit(f"starts {arguments[1]}")
+
+sys.addaudithook(refuse)
+ckc_pin.cli.main()
+"""
+
+
+def test_import_starts_no_process_that_ctrl_c_would_reach(tmp_path: Path) -> None:
+    (tmp_path / "pair.xml").write_text(MODEL)
+    with under_way(NO_PROCESSES, "import", str(tmp_path / "pair.xml"), "--out", str(tmp_path / "out")) as process:
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
