@@ -6,11 +6,12 @@ import os
 import signal
 import subprocess
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from time import monotonic
+
+from ckc_pin.interrupt import uninterrupted_thread
 
 __all__ = ["run_program"]
 
@@ -37,8 +38,7 @@ def run_program(command: Sequence[str], timeout_s: float, temporary: Path) -> su
         The program cannot be started.
     """
     stop = Event()
-    # Python raises KeyboardInterrupt in the main thread only: in another one a process cannot be lost while it starts.
-    with ThreadPoolExecutor(1) as pool:
+    with uninterrupted_thread() as pool:  # an interrupt could lose a process while it starts
         try:
             return pool.submit(_run, command, timeout_s, temporary, stop).result()
         finally:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import ckc_pin
+from ckc_pin.interrupt import uninterrupted_thread
 from ckc_pin.mechanism.whole_file import temporary_folder
 from ckc_pin.simulation.ensembles import cluster, members, store_layout, worst
 from ckc_pin.simulation.ensembles.ensemble import run_sweep, sweep_task
@@ -134,3 +135,18 @@ def test_ctrl_c_does_not_reach_workers() -> None:
     with cluster.client_of(None, 1) as client:
         assert list(client.run(sigint_is_blocked).values()) == [True]
     assert not sigint_is_blocked()
+
+
+def test_an_interrupt_while_a_thread_starts_comes_before_its_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    start = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        start(thread)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt), uninterrupted_thread() as pool:
+        pool.submit(done.append, 1)
+    time.sleep(0.1)
+    assert not done

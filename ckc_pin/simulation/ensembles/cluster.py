@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 from collections.abc import Iterable, Iterator, Set
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import active_children, resource_tracker
@@ -13,6 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import uninterrupted_thread
 from ckc_pin.mechanism.whole_file import temporary_folder
 from ckc_pin.simulation.ensembles.members import Chunk, Members
 from ckc_pin.simulation.ensembles.store import STAYS
@@ -93,11 +94,11 @@ def _silenced(*names: str) -> Iterator[None]:
 def _local_cluster(workers: int | None) -> Iterator[Any]:
     """Start a cluster of processes on this machine, and connect to it; an interrupt kills the processes.
 
-    Python raises KeyboardInterrupt in the main thread only. Dask cannot close a cluster whose construction was
+    Dask cannot close a cluster whose construction was
     interrupted, so the cluster is constructed in another thread.
     """
     others = set(active_children())
-    with ThreadPoolExecutor(1, initializer=_block_sigint) as pool:
+    with uninterrupted_thread(_block_sigint) as pool:
         starting = pool.submit(_start, workers)
         try:
             try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.errors import InputError
+from ckc_pin.interrupt import uninterrupted_thread
 from ckc_pin.mechanism.units import joined
 from ckc_pin.mechanism.whole_file import temporary_folder, written_whole
 from ckc_pin.simulation.ensembles.checksums import CHECKSUMS, ChunkChecksums, checksum, checksum_file, describe_damage
@@ -38,9 +38,8 @@ UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 def create_store(folder: Path, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
     """Create a store in a folder; one without attributes is not finished."""
-    # Python raises KeyboardInterrupt in the main thread only. Zarr writes files in a thread of its own, and would go on
-    # with it after an interrupt, while the caller removes the folder.
-    with ThreadPoolExecutor(1) as pool:
+    # Zarr writes files in a thread of its own. It would go on after an interrupt, while the caller removes the folder.
+    with uninterrupted_thread() as pool:
         pool.submit(_write_store, folder, sweep, members, count, chunk).result()
 
 
