@@ -18,32 +18,32 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
+    from ckc_pin.analysis.check import Check, check
+    from ckc_pin.codegen.symbolic import Symbolic
     from ckc_pin.control.controllers import Controller, SetPoint, Tracking
     from ckc_pin.control.sampled import Sampled
     from ckc_pin.dynamics.terms import Terms, terms
+    from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
-    from ckc_pin.generated.symbolic import Symbolic
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
+    from ckc_pin.linear.linear_model import LinearModel
+    from ckc_pin.linear.linearize import linearize
+    from ckc_pin.linear.locus import GainLocus, gain_locus
+    from ckc_pin.linear.stability_result import Stability
     from ckc_pin.mechanism import Mechanism
-    from ckc_pin.simulation.check import Check, check
-    from ckc_pin.simulation.ensembles.ensemble import ensemble
-    from ckc_pin.simulation.events import Event
-    from ckc_pin.simulation.floquet import Floquet, floquet
-    from ckc_pin.simulation.inverse import inverse_dynamics
-    from ckc_pin.simulation.ivp import as_ivp
-    from ckc_pin.simulation.linear_model import LinearModel
-    from ckc_pin.simulation.linearize import linearize
-    from ckc_pin.simulation.locus import GainLocus, gain_locus
-    from ckc_pin.simulation.motion_forces import MotionForces
-    from ckc_pin.simulation.run import Run
-    from ckc_pin.simulation.scene import Scene, load_scene
-    from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
-    from ckc_pin.simulation.simulate import simulate
-    from ckc_pin.simulation.simulator import Simulator
-    from ckc_pin.simulation.stability_result import Stability
-    from ckc_pin.simulation.state import State
+    from ckc_pin.run.events import Event
+    from ckc_pin.run.inverse import inverse_dynamics
+    from ckc_pin.run.ivp import as_ivp
+    from ckc_pin.run.motion_forces import MotionForces
+    from ckc_pin.run.run import Run
+    from ckc_pin.run.simulate import simulate
+    from ckc_pin.run.simulator import Simulator
+    from ckc_pin.run.state import State
+    from ckc_pin.scene.scene import Scene, load_scene
+    from ckc_pin.sensitivity.floquet import Floquet, floquet
+    from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
     from ckc_pin.view.inline import Figures, Playback
     from ckc_pin.view.server import ViewServer
 
@@ -92,33 +92,58 @@ __all__ = [
 __version__ = "0.1.0"
 
 
-MODULES = {  # of the names that do without simulation
+MODULES = {
+    "Check": "analysis.check",
     "CkcError": "errors",
     "Controller": "control.controllers",
+    "Event": "run.events",
+    "Floquet": "sensitivity.floquet",
+    "GainLocus": "linear.locus",
     "InputError": "errors",
+    "LinearModel": "linear.linear_model",
     "Mechanism": "mechanism",
     "MechanismError": "errors",
+    "MotionForces": "run.motion_forces",
     "NumericalError": "errors",
     "Point": "kinematics.point",
+    "Run": "run.run",
     "Sampled": "control.sampled",
+    "Scene": "scene.scene",
+    "Sensitivities": "sensitivity.sensitivities",
     "SetPoint": "control.controllers",
+    "Simulator": "run.simulator",
+    "Stability": "linear.stability_result",
+    "State": "run.state",
     "Terms": "dynamics.terms",
     "Tracking": "control.controllers",
+    "as_ivp": "run.ivp",
+    "check": "analysis.check",
+    "ensemble": "ensembles.ensemble",
+    "floquet": "sensitivity.floquet",
+    "gain_locus": "linear.locus",
+    "inverse_dynamics": "run.inverse",
+    "linearize": "linear.linearize",
     "load": "kinematics",
+    "load_scene": "scene.scene",
+    "sensitivities": "sensitivity.sensitivities",
+    "simulate": "run.simulate",
     "terms": "dynamics.terms",
 }
-FOLDERS = ("control", "dynamics", "errors", "kinematics", "mechanism", "simulation")
+ROOMS = (
+    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "formats", "kinematics", "linear",
+    "mechanism", "native", "run", "scene", "sensitivity", "view",
+)  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     """Import the module of a public name when the name is used first."""
     from importlib import import_module
 
-    if name in FOLDERS:
+    if name in ROOMS:
         return import_module(f"ckc_pin.{name}")
-    if name not in __all__:  # the others are here
+    if name not in MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"ckc_pin.{MODULES.get(name, 'simulation')}"), name)
+    value = getattr(import_module(f"ckc_pin.{MODULES[name]}"), name)
     globals()[name] = value
     return value
 
@@ -164,7 +189,7 @@ def play(
     InputError
         No run, runs of several mechanisms, numbers that cannot be, a port in use, meshcat missing.
     """
-    from ckc_pin.simulation.notebook import in_notebook
+    from ckc_pin.base.summary import in_notebook
     from ckc_pin.view.inline import Playback
     from ckc_pin.view.player import play as play_runs
 
@@ -215,7 +240,7 @@ def singularity_map(
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
-    """Write a mechanism's terms out as CasADi functions; see `ckc_pin.generated.symbolic`, which this loads."""
-    from ckc_pin.generated.symbolic import symbolic as write
+    """Write a mechanism's terms out as CasADi functions; see `ckc_pin.codegen.symbolic`, which this loads."""
+    from ckc_pin.codegen.symbolic import symbolic as write
 
     return write(mechanism)

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ckc_pin.simulation.run import Run
+    from ckc_pin.run.run import Run
 
 __all__ = ["CkcError", "InputError", "MechanismError", "NumericalError"]
 

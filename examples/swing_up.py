@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.symbolic import Symbolic
 from ckc_pin.errors import NumericalError
-from ckc_pin.generated.symbolic import Symbolic
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.view.canvas import look
 from ckc_pin.view.style import COLOURS
 

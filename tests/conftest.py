@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from ckc_pin import Mechanism, Run, load, simulate
-from ckc_pin.generated.library import compiled
+from ckc_pin.codegen.library import compiled
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
 settings.register_profile(

@@ -22,13 +22,13 @@ import numpy as np
 from ckc_pin.analysis.explored import Explored, explore
 from ckc_pin.analysis.gradient import symmetric_least
 from ckc_pin.analysis.walk import Border, follow, least, margin, same_configuration
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import Start
+from ckc_pin.scene.initial import Start
 
 __all__ = ["Certificate", "SublevelSet", "certify", "level_of", "rest_height", "sublevel_set"]
 

@@ -14,12 +14,12 @@ import numpy as np
 
 from ckc_pin.analysis.explored import Explored, explore
 from ckc_pin.analysis.walk import Border, follow, least, margin, way
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.desired import Desired
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Bound", "bound_along", "chart_step", "explore_branch", "gradient_bounds", "symmetric_least"]
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.analysis.singularities import EXACT, SingularPoint, SingularSystem
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["SingularCurve", "trace", "trace_singular"]
 

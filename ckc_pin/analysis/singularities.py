@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.assembly import assemble
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
@@ -28,7 +29,6 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import RANK_TOLERANCE, choose_dependent, rank_of, scaled
 from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Kind", "SingularPoint", "SingularSystem", "classify", "find_singular", "search_singular"]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import move
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Border", "Height", "follow", "least", "margin", "margin_gradient", "same_configuration", "way"]
 

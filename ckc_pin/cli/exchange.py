@@ -11,8 +11,8 @@ import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.output import Working, errors, print_card, print_json
 from ckc_pin.cli.signals import interrupts
+from ckc_pin.cli.tables import check_plain
 from ckc_pin.formats import exporting, importing
-from ckc_pin.simulation.report import check_plain
 
 __all__ = ["export", "import_"]
 

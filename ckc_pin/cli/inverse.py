@@ -9,14 +9,14 @@ from pathlib import Path
 import click
 
 import ckc_pin
+from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_table
 from ckc_pin.cli.signals import interrupts
+from ckc_pin.cli.tables import inverse_plain, inverse_table
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.whole_file import alone_in
-from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.report import inverse_plain, inverse_table
 
 __all__ = ["inverse"]
 

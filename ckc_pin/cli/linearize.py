@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import ckc_pin
+from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes, read_table
 from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.mechanism.whole_file import alone_in
-from ckc_pin.simulation.arguments import read_changes, read_table
-from ckc_pin.simulation.linear_report import floquet_text, linear_plain, linear_text, save_floquet, save_linear
-from ckc_pin.simulation.linearize import At
+from ckc_pin.linear.linear_report import linear_plain, linear_text, save_linear
+from ckc_pin.linear.linearize import At
+from ckc_pin.sensitivity.floquet import floquet_text, save_floquet
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -115,7 +116,7 @@ def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out:
 
     Returns how many modes are runs.
     """
-    from ckc_pin.simulation.sway import sways
+    from ckc_pin.linear.mode_animation import sways
 
     runs = sways(model)
     with ExitStack() as stack:

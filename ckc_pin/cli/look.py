@@ -8,9 +8,9 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes, read_table
 from ckc_pin.cli.output import LONG, Working, errors, print_card, print_json, print_table
-from ckc_pin.simulation.arguments import read_changes, read_table
-from ckc_pin.simulation.report import check_plain, terms_plain, terms_table
+from ckc_pin.cli.tables import check_plain, terms_plain, terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
 
@@ -19,7 +19,7 @@ __all__ = ["check", "compile_", "list_", "terms"]
 @options.as_json
 def list_(as_json: bool) -> None:
     """Shipped mechanisms and scenes, a line each."""
-    from ckc_pin.simulation.scene import catalogue
+    from ckc_pin.scene.scene import catalogue
 
     entries = catalogue()
     if as_json:
@@ -92,7 +92,7 @@ def compile_(mechanism: str, as_json: bool) -> None:
     """Compile a mechanism's terms, which its runs then take."""
     from time import perf_counter
 
-    from ckc_pin.generated.library import cache_folder, compiled, find
+    from ckc_pin.codegen.library import cache_folder, compiled, find
 
     loaded, started = ckc_pin.load(mechanism), perf_counter()
     there = find(loaded)

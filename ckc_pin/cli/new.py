@@ -9,11 +9,11 @@ from shlex import quote
 
 import click
 
+from ckc_pin.base.atomic_files import write_whole
 from ckc_pin.cli import options
 from ckc_pin.cli.output import make_folder, print_json
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.whole_file import write_whole
 
 __all__ = ["new"]
 

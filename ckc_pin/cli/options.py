@@ -26,7 +26,7 @@ class _Path(click.Path):
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
         """Return the path (InputError where it is empty or not valid)."""
-        from ckc_pin.mechanism.kinds import require_path
+        from ckc_pin.base.validation import require_path
 
         if parameter is not None:
             name = str(parameter.opts[0] if isinstance(parameter, click.Option) else parameter.metavar)
@@ -49,7 +49,7 @@ def complete_mechanisms(context: click.Context, parameter: click.Parameter, inco
 def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete a shipped mechanism's or scene's name, or a path."""
     from ckc_pin.mechanism.library import shipped
-    from ckc_pin.simulation.scene import scene_names
+    from ckc_pin.scene.scene import scene_names
 
     return _completed([name for one in shipped() for name in (one, *_of(one, scene_names(one)))], incomplete)
 

@@ -12,13 +12,13 @@ from threading import Timer
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from ckc_pin.base.summary import to_json
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.report import to_json
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-    from ckc_pin.mechanism.card import Card
+    from ckc_pin.base.summary import Card
 
 __all__ = ["LONG", "ProgressBar", "Working", "errors", "forget_answer", "has_answered", "kept", "make_folder",
            "on_terminal", "print_card", "print_json", "print_table"]  # fmt: skip

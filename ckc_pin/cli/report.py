@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import click
 
 import ckc_pin
+from ckc_pin.base.atomic_files import alone_in, write_whole
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import LONG, ProgressBar, errors, kept, make_folder, on_terminal, print_json, print_table
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.whole_file import alone_in, write_whole
-from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.prepare import prepare
+from ckc_pin.run.prepare import prepare
 
 if TYPE_CHECKING:
     from ckc_pin.analysis.precision import WorkPrecision

@@ -11,16 +11,16 @@ from typing import Any
 import click
 
 import ckc_pin
+from ckc_pin.base.atomic_files import alone_in, write_whole
+from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_card, print_json
 from ckc_pin.cli.signals import interrupts
+from ckc_pin.cli.tables import profile_table
 from ckc_pin.errors import InputError
-from ckc_pin.interrupt import acknowledge
-from ckc_pin.mechanism.whole_file import alone_in, write_whole
-from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.check import run_warnings
-from ckc_pin.simulation.report import profile_table
+from ckc_pin.run.warnings import run_warnings
 
 __all__ = ["run"]
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import click
 
 import ckc_pin
+from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
+from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_card, print_json
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.whole_file import alone_in
-from ckc_pin.simulation.arguments import read_changes
 
 __all__ = ["sensitivities"]
 

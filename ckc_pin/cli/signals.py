@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic
 
+from ckc_pin.base.interrupt import CommandInterrupt
 from ckc_pin.cli.exits import INTERRUPTED, TERMINATED
-from ckc_pin.interrupt import CommandInterrupt
 
 TYPE_CHECKING = False  # importing `typing` would take longer than the rest of this module
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ import click
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import errors, print_json, print_table
+from ckc_pin.ensembles.ensemble import Summary, run_sweep, sweep_task
+from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.ensembles.ensemble import Summary, run_sweep, sweep_task
-from ckc_pin.simulation.ensembles.task import SweepTask
 
 __all__ = ["sweep"]
 
@@ -66,7 +66,7 @@ def sweep(
     if unknown:
         raise InputError(f"--worst {unknown[0]}: no such output; there are {', '.join(task.spec.outputs)}")
     if indices is not None:
-        from ckc_pin.simulation.ensembles.importance import laws_of
+        from ckc_pin.ensembles.importance import laws_of
 
         laws_of(task, indices)  # before anything is run
     found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
@@ -100,9 +100,9 @@ def _print(found: Summary, out: Path, as_json: bool) -> None:
 
 def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures: bool) -> None:
     """Write which variable matters, a row an output and variable, and draw it."""
-    from ckc_pin.mechanism.whole_file import write_whole
-    from ckc_pin.simulation.ensembles.importance import importance
-    from ckc_pin.simulation.ensembles.store_layout import array_name
+    from ckc_pin.base.atomic_files import write_whole
+    from ckc_pin.ensembles.importance import importance
+    from ckc_pin.ensembles.store_layout import array_name
 
     found = importance(task, count, threads)
     rows = ["output,variable,first_order,total_order"]
@@ -134,7 +134,7 @@ def _afterwards(found: Summary, out: Path, worst: tuple[str, ...], figures: bool
         except InputError as error:  # matplotlib is an extra; the results are there
             errors().print(f"no figures: {error}")
     for name in worst:
-        from ckc_pin.simulation.ensembles.worst import save_worst
+        from ckc_pin.ensembles.worst import save_worst
 
         for folder in save_worst(found.prepared, results, name, out):
             errors().print(f"ckc play {quote(str(folder))}")

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.control.allocation import allocate, least
 from ckc_pin.control.spec import AllocationSpec, Limit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.linear import pivoted_columns
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Actuation", "Effort", "require_tau", "require_u"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 
 __all__ = ["allocate", "least"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.control.controllers import Model, SetPoint, Tracking
 from ckc_pin.control.gains import gain_matrix
 from ckc_pin.control.point_path import make_desired
@@ -12,7 +13,6 @@ from ckc_pin.control.torques import Torques, read_torques
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
 
 __all__ = ["make_controller"]
 

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import a_kind, require_arguments, require_callable, require_kind
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.gains import gain_matrix, require_positive_definite
 from ckc_pin.control.spec import Gain
@@ -19,9 +21,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.kinds import a_kind, require_arguments, require_callable, require_kind
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Controller", "Law", "Model", "SetPoint", "TorqueController", "Tracking", "as_controller", "gives_tau"]
 

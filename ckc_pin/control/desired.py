@@ -8,11 +8,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import convert
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.toml import convert
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Desired", "Harmonics", "Table", "cycles", "read_columns", "read_desired", "read_table"]
 

@@ -7,10 +7,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import a_kind, is_number
 from ckc_pin.control.spec import Gain
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import a_kind, is_number
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["gain_matrix", "require_positive_definite"]
 

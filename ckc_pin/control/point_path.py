@@ -12,17 +12,17 @@ from typing import Annotated, Any, Protocol
 import msgspec
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import convert
 from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
+from ckc_pin.mechanism.batch import difference, integrate
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.many import difference, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec_frames import Vector3
-from ckc_pin.mechanism.toml import convert
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Circle", "Line", "Place", "PointPath", "make_desired"]
 

@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from ckc_pin.base.toml import convert
+from ckc_pin.base.validation import is_number, require_table
 from ckc_pin.control.controllers import Controller, Law, TorqueController, as_controller
 from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import is_number, require_table
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.toml import convert
 
 __all__ = ["Sampled"]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.sources import Sources
 from ckc_pin.control.desired import read_columns
 from ckc_pin.control.spec import TorquesSpec
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Torques", "read_torques"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.continuation import same_branch
 from ckc_pin.kinematics.sigma import newton, predict
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["equilibrium", "h_gradient", "stable_equilibrium", "weight"]
 

@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.linear_algebra import Factorization, null_space
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.linear import Factorization, null_space
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = [
     "CoriolisVelocity",

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, cross
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["friction_force", "joint_wrenches", "loop_wrenches"]
 

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import Factorization
+from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.validation import require_table
+from ckc_pin.base.values import lazy
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.kinds import require_table
-from ckc_pin.mechanism.lazy import lazy
-from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Terms", "terms"]
 

@@ -12,12 +12,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.orientation import to_rpy
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import LoopSpec, MechanismSpec, PointSpec
 from ckc_pin.mechanism.spec_frames import Frame, FrameSpec, Vector3
 from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec

@@ -6,10 +6,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from ckc_pin.base.sources import write_texts
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer import mjcf
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.sources import write_texts
 
 __all__ = ["FORMATS", "Exported", "export", "write"]
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ckc_pin.base.toml import read_text
+from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft
 from ckc_pin.formats.mechanism_file import mechanism_text, write
 from ckc_pin.formats.mjcf.reader import read_mjcf
 from ckc_pin.formats.partition import settle_independent
 from ckc_pin.formats.urdf.reader import read_urdf, urdf_beside
-from ckc_pin.mechanism.strict_xml import strict_xml
-from ckc_pin.mechanism.toml import read_text
 
 __all__ = ["Draft", "mechanism_text", "read", "write"]
 

@@ -10,9 +10,9 @@ from typing import Any, get_args
 
 import msgspec
 
+from ckc_pin.base.sources import write_texts
 from ckc_pin.formats.draft import Draft
 from ckc_pin.mechanism.library import MECHANISM_FILE
-from ckc_pin.mechanism.sources import write_texts
 from ckc_pin.mechanism.spec import LoopType
 
 __all__ = ["mechanism_text", "write"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 
 __all__ = ["from_axis_angle", "from_quaternion", "from_rpy", "to_rpy"]
 

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.freedoms import count_freedoms
-from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Changes
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Assembly", "assemble", "assembled"]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import newton
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["assembly_branches"]
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Chart"]
 

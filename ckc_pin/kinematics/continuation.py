@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["follow", "follow_many", "same_branch"]
 

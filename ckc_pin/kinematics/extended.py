@@ -14,17 +14,17 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.batch import evaluate, joined
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics, Partition
-from ckc_pin.mechanism.many import evaluate, joined
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors
 from ckc_pin.mechanism.rank import RANK_TOLERANCE
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["Extended", "Task", "extend", "find_point"]
 

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import by_coordinate, convert, read_toml
+from ckc_pin.base.validation import is_number, require_kind, require_table
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.kinds import is_number, require_kind, require_table
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Changes
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.toml import by_coordinate, convert, read_toml
 
 __all__ = ["as_mechanism", "build", "load"]
 

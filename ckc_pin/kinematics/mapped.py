@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from ckc_pin.mechanism.card import Card, Row, Shown, quantities
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
+from ckc_pin.base.summary import Card, Row, Shown, quantities
 
 __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.continuation import follow_many
 from ckc_pin.kinematics.extended import Task
-from ckc_pin.mechanism.many import ManyPoses, integrate
+from ckc_pin.mechanism.batch import ManyPoses, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["SHORTEST", "Nodes", "follow", "nodes_at", "shapes", "solutions", "solve"]
 

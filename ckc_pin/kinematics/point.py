@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import require_kind
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
 from ckc_pin.kinematics.nodes import solutions
 from ckc_pin.kinematics.sigma import newton, sigma
+from ckc_pin.mechanism.batch import difference, evaluate, integrate
 from ckc_pin.mechanism.closure import Closure, Selected
 from ckc_pin.mechanism.configuration import Kinematics, Partition
-from ckc_pin.mechanism.kinds import require_kind
-from ckc_pin.mechanism.many import difference, evaluate, integrate
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Inverse", "Point"]
 

@@ -13,11 +13,11 @@ from typing import Literal
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["Newton", "Sigma", "Verdict", "move", "nearest", "newton", "predict", "shortest", "sigma"]
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.linear_algebra import Factorization
+from ckc_pin.base.values import Shared, lazy
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.lazy import lazy
-from ckc_pin.mechanism.linear import Factorization
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import scaled
-from ckc_pin.mechanism.shared import Shared
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Kinematics", "Partition", "Psi"]
 

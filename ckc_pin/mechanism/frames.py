@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.values import Shared
 from ckc_pin.errors import MechanismError
-from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Frame", "Frames"]
 

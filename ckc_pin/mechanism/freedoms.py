@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
+from ckc_pin.base.values import Shared
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
-from ckc_pin.mechanism.shared import Shared
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
 

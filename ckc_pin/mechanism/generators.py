@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from ckc_pin.mechanism.sources import Sources
+from ckc_pin.base.sources import Sources
 
 __all__ = ["GENERATORS", "MAX_N", "GeneratorSpec", "generate"]
 

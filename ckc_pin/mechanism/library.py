@@ -8,10 +8,10 @@ from functools import cache
 from os.path import exists, isdir, isfile
 from pathlib import Path
 
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import convert, read_text
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GENERATORS, GeneratorSpec, generate
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.toml import convert, read_text
 
 __all__ = ["about", "first_comment", "is_path", "library", "mechanism_file", "shipped", "texts_of"]
 

@@ -7,13 +7,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.motors import motors_of
 from ckc_pin.mechanism.parameters import Changes, changed
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
 from ckc_pin.mechanism.springs import Springs

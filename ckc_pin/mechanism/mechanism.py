@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.summary import Card, Row, Shown, quantities
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.card import Card, Row, Shown, quantities
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
+from ckc_pin.base.toml import convert
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.toml import convert
 from ckc_pin.mechanism.urdf_checks import INERTIA, LIMITS, check_inertial, check_range, floats
 
 __all__ = [

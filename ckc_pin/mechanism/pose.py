@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.lazy import lazy
-from ckc_pin.mechanism.shared import Shared
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.values import Shared, lazy
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.linear import pivoted_columns
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled", "scales"]
 

@@ -22,10 +22,11 @@ from typing import Protocol
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.values import Shared
 from ckc_pin.mechanism.pose import Pose, Rate, cross
-from ckc_pin.mechanism.shared import Shared
 from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_dot, skew
-from ckc_pin.mechanism.tree import Array, IntArray, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Affine", "Component", "Distance", "Dot", "RelativeLog", "Rows"]
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 
 __all__ = ["log_jacobian", "log_jacobian_dot", "skew"]
 

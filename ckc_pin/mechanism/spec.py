@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from ckc_pin.mechanism.file_struct import FileStruct
+from ckc_pin.base.toml import FileStruct
 from ckc_pin.mechanism.spec_frames import Frame, FrameSpec, Name, Positive, Vector3
 from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec
 

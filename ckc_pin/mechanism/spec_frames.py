@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from ckc_pin.mechanism.file_struct import FileStruct
+from ckc_pin.base.toml import FileStruct
 
 __all__ = ["Frame", "FrameSpec", "Name", "NonNegative", "Positive", "Vector3"]
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from ckc_pin.mechanism.file_struct import FileStruct
+from ckc_pin.base.toml import FileStruct
 from ckc_pin.mechanism.spec_frames import Frame, Name, NonNegative, Positive
 
 __all__ = ["CouplingSpec", "ForceSpec", "JointSpec", "MotorSpec", "SpringSpec"]

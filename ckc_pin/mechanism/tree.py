@@ -17,16 +17,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.validation import is_number
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.kinds import is_number
 
-__all__ = ["Array", "BoolArray", "IntArray", "Tree"]
+__all__ = ["Tree"]
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
 

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
+from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.strict_xml import strict_xml
 from ckc_pin.mechanism.urdf_checks import (
     Mimic,
     by_name,

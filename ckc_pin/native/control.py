@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
 from ckc_pin.control.desired import Desired, Harmonics, Table
@@ -16,7 +17,6 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.control.torques import Torques
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.native.tables import closure_table, core_table, packed
 
 __all__ = ["actuation_table", "control_table", "law_table"]

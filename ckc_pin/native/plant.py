@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.codegen.library import Library
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.generated.library import Library
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, IntArray
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
 

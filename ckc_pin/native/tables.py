@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.generated.library import Library
+from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.library import Library
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import RANK_TOLERANCE, scales
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.springs import Springs
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["closure_table", "core_table", "packed"]
 

@@ -14,10 +14,11 @@ from typing import Any, Literal
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.generated.arguments import numbers, present, values
+from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.codegen.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.tree import Array, BoolArray, Tree
+from ckc_pin.mechanism.tree import Tree
 from ckc_pin.native.tables import core_table, packed
 
 __all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "separate_parts", "variation_table"]

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.dynamics.inverse import loop_wrenches
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import commands
 from ckc_pin.view.bodies import safe
 from ckc_pin.view.commands import Command, Track

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.gaps import opening_loops

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.skeleton import Placements, is_planar, sticks, upward, viewpoint

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.atomic_files import written_whole
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.mechanism.whole_file import written_whole
 from ckc_pin.view import style
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.view.visuals import Colour
 
 __all__ = [

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import convert
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.toml import convert
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 
 __all__ = ["DesiredPath", "Poses", "desired_along", "desired_poses"]
 

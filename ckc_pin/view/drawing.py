@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.arrows import arrow_scales, arrow_tracks, arrows, draw_arrows, forces_path
 from ckc_pin.view.camera import WORLD, extent_of_motions, surroundings

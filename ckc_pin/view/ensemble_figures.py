@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.simulation.ensembles.store_layout import array_name, units_beside
+from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.ensembles.store_layout import array_name, units_beside
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, say, write
 from ckc_pin.view.labels import plain, symbol, with_unit

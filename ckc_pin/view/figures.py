@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import require_path
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.units import joined, motor_units, row_units
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import panels, poses, style
 from ckc_pin.view.canvas import Slot, fit_legend, line, look, page, write
 from ckc_pin.view.desired import desired_along

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rows import Component, Distance
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["gaps", "opening_loops"]
 

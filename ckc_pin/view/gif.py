@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.atomic_files import written_whole
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.mechanism.whole_file import written_whole
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, head, line, look
 from ckc_pin.view.desired import desired_poses

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from ckc_pin.base.validation import require_kind
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.kinds import require_kind
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 
 __all__ = ["given_runs"]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.desired import DesiredPath
 from ckc_pin.view.labels import plain, run_labels

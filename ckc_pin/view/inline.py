@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.linear_model import LinearModel
-from ckc_pin.simulation.locus import GainLocus
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.sensitivities import Sensitivities
+from ckc_pin.linear.linear_model import LinearModel
+from ckc_pin.linear.locus import GainLocus
+from ckc_pin.run.run import Run
+from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view.figures import draw, write_figures
 from ckc_pin.view.gif import save_gif
 from ckc_pin.view.linear_figure import draw_linear

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.mechanism.units import motor_units
-from ckc_pin.simulation.motion_forces import MotionForces
+from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, line, look, note_on, page, write
 from ckc_pin.view.labels import plain, symbol, with_unit

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 
 __all__ = ["plain", "rate_symbol", "run_labels", "symbol", "with_unit"]
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.simulation.linear_model import LinearModel
-from ckc_pin.simulation.locus import GainLocus
-from ckc_pin.simulation.modes import Mode, eigenvalues_of, telling
+from ckc_pin.linear.linear_model import LinearModel
+from ckc_pin.linear.locus import GainLocus
+from ckc_pin.linear.modes import Mode, eigenvalues_of, telling
 from ckc_pin.view import style
 from ckc_pin.view.canvas import look, write
 from ckc_pin.view.labels import plain, symbol

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.run.run import Run
+from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.scene import Scene
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.browser import open_in_browser
 from ckc_pin.view.camera import WORLD, extent_of_reach, surroundings

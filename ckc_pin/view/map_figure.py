@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.mapped import LABELS, Axis, Kind, Locus, SingularityMap
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, head, look, say, write
 from ckc_pin.view.labels import plain, symbol, with_unit

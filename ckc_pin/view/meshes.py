@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.sources import PACKAGE, resolve
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.sources import PACKAGE, resolve
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["Surface", "load_surface"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.view.skeleton import Placements, Projection, slides, sticks
 
 __all__ = ["Outline", "base", "outline"]

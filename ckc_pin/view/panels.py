@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.units import motor_units
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.canvas import Slot, fit_legend, limit, line, note_on, say
 from ckc_pin.view.desired import DesiredPath

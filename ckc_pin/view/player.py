@@ -10,11 +10,11 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
+from ckc_pin.base.atomic_files import write_whole
+from ckc_pin.base.interrupt import acknowledge
+from ckc_pin.base.validation import is_number, require_flag, require_kind, require_path
 from ckc_pin.errors import InputError
-from ckc_pin.interrupt import acknowledge
-from ckc_pin.mechanism.kinds import is_number, require_flag, require_kind, require_path
-from ckc_pin.mechanism.whole_file import write_whole
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view.bodies import missing_meshes
 from ckc_pin.view.browser import open_in_browser
 from ckc_pin.view.commands import Command

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.canvas import Slot
 from ckc_pin.view.group import Group, columns

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ckc_pin.mechanism.units import joined
-from ckc_pin.simulation.sensitivities import Sensitivities
-from ckc_pin.simulation.units import key_unit, per
+from ckc_pin.run.units import key_unit, per
+from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view import style
 from ckc_pin.view.canvas import fit_legend, look, write
 from ckc_pin.view.labels import plain, symbol, with_unit

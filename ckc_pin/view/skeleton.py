@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 
 __all__ = ["Placements", "Projection", "Slide", "Stick", "configurations", "is_planar", "placements", "planes",
            "slides", "sticks", "upward", "viewpoint"]  # fmt: skip

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ckc_pin.simulation.run import Run
+from ckc_pin.run.run import Run
 
 __all__ = ["COLOURS", "DPI", "GREY", "MOST", "NOTE", "RC", "REST", "WIDTH", "WIDTH_BESIDE", "colours", "drawing_order",
            "foremost", "lines"]  # fmt: skip

@@ -11,9 +11,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from ckc_pin.mechanism.urdf import parse
 
 __all__ = ["SHAPES", "Colour", "Visual", "visuals"]

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from ckc_pin import Simulator, Terms, load_scene, simulate
+from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.prepare import Prepared, prepare
-from ckc_pin.simulation.scene import catalogue
-from ckc_pin.simulation.scene_parts import scene_controller
-from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.run.prepare import Prepared, prepare
+from ckc_pin.run.simulate import run_prepared
+from ckc_pin.scene.parts import scene_controller
+from ckc_pin.scene.scene import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 INERT = [{"coordinate": "theta_1", "value": 50.0}]

@@ -15,9 +15,9 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.analysis.precision.mujoco import INTEGRATORS, STIFFNESSES, StateMap, model_of, set_up
+from ckc_pin.base.arrays import Array
+from ckc_pin.ensembles.members import Members
 from ckc_pin.formats.exporting import export
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ensembles.members import Members
 
 SCENE, T_END = "five_bar/swing", 2.0
 START = ("initial.q.theta_1",)

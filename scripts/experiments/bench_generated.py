@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ckc_pin import Simulator, Terms, linearize, load
-from ckc_pin.generated.library import compiled
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.library import compiled
 from ckc_pin.native.plant import Plant
-from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.run.simulate import run_prepared
 from scripts.experiments.bench import least, ready
 from scripts.experiments.generated_sizes import empty_cache
 

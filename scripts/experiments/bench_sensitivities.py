@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from time import process_time
 
-from ckc_pin.simulation.simulate import run_rows
+from ckc_pin.run.simulate import run_rows
+from ckc_pin.sensitivity.varying import derivatives_of
 from scripts.experiments.bench import ready
 
 # A scene, its tolerance, and names of which the first p vary.
@@ -26,7 +27,7 @@ def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[
     The least of several, taken in turns.
     """
     changes = {"formulation": "dae", "solver.rtol": rtol, "solver.terms": terms}
-    runs = [ready(scene, changes, parameters=names[:p]) for p in (0, *NUMBERS)]
+    runs = [ready(scene, changes, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)]
     seconds: list[list[float]] = [[] for _ in runs]
     for _ in range(TIMES):
         for run, found in zip(runs, seconds, strict=True):

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from ckc_pin import load_scene
-from ckc_pin.simulation.prepare import prepare
+from ckc_pin.run.prepare import prepare
+from ckc_pin.sensitivity.varying import derivatives_of
 
 EVENT = {"coordinate": "theta_1", "value": 50.0}
 SCENES: list[tuple[str, dict[str, Any]]] = [
@@ -46,7 +47,7 @@ def main(library: Path) -> int:
     counter.restype = c_long
     bad = 0
     for scene, changes, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
-        ready = prepare(load_scene(scene, changes), parameters=parameters)
+        ready = prepare(load_scene(scene, changes), derivatives=derivatives_of(parameters) if parameters else None)
         loop = ready.loop
         instants = np.linspace(0.0, 0.3, 31)
         rows = np.empty((40, loop.width))

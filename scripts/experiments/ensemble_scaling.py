@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ckc_pin.simulation.ensembles.cluster import AHEAD
-from ckc_pin.simulation.ensembles.members import Chunk, Members
-from ckc_pin.simulation.ensembles.store import Store
+from ckc_pin.ensembles.cluster import AHEAD
+from ckc_pin.ensembles.members import Chunk, Members
+from ckc_pin.ensembles.store import Store
 
 NETWORK = 1.0e9  # bytes a second to the client: a 10 Gbit/s link
 MEMBERS = 10**9

@@ -16,13 +16,13 @@ from math import pi
 from pathlib import Path
 from typing import Any
 
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.codegen.code import Code
+from ckc_pin.codegen.library import Library, compiled
 from ckc_pin.errors import InputError
-from ckc_pin.generated.code import Code
-from ckc_pin.generated.library import Library, compiled
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, written
 
 __all__ = ["NAMES", "Size", "main", "measure"]

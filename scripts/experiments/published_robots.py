@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ckc_pin
+from ckc_pin.base.sources import resolve
 from ckc_pin.formats.importing import read, write
-from ckc_pin.mechanism.sources import resolve
 from scripts.experiments.published_robots_motion import given_back
 
 PACKAGE = "package://example-robot-data/robots"

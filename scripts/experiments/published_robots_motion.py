@@ -12,9 +12,9 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin import Mechanism, NumericalError, Terms
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.desired import Table
 from ckc_pin.formats.importing import Draft, write
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["given_back"]
 

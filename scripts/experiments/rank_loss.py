@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from ckc_pin.simulation import simulate
+from ckc_pin import simulate
 
 __all__ = ["TOLERANCES", "Crossing", "crossings", "first_top_pin", "show"]
 

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, as_ivp, load, simulate
 from ckc_pin.analysis.precision.settings import FORMULATIONS
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.simulation.scene import catalogue
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.scene.scene import catalogue
 
 TIGHT = 1e-11
 ALLOWED = 100  # tolerances of a step: what a run adds up to

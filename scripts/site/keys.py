@@ -16,12 +16,12 @@ from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
+from ckc_pin.base.faults import expected
 from ckc_pin.control.point_path import PointPathSpec
 from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
-from ckc_pin.mechanism.faults import expected
+from ckc_pin.ensembles.spec import SweepSpec
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.simulation.ensembles.spec import SweepSpec
-from ckc_pin.simulation.scene_spec import SceneSpec
+from ckc_pin.scene.spec import SceneSpec
 
 __all__ = ["FILES", "Key", "Table", "markdown", "tables"]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.mechanism.library import library
-from ckc_pin.simulation.recorded_joints import RecordedJoints
+from ckc_pin.run.recorded_joints import RecordedJoints
 from ckc_pin.view import style
 from ckc_pin.view.canvas import line, look, say
 from scripts.experiments.chart import shrink

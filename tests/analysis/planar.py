@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, PointSpec
 
 INERTIA = '<inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'

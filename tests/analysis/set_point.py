@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ckc_pin import Mechanism
+from ckc_pin.base.sources import Sources
 from ckc_pin.control import SetPoint
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
+from ckc_pin.scene.initial import Start, find_start
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array
 
 G = 9.81

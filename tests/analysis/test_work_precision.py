@@ -21,9 +21,9 @@ from ckc_pin.analysis.precision.motion import INSTANTS, Motion
 from ckc_pin.analysis.precision.mujoco import model_of
 from ckc_pin.analysis.precision.reference import Reference, confirm, find_reference
 from ckc_pin.analysis.precision.settings import settings
+from ckc_pin.cli.arguments import read_changes
 from ckc_pin.formats.exporting import export
-from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.scene.parts import scene_mechanism
 from tests.analysis.swing_table import START, pendulum, write_table
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
@@ -333,7 +333,7 @@ def test_another_mechanism_in_mujoco_is_named(table: Path) -> None:
 
 
 def test_plain_data_is_json_ready(found: WorkPrecision) -> None:
-    from ckc_pin.simulation.report import to_json
+    from ckc_pin.base.summary import to_json
 
     plain = precision_plain(found)
     assert len(plain["rows"]) == len(found.rows)

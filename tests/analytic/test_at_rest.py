@@ -12,8 +12,8 @@ from scipy.optimize import linprog
 from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate, terms
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics import Terms, dae_acceleration
+from ckc_pin.linear.resting import hold
 from ckc_pin.mechanism.library import mechanism_file
-from ckc_pin.simulation.resting import hold
 from tests.analytic.small_models import plate_on_springs
 
 G = 9.81

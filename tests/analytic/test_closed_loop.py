@@ -28,7 +28,7 @@ from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import mechanism_file
-from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller
+from ckc_pin.scene.parts import scene_actuation, scene_controller
 from tests.analytic.five_bar import Array
 
 TARGET = {"theta_1": -1.2, "theta_3": -1.9}

@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from ckc_pin import InputError, Mechanism, NumericalError, linearize, load
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.native.plant import Plant
-from ckc_pin.simulation.linear_model import linear_model
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
 from tests.analytic.small_models import plate_on_springs
 from tests.analytic.test_linearization import agree

@@ -12,8 +12,8 @@ from scipy.linalg import expm
 from ckc_pin import InputError, Mechanism, linearize, load, simulate
 from ckc_pin.dynamics import Terms, dae_acceleration, multipliers, reduced_acceleration
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.simulation.linear_model import linear_model
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
 from tests.analytic.small_models import coupled_four_bar
 

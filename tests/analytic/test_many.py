@@ -5,7 +5,7 @@ import pytest
 
 from ckc_pin import load
 from ckc_pin.kinematics.extended import extend
-from ckc_pin.mechanism.many import evaluate, integrate, joined
+from ckc_pin.mechanism.batch import evaluate, integrate, joined
 from tests.conftest import assert_close
 
 MECHANISMS = ["five_bar", "delta", "three_rrr", "stewart", "andrews", "bricard", "two_ur5", "slider_crank_spatial"]

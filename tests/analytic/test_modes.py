@@ -9,8 +9,8 @@ import pytest
 
 from ckc_pin import InputError, Mechanism, linearize, load
 from ckc_pin.dynamics import Terms
-from ckc_pin.simulation.linear_model import linear_model
-from ckc_pin.simulation.sway import sway, sways
+from ckc_pin.linear.linear_model import linear_model
+from ckc_pin.linear.mode_animation import sway, sways
 
 BODY = ('<link name="{name}"><inertial><origin xyz="{x} 0.02 -0.03"/><mass value="{m}"/>'
         '<inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0.001" ixz="-0.002" iyz="0.0005"/></inertial>'

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, NumericalError, load, load_scene, simulate
+from ckc_pin.base.sources import Sources
 from ckc_pin.control.point_path import make_desired
+from ckc_pin.control.workspace import follow_desired
 from ckc_pin.kinematics.point import Point
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.simulation.workspace import follow_desired
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 

@@ -9,9 +9,9 @@ from scipy.signal import cont2discrete
 from ckc_pin import Sampled, check, load_scene, simulate
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.simulation.closed_loop import ClosedLoop, Feedback
-from ckc_pin.simulation.sampled_loop import sampled_loop, sampled_motion
-from ckc_pin.simulation.stability import stability
+from ckc_pin.linear.closed_loop import ClosedLoop, Feedback
+from ckc_pin.linear.sampled_loop import sampled_loop, sampled_motion
+from ckc_pin.linear.stability import stability
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
 from tests.analytic.test_stability import controlled, growth_by_runs
 

@@ -11,12 +11,12 @@ from ckc_pin import check, load_scene, simulate
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.linear.closed_loop import ClosedLoop
+from ckc_pin.linear.stability import stability
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.simulation.closed_loop import ClosedLoop
-from ckc_pin.simulation.scene import scene_names
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
-from ckc_pin.simulation.stability import stability
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import scene_names
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step, set_point
 
 TRACKING = ["five_bar/tracking", "stewart/wave", "delta/circle", "two_ur5/lift", "three_rrr/circle"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ckc_pin import simulate
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.scene import load_scene
 from tests.analytic.many_digits import ManyDigits, exact
 
 LENGTHS = [0.6, 0.5, 0.8, 0.7, 0.55, 0.65]

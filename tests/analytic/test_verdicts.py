@@ -15,7 +15,7 @@ from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import library
-from ckc_pin.simulation.scene_parts import scene_controller
+from ckc_pin.scene.parts import scene_controller
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.analytic.test_stability import waves
 from tests.analytic.test_workspace import EDGE

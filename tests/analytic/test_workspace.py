@@ -6,7 +6,7 @@ import pytest
 from ckc_pin import load
 from ckc_pin.control.desired import Desired, Harmonics, Table, cycles
 from ckc_pin.control.spec import HarmonicsSpec
-from ckc_pin.simulation.workspace import follow_desired
+from ckc_pin.control.workspace import follow_desired
 from tests.analytic.five_bar import FIVE_BAR
 
 EDGE = float(np.arcsin((FIVE_BAR.l[1] + FIVE_BAR.l[3] - FIVE_BAR.base) / (2 * FIVE_BAR.l[0])))  # of each link's swing

@@ -15,7 +15,7 @@ import pytest
 
 from ckc_pin import InputError, Run, Terms, load_scene, simulate
 from ckc_pin.cli.signals import Interrupts
-from ckc_pin.simulation.run_file import MAX_BYTES, MAX_META
+from ckc_pin.run.run_file import MAX_BYTES, MAX_META
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 from tests.contract.helpers.under_way import under_way

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ckc_pin import Event, Simulator, Terms, load_scene, simulate
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.run.prepare import prepare
+from ckc_pin.run.simulate import run_prepared
 
 pytestmark = pytest.mark.usefixtures("either_terms")
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, check, load, load_scene
+from ckc_pin.base.summary import to_json
+from ckc_pin.cli.tables import check_plain
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.simulation.report import check_plain, to_json
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 

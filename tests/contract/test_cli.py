@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.simulation.report import to_json
+from ckc_pin.base.summary import to_json
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 

@@ -6,9 +6,9 @@ import math
 
 import pytest
 
+from ckc_pin.base.summary import to_json
 from ckc_pin.cli.app import COMMANDS
-from ckc_pin.simulation.arguments import read_changes
-from ckc_pin.simulation.report import to_json
+from ckc_pin.cli.arguments import read_changes
 from tests.contract.helpers.command import ckc
 
 

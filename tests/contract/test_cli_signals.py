@@ -213,7 +213,7 @@ SWALLOWED = {
 }
 SWALLOWS = """
 import os, signal, sys, time
-import ckc_pin, ckc_pin.cli, ckc_pin.simulation.scene
+import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
 
 def catalogue():
     try:
@@ -222,7 +222,7 @@ def catalogue():
     {clause}
     time.sleep(60)
 
-ckc_pin.simulation.scene.catalogue = catalogue
+ckc_pin.scene.scene.catalogue = catalogue
 ckc_pin.cli.main()
 """
 
@@ -237,14 +237,14 @@ def test_an_interrupt_that_a_library_swallows_is_not_lost(name: str) -> None:
 
 IMPORTS = """
 import os, signal, sys, time
-import ckc_pin, ckc_pin.cli, ckc_pin.simulation.scene
+import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
 
 def catalogue():
     import slow
     print("imported as a whole:", slow.done, flush=True)
     time.sleep(60)
 
-ckc_pin.simulation.scene.catalogue = catalogue
+ckc_pin.scene.scene.catalogue = catalogue
 ckc_pin.cli.main()
 """
 SLOW = """
@@ -282,7 +282,7 @@ def test_importing_the_package_installs_no_handlers() -> None:
     code = """
 import signal
 before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)]
-import ckc_pin, ckc_pin.cli, ckc_pin.cli.app, ckc_pin.simulation
+import ckc_pin, ckc_pin.cli, ckc_pin.cli.app, ckc_pin.run.simulate
 assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)]
 """
     with under_way(code) as process:

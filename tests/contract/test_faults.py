@@ -10,13 +10,13 @@ import msgspec
 import pytest
 
 from ckc_pin import InputError
+from ckc_pin.base.faults import faults
+from ckc_pin.base.toml import convert
 from ckc_pin.formats.urdf.robot_yaml import RobotYaml
-from ckc_pin.mechanism.faults import faults
 from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.spec import LoopType, MechanismSpec
 from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.toml import convert
-from ckc_pin.simulation.scene_spec import SceneSpec
+from ckc_pin.scene.spec import SceneSpec
 from tests.contract.test_mutations import mutated
 
 

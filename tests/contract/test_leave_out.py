@@ -41,7 +41,7 @@ def test_importing_loads_nothing_of_size() -> None:
     """The command `ckc` imports the package before it can handle signals."""
     modules, _ = _modules(f"import ckc_pin.cli; {LIST}")
     assert {name for name in modules if name.startswith("ckc_pin.")} == {
-        "ckc_pin.cli", "ckc_pin.cli.exits", "ckc_pin.cli.signals", "ckc_pin.interrupt",
+        "ckc_pin.cli", "ckc_pin.cli.exits", "ckc_pin.cli.signals", "ckc_pin.base", "ckc_pin.base.interrupt",
     }  # fmt: skip
     assert not modules & (VIEW | {"click", "numpy", "pinocchio", "scipy", "typing"})
 
@@ -49,7 +49,7 @@ def test_importing_loads_nothing_of_size() -> None:
 def test_what_is_loaded_later_is_there() -> None:
     code = "import ckc_pin; assert set(ckc_pin.__all__) <= set(dir(ckc_pin)); from ckc_pin import *; simulate; "
     modules, _ = _modules(f"{code} assert not hasattr(ckc_pin, 'simulated'); {LIST}")
-    assert "ckc_pin.simulation" in modules
+    assert "ckc_pin.run.simulate" in modules
 
 
 def test_terms_need_no_scipy() -> None:
@@ -68,7 +68,7 @@ def test_a_run_in_json_loads_no_pictures() -> None:
 
 def test_a_command_loads_no_other_one() -> None:
     modules, _ = _modules(RUN, "run", "five_bar/swing", "--set", "t_end=0.01", "--json")
-    shared = {"app", "exits", "options", "output", "signals"}
+    shared = {"app", "arguments", "exits", "options", "output", "signals", "tables"}
     assert {name for name in modules if name.startswith("ckc_pin.cli.")} == {
         f"ckc_pin.cli.{x}" for x in {*shared, "run"}
     }

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, Mechanism, Tracking, gain_locus, linearize, load, load_scene, plot, terms
-from ckc_pin.simulation.scene_parts import scene_controller
+from ckc_pin.scene.parts import scene_controller
 
 
 def test_a_locus_without_imaginary_parts_shows_no_rounding() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Run, check, floquet, gain_locus, linearize, plot
-from ckc_pin.simulation.sway import sways
+from ckc_pin.linear.mode_animation import sways
 from tests.analytic.small_models import plate_on_springs
 from tests.contract.helpers.command import ckc
 
@@ -225,7 +225,7 @@ def test_figures_show_poles_modes_and_the_locus() -> None:
 def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_period_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ckc_pin.simulation.sway.LARGEST", 0.01)
+    monkeypatch.setattr("ckc_pin.linear.mode_animation.LARGEST", 0.01)
     model = linearize(plate_on_springs(tmp_path))  # with dampers, so that not all coordinates are in phase
     figure, sways_in_time = plot(model)["modes"], sways(model)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [

@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 
 from ckc_pin import CkcError, Run, check, load, simulate
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.summary import to_json
+from ckc_pin.base.toml import by_coordinate, convert
+from ckc_pin.cli.tables import profile_table
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.library import library
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.toml import by_coordinate, convert
-from ckc_pin.simulation.report import profile_table, to_json
-from ckc_pin.simulation.run_file import RunMeta, hashes_of
-from ckc_pin.simulation.scene import make_scene
+from ckc_pin.run.run_file import RunMeta, hashes_of
+from ckc_pin.scene.scene import make_scene
 
 NUMBERS = [float("nan"), float("inf"), -float("inf"), 0, -1, 5e-324, 1e-300, 1e300, 1.7e308, 1e12, 1e-12, 1e9, 2**63,
            10**40, True]  # fmt: skip

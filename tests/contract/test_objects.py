@@ -13,9 +13,8 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, Run, Simulator, State, Terms, check, load, load_scene, simulate
-from ckc_pin.mechanism.card import Card
+from ckc_pin.base.summary import Card, in_notebook
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.simulation.notebook import in_notebook
 from ckc_pin.view.inline import Figures, Playback
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc

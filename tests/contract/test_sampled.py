@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, NumericalError, Sampled, Terms, simulate
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Controller, Q, set_point, tracking
 from tests.conftest import assert_close
 from tests.contract.helpers.bad import Bad, expect

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, NumericalError, Simulator, Terms, as_ivp, load_scene, simulate
-from ckc_pin.simulation.simulator import State
+from ckc_pin.run.simulator import State
 from tests.conftest import assert_close
 from tests.regression.test_reference_cases import first_top_pin
 

@@ -17,8 +17,8 @@ import pytest
 
 import ckc_pin
 from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
+from ckc_pin.base.atomic_files import UNFINISHED, written_whole
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.whole_file import UNFINISHED, written_whole
 
 # --- numbers -----------------------------------------------------------------------------------------
 
@@ -192,7 +192,7 @@ def _saved(tmp_path: Path) -> Path:
 
 
 def _with_meta(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    from ckc_pin.simulation.run_file import RunMeta, hashes_of
+    from ckc_pin.run.run_file import RunMeta, hashes_of
 
     with np.load(path) as data:
         content = {name: data[name] for name in data.files}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
 from tests.conftest import assert_close
 from tests.convergence.steps import steps_of

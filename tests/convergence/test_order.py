@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.simulation import loop_tables
-from ckc_pin.simulation.prepare import Prepared, prepare
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.run import loop_tables
+from ckc_pin.run.prepare import Prepared, prepare
+from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
 from tests.convergence.steps import steps_of
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import msgspec
 
+from ckc_pin.base.toml import by_coordinate
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.toml import by_coordinate
-from ckc_pin.simulation.scene_spec import SceneSpec
+from ckc_pin.scene.spec import SceneSpec
 from tests.contract.helpers.command import ckc
 
 BLOCK = re.compile(r"^( *)(```+|~~~+)(\{?[\w-]+\}?)[^\n]*\n(.*?)^\1\2 *$", re.MULTILINE | re.DOTALL)

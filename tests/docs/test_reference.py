@@ -12,7 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import errors
 from ckc_pin.mechanism.spec import LoopType
-from ckc_pin.simulation.run_file import ARRAYS, OPTIONAL, OTHERS
+from ckc_pin.run.run_file import ARRAYS, OPTIONAL, OTHERS
 from scripts.site import api, commands, keys
 from scripts.site.gallery import ROOT
 from scripts.site.insert import INSERTS, LINE

@@ -15,8 +15,8 @@ import pytest
 import xarray as xr
 
 import ckc_pin
+from ckc_pin.ensembles.members import Members
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.ensembles.members import Members
 from tests.contract.helpers.command import ckc
 from tests.ensembles.test_sweep import results, written
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ckc_pin.ensembles.ensemble import sweep_task
+from ckc_pin.ensembles.importance import importance
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.ensembles.ensemble import sweep_task
-from ckc_pin.simulation.ensembles.importance import importance
 from tests.contract.helpers.command import ckc
 from tests.contract.test_parameters import folder
 

@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 import ckc_pin
-from ckc_pin.interrupt import uninterrupted_thread
-from ckc_pin.mechanism.whole_file import temporary_folder
-from ckc_pin.simulation.ensembles import cluster, members, store_layout, worst
-from ckc_pin.simulation.ensembles.ensemble import run_sweep, sweep_task
+from ckc_pin.base.atomic_files import temporary_folder
+from ckc_pin.base.interrupt import uninterrupted_thread
+from ckc_pin.ensembles import cluster, members, store_layout, worst
+from ckc_pin.ensembles.ensemble import run_sweep, sweep_task
 from tests.ensembles.test_sweep import results, written
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import ckc_pin
+from ckc_pin.codegen.library import compiled
+from ckc_pin.ensembles.members import DONE, FAILED, STOPPED, Members
+from ckc_pin.ensembles.outputs import SHORT
+from ckc_pin.ensembles.spec import OutputSpec
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.generated.library import compiled
-from ckc_pin.simulation.ensembles.members import DONE, FAILED, STOPPED, Members
-from ckc_pin.simulation.ensembles.outputs import SHORT
-from ckc_pin.simulation.ensembles.spec import OutputSpec
 from scripts.experiments.generated_sizes import ring
 from tests.contract.test_parameters import folder
 

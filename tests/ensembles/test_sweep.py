@@ -297,7 +297,7 @@ class Dies:
 
 
 def test_sampling_a_million_members_is_bounded_by_the_chunks(tmp_path: Path) -> None:
-    from ckc_pin.simulation.ensembles.ensemble import sweep_task
+    from ckc_pin.ensembles.ensemble import sweep_task
 
     task = sweep_task(written(tmp_path, members=10**6))
     members = task.members(1)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ckc_pin.base.sources import Sources
+from ckc_pin.ensembles.spec import sweep_of
+from ckc_pin.ensembles.variables import Variables
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.simulation.ensembles.spec import sweep_of
-from ckc_pin.simulation.ensembles.variables import Variables
 
 MANY = 20_000
 

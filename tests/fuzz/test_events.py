@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import ckc_pin
-from ckc_pin.simulation import Run
+from ckc_pin import Run
 from scripts.experiments.fuzz.events import beside_a_turn, between_rows, located, on_both_sides
 from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion

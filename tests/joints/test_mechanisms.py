@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from ckc_pin import Run, Simulator, load, simulate
-from ckc_pin.generated.library import compiled
+from ckc_pin.codegen.library import compiled
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS

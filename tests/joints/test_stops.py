@@ -12,8 +12,8 @@ from scipy.optimize import nnls
 from scipy.special import ellipk
 
 from ckc_pin import InputError, Run, load, sensitivities, simulate
-from ckc_pin.simulation.scene_spec import SolverSpec
-from ckc_pin.simulation.stops import Stop, explain
+from ckc_pin.run.stop_reasons import Stop, explain
+from ckc_pin.scene.spec import SolverSpec
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS, Make, slide

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from ckc_pin import load_scene
-from ckc_pin.simulation.ivp import Ivp, as_ivp
-from ckc_pin.simulation.prepare import Prepared, prepare
+from ckc_pin.run.ivp import Ivp, as_ivp
+from ckc_pin.run.prepare import Prepared, prepare
 
 
 def started(scene: str, changes: dict[str, Any] | None = None) -> Prepared:

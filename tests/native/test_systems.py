@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ckc_pin.dynamics import Terms, dae_acceleration
-from ckc_pin.simulation.scene import catalogue, load_scene
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.scene import catalogue, load_scene
 from tests.native.loops import both, started
 
 FORMULATIONS = [{"formulation": "dae"}, {"formulation": "reduced"}, {"formulation": "spf"}]

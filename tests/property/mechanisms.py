@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.sources import Sources
 from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, TreeSpec
 from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec, JointSpec, SpringSpec

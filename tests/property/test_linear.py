@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin.dynamics import Terms, dae_acceleration, multipliers
 from ckc_pin.kinematics.sigma import nearest, shortest
+from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.native.plant import Plant
-from ckc_pin.simulation.linear_model import linear_model
 from tests.analytic.five_bar import Array
 from tests.property.mechanisms import Closed, closed_mechanism
 from tests.property.strategies import TYPES, seeds

@@ -13,10 +13,10 @@ from sksundae.ida import IDA
 
 from ckc_pin import Run, load, simulate
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.simulation.initial import Start
-from ckc_pin.simulation.ivp import Dae, as_ivp
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.run.ivp import Dae, as_ivp
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.initial import Start
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark.peers.ida import Stabilised
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.regression.reference import trajectory

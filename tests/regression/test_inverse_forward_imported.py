@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ckc_pin import InputError, MechanismError, inverse_dynamics, load, simulate
+from ckc_pin.base.sources import resolve
 from ckc_pin.formats.importing import Draft, read, write
-from ckc_pin.mechanism.sources import resolve
 from scripts.experiments.published_robots_motion import given_back
 from tests.contract.helpers.models import TWO_ARMS, model
 from tests.contract.test_import_urdf import FOUR_BAR, PIN, YAML, imported, legs, spatial, two_legs

@@ -12,7 +12,7 @@ import pytest
 from ckc_pin import InputError, Mechanism, Run, check, load, simulate
 from ckc_pin.dynamics import Terms, h_gradient, stable_equilibrium
 from ckc_pin.mechanism.library import library, shipped
-from ckc_pin.simulation.scene import catalogue, scene_names
+from ckc_pin.scene.scene import catalogue, scene_names
 
 # coordinates, freedoms, closure rows, rank: what the literature, or counting, says
 MOBILITY = {

@@ -10,7 +10,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import NumericalError, simulate
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.regression.test_dae import IN_LINE, by_slider
 from tests.sensitivity.changed import NUMBERS, differentiated, written
 from tests.sensitivity.sliders import force, joint, sliders

@@ -12,7 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import InputError, simulate
 from ckc_pin.mechanism.parameters import values_of, with_components
-from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.sensitivity.sensitivities import sensitivities
 from tests.sensitivity.changed import TIGHT
 
 CLOSE = 1e-8  # of the largest

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import ckc_pin
-from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.sensitivity.sensitivities import sensitivities
 from ckc_pin.view.sensitivity_figure import draw_sensitivities, save_sensitivities
 from tests.sensitivity.changed import written
 

@@ -16,8 +16,8 @@ from scipy.special import mathieu_a
 
 from ckc_pin import InputError, load_scene
 from ckc_pin.control.controllers import Tracking
-from ckc_pin.simulation.floquet import floquet
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.sensitivity.floquet import floquet
 from tests.sensitivity.sliders import sliders
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
@@ -109,7 +109,7 @@ def test_a_scene_is_taken_as_its_name_is(tmp_path: Path) -> None:
 def test_before_its_variational_equations_the_motion_is_run_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = import_module("ckc_pin.simulation.floquet")  # whose name is also a function's
+    module = import_module("ckc_pin.sensitivity.floquet")  # whose name is also a function's
     monkeypatch.setattr(module, "sensitivities", lambda *_: pytest.fail("what they cost"))
     with pytest.raises(InputError, match="is none: after it y is off by"):
         floquet(written(tmp_path, g, 0.2), 0.9)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, simulate
-from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.sensitivity.sensitivities import sensitivities
 from tests.sensitivity.changed import TIGHT, written
 
 CLOSE = 1e-6  # of the largest: one-sided differences

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import simulate
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 
 FOLDER = "tests/sensitivity/loops"
 HEIGHT = "link.la1.com.z"

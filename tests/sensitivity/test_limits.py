@@ -12,7 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import simulate
 from ckc_pin.mechanism.parameters import values_of
-from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.sensitivity.sensitivities import sensitivities
 from tests.sensitivity.changed import TIGHT
 
 CLOSE = 1e-6  # of the largest: of a fast motion, whose differences have 1e-7

@@ -12,7 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import InputError, MechanismError, simulate
 from ckc_pin.mechanism.parameters import values_of, with_components
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import TIGHT, written
 from tests.sensitivity.spatial import arms, tethered
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import simulate
-from ckc_pin.simulation.sensitivities import sensitivities
+from ckc_pin.sensitivity.sensitivities import sensitivities
 
 LINK = """<link name="{name}"><inertial><origin xyz="{x} 0 0"/><mass value="{m}"/>
 <inertia ixx="1e-4" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""

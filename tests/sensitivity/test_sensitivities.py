@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, simulate
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import NUMBERS, TIGHT, differentiated, written
 from tests.sensitivity.spatial import tethered
 

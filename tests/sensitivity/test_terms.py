@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ckc_pin import load, simulate
-from ckc_pin.generated.library import compiled
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.codegen.library import compiled
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import TIGHT, written
 from tests.sensitivity.spatial import arms, tethered
 
@@ -93,7 +93,7 @@ def test_of_one_parameter_and_of_several_is_the_same() -> None:
 def test_terms_that_are_compiled_on_the_way(there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Say from there on how the motion changes, also where those of the motion alone were compiled before."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(sys.modules["ckc_pin.simulation.simulate"], "REPAYS", 300)
+    monkeypatch.setattr(sys.modules["ckc_pin.run.simulate"], "REPAYS", 300)
     scene, names = written(tmp_path), ["link.crank.mass", "joint.b.armature", "initial.q.a"]
     if there:
         compiled(load(tmp_path / "bars.toml"))

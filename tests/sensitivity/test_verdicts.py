@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, simulate
-from ckc_pin.simulation.sensitivities import Sensitivities, sensitivities
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.sliders import force, joint, sliders
 
 TIGHT = {"solver.rtol": 1e-11, "solver.atol": 1e-13}

@@ -10,20 +10,20 @@ import numpy as np
 from ckc_pin.analysis.map.aspect import Grid
 from ckc_pin.analysis.map.domain import Domain
 from ckc_pin.analysis.map.loci import seen
+from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import PointPath
+from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.mapped import Approach, Locus, Path
 from ckc_pin.kinematics.nodes import shapes
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.batch import evaluate
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.many import evaluate
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, BoolArray
-from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
-from ckc_pin.simulation.workspace import DesiredCheck, follow_desired
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import Scene
 
 __all__ = ["Wanted", "add_path", "read_wanted"]
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ckc_pin.analysis.map.domain import Domain
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.kinematics.nodes import SHORTEST, Nodes, follow, nodes_at
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["CORNERS", "HURRIED", "SIDES", "Grid", "fill", "flood"]
 

@@ -14,16 +14,16 @@ from ckc_pin.analysis.map.domain import Domain, joint_axis, middles, reach
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.value import located, map_value, name_of
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.validation import require_callable, require_kind
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import nodes_at, solutions
-from ckc_pin.mechanism.kinds import require_callable, require_kind
-from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, IntArray
-from ckc_pin.simulation.scene import TAKES, Scene, load_scene
+from ckc_pin.scene.scene import TAKES, Scene, load_scene
 
 __all__ = ["singularity_map"]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.kinematics.extended import Task
 from ckc_pin.kinematics.mapped import Axis
-from ckc_pin.mechanism.tree import Array, IntArray
 
 __all__ = ["Domain", "joint_axis", "reach"]
 

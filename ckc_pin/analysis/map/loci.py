@@ -17,13 +17,13 @@ from ckc_pin.analysis.map.domain import Domain
 from ckc_pin.analysis.map.progress import Steps
 from ckc_pin.analysis.singular_curve import SingularCurve, trace
 from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.extended import Extended
 from ckc_pin.kinematics.mapped import Kind, Locus
 from ckc_pin.kinematics.nodes import shapes
+from ckc_pin.mechanism.batch import evaluate
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.many import evaluate
 from ckc_pin.mechanism.rank import rank_of, scaled
-from ckc_pin.mechanism.tree import Array, BoolArray, IntArray
 
 __all__ = ["LocusSystem", "find_loci", "seen"]
 

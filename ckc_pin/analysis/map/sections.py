@@ -18,14 +18,14 @@ from ckc_pin.analysis.map.domain import Domain, middles, reach
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.value import located, map_value
+from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Task, extend, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import SHORTEST, follow, nodes_at
-from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array, BoolArray
 
 __all__ = ["Stack", "workspace_sections"]
 

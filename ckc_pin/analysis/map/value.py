@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from ckc_pin.analysis.map.aspect import Grid
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.extended import Extended, Task
 from ckc_pin.kinematics.mapped import Aspect, Locus, Path, SingularityMap, Space
-from ckc_pin.mechanism.many import ManyPoses
+from ckc_pin.mechanism.batch import ManyPoses
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["located", "map_value", "name_of"]
 

@@ -15,11 +15,11 @@ from ckc_pin.analysis.precision.advice import Advice, advise
 from ckc_pin.analysis.precision.motion import Motion, PrecisionRow, apart, move, no_motion, on_span
 from ckc_pin.analysis.precision.reference import Reference, find_reference
 from ckc_pin.analysis.precision.settings import changed, off_manifold, settings
+from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.errors import InputError
-from ckc_pin.interrupt import acknowledge
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import Scene, load_scene
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["BUDGET", "WorkPrecision", "work_precision"]
 

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.errors import CkcError
-from ckc_pin.interrupt import interrupt_again
-from ckc_pin.mechanism.tree import Array, Tree
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.mechanism.tree import Tree
+from ckc_pin.run.prepare import prepare
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import run_prepared
+from ckc_pin.scene.scene import Scene
 
 __all__ = ["INSTANTS", "Apart", "Motion", "PrecisionRow", "apart", "move", "no_motion", "on_span"]
 

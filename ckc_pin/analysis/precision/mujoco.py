@@ -14,10 +14,10 @@ import pinocchio as pin
 from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.analysis.precision.settings import off_manifold
 from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.scene import Scene
+from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.scene import Scene
 
 __all__ = ["StateMap", "missing", "model_of", "rows", "set_up", "stepper"]
 

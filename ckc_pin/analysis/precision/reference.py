@@ -12,10 +12,10 @@ import numpy as np
 
 from ckc_pin.analysis.precision.motion import INSTANTS, Motion, apart, move, on_span
 from ckc_pin.analysis.precision.settings import FORMULATIONS, changed, off_manifold
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene
+from ckc_pin.run.run import Run
+from ckc_pin.scene.scene import Scene
 
 __all__ = ["TIGHT", "Reference", "confirm", "find_reference", "said"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ckc_pin.simulation.scene import Scene, make_scene, with_changes
+from ckc_pin.scene.scene import Scene, make_scene, with_changes
 
 __all__ = ["FORMULATIONS", "Setting", "changed", "off_manifold", "settings"]
 

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from ckc_pin.analysis.precision.motion import Motion
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 
 __all__ = ["REPEATS", "SHORT", "Stepper"]
 

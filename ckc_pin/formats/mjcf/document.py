@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from ckc_pin.base.toml import read_text
+from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.files import Files, expand
-from ckc_pin.mechanism.strict_xml import strict_xml
-from ckc_pin.mechanism.toml import read_text
 
 __all__ = ["ASSEMBLED", "LARGEST", "Document"]
 

@@ -9,6 +9,7 @@ from itertools import groupby
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import frame, number, unique, vector
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tendons import Tendon, Tendons
@@ -17,7 +18,6 @@ from ckc_pin.formats.orientation import from_quaternion
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_frames import Frame
 from ckc_pin.mechanism.spec_parts import CouplingSpec
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Equalities"]
 

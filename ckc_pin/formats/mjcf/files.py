@@ -7,9 +7,9 @@ from pathlib import Path
 from stat import S_ISREG
 from xml.etree.ElementTree import Element
 
+from ckc_pin.base.toml import read_text
+from ckc_pin.base.xml import MAX_DEPTH, strict_xml
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.strict_xml import MAX_DEPTH, strict_xml
-from ckc_pin.mechanism.toml import read_text
 
 __all__ = ["Files", "expand"]
 

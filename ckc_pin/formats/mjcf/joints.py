@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import number
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.orientation import from_axis_angle
 from ckc_pin.formats.urdf.elements import UNLIMITED, JointLimits
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Joint", "is_free_root"]
 

@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import number, some, unique, vector
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.joints import Joint, is_free_root
@@ -22,7 +23,6 @@ from ckc_pin.formats.mjcf.shapes import draw
 from ckc_pin.formats.orientation import from_quaternion, to_rpy
 from ckc_pin.formats.urdf.elements import UNLIMITED, Body, JointLimits, add_inertial, add_joint, add_link
 from ckc_pin.mechanism.spec_parts import JointSpec, SpringSpec
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["MjcfTree", "Placed"]
 

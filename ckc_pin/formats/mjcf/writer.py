@@ -6,10 +6,10 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.mjcf.writer_loops import Sites, add_loops, add_springs, numbers, quaternion
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["mjcf"]
 

@@ -11,6 +11,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -18,7 +19,6 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["Sites", "add_loops", "add_springs", "in_one_plane", "numbers", "quaternion"]
 

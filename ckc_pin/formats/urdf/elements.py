@@ -8,9 +8,9 @@ from xml.etree.ElementTree import Element, SubElement
 
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import number
 from ckc_pin.formats.orientation import to_rpy
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["UNLIMITED", "Body", "JointLimits", "add_inertial", "add_joint", "add_link", "add_shape", "numbers"]
 

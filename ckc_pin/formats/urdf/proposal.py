@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import Draft, vector
 from ckc_pin.kinematics.assembly import assemble
 from ckc_pin.mechanism.closure import ClosureBuilder
@@ -18,7 +19,7 @@ from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
-from ckc_pin.mechanism.tree import Array, Tree
+from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["propose"]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+from ckc_pin.base.toml import read_text
+from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft, safe_name, some
 from ckc_pin.formats.urdf.closing_frames import take_closing_frames
 from ckc_pin.formats.urdf.names import Names
 from ckc_pin.formats.urdf.rbda_loops import take_loops
 from ckc_pin.formats.urdf.robot_yaml import take_yaml
-from ckc_pin.mechanism.strict_xml import strict_xml
-from ckc_pin.mechanism.toml import read_text
 from ckc_pin.mechanism.urdf import parse
 
 __all__ = ["read_urdf", "urdf_beside"]

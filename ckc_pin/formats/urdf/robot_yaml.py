@@ -13,11 +13,11 @@ from xml.etree.ElementTree import Element, SubElement
 
 import msgspec
 
+from ckc_pin.base.toml import convert
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.draft import Draft, some, unique
 from ckc_pin.formats.urdf.names import Names
 from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.toml import convert
 
 __all__ = ["take_yaml"]
 

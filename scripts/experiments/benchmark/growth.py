@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.generators import GeneratorSpec, generate
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.simulate import run_prepared
+from ckc_pin.run.prepare import prepare
+from ckc_pin.run.simulate import run_prepared
+from ckc_pin.scene.scene import load_scene
 
 __all__ = [
     "FAMILIES",

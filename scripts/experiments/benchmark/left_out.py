@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.dynamics.formulations import multipliers
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import CkcError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import Ivp, as_ivp
-from ckc_pin.simulation.scene import Scene, catalogue, load_scene
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.ivp import Ivp, as_ivp
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.scene import Scene, catalogue, load_scene
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 

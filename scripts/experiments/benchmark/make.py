@@ -15,8 +15,8 @@ from joblib import Memory
 
 from ckc_pin.analysis.precision.motion import no_motion
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark import analysis, growth, left_out, ours
 from scripts.experiments.benchmark.figure import draw, draw_growth, draw_main
 from scripts.experiments.benchmark.growth import Growth

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Reference", "reference"]

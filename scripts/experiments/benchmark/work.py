@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.library import compiled
 from ckc_pin.errors import InputError
-from ckc_pin.generated.library import compiled
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.simulation.scene_parts import scene_mechanism
+from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["WORKS", "Budget", "Work"]
 

@@ -9,8 +9,8 @@ from time import perf_counter
 
 from ckc_pin.analysis.precision.motion import move
 from ckc_pin.analysis.precision.settings import changed
+from ckc_pin.codegen.library import compiled
 from ckc_pin.errors import InputError
-from ckc_pin.generated.library import compiled
 from scripts.experiments.benchmark.work import Work
 from scripts.experiments.generated_sizes import empty_cache
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.simulation import Run
+from ckc_pin import Run
 from scripts.experiments.fuzz.read import Model, NoJudge
 from scripts.experiments.fuzz.spatial import Array, IntArray
 

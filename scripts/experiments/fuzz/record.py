@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin import Run
 from ckc_pin.errors import CkcError
-from ckc_pin.simulation import Run
 from scripts.experiments.fuzz.events import beside_a_turn, between_rows, located
 from scripts.experiments.fuzz.joint_forces import Unlike, joint_forces
 from scripts.experiments.fuzz.judge import Judge

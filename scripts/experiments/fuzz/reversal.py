@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 import ckc_pin
+from ckc_pin import Run
 from ckc_pin.errors import CkcError
-from ckc_pin.simulation import Run
 from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
 

@@ -8,7 +8,7 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
-from ckc_pin.simulation import Run
+from ckc_pin import Run
 from scripts.experiments.fuzz.motions import Motion
 from scripts.experiments.fuzz.record import Record, run_motion
 

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import Desired
+from ckc_pin.control.workspace import follow_desired
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
-from ckc_pin.simulation.simulate import simulate
-from ckc_pin.simulation.workspace import follow_desired
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.simulation.ivp import Ivp
+from ckc_pin.run.ivp import Ivp
 from scripts.experiments.paper.experiment import Outcome, Problem, difference, end_of, march
 
 __all__ = ["EPSILONS", "METHODS", "Cost", "Search", "cheapest", "cost_at_equal_error", "study"]

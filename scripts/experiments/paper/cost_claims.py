@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim

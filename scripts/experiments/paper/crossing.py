@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.analysis.singularities import SingularPoint
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import Dae
+from ckc_pin.run.ivp import Dae
 from scripts.experiments.paper.experiment import between, march
 
 __all__ = ["Crossing", "cross"]

@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import newton
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import Force, Ivp, LevelSet
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.run.ivp import Force, Ivp, LevelSet
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.paper.experiment import Problem, between, march
 
 __all__ = ["PERIOD", "Deviation", "FromLast", "OwnSigma", "Setting", "Track", "deviation", "instants", "track"]

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.analysis.singularities import search_singular
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics, Psi
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import PrintedSpf
+from ckc_pin.run.ivp import PrintedSpf
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import march

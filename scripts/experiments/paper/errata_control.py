@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import LevelSet
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_controller
+from ckc_pin.run.ivp import LevelSet
+from ckc_pin.scene.parts import scene_controller
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, march

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ckc_pin.analysis.singularities import search_singular
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.pages import said
 from scripts.experiments.paper.along_eq21 import tracking, widest
 from scripts.experiments.paper.domain import check_psi

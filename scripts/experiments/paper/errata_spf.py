@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import CoriolisVelocity, spf_terms
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, on_level

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
@@ -19,13 +21,11 @@ from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.linear import one_blas_thread
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import find_start
-from ckc_pin.simulation.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
-from ckc_pin.simulation.scene import Scene
-from ckc_pin.simulation.scene_parts import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.run.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
+from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.scene.scene import Scene
 
 __all__ = [
     "W0",

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.tree import Array
 
 __all__ = ["FIVE_BAR", "PRINTED", "Links", "elbow_distance", "links", "wrap"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
+from ckc_pin.base.arrays import Array
+from ckc_pin.run.run import Run
 
 __all__ = ["Record", "derivative", "record"]
 

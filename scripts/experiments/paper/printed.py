@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
+from ckc_pin.base.arrays import Array
 
 __all__ = ["TABLE_I", "Printed"]
 

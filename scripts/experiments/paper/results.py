@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Model, Tracking
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import LevelSet, force_of
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.ivp import LevelSet, force_of
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.pages import said
 from scripts.experiments.paper.along_eq21 import tracking
 from scripts.experiments.paper.claim import Claim

@@ -10,9 +10,9 @@ import numpy as np
 
 from ckc_pin.analysis.certificate import Certificate
 from ckc_pin.analysis.gradient import Bound
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.base.arrays import Array
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import Record

@@ -18,11 +18,11 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.simulation.initial import Start, find_start
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.initial import Start, find_start
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.paper.lyapunov import Record, record
 from scripts.experiments.paper.solutions import Equilibrium, equilibria
 

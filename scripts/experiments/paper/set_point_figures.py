@@ -10,8 +10,8 @@ import numpy as np
 
 from ckc_pin.analysis.certificate import Certificate, rest_height, sublevel_set
 from ckc_pin.analysis.gradient import Bound
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
+from ckc_pin.base.arrays import Array
+from ckc_pin.run.run import Run
 from ckc_pin.view.labels import symbol, with_unit
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.paper.lyapunov import Record

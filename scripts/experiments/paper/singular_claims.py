@@ -12,9 +12,9 @@ import numpy as np
 
 from ckc_pin.analysis.singular_curve import SingularCurve, trace_singular
 from ckc_pin.analysis.singularities import SingularPoint, search_singular
+from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim

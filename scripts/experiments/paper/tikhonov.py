@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import CoriolisVelocity
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
 from scripts.experiments.paper import boundary_layer

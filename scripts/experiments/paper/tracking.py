@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.deviations import PERIOD, Deviation

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
-from ckc_pin.simulation.scene import Scene, load_scene
-from ckc_pin.simulation.scene_parts import scene_controller, scene_mechanism
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.run import Run
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.scene import Scene, load_scene
 from scripts.experiments.paper.deviations import Deviation, Setting, Track, deviation, instants, track
 from scripts.experiments.paper.lyapunov import Record, record
 

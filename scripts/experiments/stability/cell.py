@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ckc_pin import Run, simulate
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.sources import Sources
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation import Run, simulate
-from ckc_pin.simulation.scene import make_scene, with_changes
+from ckc_pin.scene.scene import make_scene, with_changes
 from scripts.experiments.stability.planar import Planar
 from scripts.experiments.stability.reference import Reference
 

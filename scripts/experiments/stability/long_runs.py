@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation import simulate
+from ckc_pin import simulate
+from ckc_pin.base.arrays import Array
 from scripts.experiments.stability.cell import kinetic_energies
 from scripts.experiments.stability.equations import to_absolute
 

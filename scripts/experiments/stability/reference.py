@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.run import Run
+from ckc_pin.base.arrays import Array
+from ckc_pin.run.run import Run
 from scripts.experiments.stability.equations import Control, Reduced, free_motion, miss, to_absolute, uncontrolled
 from scripts.experiments.stability.planar import Planar
 

@@ -13,7 +13,7 @@ import pytest
 import scipy.integrate._ivp.bdf as bdf
 import scipy.integrate._ivp.radau as radau
 
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.paper import cost_claims
 from scripts.experiments.paper.cost import Cost, Search, cheapest, cost_at_equal_error, study
 from scripts.experiments.paper.experiment import Outcome, Problem, difference, end_of, five_bar_problem, march, sample

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load, load_scene
-from ckc_pin.generated.code import Code
+from ckc_pin.codegen.code import Code
 from scripts.experiments.generated_sizes import Size, measure, ring
 
 

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ckc_pin.kinematics.loading import load
-from ckc_pin.simulation.prepare import prepare
-from ckc_pin.simulation.scene import load_scene
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.prepare import prepare
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark import growth, left_out
 from scripts.experiments.benchmark.left_out import module_costs, modules_of, terms_of
 from tests.conftest import assert_close

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.analysis.precision.settings import Setting, changed
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark import make, ours
 from scripts.experiments.benchmark.peers import peers
 from scripts.experiments.benchmark.reference import Reference, reference

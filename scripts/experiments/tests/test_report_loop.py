@@ -66,7 +66,7 @@ def test_it_follows_the_closed_form() -> None:
 
 @compiles
 def test_its_springs_and_its_free_root_move_as_ours() -> None:
-    from ckc_pin.simulation.simulate import simulate
+    from ckc_pin.run.simulate import simulate
 
     for key, t_end in (("andrews", 0.01), ("two_ur5", 0.2)):
         work = next(work for work in WORKS if work.key == key)

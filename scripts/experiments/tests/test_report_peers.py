@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark.peers import Peer, peers
 from scripts.experiments.benchmark.peers.exudyn_plane import in_plane
 from scripts.experiments.benchmark.work import WORKS, Work

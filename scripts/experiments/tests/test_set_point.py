@@ -11,7 +11,7 @@ import pytest
 from ckc_pin.analysis.certificate import Certificate
 from ckc_pin.analysis.gradient import chart_step, explore_branch, gradient_bounds
 from ckc_pin.errors import InputError
-from ckc_pin.simulation.simulate import simulate
+from ckc_pin.run.simulate import simulate
 from scripts.experiments.paper import set_point
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import derivative, record

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.simulation.scene import load_scene
+from ckc_pin.scene.scene import load_scene
 from scripts.experiments.paper import tracking
 from scripts.experiments.paper.deviations import (
     PERIOD,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.frames import Frame
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.exudyn_steps import Steps
 from scripts.experiments.benchmark.peers.stepping import start_of
 from scripts.experiments.benchmark.work import Work

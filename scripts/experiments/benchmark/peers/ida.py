@@ -20,11 +20,11 @@ import numpy as np
 
 from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.analysis.precision.stepping import REPEATS, SHORT
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.mechanism.linear import one_blas_thread
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.ivp import Dae, as_ivp
+from ckc_pin.run.ivp import Dae, as_ivp
 from scripts.experiments.benchmark import ours
 from scripts.experiments.benchmark.work import Work
 

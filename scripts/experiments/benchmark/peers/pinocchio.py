@@ -11,9 +11,9 @@ import pinocchio as pin
 
 from ckc_pin.analysis.precision.motion import Motion
 from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
 from scripts.experiments.benchmark.work import Work
 

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.analysis.precision.motion import Motion, no_motion
+from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.tree import Array
 from scripts.experiments.benchmark.peers.compiled import program, version
 from scripts.experiments.benchmark.peers.pinocchio import closed, not_closed
 from scripts.experiments.benchmark.peers.stepping import start_of

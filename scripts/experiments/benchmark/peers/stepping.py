@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from ckc_pin.analysis.precision.motion import Motion, no_motion
 from ckc_pin.analysis.precision.stepping import Stepper
-from ckc_pin.mechanism.tree import Array
-from ckc_pin.simulation.initial import find_start
+from ckc_pin.base.arrays import Array
+from ckc_pin.scene.initial import find_start
 from scripts.experiments.benchmark.work import INSTANTS, Work
 
 __all__ = ["CONTROLLED", "divided", "halved", "start_of", "stepped"]

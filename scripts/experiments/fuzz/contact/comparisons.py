@@ -7,7 +7,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from ckc_pin.simulation import Run
+from ckc_pin import Run
 from scripts.experiments.fuzz.contact.cases import Case
 from scripts.experiments.fuzz.contact.judges import JOINT_EVENTS, columns_of, start_rates
 from scripts.experiments.fuzz.contact.slides import Slides

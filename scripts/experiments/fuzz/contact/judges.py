@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.simulation import Run
+from ckc_pin import Run
 from scripts.experiments.fuzz.contact.cases import Case
 from scripts.experiments.fuzz.motion import REDUNDANT, Motion
 from scripts.experiments.fuzz.read import Model

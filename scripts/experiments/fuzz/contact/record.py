@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
+from ckc_pin import Run
 from ckc_pin.errors import CkcError
-from ckc_pin.simulation import Run
 from scripts.experiments.fuzz.contact import comparisons, judges
 from scripts.experiments.fuzz.contact.cases import Case, Draw
 from scripts.experiments.fuzz.contact.draw_chains import draw_closed, draw_jammed, draw_pendulums

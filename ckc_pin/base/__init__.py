@@ -1,0 +1,1 @@
+"""Foundations without mechanics: arrays, validation, TOML and XML, atomic files, summaries, linear algebra."""

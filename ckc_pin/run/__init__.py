@@ -1,0 +1,1 @@
+"""From a scene to a `Run`: prepare, simulate, step, record and save."""

@@ -1,0 +1,302 @@
+"""The three formulations as y' = f(t, y) in NumPy: the readable reference, for SciPy's solvers or any other.
+
+============ ==================== =====================================================
+class        y                    equations
+============ ==================== =====================================================
+`LevelSet`   q, q_dot             eq. 6 on the level set phi = w(0) exp(-t / epsilon): with
+                                  w(0) = 0 the reduced model, else the SPF in eq. 17's
+                                  coordinates, whose w is known in closed form
+`PrintedSpf` q, q_dot, z          eq. 8 as printed
+`Dae`        q', v'               eq. 1, its closure differentiated twice; nothing is projected
+============ ==================== =====================================================
+
+The step loop has the same in C++, and nothing of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import a_kind, is_number
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.dynamics.formulations import (
+    CoriolisVelocity,
+    dae_acceleration,
+    reduced_acceleration,
+    spf_terms,
+    spf_z_dot,
+)
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.kinematics.chart import Chart
+from ckc_pin.kinematics.sigma import move
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.scene.scene import Scene, as_scene
+
+__all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
+
+Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
+
+
+class Ivp(Protocol):
+    """An initial value problem and what reads its states.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    y0 : array
+        At t = 0.
+    t_span : (0, t_end)
+        s.
+    counts : dict of str to int
+        "newton": corrections of sigma so far.
+    """
+
+    mechanism: Mechanism
+    y0: Array
+    t_span: tuple[float, float]
+    counts: dict[str, int]
+
+    def f(self, t: float, y: Array) -> Array:
+        """y' at (t, y); NaN where it does not exist, on which solvers shorten their steps."""
+
+    def terms(self, t: float, y: Array) -> Terms:
+        """Terms at a state; NumericalError where they do not exist."""
+
+    def velocity(self, t: float, y: Array) -> Array:
+        """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
+
+
+def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) -> Ivp:
+    """Return a scene's motion as an initial value problem.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, its shipped name or its path; its solver and its events have no meaning here.
+    changes : mapping, optional
+        Values by dotted key.
+
+    Raises
+    ------
+    InputError, MechanismError
+        The scene cannot be run as written, its controller is sampled, or its joints stick or stop.
+    NumericalError
+        Its start is singular.
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> problem = as_ivp("five_bar/swing", {"formulation": "reduced"})
+    >>> solution = solve_ivp(problem.f, problem.t_span, problem.y0, "LSODA", rtol=1e-8, atol=1e-10)
+    >>> problem.terms(2.0, solution.y[:, -1]).q_tree
+    """
+    scene = as_scene(scene, changes, "as_ivp")
+    spec, mechanism = scene.spec, scene_mechanism(scene)
+    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
+        raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")
+    smoothing = spec.friction_smoothing
+    if mechanism.joints.has_events(smoothing):
+        raise InputError(
+            f"as_ivp: joints of {mechanism.name} stick or stop, which is no function of t and y; without stops give "
+            "friction_smoothing"
+        )
+    start = find_start(mechanism, scene)
+    force = force_of(scene_controller(scene, mechanism), scene_actuation(scene, mechanism))
+    if smoothing is not None:
+        force = _with_friction(force, mechanism, smoothing)
+    span = (0.0, spec.t_end)
+    if spec.formulation == "dae":
+        return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, span)
+    if spec.formulation == "reduced":
+        return LevelSet(mechanism, start.at, start.q_dot, force, span)
+    how = (spec.epsilon, start.w, spec.coriolis_velocity)
+    if spec.spf_coordinates == "z":
+        return PrintedSpf(mechanism, start.at, start.q_dot, force, span, *how)
+    return LevelSet(mechanism, start.at, start.q_dot, force, span, *how)
+
+
+def force_of(controller: Controller | TorqueController | None, actuation: Actuation) -> Force:
+    """Return u' on the tree as a function of (t, terms)."""
+    if controller is None:
+        return lambda t, terms: actuation.none.u_tree
+    torques = gives_tau(controller)
+    law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
+    act = actuation.drive if torques else actuation.apply
+    return lambda t, terms: act(terms, law(t, terms)).u_tree
+
+
+def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:
+    return lambda t, terms: force(t, terms) + mechanism.joints.smooth_friction(terms.v_tree, smoothing)
+
+
+@dataclass
+class LevelSet:
+    """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
+
+    z is found on the level set from the state evaluated last, along the straight line in q.
+    """
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    t_span: tuple[float, float]
+    epsilon: float = 1.0
+    w0: Array | None = None
+    convention: CoriolisVelocity = "rho"
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self._d, self._last = self.mechanism.d, self.initial
+        self._off = self.w0 is not None and bool(np.any(self.w0))
+        self._chart = Chart(self.mechanism.tree, self.initial.partition.q, self.initial.q_tree)
+        self.y0 = np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
+
+    def w(self, t: float) -> Array:
+        """Eq. 17's second line, exact, shape (rows,)."""
+        w0 = np.zeros(self.mechanism.closure.rows) if self.w0 is None else self.w0
+        return w0 * np.exp(-t / self.epsilon)
+
+    def close(self, t: float, numbers: Array) -> Kinematics:
+        """Return the configuration at q on the level set phi(q, z) = w(t)."""
+        step = self._chart.step(self._last.q_tree, numbers)
+        found = move(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
+        self.counts["newton"] += found.iterations
+        if found.verdict != "converged":
+            tree = self.mechanism.tree
+            where = tree.named(tree.to_coordinates(found.at.q_tree))
+            raise NumericalError(f"move(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
+        self._last = found.at
+        return found.at
+
+    def terms(self, t: float, y: Array) -> Terms:
+        y = _state(t, y, self.y0)
+        at, q_dot = self.close(t, y[: self._d]), y[self._d :]
+        if self._off:
+            return spf_terms(self.mechanism, at, q_dot, self.epsilon, self.w(t), self.convention)
+        return Terms(self.mechanism, at, at.rho @ q_dot)
+
+    def velocity(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
+        terms = self.terms(t, y)
+        return _spf_velocity(terms, y[self._d :], self.epsilon, self.w(t)) if self._off else terms.v_tree
+
+    def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
+        try:
+            terms, q_dot = self.terms(t, y), y[self._d :]
+            actual = self._off and self.convention == "actual"
+            q_ddot = reduced_acceleration(terms, self.force(t, terms), q_dot if actual else None)
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        return np.concatenate([self._chart.rate(terms.q_tree, q_dot), q_ddot])
+
+
+@dataclass
+class PrintedSpf:
+    """Eq. 8 as printed: y = (q, q_dot, z), with phi = w0 at the start. No free root: its rotation is no number."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    q_dot: Array
+    force: Force
+    t_span: tuple[float, float]
+    epsilon: float
+    w0: Array
+    convention: CoriolisVelocity = "rho"
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self._d, partition, place = self.mechanism.d, self.mechanism.partition, self.mechanism.tree.place
+        self._q, self._z = place[partition.q], place[partition.z]
+        self.y0 = np.concatenate([self.initial.q_tree[self._q], self.q_dot, self.initial.q_tree[self._z]])
+
+    def terms(self, t: float, y: Array) -> Terms:
+        y, d, q_tree = _state(t, y, self.y0), self._d, np.empty(self.mechanism.tree.nq)
+        q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
+        at = self.mechanism.kinematics(q_tree)
+        return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
+
+    def velocity(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
+        # with the exact w: what a tolerance leaves phi off by would be divided by epsilon
+        w = self.w0 * np.exp(-t / self.epsilon)
+        return _spf_velocity(self.terms(t, y), y[self._d : 2 * self._d], self.epsilon, w)
+
+    def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
+        if not np.all(np.isfinite(y)):
+            return np.full_like(y, np.nan)
+        terms, q_dot = self.terms(t, y), y[self._d : 2 * self._d]
+        try:
+            u_tree = self.force(t, terms)
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        q_ddot = reduced_acceleration(terms, u_tree, q_dot if self.convention == "actual" else None)
+        return np.concatenate([q_dot, q_ddot, spf_z_dot(terms.at, q_dot, self.epsilon, terms.phi)])
+
+
+@dataclass
+class Dae:
+    """Eq. 1: y = (q', v'). What is off the closure stays, and grows with time squared."""
+
+    mechanism: Mechanism
+    initial: Kinematics
+    v_tree: Array
+    force: Force
+    t_span: tuple[float, float]
+    counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
+
+    def __post_init__(self) -> None:
+        self.y0 = np.concatenate([self.initial.q_tree, self.v_tree])
+
+    def terms(self, t: float, y: Array) -> Terms:
+        y, tree = _state(t, y, self.y0), self.mechanism.tree
+        q_tree = y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])
+        return Terms(self.mechanism, self.mechanism.kinematics(q_tree), y[tree.nq :])
+
+    def velocity(self, t: float, y: Array) -> Array:
+        return _state(t, y, self.y0)[self.mechanism.tree.nq :]
+
+    def f(self, t: float, y: Array) -> Array:
+        y = _state(t, y, self.y0)
+        if not np.all(np.isfinite(y)):
+            return np.full_like(y, np.nan)
+        terms = self.terms(t, y)
+        try:
+            acceleration = dae_acceleration(terms, self.force(t, terms))
+        except NumericalError:
+            return np.full_like(y, np.nan)
+        return np.concatenate([self.mechanism.tree.configuration_rate(terms.q_tree, terms.v_tree), acceleration])
+
+
+def _state(t: Any, y: Any, y0: Array) -> Array:
+    """Return a state as numbers (InputError where it, or t, is none)."""
+    if not is_number(t):
+        raise InputError(f"as_ivp: t: {a_kind(t)} was given; it takes a number, s")
+    try:
+        found = np.asarray(y, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"as_ivp: y: {a_kind(y)} was given; it takes {len(y0)} numbers, as y0 has") from None
+    if found.shape != y0.shape:
+        raise InputError(f"as_ivp: y: shape {found.shape} was given; it takes {len(y0)} numbers, as y0 has")
+    return found
+
+
+def _spf_velocity(terms: Terms, q_dot: Array, epsilon: float, w: Array) -> Array:
+    velocity = terms.at.rho @ q_dot
+    velocity[terms.at.partition.z] = spf_z_dot(terms.at, q_dot, epsilon, w)
+    return velocity

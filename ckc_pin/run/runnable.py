@@ -1,0 +1,53 @@
+"""Whether a scene can be run from where it starts, under what controls it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.sampled import Sampled
+from ckc_pin.dynamics.formulations import refuse_massless
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
+from ckc_pin.mechanism.warnings import beyond_stops
+from ckc_pin.scene.initial import Start, find_start, require_chart
+from ckc_pin.scene.scene import Scene
+
+__all__ = ["require_runnable"]
+
+
+def require_runnable(
+    scene: Scene,
+    mechanism: Mechanism,
+    controller: Controller | TorqueController | Sampled | None,
+    actuation: Actuation,
+    *,
+    free: bool = False,
+) -> Start:
+    """Return where a scene starts, where it can be run from there under a controller.
+
+    Raises
+    ------
+    InputError, NumericalError
+        It cannot: no freedoms, no or a singular start, motors that cannot do what the controller wants.
+    """
+    if isinstance(controller, Sampled):
+        with scene.sources.naming():
+            controller.require_countable(scene.spec.t_end)
+            controller.require_sensible(mechanism)
+    if mechanism.d == 0:
+        raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
+    if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
+    start = find_start(mechanism, scene)
+    with scene.sources.naming():
+        if beyond := beyond_stops(mechanism, start.at.q_tree):
+            raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within them")
+    refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
+    law = controller.controller if isinstance(controller, Sampled) else controller
+    if law is not None and not gives_tau(law):
+        require_chart(mechanism, start)
+        actuation.require_transmission(start.at)
+    return start

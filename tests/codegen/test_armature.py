@@ -1,0 +1,135 @@
+"""Rotors on the joints of the five-bar: every term and every way to move it against the appendix in numpy."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin import Mechanism, as_ivp, load, simulate, symbolic, terms
+from ckc_pin.codegen.library import compiled
+from ckc_pin.dynamics import dae_acceleration, reduced_acceleration
+from ckc_pin.native import _core
+from ckc_pin.native.tables import core_table
+from tests.analytic.five_bar import FIVE_BAR, Array, E, FiveBar
+from tests.conftest import assert_close
+
+EXACT = 1e-12
+NAMES = ("theta_1", "theta_2", "theta_3", "theta_4")
+START = np.array([-1.1, -2.0])
+
+
+@dataclass(frozen=True)
+class Geared(FiveBar):
+    """A five-bar whose joints turn rotors: kg m^2 as seen from the joint, their axes at rest otherwise."""
+
+    rotors: tuple[float, ...] = (0.03, 0.008, 0.05, 0.002)
+
+    def D_tree(self, q_tree: Array) -> Array:
+        """D' of eq. 24 and what the rotors add, (4, 4)."""
+        return super().D_tree(q_tree) + np.diag(self.rotors)
+
+
+GEARED = Geared(**asdict(FIVE_BAR))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("geared")
+    for name, text in load("five_bar").sources.texts.items():
+        (folder / name).write_text(text)
+    tables = (f'[[joint]]\nname = "{n}"\narmature = {x}\n' for n, x in zip(NAMES, GEARED.rotors, strict=True))
+    with (folder / "mechanism.toml").open("a") as file:
+        file.write("\n" + "".join(tables))
+    initial = f"[initial.q]\ntheta_1 = {START[0]}\ntheta_3 = {START[1]}\n"
+    (folder / "default.scene.toml").write_text(
+        f'mechanism = "mechanism.toml"\nformulation = "dae"\nt_end = 1.0\n{initial}[solver]\nrtol = 1e-11\n'
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mechanism(folder: Path) -> Mechanism:
+    return load(folder)
+
+
+def states() -> list[tuple[Array, Array, Array]]:
+    """Closed configurations, velocities on the closure, torques."""
+    random, found = np.random.default_rng(11), []
+    for _ in range(20):
+        q_tree = GEARED.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.4, 0.4, 2))
+        found.append((q_tree, random.uniform(-3, 3, 2), random.uniform(-2, 2, 2)))
+    return found
+
+
+def test_terms_have_the_rotors(mechanism: Mechanism) -> None:
+    for q_tree, q_dot, _ in states():
+        v_tree = GEARED.rho(q_tree) @ q_dot
+        found = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
+        assert_close(found.D_tree, GEARED.D_tree(q_tree), EXACT)
+        assert_close(found.D, GEARED.D(q_tree), EXACT)
+        assert_close(found.C_times(q_dot), GEARED.C(q_tree, v_tree) @ q_dot, 1e-11)
+        assert_close(found.bias_tree, GEARED.C_tree(q_tree, v_tree) @ v_tree + GEARED.h_tree(q_tree), 1e-11)
+        assert_close(found.energy, GEARED.energy(q_tree, v_tree), 1e-11)
+
+
+def test_accelerations_have_the_rotors(mechanism: Mechanism) -> None:
+    """In NumPy, in C++ with Pinocchio's terms and with compiled ones, and of CasADi."""
+    cores = [_core.Core(core_table(mechanism)), _core.Core(core_table(mechanism, compiled(mechanism)))]
+    expressions = symbolic(mechanism)
+    for q_tree, q_dot, u in states():
+        v_tree = GEARED.rho(q_tree) @ q_dot
+        wanted, _ = GEARED.acceleration_and_multipliers(q_tree, v_tree, u)
+        tolerance = 1e-10 * np.abs(wanted).max()
+        at = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
+        assert_close(dae_acceleration(at, E @ u), wanted, tolerance)
+        assert_close(reduced_acceleration(at, E @ u), wanted[[0, 2]], tolerance)
+        for core in cores:
+            assert_close(core.dae_acceleration(q_tree, v_tree, E @ u, np.zeros(2)), wanted, tolerance)
+            assert_close(core.reduced_acceleration(q_tree, q_dot, v_tree, E @ u, False), wanted[[0, 2]], tolerance)
+            assert_close(core.terms(q_tree, v_tree)["D_tree"], GEARED.D_tree(q_tree), EXACT)
+        v_dot = expressions.v_dot(q_tree, v_tree, E @ u, expressions.values)
+        assert_close(v_dot.full()[:, 0], wanted, tolerance)
+        kinetic = v_tree @ GEARED.D_tree(q_tree) @ v_tree / 2
+        assert_close(float(expressions.kinetic(q_tree, v_tree, expressions.values)), kinetic, EXACT * max(1, kinetic))
+
+
+def swung(five_bar: FiveBar) -> Array:
+    """q and q_dot at t = 1 s, by the appendix and SciPy."""
+
+    def f(t: float, y: Array) -> Array:
+        return np.concatenate([y[2:], five_bar.acceleration(five_bar.sigma(y[:2]), y[2:], np.zeros(2))])
+
+    start = np.concatenate([START, np.zeros(2)])
+    return solve_ivp(f, (0.0, 1.0), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+@pytest.fixture(scope="module")
+def swing() -> Array:
+    """With rotors; without them it swings elsewhere."""
+    found = swung(GEARED)
+    assert np.abs(swung(FIVE_BAR) - found).max() > 0.1
+    return found
+
+
+@pytest.mark.parametrize("generated", [False, True])
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_the_swing_is_that_of_the_appendix(formulation: str, generated: bool, folder: Path, swing: Array) -> None:
+    whose = "generated" if generated else "pinocchio"
+    run = simulate(folder, {"formulation": formulation, "solver.terms": whose})
+    assert run.stats["terms"] == whose
+    assert_close(run.q_tree[-1][[0, 2]], swing[:2], 1e-8)
+    assert_close(run.v_tree[-1][[0, 2]], swing[2:], 1e-8)
+    assert_close(run.energy, GEARED.energy(GEARED.sigma(START), np.zeros(4)), 1e-9)
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_the_readable_equations_have_the_rotors(formulation: str, folder: Path, swing: Array) -> None:
+    problem = as_ivp(folder, {"formulation": formulation})
+    found = solve_ivp(problem.f, problem.t_span, problem.y0, "DOP853", rtol=1e-10, atol=1e-12)
+    at = problem.terms(1.0, found.y[:, -1])
+    assert_close(at.q, swing[:2], 1e-8)
+    assert_close(at.q_dot, swing[2:], 1e-8)

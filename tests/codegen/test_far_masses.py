@@ -1,0 +1,110 @@
+"""Compiled terms with masses far from those of the mechanism's files are as good as Pinocchio's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ckc_pin import ensemble, load, sensitivities, simulate
+from ckc_pin.codegen.library import compiled
+from ckc_pin.mechanism.parameters import values_of
+from ckc_pin.run.prepare import prepare
+from ckc_pin.scene.scene import load_scene
+from tests.analytic.many_digits import ManyDigits, exact
+
+SCENES = {"stewart": 0.3, "five_bar/swing": 0.5, "four_bar/turning": 0.5}  # s
+SETS = 6
+# A leg so light that the spring on it alone would give it 1e8 m/s^2
+LIGHT_LEG = {"link.piston_1.mass": 1e-6, "link.cylinder_1.mass": 1e-6}
+# A set of masses that stopped the reduced model with a false reason
+STOPPED = {
+    "link.cylinder_1.mass": 2e-5, "link.piston_1.mass": 1e-6, "link.cylinder_2.mass": 20.0,
+    "link.piston_2.mass": 1e-4, "link.cylinder_4.mass": 3e-4, "link.piston_5.mass": 8e-6,
+}  # fmt: skip
+
+
+def masses(scene: str, random: np.random.Generator) -> dict[str, float]:
+    """About half of a mechanism's masses anywhere from 1e-6 to 1e3 kg."""
+    mechanism = load(scene.partition("/")[0])
+    names = [name for name in values_of(mechanism.spec, mechanism.urdf) if name.endswith(".mass")]
+    return {name: float(10 ** random.uniform(-6, 3)) for name in names if random.random() < 0.5}
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced"])
+@pytest.mark.parametrize("scene", SCENES)
+def test_status_and_right_hand_sides_are_those_of_pinocchios_terms(scene: str, formulation: str) -> None:
+    random = np.random.default_rng(3)
+    for _ in range(SETS):
+        changes: dict[str, Any] = {**masses(scene, random), "formulation": formulation, "controller": None}
+        changes |= {"t_end": SCENES[scene], "solver.rtol": float(random.choice([1e-6, 1e-8, 1e-10]))}
+        theirs, ours = (simulate(scene, {**changes, "solver.terms": x}) for x in ("pinocchio", "generated"))
+        assert ours.status == theirs.status == "done"
+        assert ours.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1), changes
+
+
+@pytest.mark.parametrize("changes", [LIGHT_LEG, STOPPED], ids=["light leg", "false reason"])
+def test_the_general_elimination_takes_over_and_is_counted(changes: dict[str, float]) -> None:
+    wanted = {**changes, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
+    theirs, ours = (simulate("stewart", {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated"))
+    assert ours.status == theirs.status == "done"
+    by_terms = ours.stats["rhs_by_terms"]
+    assert by_terms["general"] > 0
+    assert sum(by_terms.values()) == ours.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_masses_of_the_files_are_eliminated_as_compiled(scene: str) -> None:
+    for formulation in ("dae", "reduced"):
+        changes = {"formulation": formulation, "controller": None, "t_end": 0.3, "solver.terms": "generated"}
+        run = simulate(scene, changes)
+        assert run.stats["rhs_by_terms"] == {"generated": run.stats["rhs"]}
+
+
+def test_acceleration_of_a_light_leg_has_all_digits() -> None:
+    """Against forty digits of the tests' own model."""
+    wanted = {**LIGHT_LEG, "formulation": "dae", "controller": None, "solver.terms": "generated"}
+    ready = prepare(load_scene("stewart", wanted))
+    ready.begin()
+    ready.loop.advance(0.01, True, 1.0, 10.0)
+    y, nq, n = ready.loop.y, ready.mechanism.tree.nq, ready.mechanism.n
+    model = ManyDigits(ready.mechanism)
+    right = model.acceleration(model.configuration(y[:nq]), exact(y[nq:]), exact(np.zeros(n)))[0].astype(float)
+    assert np.abs(ready.loop.rhs(0.01, y)[nq:] - right).max() <= 1e-12 * np.abs(right).max()
+
+
+def test_a_library_does_not_depend_on_the_masses_it_was_first_asked_for_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither its order of elimination nor whether it can be checked: rounding with these masses is 1e-9."""
+    names = []
+    for k, changes in enumerate([{}, STOPPED]):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(k)))
+        names.append(Path(compiled(load("stewart", changes)).path).name)
+    assert names[0] == names[1]
+
+
+def test_each_member_of_an_ensemble_is_judged_by_its_own_masses() -> None:
+    """A member is the run with its numbers to the bit, whichever thread it is in and whatever ran there before."""
+    changes: dict[str, Any] = {"formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-9}
+    changes["solver.terms"] = "generated"
+    light = {name: [1e-6, 1.0] for name in LIGHT_LEG}
+    one, two = (
+        ensemble("stewart", light, {"end": "q_tree"}, changes=changes, threads=threads, progress=False)["end"].values
+        for threads in (1, 2)
+    )
+    assert np.array_equal(one, two)
+    for k, (piston, cylinder) in enumerate([(a, b) for a in (1e-6, 1.0) for b in (1e-6, 1.0)]):
+        run = simulate("stewart", {**changes, "link.piston_1.mass": piston, "link.cylinder_1.mass": cylinder})
+        assert np.array_equal(one[k], run.q_tree[-1])
+
+
+def test_sensitivities_with_far_masses_are_those_of_pinocchios_terms() -> None:
+    wanted = {**LIGHT_LEG, "formulation": "dae", "controller": None, "t_end": 0.1, "solver.rtol": 1e-8}
+    theirs, ours = (
+        sensitivities("stewart", ["link.plate.mass"], {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated")
+    )
+    assert ours.run.status == theirs.run.status == "done"
+    assert ours.run.stats["rhs"] == pytest.approx(theirs.run.stats["rhs"], rel=0.1)
