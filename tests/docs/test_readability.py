@@ -10,7 +10,7 @@ from statistics import mean
 
 import pytest
 
-from scripts.site.gallery import ROOT
+from scripts.site.gallery import ROOT, Example, examples
 from tests.docs.prose import Paragraph, count_words, paragraphs
 
 MAX_MEAN_WORDS = 19  # per sentence, on each page
@@ -55,6 +55,13 @@ def test_paragraphs_are_short(page: str) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_mean_sentence_is_short(page: str) -> None:
     assert mean(words_per_sentence(page)) <= MAX_MEAN_WORDS
+
+
+@pytest.mark.parametrize("example", examples(), ids=lambda example: example.name)
+def test_example_descriptions_are_short(example: Example) -> None:
+    description = paragraphs(example.about)
+    assert max(count_words(sentence) for x in description for sentence in x.sentences()) <= MAX_WORDS
+    assert max(len(x.text) for x in description) <= MAX_CHARACTERS
 
 
 def test_parser_skips_what_is_not_prose() -> None:
