@@ -27,16 +27,16 @@ def main():
     force_and_slope = cs.Function("force_and_slope", [q, v, a, p], [force, cs.jacobian(force, p)[:, k]])
 
     rng = np.random.default_rng(7)
-    unknown = model.values.copy()
-    unknown[k] = 0.0
+    without_link = model.values.copy()
+    without_link[k] = 0.0
     slopes, residuals = [], []
     for j in range(len(run.t)):
         terms = ckc_pin.terms(run.mechanism, dict(zip(run.coordinates, run.q_tree[j].tolist(), strict=True)))
         state = run.q_tree[j], run.v_tree[j], forces.a_tree[j]
-        massless, slope = (np.array(x).ravel() for x in force_and_slope(*state, unknown))
+        rest, slope = (np.array(x).ravel() for x in force_and_slope(*state, without_link))
         measured = run.u[j] + NOISE * rng.standard_normal(2)
         slopes.append(terms.rho.T @ slope)  # eq. 6: constraint forces do no work along rho
-        residuals.append(measured - terms.rho.T @ massless)
+        residuals.append(measured - terms.rho.T @ rest)
     slopes, residuals = np.concatenate(slopes), np.concatenate(residuals)
     mass = slopes @ residuals / (slopes @ slopes)
     sigma = NOISE / np.sqrt(slopes @ slopes)

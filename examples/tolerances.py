@@ -44,12 +44,12 @@ def main():
     for label, lengths, masses, marker in (("both", True, True, "o"), ("masses", False, True, "^"),
                                            ("lengths", True, False, "s")):  # fmt: skip
         results, tips = sweep(lengths, masses)
-        off = 1e3 * (tips - target)
-        spread[label] = np.sqrt(np.mean(np.sum(off**2, axis=1)))
-        print(f"{label}: {spread[label]:.3f} mm off in the mean, {np.linalg.norm(off, axis=1).max():.3f} at worst")
+        errors = 1e3 * (tips - target)
+        spread[label] = np.sqrt(np.mean(np.sum(errors**2, axis=1)))
+        print(f"{label}: {spread[label]:.3f} mm off in the mean, {np.linalg.norm(errors, axis=1).max():.3f} at worst")
         if label == "both":
-            worst = results.isel(member=int(np.argmax(np.linalg.norm(off, axis=1))))
-        ax.plot(*off.T, marker, markersize=4, linestyle="none", label=label)
+            worst = results.isel(member=int(np.argmax(np.linalg.norm(errors, axis=1))))
+        ax.plot(*errors.T, marker, markersize=4, linestyle="none", label=label)
     ax.plot(0, 0, "+", color="black", markersize=12, label="as drawn")
     ax.set(xlabel="x from the target (mm)", ylabel="y from the target (mm)", aspect="equal")
     ax.set(title=f"lengths ± {1e3 * LENGTH_SIGMA} mm, masses ± {100 * MASS_SIGMA} %")
