@@ -1,7 +1,7 @@
 """A delta robot from a URDF.
 
-A tree of three arms and six rods, cut open at the balls of the plate and closed again by six loops of three rows. The
-plate goes round a level circle, prescribed as a circle: exact inverse kinematics gives the arms' angles.
+The tree has three arms and six rods. It is cut open at the ball joints of the plate, and closed again by six loops of
+three rows each. The plate follows a horizontal circle; exact inverse kinematics gives the arms' angles.
 """
 
 import matplotlib.pyplot as plt
@@ -15,9 +15,9 @@ CIRCLE = {"point": "plate", "circle": {"centre": [0.0, 0.0, -0.38], "radius": 0.
 
 @look()
 def main():
-    found = ckc_pin.check("delta")
-    print(f"{found.d} freedoms, {found.rows} rows of which {len(found.redundant)} are redundant")
-    assert found.d == 3
+    report = ckc_pin.check("delta")
+    print(f"{report.d} freedoms, {report.rows} rows of which {len(report.redundant)} are redundant")
+    assert report.d == 3
 
     forces = ckc_pin.inverse_dynamics("delta/circle", {"controller.desired": CIRCLE, "t_end": 2 * np.pi / 4.0})
     delta = ckc_pin.load("delta")

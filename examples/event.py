@@ -1,7 +1,7 @@
 """An event.
 
-Any function of time and terms is an event where it crosses zero. Here: where the left arm turns, and a stop when the
-tip first rises above a height.
+Any function of time and terms is an event where it crosses zero. One event here records when the left arm reverses.
+The other one stops the run when the tip first rises above a height.
 """
 
 import matplotlib.pyplot as plt

@@ -1,8 +1,8 @@
 """A gymnasium environment.
 
-The five-bar as a task for reinforcement learning: torques by motor in, angles and rates out, a reward for the tip
-near a goal. A `Simulator` is the physics, with the tolerance of a run; gymnasium's own checker approves of it, and
-random torques play an episode.
+The five-bar as a task for reinforcement learning. Actions are the motor torques, observations are angles, rates and
+the tip's position, and the reward is highest with the tip at a goal. A `Simulator` computes the physics, with the
+tolerance of a run. Gymnasium's own checker accepts the environment, and random torques play an episode.
 """
 
 import gymnasium as gym
@@ -19,7 +19,7 @@ DT = 0.02  # s
 
 
 class FiveBar(gym.Env):
-    """Observation: sines and cosines of q, q_dot, and where the tip is; action: motors' torques over their limit."""
+    """Observation: sin(q), cos(q), q_dot and the tip's position; action: motor torques relative to their limit."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
@@ -34,7 +34,7 @@ class FiveBar(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.simulator.reset(self.start)
-        for _ in range(10):  # to a state of its own
+        for _ in range(10):  # random torques lead to a random start
             self.simulator.step(self.np_random.uniform(-0.3, 0.3, 2), DT)
         return self.observe(), {}
 
@@ -43,8 +43,8 @@ class FiveBar(gym.Env):
             self.simulator.step(tau=dict(zip(self.motors, (TORQUE * action).tolist(), strict=True)), dt=DT)
         except ckc_pin.NumericalError as stop:  # a singular configuration ends the episode
             return self.observe(), -1.0, True, False, {"why": str(stop)}
-        seen = self.observe()
-        return seen, float(-np.sum((seen[6:] - GOAL) ** 2)), False, self.simulator.state.t > 5.0, {}
+        observation = self.observe()
+        return observation, float(-np.sum((observation[6:] - GOAL) ** 2)), False, self.simulator.state.t > 5.0, {}
 
     def observe(self):
         state = self.simulator.state
@@ -56,12 +56,12 @@ class FiveBar(gym.Env):
 def main(steps=150):
     check_env(FiveBar(), skip_render_check=True)
     env = FiveBar()
-    seen, _ = env.reset(seed=1)
+    observation, _ = env.reset(seed=1)
     env.action_space.seed(1)
-    tips, rewards = [seen[6:]], []
+    tips, rewards = [observation[6:]], []
     for _ in range(steps):
-        seen, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        tips.append(seen[6:])
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        tips.append(observation[6:])
         rewards.append(reward)
         if terminated or truncated:
             break

@@ -1,8 +1,8 @@
 """A leg linkage.
 
-Two motors on one axis and four links that meet at the foot, which treads a circle. The mechanism is three files in
-`examples/leg`; tracking control drives it there through gears of 10, and inverse dynamics says what the motors must
-bear.
+Two motors on one axis drive four links that meet at the foot. The foot follows a circle. The mechanism is three files
+in `examples/leg`. Tracking control drives it through gears with ratio 10, and inverse dynamics gives the torques that
+the motors need.
 """
 
 from pathlib import Path

@@ -1,8 +1,9 @@
 """A linear-quadratic regulator.
 
-Designed on the five-bar's linear model, run on the nonlinear one. The tip stands above the base, where gravity and the
-loops make the mechanism fall to one side; the motors hold it there. A and B of the operating point give the gain, SciPy
-solves Riccati's equation, and the regulator then acts on the full closed chain, started off the point.
+The regulator is designed on the linear model of the five-bar, and tested on the nonlinear one. The tip stands above
+the base, where gravity makes the mechanism fall to one side; the motors hold it there. SciPy solves the Riccati
+equation with A and B of the operating point. The regulator then acts on the full closed chain, which starts off that
+point.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import ckc_pin
 from ckc_pin.view.canvas import look
 
 POINT = {"theta_1": 1.9, "theta_3": 1.2}
-OFF = {"theta_1": 0.08, "theta_3": -0.05}  # rad, at the start
+OFFSET = {"theta_1": 0.08, "theta_3": -0.05}  # rad, at the start
 Q, R = np.diag([100.0, 100.0, 1.0, 1.0]), np.diag([5.0, 5.0])
 
 
@@ -42,15 +43,15 @@ def design() -> tuple[ckc_pin.LinearModel, Regulator]:
 
 
 def hold(regulator: Regulator | None) -> ckc_pin.Run:
-    """Run the five-bar from off the point; without a regulator only the torques of the point act."""
-    start = {name: POINT[name] + OFF[name] for name in POINT}
+    """Run the five-bar from a start off the point. Without a regulator, the constant torques of the point act."""
+    start = {name: POINT[name] + OFFSET[name] for name in POINT}
     changes = {"formulation": "reduced", "t_end": 4.0, "controller": None, "initial": {"q": start}}
     return ckc_pin.simulate("five_bar/swing", changes, controller=regulator)
 
 
 @look()
 def main() -> Figure:
-    """Design, run, and say how it went."""
+    """Design the regulator, run with and without it, and plot the errors."""
     model, regulator = design()
     print(model)
     closed = model.A - model.B @ regulator.K

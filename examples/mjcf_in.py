@@ -1,7 +1,7 @@
 """MJCF in.
 
-A slider-crank written for MuJoCo, with its soft `connect`, becomes a mechanism with an exact loop: read, completed by
-what the format leaves open, written as a folder, and run.
+A slider-crank written for MuJoCo, with a soft `connect`, becomes a mechanism with an exact loop. The example imports
+the model, writes it as a folder, adds a scene and runs it.
 """
 
 import tempfile
@@ -53,12 +53,12 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "press.xml"
         source.write_text(MODEL)
-        mine = Path(folder) / "press"
-        importing.write(importing.read(source), mine)
-        found = ckc_pin.check(mine)
-        print(f"{found.d} freedom, {found.rank} of {found.rows} rows count; redundant: {', '.join(found.redundant)}")
-        assert found.d == 1
-        scene = mine / "default.scene.toml"
+        imported = Path(folder) / "press"
+        importing.write(importing.read(source), imported)
+        report = ckc_pin.check(imported)
+        print(f"{report.d} freedom, {report.rows} rows of rank {report.rank}; redundant: {', '.join(report.redundant)}")
+        assert report.d == 1
+        scene = imported / "default.scene.toml"
         scene.write_text(SCENE)
         run = ckc_pin.simulate(scene)
     assert run.max_phi < 1e-9

@@ -1,7 +1,7 @@
 """MJCF out.
 
-The swinging five-bar as a model for MuJoCo, stepped there beside it: MuJoCo's loop is a soft constraint, and the
-difference grows.
+The swinging five-bar is exported as a MuJoCo model, and MuJoCo steps it. MuJoCo's loop is a soft constraint, so the
+difference from the exact run grows.
 """
 
 import matplotlib.pyplot as plt
@@ -16,7 +16,7 @@ from ckc_pin.view.canvas import look
 @look()
 def main():
     exported = export(ckc_pin.load("five_bar"), "mjcf")
-    print("What moves otherwise there:", *exported.differs, sep="\n  ")
+    print("Differences in MuJoCo:", *exported.differs, sep="\n  ")
     run = ckc_pin.simulate("five_bar/swing")
 
     model = mujoco.MjModel.from_xml_string(exported.text)
@@ -25,12 +25,12 @@ def main():
     data = mujoco.MjData(model)
     columns = [model.joint(name).qposadr[0] for name in run.coordinates]
     data.qpos[columns] = run.q_tree[0]
-    theirs = []
+    mujoco_q = []
     for t in run.t:
         while data.time < t - 0.5e-4:
             mujoco.mj_step(model, data)
-        theirs.append(data.qpos[columns].copy())
-    error = np.abs(np.array(theirs) - run.q_tree).max(axis=1)
+        mujoco_q.append(data.qpos[columns].copy())
+    error = np.abs(np.array(mujoco_q) - run.q_tree).max(axis=1)
     assert 0 < error.max() < 0.1
 
     figure, ax = plt.subplots()

@@ -1,7 +1,7 @@
 """A mode of a closed chain.
 
-The five-bar about its stable equilibrium: the linear model gives its modes. A start along one of them swings at its
-frequency, and the larger the swing the further from it.
+The linear model of the five-bar about its stable equilibrium gives its modes. A small swing along one of them has its
+frequency. The larger the swing, the further its period is from the linear model's.
 """
 
 import matplotlib.pyplot as plt
@@ -21,7 +21,7 @@ def main():
     shape /= np.abs(shape).max()
     print(model)
     figure, ax = plt.subplots()
-    off = []
+    errors = []
     for size in (0.02, 0.2, 0.4):
         start = {name: rest[name] + size * x for name, x in zip(names, shape, strict=True)}
         run = ckc_pin.simulate(
@@ -31,14 +31,14 @@ def main():
         )
         turns = [event["t"] for event in run.events if event["t"] > 0.1]
         period = np.diff(turns).mean()
-        off.append(abs(period * mode.frequency - 1))
-        print(f"{size} rad: period {period:.5f} s, of the linear model {1 / mode.frequency:.5f} s")
+        errors.append(abs(period * mode.frequency - 1))
+        print(f"{size} rad: period {period:.5f} s, linear model {1 / mode.frequency:.5f} s")
         ax.plot(run.t * mode.frequency, (run[names[0]] - rest[names[0]]) / size, label=f"from {size} rad")
     ax.set(xlabel="time (periods of the linear model)", ylabel="swing of θ₁, scaled")
     ax.set(title="The larger the swing, the longer its period")
     figure.legend(loc="outside lower center", ncols=3)
-    assert off[0] < 1e-3
-    assert off[0] < off[1] < off[2]
+    assert errors[0] < 1e-3
+    assert errors[0] < errors[1] < errors[2]
     return figure
 
 

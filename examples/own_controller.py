@@ -1,8 +1,8 @@
 """A controller of your own.
 
-Whatever has a `u(t, terms)` controls a run; it gets the terms that the step loop has already computed. This one
-compensates gravity exactly, shapes the closed loop as a critically damped oscillator by the reduced model's D and C,
-and so knows its motion in closed form.
+Any object with a method `u(t, terms)` can control a run. It gets the terms that the step loop has already computed.
+This one compensates gravity exactly, and D and C of the reduced model make the closed loop a critically damped
+oscillator. Its motion is therefore known in closed form.
 """
 
 import matplotlib.pyplot as plt
@@ -16,11 +16,11 @@ RATE = 4.0  # 1/s
 
 
 class ComputedTorque:
-    """D q̈_wanted + C q̇ + h."""
+    """u = D q̈_d + C q̇ + h, with q̈_d that of a critically damped oscillator."""
 
     def u(self, t, terms):
-        wanted = -2 * RATE * terms.q_dot - RATE**2 * (terms.q - TARGET)
-        return terms.D @ wanted + terms.C @ terms.q_dot + terms.h
+        q_ddot = -2 * RATE * terms.q_dot - RATE**2 * (terms.q - TARGET)
+        return terms.D @ q_ddot + terms.C @ terms.q_dot + terms.h
 
 
 @look()

@@ -1,7 +1,7 @@
 """Sampled control.
 
-The set-point controller as a computer runs it: samples, a delay, encoders of 4096 counts, rates by differences, a
-filter. The error that remains is what an encoder's step leaves open.
+The set-point controller runs as on a computer: with samples, a delay, encoders of 4096 counts, rates by differences and
+a filter. The remaining error is of the size of an encoder step.
 """
 
 import matplotlib.pyplot as plt
@@ -26,11 +26,11 @@ def main():
         name = "continuous" if sample_time is None else f"sampled every {1e3 * sample_time:g} ms"
         ax.semilogy(run.t, np.abs(error), label=name)
         ends.append(np.abs(error[run.t > 1.2]).max())
-    ax.axhline(SENSOR["resolution"] / 2, color="black", lw=0.8, ls="--", label="half an encoder's step")
-    ax.set(xlabel="t (s)", ylabel="|error of θ₁| (rad)", title="Set-point control, as a computer runs it")
+    ax.axhline(SENSOR["resolution"] / 2, color="black", lw=0.8, ls="--", label="half an encoder step")
+    ax.set(xlabel="t (s)", ylabel="|error of θ₁| (rad)", title="Set-point control, sampled")
     figure.legend(loc="outside lower center", ncols=2)
     print("largest error after 1.2 s:", *(f"{end:.1e}" for end in ends))
-    assert ends[0] < 1e-5 < ends[1]  # the encoders' step remains
+    assert ends[0] < 1e-5 < ends[1]  # limited by the encoder's resolution
     return figure
 
 

@@ -1,8 +1,8 @@
 """Through a loss of rank.
 
-Four-bars in a row lie flat at t = 0.718 s, where the closure loses a rank for each. The projected DAE goes on along
-its own branch by a checked collocation step. All rods keep one angle θ with θ'' = -k cos θ, which SciPy integrates as
-a second opinion.
+Four-bars in a row lie flat at t = 0.718 s, where J loses one rank per four-bar. The projected DAE continues on its own
+branch by a checked collocation step. All rods have the same angle θ with θ'' = -k cos θ. SciPy integrates this equation
+as an independent check.
 """
 
 import matplotlib.pyplot as plt
@@ -34,7 +34,7 @@ def main():
     angle.plot(run.t, exact, "k:", label="θ'' = -k cos θ, by SciPy")
     angle.set(xlabel="t (s)", ylabel="θ₀ (rad)", title="The row swings through flat")
     rank.semilogy(run.t, np.maximum(sigma, 1e-12))
-    rank.set(xlabel="t (s)", ylabel="least singular value of J (m)", title="There the closure loses rank")
+    rank.set(xlabel="t (s)", ylabel="smallest singular value of J (m)", title="J loses rank where it is flat")
     figure.legend(loc="outside lower center", ncols=2)
     return figure
 

@@ -1,7 +1,7 @@
 """The paper's five-bar.
 
-Both of its control cases, each as the singular perturbation formulation that eq. 8 prints and as the reduced model of
-eq. 6: errors of the arms, and torques within the 30 N m that the paper states.
+Both control cases of the paper, each as the singular perturbation formulation that eq. 8 prints and as the reduced
+model of eq. 6. The figure shows the angles of the arms, and torques within the 30 N m that the paper states.
 """
 
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ from ckc_pin.view.style import COLOURS
 
 FORMULATIONS = {"reduced": {"formulation": "reduced"},
                 "SPF, ε = 1e-3": {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-3}}  # fmt: skip
-CASES = {"set_point": ("Set-point control", 0.6), "tracking": ("Tracking control", 9.5)}  # s, shown
+CASES = {"set_point": ("Set-point control", 0.6), "tracking": ("Tracking control", 9.5)}  # title, and the time shown, s
 LOOKS = {"lw": 3, "alpha": 0.4}, {"ls": "--", "lw": 1.2}
 
 
@@ -22,7 +22,7 @@ def main():
     figure, axes = plt.subplots(2, 2, figsize=(7.0, 4.6), sharex="col")
     for (angles, torques), (case, (title, shown)) in zip(axes.T, CASES.items(), strict=True):
         for ax in (angles, torques):
-            ax.set_prop_cycle(color=COLOURS[:2])  # a colour an arm, whatever the formulation
+            ax.set_prop_cycle(color=COLOURS[:2])  # one colour per arm, for both formulations
         ends = []
         for (name, changes), style in zip(FORMULATIONS.items(), LOOKS, strict=True):
             run = ckc_pin.simulate(f"five_bar/{case}", changes)

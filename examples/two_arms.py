@@ -1,7 +1,7 @@
 """Two arms on one load.
 
-Two UR5 hold one bar: a closed chain of twelve motors and six freedoms. The motors share the work by least norm, and
-the run says what the grips bear.
+Two UR5 hold one bar: a closed chain with twelve motors and six freedoms. The motors share the work by minimum norm, and
+inverse dynamics gives the forces in the grips.
 """
 
 import matplotlib.pyplot as plt
@@ -16,7 +16,7 @@ from ckc_pin.view.style import COLOURS
 def main():
     run = ckc_pin.simulate("two_ur5/lift", {"formulation": "reduced", "t_end": 2.0})
     assert run.status == "done"
-    assert run.max_phi < 1e-8  # m, rad: the bar stays in both hands
+    assert run.max_phi < 1e-8  # m, rad: both grips stay closed
     forces = ckc_pin.inverse_dynamics(run)
 
     figure, (torque, grip) = plt.subplots(1, 2, figsize=(7.0, 3.2))

@@ -1,4 +1,4 @@
-"""Terms that a page compiles go to a cache that other tests do not see."""
+"""Compile terms of pages into a cache of their own, which other tests do not use."""
 
 from __future__ import annotations
 

@@ -1,8 +1,15 @@
-"""Pieces of code in a page: commands and Python are run, files are written and read, keys are checked.
+"""Run the code blocks of a page, in their order, in one folder and one Python namespace.
 
-In a page's order, in one folder and one namespace. A TOML or XML piece whose first line is a comment with a file's
-name is that file; a TOML piece without is checked as part of a scene or a mechanism. ``text`` is what the last command
-before it prints, ``...`` standing for the rest of a line or for lines. ``console`` is only shown.
+=================  =====================================================================================
+language           what is done
+=================  =====================================================================================
+``python``         executed
+``sh``             commands of the program are run; ``# exit code 2`` expects that exit code
+``toml``, ``xml``  written to a file if the first line is a comment with its name; other TOML is validated as part of
+                   a scene or a mechanism
+``text``           compared with the output of the last command; ``...`` stands for the rest of a line, or for lines
+``console``        not run
+=================  =====================================================================================
 """
 
 from __future__ import annotations
@@ -26,12 +33,12 @@ from tests.contract.helpers.command import ckc
 BLOCK = re.compile(r"^( *)(```+|~~~+)(\{?[\w-]+\}?)[^\n]*\n(.*?)^\1\2 *$", re.MULTILINE | re.DOTALL)
 FILE = re.compile(r"^(?:#|<!--) ([\w./-]+\.(?:toml|urdf|xml|csv))\b")
 SHOWN = {"console", "csv", "bibtex", "json"}
-FOREIGN = ("ckc play", "ckc run five_bar/swing --meshcat")  # they open a server, and wait
+SERVERS = ("ckc play", "ckc run five_bar/swing --meshcat")  # open a server and wait: only their --help is run
 
 
 @dataclass(frozen=True)
 class Snippet:
-    """A piece: where it begins, its language, its text."""
+    """A code block: its first line, its language and its text."""
 
     line: int
     language: str
@@ -39,18 +46,18 @@ class Snippet:
 
 
 def snippets(page: str) -> list[Snippet]:
-    """Return a page's pieces in order; directives are none."""
-    found = []
+    """Return the code blocks of a page in order, without directives."""
+    blocks = []
     for match in BLOCK.finditer(page):
         indent, language = match[1], match[3]
         if not language.startswith("{"):
             text = "".join(line.removeprefix(indent) for line in match[4].splitlines(keepends=True))
-            found.append(Snippet(page.count("\n", 0, match.start()) + 1, language, text))
-    return found
+            blocks.append(Snippet(page.count("\n", 0, match.start()) + 1, language, text))
+    return blocks
 
 
 def run(snippet: Snippet, space: dict[str, Any]) -> None:
-    """Run a piece in the working directory; AssertionError where it is not as it says."""
+    """Run a code block in the working directory; raise AssertionError if it does not do what the page shows."""
     language, text = snippet.language, snippet.text
     if language == "python":
         exec(compile(text, f"line {snippet.line}", "exec"), space)
@@ -66,21 +73,21 @@ def run(snippet: Snippet, space: dict[str, Any]) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         else:
-            assert language == "toml", "an XML piece begins with <!-- FILE -->"
+            assert language == "toml", "an XML block begins with <!-- FILE -->"
             check_part(text)
     else:
-        assert language in SHOWN, f"line {snippet.line}: no language {language!r}"
+        assert language in SHOWN, f"line {snippet.line}: unknown language {language!r}"
 
 
 def check_printed(shown: str, printed: str) -> None:
-    """Check that what is shown was printed, in that order."""
+    """Check that the output contains the lines shown, in that order."""
     lines = [re.escape(line).replace(r"\.\.\.", "[^\n]*") for line in shown.splitlines()]
-    wanted = "\n".join(".*" if line.strip(r"\ ") == "[^\n]*" else line for line in lines)
-    assert re.search(wanted, printed, re.DOTALL), f"shown:\n{shown}\nprinted:\n{printed}"
+    pattern = "\n".join(".*" if line.strip(r"\ ") == "[^\n]*" else line for line in lines)
+    assert re.search(pattern, printed, re.DOTALL), f"shown:\n{shown}\nprinted:\n{printed}"
 
 
 def _line(line: str) -> str:
-    """Run commands joined by &&, in the folders that they change to; return what the last one prints."""
+    """Run commands joined by &&, with their ``cd``; return the output of the last one."""
     printed = ""
     parts = line.split(" && ")
     with chdir("."):
@@ -93,22 +100,22 @@ def _line(line: str) -> str:
 
 
 def _command(line: str) -> str:
-    """Run a command, and return what it prints."""
+    """Run a command and return its output."""
     words = shlex.split(line, comments=True)
     if not words or words[0].startswith("./scripts/") or words[0] in ("pip", "git", "cd"):
         return ""
-    assert words[0] == "ckc", f"not a command of the program: {line}"
-    if line.startswith(FOREIGN) and "--html" not in words:
+    assert words[0] == "ckc", f"not a ckc command: {line}"
+    if line.startswith(SERVERS) and "--html" not in words:
         assert ckc(words[1], "--help").code == 0
         return ""
-    wanted = re.search(r"# exit code (\d)", line)
-    found = ckc(*words[1:])
-    assert found.code == int(wanted[1] if wanted else 0), f"{line}\n{found.err}"
-    return found.out
+    expected = re.search(r"# exit code (\d)", line)
+    result = ckc(*words[1:])
+    assert result.code == int(expected[1] if expected else 0), f"{line}\n{result.err}"
+    return result.out
 
 
 def check_part(text: str) -> None:
-    """Check keys as part of a scene, of a mechanism, or of a controller."""
+    """Validate keys as part of a scene, a mechanism or a controller."""
     data = tomllib.loads(text)
     for table in (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("q_guess",)):
         by_coordinate(data, *table)

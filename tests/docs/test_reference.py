@@ -117,15 +117,15 @@ def test_every_json_key_array_and_error_is_named() -> None:
     assert [name for name in errors.__all__ if f"| `{name}`" not in page("reference/errors.md")] == []
 
 
-def test_every_extra_is_described() -> None:
-    """But for those that the project's own work alone needs."""
+def test_install_page_describes_every_extra() -> None:
+    """Except the extras that only development of the project needs."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    said = re.findall(r"^\| `(\w+)` \|", page("install.md"), re.MULTILINE)
-    assert set(said) == set(extras) - {"dev", "lab", "peers", "sundials"}
+    described = re.findall(r"^\| `(\w+)` \|", page("install.md"), re.MULTILINE)
+    assert set(described) == set(extras) - {"dev", "lab", "peers", "sundials"}
 
 
-def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs() -> None:
-    """Texts of the sources, pieces of one string joined."""
+def test_troubleshooting_headings_quote_messages_of_the_program() -> None:
+    """A message is looked up in the source text, with adjacent string literals joined."""
     source = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "ckc_pin").rglob("*.py")))
     joined = re.sub(r'"\s*\n\s*f?"', "", source)
     headings = re.findall(r"^### (.*)$", page("guide/troubleshooting.md"), re.MULTILINE)

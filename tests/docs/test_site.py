@@ -1,4 +1,4 @@
-"""The site is built without a warning, its links lead somewhere, nothing is fetched, and its search finds units."""
+"""The site builds without warnings, has no broken links, loads nothing from the network, and its search finds units."""
 
 from __future__ import annotations
 
@@ -32,54 +32,54 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "docs",
         str(out),
     ]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stderr
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
     return out
 
 
-def test_links_lead_somewhere(site: Path) -> None:
+def test_site_has_no_broken_links(site: Path) -> None:
     assert broken(site) == []
 
 
-def test_a_link_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+def test_broken_link_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text(
         '<p id="here"><a href="b.html">b</a><a href="a.html#there">c</a><a href="#here">d</a>'
     )
     assert broken(tmp_path) == ["a.html: b.html: no such file", "a.html: a.html#there: no such anchor"]
 
 
-def test_docstrings_are_shown_as_they_are(site: Path) -> None:
+def test_docstrings_are_rendered_unchanged(site: Path) -> None:
     page = re.sub(r"<[^>]+>", "", (site / "reference" / "api.html").read_text(encoding="utf-8"))
     assert "Values by dotted key, e.g. " in page
     assert "Largest |phi - w| and |phi_dot - w_dot| over the output instants." in page
     assert "!! processed by numpydoc !!" not in page
 
 
-def test_nothing_is_fetched(site: Path) -> None:
+def test_pages_load_nothing_from_the_network(site: Path) -> None:
     pages = [path.read_text(encoding="utf-8") for path in site.rglob("*.html")]
     assert len(pages) > 30
-    fetched = [
+    remote = [
         m
         for page in pages
         for m in re.findall(r"<(?:script|img|link|iframe)\b[^>]*?(?:src|href)=\"(https?:[^\"]*)", page)
     ]
-    assert fetched == []
+    assert remote == []
 
 
-def test_every_example_is_in_the_gallery(site: Path) -> None:
+def test_gallery_has_every_example(site: Path) -> None:
     page = (site / "gallery.html").read_text(encoding="utf-8")
     assert [
         example.name for example in examples() if f'id="example-{example.name.replace("_", "-")}"' not in page
     ] == []
 
 
-def test_the_search_finds_a_key_by_its_unit(site: Path, browser: Browser) -> None:
-    """From disk, in a browser without network; the entry leads to the key."""
+def test_search_finds_key_by_its_unit(site: Path, browser: Browser) -> None:
+    """Searched from disk, in a browser without network; the result links to the key."""
     page = browser.new_context(offline=True).new_page()
     page.goto(f"{(site / 'search.html').as_uri()}?q=rad%2Fs")
-    found = page.locator("#search-results li a", has_text="frequency [rad/s]").first
-    found.wait_for(timeout=PATIENCE * 1e3)
-    found.click()
+    result = page.locator("#search-results li a", has_text="frequency [rad/s]").first
+    result.wait_for(timeout=PATIENCE * 1e3)
+    result.click()
     page.wait_for_url("**/reference/scene.html*")
     key = page.evaluate("document.getElementById(decodeURIComponent(location.hash.slice(1))).textContent")
     assert "frequency" in key

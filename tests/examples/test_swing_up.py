@@ -1,4 +1,4 @@
-"""The planned swing-up against the library's loop, its energy, and what it was asked for."""
+"""The planned swing-up, compared with its simulation, its energy balance and its requirements."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ def plan() -> swing_up.Plan:
     return swing_up.plan()
 
 
-def test_the_loop_goes_where_the_plan_goes(plan: swing_up.Plan) -> None:
+def test_simulation_reproduces_planned_states(plan: swing_up.Plan) -> None:
     assert np.abs(swing_up.replay(plan) - plan.states).max() <= 1e-6
 
 
-def test_half_the_pieces_are_further_off(plan: swing_up.Plan) -> None:
-    """By 2^8 at Gauss points' order; what grows along the motion, and another optimum, leave most of that."""
+def test_error_grows_with_half_the_pieces(plan: swing_up.Plan) -> None:
+    """The order at Gauss points would give 2^8; error growth along the motion and another optimum reduce this."""
     coarse = swing_up.plan(pieces=1)
-    off = [np.abs(swing_up.replay(found) - found.states).max() for found in (plan, coarse)]
-    assert 16 * off[0] < off[1] < 1e-2
+    errors = [np.abs(swing_up.replay(solution) - solution.states).max() for solution in (plan, coarse)]
+    assert 16 * errors[0] < errors[1] < 1e-2
 
 
-def test_the_motors_keep_their_limit_and_lift_what_they_cannot_hold(plan: swing_up.Plan) -> None:
+def test_torques_respect_limit_below_holding_torque(plan: swing_up.Plan) -> None:
     assert np.abs(plan.u).max() <= swing_up.TORQUE * (1 + 1e-6)
     assert np.abs(plan.states[-1, [0, 2, 4, 6]] - [np.pi / 2, np.pi / 2, 0, 0]).max() < 1e-9
     level = ckc_pin.terms(ckc_pin.load("five_bar"), {"theta_1": 0.0, "theta_3": 0.0})
     assert level.h.min() > swing_up.TORQUE
 
 
-def test_the_work_of_the_torques_is_the_energy(plan: swing_up.Plan) -> None:
-    """Constant on an interval, a torque does its angle's change times itself; the energy is Pinocchio's."""
+def test_work_of_torques_equals_energy_gain(plan: swing_up.Plan) -> None:
+    """The work of a constant torque is torque times angle; the energy is Pinocchio's."""
     mechanism = ckc_pin.load("five_bar")
 
     def energy(state: np.ndarray) -> float:
@@ -48,7 +48,7 @@ def test_the_work_of_the_torques_is_the_energy(plan: swing_up.Plan) -> None:
     assert abs(work - gained) < 1e-6 * gained
 
 
-def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_casadi_is_reported_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ckc_pin.InputError, match=r"pip install ckc_pin\[symbolic\]"):
         swing_up.plan()
