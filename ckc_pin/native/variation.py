@@ -21,7 +21,7 @@ from ckc_pin.mechanism.spec_frames import FrameSpec
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.native.tables import core_table, packed
 
-__all__ = ["Effect", "Lock", "Place", "Varying", "directions_of", "separate_parts", "variation_table"]
+__all__ = ["Effect", "Lock", "Place", "SensitivityParameter", "directions_of", "separate_parts", "variation_table"]
 
 Place = Literal["joint", "point", "spring", "direction", "log_a", "log_b", "reported"]
 
@@ -96,20 +96,22 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Varying:
-    """One number that a motion's change with is wanted.
+class SensitivityParameter:
+    """A parameter whose sensitivities are integrated along a run.
 
     Attributes
     ----------
     name : str
     effects : tuple of Effect
     q : (n,) array or None
-        How the start's independent coordinates change, tangent.
+        Derivative of the start's coordinates, as a tangent vector.
     q_dot : (d,) array or None
+        Derivative of the start's independent rates.
     places : tuple of Effect
-        What places the joints, and the points that are only reported.
+        Effects on the placement of joints and of reported points.
     assembled_at : int
-        A coordinate: the start is assembled at its stop, which the number moves, and goes along one way only; or -1.
+        Coordinate whose stop the assembled start touches, if this parameter moves that stop and the start follows it
+        in one direction only; -1 otherwise.
     """
 
     name: str
@@ -123,7 +125,9 @@ class Varying:
 # --- where terms are written out ---------------------------------------------------------------------
 
 
-def directions_of(mechanism: Mechanism, varying: Sequence[Varying]) -> tuple[dict[str, BoolArray], Array] | None:
+def directions_of(
+    mechanism: Mechanism, parameters: Sequence[SensitivityParameter]
+) -> tuple[dict[str, BoolArray], Array] | None:
     """Return which numbers the written-out code has to take, and how they change with each parameter.
 
     Returns
@@ -135,7 +139,7 @@ def directions_of(mechanism: Mechanism, varying: Sequence[Varying]) -> tuple[dic
     None where a parameter turns something: angles between joints are no arguments.
     """
     own = numbers(mechanism)
-    changes = [_direction(own, x.effects) for x in varying]
+    changes = [_direction(own, x.effects) for x in parameters]
     which = present(own)
     for found in changes:
         if found is None:
@@ -207,7 +211,7 @@ def _plain(x: Any) -> Any:
 
 def variation_table(
     mechanism: Mechanism,
-    varying: Sequence[Varying],
+    parameters: Sequence[SensitivityParameter],
     directions: Array | None,
     *,
     at_equilibrium: bool,
@@ -221,7 +225,7 @@ def variation_table(
     there; none where it compensates another one's. `controlled`: a controller acts, which may look at every joint.
     """
     tree = mechanism.tree
-    locks = _Locks([effect for x in varying for effect in x.effects if effect.lock is not None])
+    locks = _Locks([effect for x in parameters for effect in x.effects if effect.lock is not None])
     model = pin.Model()
     model.gravity.linear = tree.model.gravity.linear
     plain = core_table(mechanism)
@@ -281,10 +285,10 @@ def variation_table(
         "parameters": [
             ([crossing(effect) for effect in x.effects], np.zeros(tree.n) if x.q is None else x.q,
              np.zeros(mechanism.d) if x.q_dot is None else x.q_dot, x.assembled_at)
-            for x in varying
+            for x in parameters
         ],
         "part": [0] * tree.n if controlled else separate_parts(mechanism),
-        "directions": np.zeros((0, len(varying))) if directions is None else np.asfortranarray(directions),
+        "directions": np.zeros((0, len(parameters))) if directions is None else np.asfortranarray(directions),
     }  # fmt: skip
 
 

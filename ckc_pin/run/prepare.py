@@ -20,7 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
-from ckc_pin.native.variation import Varying
+from ckc_pin.native.variation import SensitivityParameter
 from ckc_pin.run.compiled_terms import library_of
 from ckc_pin.run.events import Event, EventFunction, event_functions
 from ckc_pin.run.loop_tables import formulation_table, solver_table
@@ -45,7 +45,7 @@ class ParameterDerivatives:
 
     Attributes
     ----------
-    varying : tuple of Varying
+    sensitivity_parameters : tuple of SensitivityParameter
         The parameters.
     table : dict
         The formulation's entry for them.
@@ -55,7 +55,7 @@ class ParameterDerivatives:
         Arguments that a library would need to have these derivatives; None where there is one, or none can.
     """
 
-    varying: tuple[Varying, ...]
+    sensitivity_parameters: tuple[SensitivityParameter, ...]
     table: dict[str, Any]
     library: Library | None
     missing_arguments: dict[str, BoolArray] | None

@@ -34,8 +34,8 @@ from ckc_pin.run.simulate import Progress, simulate
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
 from ckc_pin.scene.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.sensitivity.parameters import derivatives_of
 from ckc_pin.sensitivity.sensitivities import sensitivities
-from ckc_pin.sensitivity.varying import derivatives_of
 
 __all__ = ["Floquet", "floquet"]
 

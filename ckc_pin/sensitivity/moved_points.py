@@ -9,18 +9,20 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.native.variation import Varying
+from ckc_pin.native.variation import SensitivityParameter
 
 __all__ = ["moved_points"]
 
 
-def moved_points(mechanism: Mechanism, varying: Sequence[Varying], q_tree: Array, steps: Array) -> dict[str, Array]:
+def moved_points(
+    mechanism: Mechanism, parameters: Sequence[SensitivityParameter], q_tree: Array, steps: Array
+) -> dict[str, Array]:
     """Return how the mechanism's points move with each parameter, in world axes.
 
     Parameters
     ----------
     mechanism : Mechanism
-    varying : sequence of Varying
+    parameters : sequence of SensitivityParameter
     q_tree : (m, n) array
         By instant and coordinate, as a run has them.
     steps : (m, n, p) array
@@ -31,10 +33,10 @@ def moved_points(mechanism: Mechanism, varying: Sequence[Varying], q_tree: Array
     dict of str to (m, 3, p) arrays
         m for each parameter's unit.
     """
-    found = {name: np.zeros((len(q_tree), 3, len(varying))) for name in mechanism.points}
+    found = {name: np.zeros((len(q_tree), 3, len(parameters))) for name in mechanism.points}
     if not found:
         return found
-    placing = [(k, x) for k, x in enumerate(varying) if x.places]
+    placing = [(k, x) for k, x in enumerate(parameters) if x.places]
     for row, (numbers, step) in enumerate(zip(q_tree, steps, strict=True)):
         q = mechanism.tree.from_coordinates(numbers)
         for name, along in mechanism.point_jacobians(q).items():
@@ -48,7 +50,7 @@ def moved_points(mechanism: Mechanism, varying: Sequence[Varying], q_tree: Array
     return found
 
 
-def _placed(mechanism: Mechanism, x: Varying, number: int, name: str, at: Array, pose: Pose) -> Array:
+def _placed(mechanism: Mechanism, x: SensitivityParameter, number: int, name: str, at: Array, pose: Pose) -> Array:
     """How a point moves with what places it, and what places the joints that carry it."""
     carriers, total = set(mechanism.tree.model.supports[mechanism.points[name].joint]), np.zeros(3)
     for effect in x.places:

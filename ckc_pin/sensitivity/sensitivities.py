@@ -19,7 +19,7 @@ from ckc_pin.base.values import lazy
 from ckc_pin.control.controllers import Controller, Law
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.native.variation import Varying
+from ckc_pin.native.variation import SensitivityParameter
 from ckc_pin.run.events import Event
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run
@@ -27,7 +27,7 @@ from ckc_pin.run.simulate import Progress, run_of, run_rows
 from ckc_pin.run.units import key_unit, per
 from ckc_pin.scene.scene import Scene, as_scene
 from ckc_pin.sensitivity.moved_points import moved_points
-from ckc_pin.sensitivity.varying import derivatives_of
+from ckc_pin.sensitivity.parameters import derivatives_of
 
 __all__ = ["Sensitivities", "sensitivities"]
 
@@ -52,7 +52,7 @@ class Sensitivities(Shown):
         more than freedoms share a force. Zero without a controller.
     end_time : (p,) array or None
         How the time of the event that ended the run changes, s; None where it ended at `t_end`.
-    varying : tuple of Varying
+    sensitivity_parameters : tuple of SensitivityParameter
         What the parameters do.
     """
 
@@ -63,7 +63,7 @@ class Sensitivities(Shown):
     u: Array
     tau: Array
     end_time: Array | None
-    varying: tuple[Varying, ...]
+    sensitivity_parameters: tuple[SensitivityParameter, ...]
 
     def card(self) -> Card:
         """Return what there is to see of it."""
@@ -77,7 +77,7 @@ class Sensitivities(Shown):
     @lazy
     def points(self) -> dict[str, Array]:
         """How the mechanism's points move, (m, 3, p) in world axes: with the coordinates, and with what places them."""
-        return moved_points(self.run.mechanism, self.varying, self.run.q_tree, self.q_tree)
+        return moved_points(self.run.mechanism, self.sensitivity_parameters, self.run.q_tree, self.q_tree)
 
     def of(self, name: str, parameter: str) -> Array:
         """Return how a quantity changes with a parameter along the run, shape (m,).
@@ -225,13 +225,13 @@ def sensitivities(
     q_tree, v_tree, u, tau = _parts(ready, rows)
     if np.isnan(q_tree[0]).any():
         raise NumericalError(f"sensitivities: {_start(ready)}", t=0.0)
-    varying = _varying(ready)
-    names = tuple(x.name for x in varying)
-    return Sensitivities(run, names, q_tree, v_tree, u, tau, _end_time(ready), varying)
+    sensitivity_parameters = _sensitivity_parameters(ready)
+    names = tuple(x.name for x in sensitivity_parameters)
+    return Sensitivities(run, names, q_tree, v_tree, u, tau, _end_time(ready), sensitivity_parameters)
 
 
-def _varying(ready: Prepared) -> tuple[Varying, ...]:
-    return ready.derivatives.varying if ready.derivatives else ()
+def _sensitivity_parameters(ready: Prepared) -> tuple[SensitivityParameter, ...]:
+    return ready.derivatives.sensitivity_parameters if ready.derivatives else ()
 
 
 def _apart(ready: Prepared) -> str | None:
@@ -240,9 +240,13 @@ def _apart(ready: Prepared) -> str | None:
     if found is None:
         return None
     coordinate, of_rate, parameter, reason = found
-    joint, name, t = ready.mechanism.coordinates[coordinate], _varying(ready)[parameter].name, float(ready.loop.t)
+    joint, name, t = (
+        ready.mechanism.coordinates[coordinate],
+        _sensitivity_parameters(ready)[parameter].name,
+        float(ready.loop.t),
+    )
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
-    if t == 0.0 and _varying(ready)[parameter].assembled_at == coordinate:
+    if t == 0.0 and _sensitivity_parameters(ready)[parameter].assembled_at == coordinate:
         return (
             f"stopped {where}: {joint} is assembled at its stop, and with another {name} it starts elsewhere one way "
             "only, so that the motion has no derivative"
@@ -268,7 +272,7 @@ def _apart(ready: Prepared) -> str | None:
 
 def _refuse_terms(ready: Prepared) -> None:
     """Refuse what a caller's controller makes of terms that are other ones with other parameters."""
-    name = next((x.name for x in _varying(ready) if any(effect.is_term for effect in x.effects)), None)
+    name = next((x.name for x in _sensitivity_parameters(ready) if any(effect.is_term for effect in x.effects)), None)
     if name is not None and ready.loop.asked():
         raise InputError(
             f"sensitivities: {name}: the controller looks at terms of the mechanism, which change with it in a way "
@@ -293,7 +297,7 @@ def _start(ready: Prepared) -> str:
 
 def _parts(ready: Prepared, rows: Array) -> list[Array]:
     """Split what the loop has recorded behind the motion: by parameter q' and v' together, then u, then tau."""
-    mechanism, p = ready.mechanism, len(_varying(ready))
+    mechanism, p = ready.mechanism, len(_sensitivity_parameters(ready))
     sizes = [2 * mechanism.n, mechanism.d, len(mechanism.actuated)]
     end = rows.shape[1] - p * sum(sizes)
     found = []

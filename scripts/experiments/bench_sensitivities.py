@@ -5,7 +5,7 @@ from __future__ import annotations
 from time import process_time
 
 from ckc_pin.run.simulate import run_rows
-from ckc_pin.sensitivity.varying import derivatives_of
+from ckc_pin.sensitivity.parameters import derivatives_of
 from scripts.experiments.bench import ready
 
 # A scene, its tolerance, and names of which the first p vary.

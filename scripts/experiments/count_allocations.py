@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin import load_scene
 from ckc_pin.run.prepare import prepare
-from ckc_pin.sensitivity.varying import derivatives_of
+from ckc_pin.sensitivity.parameters import derivatives_of
 
 EVENT = {"coordinate": "theta_1", "value": 50.0}
 SCENES: list[tuple[str, dict[str, Any]]] = [

@@ -148,7 +148,7 @@ def test_of_motors_and_what_they_do(formulation: str, tmp_path: Path) -> None:
         found = sensitivities(scene, names, TIGHT)
         some = Sensitivities(
             found.run, found.parameters[:4], found.q_tree[:, :, :4], found.v_tree[:, :, :4], found.u[:, :, :4],
-            found.tau[:, :, :4], None, found.varying[:4],
+            found.tau[:, :, :4], None, found.sensitivity_parameters[:4],
         )  # fmt: skip
         agree(some, scene, TIGHT, parts=("q_tree", "v_tree", "u", "tau"))
 

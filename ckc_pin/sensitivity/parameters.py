@@ -32,7 +32,7 @@ from ckc_pin.mechanism.parameters import (
     values_of,
     with_components,
 )
-from ckc_pin.native.variation import Effect, Varying, directions_of, variation_table
+from ckc_pin.native.variation import Effect, SensitivityParameter, directions_of, variation_table
 from ckc_pin.run.compiled_terms import changing_library
 from ckc_pin.run.prepare import DerivativeSetup, ParameterDerivatives
 from ckc_pin.scene.initial import Start
@@ -40,7 +40,7 @@ from ckc_pin.scene.parts import changed_mechanism
 from ckc_pin.scene.scene import Scene
 from ckc_pin.sensitivity.effects import effects_of
 
-__all__ = ["derivatives_of", "varying_of"]
+__all__ = ["derivatives_of", "find_sensitivity_parameters"]
 
 OTHERWISE = 1e-3  # rad, or of the mechanism's size: another value, to see whether it moves with that too
 NEARBY = 1e-7  # the same: how far a stop is moved to see whether the assembled start follows
@@ -60,18 +60,18 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
     ) -> ParameterDerivatives:
         given, changed = scene.spec.parameters, partial(changed_mechanism, scene)
         law = controller.controller if isinstance(controller, Sampled) else controller
-        varying = varying_of(mechanism, scene, law, actuation, names, changed, start.at.q_tree)
-        require_known_motion(mechanism, scene, controller, varying)
-        require_movable(mechanism, given, varying, changed)
+        parameters = find_sensitivity_parameters(mechanism, scene, law, actuation, names, changed, start.at.q_tree)
+        require_known_motion(mechanism, scene, controller, parameters)
+        require_movable(mechanism, given, parameters, changed)
         if scene.spec.initial.at == "assembled":
-            varying = [at_assembled_stop(mechanism, given, x, changed) for x in varying]
-        arguments, directions = directions_of(mechanism, varying) or (None, None)
+            parameters = [at_assembled_stop(mechanism, given, x, changed) for x in parameters]
+        arguments, directions = directions_of(mechanism, parameters) or (None, None)
         library = changing_library(mechanism, scene.spec.solver.terms, arguments)
         table = variation_table(
-            mechanism, varying, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
+            mechanism, parameters, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=compensated_at(mechanism, law), controlled=controller is not None,
         )  # fmt: skip
-        return ParameterDerivatives(tuple(varying), table, library, arguments if library is None else None)
+        return ParameterDerivatives(tuple(parameters), table, library, arguments if library is None else None)
 
     return setup
 
@@ -87,7 +87,7 @@ def require_known_motion(
     mechanism: Mechanism,
     scene: Scene,
     controller: Controller | TorqueController | Sampled | None,
-    varying: Sequence[Varying],
+    parameters: Sequence[SensitivityParameter],
 ) -> None:
     """Refuse a scene whose motion has no known derivatives (InputError)."""
     spec = scene.spec
@@ -112,7 +112,7 @@ def require_known_motion(
         raise InputError(
             "sensitivities: solver.baumgarte, solver.projection: the loops have to be closed; leave them out"
         )
-    shaping = next((x.name for x in varying if any(effect.is_shape for effect in x.effects)), None)
+    shaping = next((x.name for x in parameters if any(effect.is_shape for effect in x.effects)), None)
     if shaping is not None and type(controller) is Tracking and isinstance(controller.desired, PointPath):
         raise InputError(
             f"sensitivities: {shaping}: q_d is where the mechanism's own lengths bring the point that is to follow a "
@@ -126,13 +126,13 @@ def require_known_motion(
     if not spec.friction_smoothing:
         # joints that cannot move do not turn round
         frictionless = (mechanism.joints.friction == 0) & ~mechanism.freedoms.immobile
-        for x in varying:
+        for x in parameters:
             if any(effect.kind == "friction" and frictionless[effect.index] for effect in x.effects):
                 raise InputError(
                     f"sensitivities: {x.name}: it is 0, and where the joint turns round is not looked for then; give a "
                     f"small one, {x.name} = 1e-6 in [parameters], or friction_smoothing"
                 )
-    plant = [x.name for x in varying if any(effect.is_term for effect in x.effects)]
+    plant = [x.name for x in parameters if any(effect.is_term for effect in x.effects)]
     if type(controller) is Tracking and controller.model is None and plant:
         raise InputError(
             f"sensitivities: {plant[0]}: tracking compensates the mechanism's own terms, and how u changes with "
@@ -147,7 +147,10 @@ def require_known_motion(
 
 
 def require_movable(
-    mechanism: Mechanism, given: Changes, varying: Sequence[Varying], changed: Callable[[Changes], Mechanism]
+    mechanism: Mechanism,
+    given: Changes,
+    parameters: Sequence[SensitivityParameter],
+    changed: Callable[[Changes], Mechanism],
 ) -> None:
     """Refuse a length that redundant rows allow no other value of: the changed mechanism would not move at all.
 
@@ -156,7 +159,7 @@ def require_movable(
     mechanism : Mechanism
     given : mapping
         The scene's own changes of its numbers.
-    varying : sequence of Varying
+    parameters : sequence of SensitivityParameter
     changed : callable
         Makes the mechanism of other changes.
 
@@ -167,7 +170,7 @@ def require_movable(
     if not mechanism.redundant:
         return
     present = values_of(mechanism.spec, mechanism.urdf)
-    for x in varying:
+    for x in parameters:
         if not any(effect.is_shape for effect in x.effects):
             continue
         whole, k = split_component(x.name)
@@ -187,8 +190,8 @@ def require_movable(
 
 
 def at_assembled_stop(
-    mechanism: Mechanism, given: Changes, x: Varying, changed: Callable[[Changes], Mechanism]
-) -> Varying:
+    mechanism: Mechanism, given: Changes, x: SensitivityParameter, changed: Callable[[Changes], Mechanism]
+) -> SensitivityParameter:
     """Mark the parameter of a stop that the assembled start touches: the start then follows the stop one way only.
 
     Parameters
@@ -196,7 +199,7 @@ def at_assembled_stop(
     mechanism : Mechanism
     given : mapping
         The scene's own changes of its numbers.
-    x : Varying
+    x : SensitivityParameter
     changed : callable
         Makes the mechanism of other changes.
 
@@ -236,7 +239,7 @@ def _moved(value: tuple[float, float, float], k: int, step: float) -> Value:
     return x, y, z
 
 
-def varying_of(
+def find_sensitivity_parameters(
     mechanism: Mechanism,
     scene: Scene,
     controller: object,
@@ -244,7 +247,7 @@ def varying_of(
     names: Sequence[str],
     changed: Callable[[Changes], Mechanism],
     q_tree: Array,
-) -> list[Varying]:
+) -> list[SensitivityParameter]:
     """Look names up; a vector's stands for its three components.
 
     `changed` makes the mechanism of other changes; `q_tree` is q' at the start.
@@ -270,18 +273,18 @@ def varying_of(
             if is_parameter(name) else of_scene[name] for name in labels]  # fmt: skip
 
 
-def _of_mechanism(name: str, effects: Sequence[Effect]) -> Varying:
+def _of_mechanism(name: str, effects: Sequence[Effect]) -> SensitivityParameter:
     """Keep what moves nothing but a point that is reported apart from what the motion depends on."""
     placed = ["" if effect.lock is None else effect.lock.placed for effect in effects]
     by_place = list(zip(placed, effects, strict=True))
-    return Varying(
+    return SensitivityParameter(
         name,
         tuple(effect for place, effect in by_place if place != "reported"),
         places=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
     )
 
 
-def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[Varying]:
+def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[SensitivityParameter]:
     """Gains, a number for all or one of the diagonal, and where eq. 14 holds."""
     spec, each = scene.spec.controller, np.eye(mechanism.d)
     gains = {"K_P": "gain_q", "K_V": "gain_q_dot"} if type(controller) is SetPoint else {}
@@ -290,13 +293,13 @@ def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> It
         changes = {f"controller.{key}": each} if isinstance(getattr(spec, key), float | int) else {}
         changes |= {f"controller.{key}.{name}": np.diag(each[k]) for k, name in enumerate(mechanism.independent)}
         for name, gain in changes.items():
-            yield Varying(name, (Effect(kind, 0, gain.ravel(order="F")),))
+            yield SensitivityParameter(name, (Effect(kind, 0, gain.ravel(order="F")),))
     if type(controller) is SetPoint and compensated_at(mechanism, controller).size:
         for k, name in enumerate(mechanism.independent):
-            yield Varying(f"controller.q_d.{name}", (Effect("target", k, controller.K_P[:, k]),))
+            yield SensitivityParameter(f"controller.q_d.{name}", (Effect("target", k, controller.K_P[:, k]),))
 
 
-def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[Varying]:
+def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[SensitivityParameter]:
     tree, moved = mechanism.tree, np.eye(mechanism.tree.n)
     for q, v in tree.free:  # numbers in the world's axes, tangent in the body's
         moved[v : v + 3, v : v + 3] = pin.Quaternion(q_tree[q + 3 : q + 7]).matrix().T
@@ -305,5 +308,5 @@ def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[Var
     parted = {name for root in roots if not set(root) <= set(mechanism.independent) for name in root}
     for k, name in enumerate(mechanism.independent):
         if name not in parted and scene.spec.initial.at is None:
-            yield Varying(f"initial.q.{name}", q=moved[:, tree.index[name]])
-        yield Varying(f"initial.q_dot.{name}", q_dot=np.eye(mechanism.d)[k])
+            yield SensitivityParameter(f"initial.q.{name}", q=moved[:, tree.index[name]])
+        yield SensitivityParameter(f"initial.q_dot.{name}", q_dot=np.eye(mechanism.d)[k])
