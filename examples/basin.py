@@ -29,7 +29,7 @@ def main():
     )
     done, settled = results["status"].to_numpy() == 1, results["settled"].to_numpy() == 1
     theta_1, theta_3 = results["initial.q.theta_1"].to_numpy(), results["initial.q.theta_3"].to_numpy()
-    target = ckc_pin.load_scene("five_bar/set_point").plain()["controller"]["q_d"]
+    target = ckc_pin.load_scene("five_bar/set_point").to_dict()["controller"]["q_d"]
     print(f"{done.sum()} of {done.size} starts can be assembled and run to the end; {settled.sum()} settle")
     figure, ax = plt.subplots(figsize=(4.0, 4.2))
     for members, label, marker, size in (

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_flag, require_kind, require_table
 from ckc_pin.codegen.library import find
 from ckc_pin.control.actuation import Actuation
@@ -41,7 +41,7 @@ AXES = tuple(combinations_with_replacement(enumerate("xyz"), 2))
 
 
 @dataclass(frozen=True, repr=False)
-class Check(Shown):
+class Check(HasSummary):
     """Findings on a mechanism, and on a scene's desired trajectory.
 
     Attributes
@@ -103,9 +103,9 @@ class Check(Shown):
     stability: Stability | None = None
     branches: Array | None = None
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return check_card(self)
+        return check_summary(self)
 
 
 def check(
@@ -240,7 +240,7 @@ def _leaves_out(scene: Scene, actuation: Actuation) -> tuple[str, ...]:
     return tuple(name for name, is_there in there.items() if is_there)
 
 
-def check_card(found: Check) -> Card:
+def check_summary(found: Check) -> Summary:
     """Return what a check found."""
     redundant = f", redundant: {', '.join(found.redundant)}" if found.redundant else ""
     about = [f"i{a}{b} = {found.inertia[i, j]:.6g}" for (i, a), (j, b) in AXES]
@@ -251,7 +251,7 @@ def check_card(found: Check) -> Card:
         ("singular values", f"{found.gap[0]:.2e} | {found.gap[1]:.2e} around the cut (relative, scaled J)"),
         ("independent q", _list(found.independent)),
         ("dependent z", _list(found.dependent)),
-        ("assembled at", quantities(found.coordinates, found.q_tree, found.units)),
+        ("assembled at", format_quantities(found.coordinates, found.q_tree, found.units)),
     ]
     if found.det_phi_z is not None:
         rows.append(("det phi_z", f"{found.det_phi_z:.6g}"))
@@ -263,7 +263,7 @@ def check_card(found: Check) -> Card:
         ("terms", found.terms),
     ]
     for k, numbers in enumerate(found.branches if found.branches is not None else ()):
-        rows.append((f"branch {k + 1}", quantities(found.coordinates, numbers, found.units)))
+        rows.append((f"branch {k + 1}", format_quantities(found.coordinates, numbers, found.units)))
     if found.desired is not None and found.desired.leaves_at is None:
         closest = f"stays inside; closest to singular at t = {found.desired.closest_t:.4f} s"
         rows.append(("desired", f"{closest}, sigma_min(phi_z) = {found.desired.sigma_min:.4g}"))
@@ -274,7 +274,7 @@ def check_card(found: Check) -> Card:
     units = dict(zip(found.coordinates, found.units, strict=True))
     rows += [(f"joint {name}", _of_joint(joint, units[name])) for name, joint in found.joints.items()]
     rows += [("warning", warning) for warning in found.warnings]
-    return Card(f"{found.name}: {_count(found.d, 'freedom')}, {_count(len(found.warnings), 'warning')}", rows)
+    return Summary(f"{found.name}: {_count(found.d, 'freedom')}, {_count(len(found.warnings), 'warning')}", rows)
 
 
 def _of_joint(joint: dict[str, float], unit: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""A value as a person sees it first: a title and a few lines, as text for a terminal or as a table for a notebook."""
+"""One-screen summaries of results, as text for a terminal and as HTML for a notebook, and JSON of results."""
 
 from __future__ import annotations
 
@@ -14,51 +14,63 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import printable
 
-__all__ = ["Card", "Row", "Shown", "eigenvalues_text", "in_notebook", "pairs", "quantities", "to_json"]
+__all__ = [
+    "HasSummary",
+    "Row",
+    "Summary",
+    "format_eigenvalues",
+    "format_quantities",
+    "in_notebook",
+    "to_json",
+    "to_pairs",
+]
 
-WIDTH = 88  # characters of a line of a repr
-MOST_LINES = 3  # of a row of a repr; a command prints all
-MOST_ROWS = 16
-COUNTED = 14  # characters of what says how many items are left out
-GAP = "  "  # between items
-SHOWN = 6  # eigenvalues, in what people read
+LINE_WIDTH = 88  # characters of a line of a repr
+MAX_LINES_PER_ROW = 3  # in a repr; a command prints every line
+MAX_ROWS = 16  # in a repr
+REMAINDER_WIDTH = 14  # characters kept free for "and 12 more"
+GAP = "  "  # between two items, and between label and content
+MAX_EIGENVALUES = 6
+REAL_TOLERANCE = 1e-9  # an eigenvalue is printed as real if its imaginary part is smaller, relative to its size
 
 Row = tuple[str, str | Sequence[str]]
 
 
 @dataclass(frozen=True)
-class Card:
-    """What there is to see of a value.
+class Summary:
+    """Title and labelled rows that describe a value.
 
     Attributes
     ----------
     title : str
     rows : sequence of (label, text) or (label, items)
-        A text is broken between words; of items none is broken.
+        A text may be broken between words. A list of items is broken between items only.
     """
 
     title: str
     rows: Sequence[Row]
 
-    def lines(self, width: int = WIDTH, most: int | None = None) -> Iterator[str]:
-        """Yield the lines below the title; `most` of a row, where the rest is counted."""
+    def lines(self, width: int = LINE_WIDTH, max_lines: int | None = None) -> Iterator[str]:
+        """Yield the lines below the title: at most `max_lines` for each row, the last with a count of omitted items."""
         column = max((len(label) for label, _ in self.rows), default=0) + len(GAP)
         for label, content in self.rows:
-            room = max(width - column, 20)
-            broken = _of_text(content, room, most) if isinstance(content, str) else _of_items(content, room, most)
-            for k, line in enumerate(broken or [""]):
+            available = max(width - column, 20)
+            wrap = _wrap_text if isinstance(content, str) else _wrap_items
+            for k, line in enumerate(wrap(content, available, max_lines) or [""]):  # type: ignore[arg-type]
                 yield f"{'' if k else label:<{column}}{line}".rstrip()
 
-    def text(self, width: int = WIDTH, most: int | None = MOST_LINES) -> str:
-        """Return title and rows for a terminal of so many columns."""
-        shown = self
-        if most is not None and len(self.rows) > MOST_ROWS:
-            shown = Card(self.title, [*self.rows[: MOST_ROWS - 1], ("…", f"and {len(self.rows) - MOST_ROWS + 1} more")])
-        return "\n".join([printable(self.title), *(f"  {printable(line)}" for line in shown.lines(width - 2, most))])
+    def text(self, width: int = LINE_WIDTH, max_lines: int | None = MAX_LINES_PER_ROW) -> str:
+        """Return title and rows as text of at most `width` columns."""
+        summary = self
+        if max_lines is not None and len(self.rows) > MAX_ROWS:
+            omitted = len(self.rows) - MAX_ROWS + 1
+            summary = Summary(self.title, [*self.rows[: MAX_ROWS - 1], ("…", f"and {omitted} more")])
+        lines = (f"  {printable(line)}" for line in summary.lines(width - 2, max_lines))
+        return "\n".join([printable(self.title), *lines])
 
     def html(self) -> str:
-        """Return title and rows as a table for a notebook."""
-        from html import escape  # here, as wrap below: a run whose outcome is JSON needs neither
+        """Return title and rows as an HTML table, with every row and every item."""
+        from html import escape  # imported here because a run that prints JSON does not need it
 
         rows = "".join(
             f'<tr><th style="text-align: left; white-space: nowrap">{escape(label)}</th>'
@@ -68,40 +80,41 @@ class Card:
         return f"<div><strong>{escape(self.title)}</strong><table>{rows}</table></div>"
 
 
-class Shown:
-    """A value that shows itself as a card: in one screen, and inline in a notebook."""
+class HasSummary:
+    """Base of results that print as a one-screen summary, and as a table in a notebook."""
 
-    def card(self) -> Card:
-        """Return what there is to see."""
+    def summary(self) -> Summary:
+        """Return the title and rows that describe this value."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        return self.card().text()
+        return self.summary().text()
 
     def _repr_html_(self) -> str:
-        return self.card().html()
+        return self.summary().html()
 
 
-def quantities(names: Sequence[str], values: Array, units: Sequence[str] = (), digits: int = 6) -> list[str]:
-    """Return items as ``theta_1 = 0.4 rad``, one a name."""
-    shown = [f"{name} = {value:.{digits}g}" for name, value in zip(names, np.asarray(values).tolist(), strict=True)]
-    return [f"{text} {unit}" for text, unit in zip(shown, units, strict=True)] if len(units) else shown
+def format_quantities(names: Sequence[str], values: Array, units: Sequence[str] = (), digits: int = 6) -> list[str]:
+    """Return one text for each quantity, such as ``theta_1 = 0.4 rad``."""
+    texts = [f"{name} = {value:.{digits}g}" for name, value in zip(names, np.asarray(values).tolist(), strict=True)]
+    return [f"{text} {unit}" for text, unit in zip(texts, units, strict=True)] if len(units) else texts
 
 
-def _of_text(text: str, room: int, most: int | None) -> list[str]:
-    from textwrap import wrap
+def _wrap_text(text: str, width: int, max_lines: int | None) -> list[str]:
+    from textwrap import wrap  # imported here because a run that prints JSON does not need it
 
-    lines = wrap(text, room, break_long_words=False, break_on_hyphens=False)
-    return lines if most is None or len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1]} …"]
+    lines = wrap(text, width, break_long_words=False, break_on_hyphens=False)
+    if max_lines is None or len(lines) <= max_lines:
+        return lines
+    return [*lines[: max_lines - 1], f"{lines[max_lines - 1]} …"]
 
 
-def _of_items(items: Sequence[str], room: int, most: int | None) -> list[str]:
-    """Break between items alone."""
+def _wrap_items(items: Sequence[str], width: int, max_lines: int | None) -> list[str]:
     lines: list[list[str]] = [[]]
     for k, item in enumerate(items):
-        last = most is not None and len(lines) == most
-        if lines[-1] and len(GAP.join([*lines[-1], item])) > room - (COUNTED if last else 0):
-            if last:
+        is_last_line = max_lines is not None and len(lines) == max_lines
+        if lines[-1] and len(GAP.join([*lines[-1], item])) > width - (REMAINDER_WIDTH if is_last_line else 0):
+            if is_last_line:
                 lines[-1].append(f"and {len(items) - k} more")
                 break
             lines.append([])
@@ -110,34 +123,35 @@ def _of_items(items: Sequence[str], room: int, most: int | None) -> list[str]:
 
 
 def in_notebook() -> bool:
-    """Whether what a cell returns is shown in a page: a kernel runs us, and not a terminal."""
+    """Whether the program runs in a notebook kernel, which can display HTML, and not in a terminal."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return shell is not None and hasattr(shell, "kernel")
 
 
 def to_json(data: dict[str, Any]) -> str:
-    """Return plain data as one line of JSON, which knows no NaN and no infinity: null."""
-    return json.dumps(_finite(data), allow_nan=False)
+    """Return data as one line of JSON. NaN and infinity, which JSON does not have, become null."""
+    return json.dumps(_replace_nonfinite(data), allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
+def _replace_nonfinite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(x) for key, x in value.items()}
+        return {key: _replace_nonfinite(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(x) for x in value]
+        return [_replace_nonfinite(x) for x in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def pairs(values: Any) -> list[list[float]]:
-    """Return complex numbers as [re, im]."""
+def to_pairs(values: Any) -> list[list[float]]:
+    """Return complex numbers as a list of [real part, imaginary part]."""
     return [[float(x.real), float(x.imag)] for x in np.asarray(values, dtype=complex)]
 
 
-def eigenvalues_text(values: Any) -> str:
-    """Return the rightmost eigenvalues in words, a pair of conjugates as one."""
-    some = [x for x in values if x.imag >= -1e-9 * abs(x)]
-    shown = [
-        f"{x.real:.4g}" if abs(x.imag) <= 1e-9 * abs(x) else f"{x.real:.4g} +- {x.imag:.4g}i" for x in some[:SHOWN]
+def format_eigenvalues(values: Any) -> str:
+    """Return the first eigenvalues as text, such as ``-1 +- 2i, -3``: a conjugate pair is written once."""
+    upper = [x for x in values if x.imag >= -REAL_TOLERANCE * abs(x)]
+    texts = [
+        f"{x.real:.4g}" if abs(x.imag) <= REAL_TOLERANCE * abs(x) else f"{x.real:.4g} +- {x.imag:.4g}i"
+        for x in upper[:MAX_EIGENVALUES]
     ]
-    return ", ".join(shown) + (f" and {len(some) - SHOWN} more" if len(some) > SHOWN else "")
+    return ", ".join(texts) + (f" and {len(upper) - MAX_EIGENVALUES} more" if len(upper) > MAX_EIGENVALUES else "")

@@ -9,7 +9,7 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.output import Working, errors, print_card, print_json
+from ckc_pin.cli.output import Working, errors, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.cli.tables import check_plain
 from ckc_pin.formats import exporting, importing
@@ -50,7 +50,7 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
         for item in items:
             print(f"{verb}: {item}")
     if found:
-        print_card(found.card())
+        print_summary(found.summary())
     else:
         print(f"check: {problem}")
 

@@ -71,7 +71,7 @@ def linearize(
             found = ckc_pin.floquet(what, period, read_changes("--set", changes), progress)
         if out is not None:
             _write_floquet(found, out)
-        _print(found.plain() if as_json else floquet_text(found), out)
+        _print(found.to_dict() if as_json else floquet_text(found), out)
         return
     with Working(f"linearizing {what}"):
         model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_changes("--set", changes))

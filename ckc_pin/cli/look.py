@@ -9,7 +9,7 @@ import click
 import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_changes, read_table
-from ckc_pin.cli.output import LONG, Working, errors, print_card, print_json, print_table
+from ckc_pin.cli.output import LONG, Working, errors, print_json, print_summary, print_table
 from ckc_pin.cli.tables import check_plain, terms_plain, terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
@@ -59,7 +59,7 @@ def check(what: str, changes: tuple[str, ...], branches: bool, as_json: bool) ->
     if as_json:
         print_json(check_plain(found))
     else:
-        print_card(found.card())
+        print_summary(found.summary())
 
 
 @click.command(

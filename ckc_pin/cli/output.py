@@ -18,10 +18,22 @@ from ckc_pin.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-    from ckc_pin.base.summary import Card
+    from ckc_pin.base.summary import Summary
 
-__all__ = ["LONG", "ProgressBar", "Working", "errors", "forget_answer", "has_answered", "kept", "make_folder",
-           "on_terminal", "print_card", "print_json", "print_table"]  # fmt: skip
+__all__ = [
+    "LONG",
+    "ProgressBar",
+    "Working",
+    "errors",
+    "forget_answer",
+    "has_answered",
+    "kept",
+    "make_folder",
+    "on_terminal",
+    "print_json",
+    "print_summary",
+    "print_table",
+]  # fmt: skip
 
 
 LONG = 10.0  # s: what may take longer says so before
@@ -68,9 +80,9 @@ def print_table(table: RenderableType) -> None:
     Console(highlight=False, markup=False, emoji=False).print(table)
 
 
-def print_card(card: Card) -> None:
-    """Print all of a card, as wide as the terminal is; a command that prints no more loads no rich."""
-    print(card.text(get_terminal_size().columns, None))
+def print_summary(summary: Summary) -> None:
+    """Print a summary in the full width of the terminal, without importing rich."""
+    print(summary.text(get_terminal_size().columns, None))
 
 
 def kept(out: Path | None, what: str) -> str:

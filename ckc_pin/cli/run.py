@@ -16,7 +16,7 @@ from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted
-from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_card, print_json
+from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.cli.tables import profile_table
 from ckc_pin.errors import InputError
@@ -91,9 +91,9 @@ def _report(finished: ckc_pin.Run, out: Path | None, figures: bool, profile: boo
     if profile:
         errors().print(profile_table(finished))
     if as_json:
-        print_json(finished.summary())
+        print_json(finished.to_dict())
     else:
-        print_card(finished.card())
+        print_summary(finished.summary())
         print(kept(out, "the run, for ckc play, plot and inverse"))
     sys.stdout.flush()  # a view may keep the command alive
     if finished.status != "done":

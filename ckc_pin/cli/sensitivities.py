@@ -13,7 +13,7 @@ from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_changes
 from ckc_pin.cli.exits import STOPPED, interrupted
-from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_card, print_json
+from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 
@@ -52,9 +52,9 @@ def sensitivities(
     if out is not None:
         _write(found, out, figures)
     if as_json:
-        print_json(found.plain())
+        print_json(found.to_dict())
     else:
-        print_card(found.card())
+        print_summary(found.summary())
         print(kept(out, "sensitivities.npz, for other programs"))
     sys.stdout.flush()
     if found.run.status != "done":

@@ -10,7 +10,7 @@ import click
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import errors, print_json, print_table
-from ckc_pin.ensembles.ensemble import Summary, run_sweep, sweep_task
+from ckc_pin.ensembles.ensemble import SweepResult, run_sweep, sweep_task
 from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.errors import InputError
 
@@ -82,7 +82,7 @@ def sweep(
         raise click.exceptions.Exit(STOPPED if found.status == "stopped" else interrupted(found.message))
 
 
-def _print(found: Summary, out: Path, as_json: bool) -> None:
+def _print(found: SweepResult, out: Path, as_json: bool) -> None:
     keys = ("members", "done", "stopped", "failed", "wall_s", "rate")
     summary = {key: getattr(found, key) for key in keys}
     if as_json:
@@ -121,7 +121,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
     write_whole(out / "indices.csv", "\n".join(rows) + "\n")
 
 
-def _afterwards(found: Summary, out: Path, worst: tuple[str, ...], figures: bool) -> None:
+def _afterwards(found: SweepResult, out: Path, worst: tuple[str, ...], figures: bool) -> None:
     """Draw figures, and run the worst members again."""
     import xarray as xr
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Row, Shown
+from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.codegen.acceleration import ConstrainedInertia
 from ckc_pin.codegen.arguments import labels, numbers, present, values
 from ckc_pin.codegen.expressions import expressions
@@ -24,7 +24,7 @@ FUNCTIONS = ("phi", "J", "J_dot_v", "D_tree", "potential", "bias_tree", "damping
 
 
 @dataclass(frozen=True, repr=False)
-class Symbolic(Shown):
+class Symbolic(HasSummary):
     """CasADi functions of a mechanism; SI units, vectors in the order of `coordinates`.
 
     q is Pinocchio's q' (nq numbers, a free root's rotation a quaternion x, y, z, w of unit length), v is v' (n numbers,
@@ -69,7 +69,7 @@ class Symbolic(Shown):
     q_dot: Any
     v_dot: Any
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
         functions = [str(getattr(self, name)) for name in FUNCTIONS]
         rows: list[Row] = [
@@ -78,7 +78,7 @@ class Symbolic(Shown):
             ("parameters", self.parameters),
             *zip(FUNCTIONS, functions, strict=True),
         ]
-        return Card(f"CasADi functions of {len(self.coordinates)} coordinates", rows)
+        return Summary(f"CasADi functions of {len(self.coordinates)} coordinates", rows)
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:

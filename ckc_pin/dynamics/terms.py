@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import Factorization
-from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_table
 from ckc_pin.base.values import lazy
 from ckc_pin.errors import InputError, NumericalError
@@ -27,7 +27,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 __all__ = ["Terms", "terms"]
 
 
-class Terms(Shown):
+class Terms(HasSummary):
     """Dynamics of a mechanism at one state.
 
     Parameters
@@ -49,19 +49,19 @@ class Terms(Shown):
         self.q_tree = at.q_tree
         self.v_tree = v_tree
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it: the state, and what it can be asked for."""
         mechanism, tree = self.mechanism, self.mechanism.tree
         names, n, d = mechanism.coordinates, mechanism.n, mechanism.d
         rows: list[Row] = [
-            ("q_tree", quantities(names, tree.to_coordinates(self.q_tree), tree.units())),
-            ("v_tree", quantities(names, self.v_tree, tree.units("/s"))),
+            ("q_tree", format_quantities(names, tree.to_coordinates(self.q_tree), tree.units())),
+            ("v_tree", format_quantities(names, self.v_tree, tree.units("/s"))),
             ("energy", f"{self.energy:.9g} J"),
             ("largest |phi|", f"{np.abs(self.phi).max(initial=0.0):.2g}"),
             ("of the tree", [f"D_tree {n, n}", f"C_tree {n, n}", f"h_tree ({n},)"]),
             ("reduced", [f"D {d, d}", f"C {d, d}", f"h ({d},)", f"rho {n, d}", f"rho_dot {n, d}"]),
         ]
-        return Card(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
+        return Summary(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
 
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ from ckc_pin.scene.scene import CHANGES, as_toml
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Summary", "ensemble", "run_sweep", "sweep_task"]
+__all__ = ["SweepResult", "ensemble", "run_sweep", "sweep_task"]
 
 CHUNK_S = 1.0  # of a chunk: what is lost at most, and long beside what it costs to hand it around
 RATE = {"generated": 3e6, "pinocchio": 6e5}  # right-hand sides a second, roughly: a chunk's length is no result
@@ -37,7 +37,7 @@ MOST_CHUNK = 2**16
 
 
 @dataclass(frozen=True)
-class Summary:
+class SweepResult:
     """What `ckc sweep --json` prints, where the results are, and who can run a member again."""
 
     status: Literal["done", "stopped", "interrupted"]
@@ -187,7 +187,7 @@ def run_sweep(
     scheduler: str | None = None,
     chunk: int | None = None,
     progress: bool = True,
-) -> Summary:
+) -> SweepResult:
     """Run what of a sweep is not there yet.
 
     Raises
@@ -234,7 +234,7 @@ def run_sweep(
         status, message = "interrupted", f"interrupted{by}; what is there stays, the same command goes on from it"
     wall_s, after = perf_counter() - started, store.counts()
     ran = before["pending"] - after["pending"]
-    return Summary(
+    return SweepResult(
         status, message, count, after["done"], after["stopped"], after["failed"], wall_s, ran / wall_s if ran else 0.0,
         store.repairs, store.place, members,
     )  # fmt: skip
@@ -258,7 +258,7 @@ def _content(task: SweepTask, members: Members) -> dict[str, Any]:
     functions = {name: getattr(f, "__qualname__", type(f).__qualname__) for name, f in task.functions.items()}
     files = {file: Sources(task.name, task.folder).text(file) for v in task.spec.variables.values() if (file := v.file)}
     return {
-        "scene_name": members.scene.name, "scene": members.scene.plain() | {"name": members.scene.name},
+        "scene_name": members.scene.name, "scene": members.scene.to_dict() | {"name": members.scene.name},
         "texts": members.ready.texts, "variables": msgspec.to_builtins(task.spec.variables), "files": files,
         "outputs": {**msgspec.to_builtins(task.spec.outputs), **functions}, "members": task.variables().count,
         "seed": task.spec.seed, "terms": members.terms,

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
-from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 
 __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
 
@@ -150,7 +150,7 @@ class Path:
 
 
 @dataclass(frozen=True, repr=False)
-class SingularityMap(Shown):
+class SingularityMap(HasSummary):
     """Fig. 2 of any mechanism.
 
     Attributes
@@ -190,17 +190,19 @@ class SingularityMap(Shown):
     seconds: float
     notes: tuple[str, ...] = field(default=())
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
         rows: list[Row] = [(a.name, f"{a.low:.4g} to {a.high:.4g} {a.unit}, {len(a.values)} cells") for a in self.axes]
-        rows += [("fixed", quantities(list(self.fixed), np.array(list(self.fixed.values()))))] if self.fixed else []
+        rows += (
+            [("fixed", format_quantities(list(self.fixed), np.array(list(self.fixed.values()))))] if self.fixed else []
+        )
         rows.append(("branches", f"{len(self.aspects)}{', and more' if self.more_branches else ''}"))
         rows.append(("loci", f"{len(self.loci)}: where {self.measure} or J is singular"))
         if self.path is not None:
             rows.append(("desired", self.path.name))
         rows += [("note", note) for note in self.notes]
         where = "independent coordinates" if self.point is None or self.space == "joint" else f"place of {self.point}"
-        return Card(f"Singularity map of {self.mechanism} over {where}", rows)
+        return Summary(f"Singularity map of {self.mechanism} over {where}", rows)
 
     @property
     def counts(self) -> IntArray:

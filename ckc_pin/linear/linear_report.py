@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import written_whole
-from ckc_pin.base.summary import eigenvalues_text, pairs
+from ckc_pin.base.summary import format_eigenvalues, to_pairs
 from ckc_pin.linear.linear_model import LinearModel, eigenvalues_of
 from ckc_pin.linear.stability_result import Stability
 
@@ -39,13 +39,13 @@ def linear_plain(model: LinearModel) -> dict[str, Any]:
         "inputs": model.inputs,
         "outputs": model.outputs,
         **{name: getattr(model, name).tolist() for name in "ABCD"},
-        "eigenvalues": pairs(model.eigenvalues),
+        "eigenvalues": to_pairs(model.eigenvalues),
         "modes": [
             {
-                "eigenvalue": pairs([mode.eigenvalue])[0],
+                "eigenvalue": to_pairs([mode.eigenvalue])[0],
                 "frequency": mode.frequency,
                 "damping_ratio": mode.damping_ratio,
-                "shape": dict(zip(model.coordinates, pairs(mode.shape), strict=True)),
+                "shape": dict(zip(model.coordinates, to_pairs(mode.shape), strict=True)),
             }
             for mode in model.modes
         ],
@@ -58,7 +58,9 @@ def linear_plain(model: LinearModel) -> dict[str, Any]:
             "tau": model.tau.tolist(),
         },
         "locked": model.locked,
-        "closed_loop": None if closed is None else {"A": closed.tolist(), "eigenvalues": pairs(eigenvalues_of(closed))},
+        "closed_loop": None
+        if closed is None
+        else {"A": closed.tolist(), "eigenvalues": to_pairs(eigenvalues_of(closed))},
         "notes": model.notes,
     }
 
@@ -69,7 +71,7 @@ def linear_text(model: LinearModel) -> Text:
 
     lines = [repr(model)]
     if model.closed_loop is not None:
-        lines.append(f"  closed loop: {eigenvalues_text(eigenvalues_of(model.closed_loop))} 1/s")
+        lines.append(f"  closed loop: {format_eigenvalues(eigenvalues_of(model.closed_loop))} 1/s")
     return Text("\n".join(lines))
 
 
@@ -106,7 +108,7 @@ def stability_plain(found: Stability | None) -> dict[str, Any] | None:
         return None
     return {
         **vars(found),
-        "eigenvalues": None if found.eigenvalues is None else pairs(found.eigenvalues),
+        "eigenvalues": None if found.eigenvalues is None else to_pairs(found.eigenvalues),
         "least_K_P": None if found.least_K_P is None else found.least_K_P.tolist(),
         "offset": None if found.offset is None else found.offset.tolist(),
     }
@@ -126,7 +128,7 @@ def stability_text(found: Stability) -> str:
     if found.growth is not None and found.largest_growth is not None and found.offset is not None:
         far = float(found.offset.max())
         off = f", a run goes up to {far:.2g} rad or m off it" if found.stable and far > OFF else ""
-        values = eigenvalues_text(found.eigenvalues)
+        values = format_eigenvalues(found.eigenvalues)
         return (
             f"{says} along the motion{as_sampled}: errors grow to {_times(found.largest_growth)} at most, to "
             f"{_times(found.growth)} at its end{off}; eigenvalues at its start {values} 1/s"
@@ -135,7 +137,7 @@ def stability_text(found: Stability) -> str:
         says += f"{as_sampled}, factor {found.multiplier:.6g} a sample,"
     slowest = "" if found.slowest is None or np.isinf(found.slowest) else f", slowest decay {found.slowest:.3g} s"
     where = "where it rests" if found.least_K_P is None else "at its target"
-    return f"{says} {where}{slowest}: eigenvalues {eigenvalues_text(found.eigenvalues)} 1/s"
+    return f"{says} {where}{slowest}: eigenvalues {format_eigenvalues(found.eigenvalues)} 1/s"
 
 
 def stability_warning(found: Stability, independent: tuple[str, ...]) -> list[str]:

@@ -316,7 +316,7 @@ def _run_to(scene: Scene, t: float) -> Run:
     if not 0 <= t <= t_end:
         raise InputError(f"t = {t:.15g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:.15g} s")
     changes = {"t_end": max(t, min(MOMENT, t_end))}
-    run = simulate(make_scene(with_changes(scene.plain(), changes), scene.name, scene.sources))
+    run = simulate(make_scene(with_changes(scene.to_dict(), changes), scene.name, scene.sources))
     if run.status == "interrupted":
         raise interrupt_again(run.message)
     if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.summary import Card, Row, Shown, eigenvalues_text
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues
 from ckc_pin.base.validation import require_kind
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
@@ -32,7 +32,7 @@ GAINS = {SetPoint: ("K_P", "K_V"), Tracking: ("K_D", "Lambda")}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GainLocus(Shown):
+class GainLocus(HasSummary):
     """Eigenvalues of a scene's closed loop by a factor on one gain; `ckc_pin.plot` draws it.
 
     Attributes
@@ -59,9 +59,9 @@ class GainLocus(Shown):
         """Where the scene's own gain is among the factors."""
         return int(np.argmin(np.abs(np.log(self.factors))))
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return locus_card(self)
+        return locus_summary(self)
 
 
 def gain_locus(
@@ -128,10 +128,10 @@ def gain_locus(
     return GainLocus(what.name, gain, at, FACTORS, np.array(values))
 
 
-def locus_card(found: GainLocus) -> Card:
+def locus_summary(found: GainLocus) -> Summary:
     """Return where the eigenvalues of a closed loop are at the ends of a locus, and as the scene has the gain."""
     rows: list[Row] = [
-        (f"{found.gain} times {found.factors[k]:.4g}", f"{eigenvalues_text(found.eigenvalues[k])} 1/s")
+        (f"{found.gain} times {found.factors[k]:.4g}", f"{format_eigenvalues(found.eigenvalues[k])} 1/s")
         for k in sorted({0, found.own, len(found.factors) - 1})
     ]
-    return Card(f"GainLocus of {found.name}, {found.at}: {len(found.factors)} factors on {found.gain}", rows)
+    return Summary(f"GainLocus of {found.name}, {found.at}: {len(found.factors)} factors on {found.gain}", rows)

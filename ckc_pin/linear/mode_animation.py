@@ -118,7 +118,7 @@ def _run(model: LinearModel, number: int, mode: Mode, seconds: Array, states: li
         events=[],
         stats=stats,
         scene_name=name,
-        scene=make_scene(scene, name, mechanism.sources).plain(),
+        scene=make_scene(scene, name, mechanism.sources).to_dict(),
         texts=dict(mechanism.sources.texts),
     )
     run.__dict__["mechanism"] = mechanism

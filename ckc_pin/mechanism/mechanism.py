@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
@@ -24,7 +24,7 @@ CONSTRAINED_IN_PART = (
 )
 
 
-class Mechanism(Shown):
+class Mechanism(HasSummary):
     """A closed chain: everything that does not depend on the state. `load` makes one.
 
     Parameters
@@ -86,7 +86,7 @@ class Mechanism(Shown):
         self._split(linkage.motors)
         self._actuate(linkage.motors)
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
         tree = self.tree
         loops = [f"{loop.name} ({loop.type})" for loop in self.spec.loop]
@@ -97,11 +97,11 @@ class Mechanism(Shown):
             ("independent q", ", ".join(self.independent) or "none"),
             ("dependent z", ", ".join(self.dependent) or "none"),
             ("motors", ", ".join(self.actuated) or "none"),
-            ("assembled at", quantities(self.coordinates, tree.to_coordinates(self.q_tree), tree.units())),
+            ("assembled at", format_quantities(self.coordinates, tree.to_coordinates(self.q_tree), tree.units())),
         ]
         rows += [("points", list(self.points))] if self.points else []
         rows += [("warning", warning) for warning in self.warnings]
-        return Card(f"Mechanism {self.name}: {self.n} coordinates, {self.d} freedoms", rows)
+        return Summary(f"Mechanism {self.name}: {self.n} coordinates, {self.d} freedoms", rows)
 
     # --- one configuration -----------------------------------------------------------------------
 

@@ -94,7 +94,7 @@ def changed(
     present = values_of(spec, urdf)
     require_known(changes, with_components(present), f"{source}: parameters")
     whole = _whole(present, changes, source)
-    data = spec.plain()
+    data = spec.to_dict()
     links = {link.attrib["name"]: link for link in urdf.findall("link")}
     joints = {joint.attrib["name"]: joint for joint in urdf.findall("joint")}
     warnings: list[str] = []
@@ -237,7 +237,7 @@ def _all(spec: MechanismSpec, urdf: ElementTree.Element) -> Iterator[tuple[str, 
 
 def _of_file(spec: MechanismSpec) -> Iterator[tuple[str, Value]]:
     """Numbers of the tables [[loop]], [[coupling]], [[spring]], [[force]] and [[motor]]."""
-    data = spec.plain()
+    data = spec.to_dict()
     for kind, keys in OF_ENTRY.items():
         for k, entry in enumerate(data[kind]):
             for key in keys:

@@ -190,7 +190,7 @@ class MechanismSpec(FileStruct, frozen=True):
     motor: list[MotorSpec] = []
     point: list[PointSpec] = []
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the file's content as plain data."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

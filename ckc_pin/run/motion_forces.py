@@ -12,10 +12,10 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import written_whole
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Status
-from ckc_pin.run.summary import forces_card
+from ckc_pin.run.summary import forces_summary
 
 __all__ = ["MotionForces", "collected"]
 
@@ -23,7 +23,7 @@ BEYOND = 1e-9  # of a limit: what was cut off there stands at it, but for roundi
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MotionForces(Shown):
+class MotionForces(HasSummary):
     """What acts in a mechanism along a motion; a row of each array is an instant.
 
     Attributes
@@ -70,9 +70,9 @@ class MotionForces(Shown):
     joint_forces: dict[str, Array]
     exceeded: list[dict[str, Any]]
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return forces_card(self)
+        return forces_summary(self)
 
     @property
     def coordinates(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import write_whole
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.base.validation import a_kind, is_number, require_path
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import build
@@ -24,7 +24,7 @@ from ckc_pin.run.columns import as_csv, as_data_frame, as_dataset
 from ckc_pin.run.instants import part_of, state_of
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
 from ckc_pin.run.state import State
-from ckc_pin.run.summary import run_card
+from ckc_pin.run.summary import run_summary
 
 if TYPE_CHECKING:
     import pandas
@@ -41,7 +41,7 @@ META = tuple(name for name in RunMeta.__struct_fields__ if name not in ("format"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Run(Shown):
+class Run(HasSummary):
     """A simulated motion; a row of each array is an output instant.
 
     ``run["theta_1"]`` is a coordinate along the motion, ``run.sel(t=0.5)`` the state at an instant, ``run.plot()`` and
@@ -128,9 +128,9 @@ class Run(Shown):
             raise InputError(f"{self.scene_name}: damaged: the run's phi has {rows}")
         return mechanism
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return run_card(self)
+        return run_summary(self)
 
     # --- by name, by time ------------------------------------------------------------------------
 
@@ -230,7 +230,7 @@ class Run(Shown):
 
         return loop_forces(self)
 
-    def summary(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return what `ckc run --json` prints (docs/reference/json.md): scalars, and the last instant by name."""
         last = {name: path[-1].tolist() for name, path in self.points.items()}
         return {

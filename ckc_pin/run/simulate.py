@@ -138,7 +138,7 @@ def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: f
         events=events_met(ready.events, mechanism, loop),
         stats={**loop.stats(), "wall_s": wall_s},
         scene_name=scene.name,
-        scene=scene.plain(),
+        scene=scene.to_dict(),
         texts=ready.texts,
         profile={name: {"calls": calls, "seconds": spent} for name, (calls, spent) in loop.profile().items()},
         **parts,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.base.validation import is_number
 from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController
@@ -20,7 +20,7 @@ from ckc_pin.run.events import Event, events_met
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.state import State
 from ckc_pin.run.stop_reasons import PAUSE, Stop, explain
-from ckc_pin.run.summary import simulator_card
+from ckc_pin.run.summary import simulator_summary
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import scene_controller
 from ckc_pin.scene.scene import Scene, as_scene, make_scene, with_changes
@@ -30,7 +30,7 @@ __all__ = ["Simulator"]
 AT_WORK = "this simulator is at work on another call; it takes one at a time, and none from an event's function"
 
 
-class Simulator(Shown):
+class Simulator(HasSummary):
     """A scene that is stepped by its caller, who gives u; as accurate as `simulate`, and it stops for the same reasons.
 
     Parameters
@@ -108,9 +108,9 @@ class Simulator(Shown):
             "is with other.reset(simulator.state)"
         )
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return simulator_card(self)
+        return simulator_summary(self)
 
     @property
     def state(self) -> State:
@@ -227,7 +227,7 @@ class Simulator(Shown):
         if not isinstance(table, Mapping):
             raise InputError(f"reset: {table!r:.80} is no State and no table as a scene's [initial]")
         scene = self._ready.scene
-        data = with_changes(scene.plain(), {"initial": table})
+        data = with_changes(scene.to_dict(), {"initial": table})
         return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 
     def _require_dt(self, dt: Any) -> float:

@@ -7,16 +7,16 @@ from functools import cached_property
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.summary import state_card
+from ckc_pin.run.summary import state_summary
 
 __all__ = ["State"]
 
 
-class State(Shown):
+class State(HasSummary):
     """Where a simulator is, or a run was. It stays as it is when the simulator goes on; its arrays are read-only.
 
     Attributes
@@ -31,9 +31,9 @@ class State(Shown):
         self.t = t
         numbers.setflags(write=False)
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return state_card(self)
+        return state_summary(self)
 
     @cached_property
     def _q_tree(self) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import Card, Row, quantities
+from ckc_pin.base.summary import Row, Summary, format_quantities
 from ckc_pin.codegen.library import too_large
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from ckc_pin.run.simulator import Simulator
     from ckc_pin.run.state import State
 
-__all__ = ["forces_card", "run_card", "simulator_card", "state_card"]
+__all__ = ["forces_summary", "run_summary", "simulator_summary", "state_summary"]
 
 MOST_EVENTS = 10
 LONG = 10.0  # s: what compiling a mechanism's terms takes at most, as a rule
 
 
-def run_card(run: Run) -> Card:
+def run_summary(run: Run) -> Summary:
     """Return the outcome of a run."""
     mechanism = _mechanism(run)
     units = ([], []) if mechanism is None else (mechanism.tree.units(), mechanism.tree.units("/s"))
     rows: list[Row] = [
         ("formulation", formulation_of(run.scene, exact=not run.w[0].any())),
         ("instants", f"{len(run.t)}, from t = {run.t[0]:g} to {run.t[-1]:g} s"),
-        ("q_tree at the end", quantities(run.coordinates, run.q_tree[-1], units[0], 9)),
-        ("v_tree at the end", quantities(run.coordinates, run.v_tree[-1], units[1])),
+        ("q_tree at the end", format_quantities(run.coordinates, run.q_tree[-1], units[0], 9)),
+        ("v_tree at the end", format_quantities(run.coordinates, run.v_tree[-1], units[1])),
     ]
     if np.any(run.u) or np.any(run.tau) or "controller" in run.scene:
         u_unit, tau_unit = ("", "") if mechanism is None else _efforts(mechanism)
@@ -53,7 +53,7 @@ def run_card(run: Run) -> Card:
     if len(run.events) > MOST_EVENTS:
         rows.append(("", f"and {len(run.events) - MOST_EVENTS} more events"))
     said = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"
-    return Card(f"Run of {run.scene_name}, {said}", rows)
+    return Summary(f"Run of {run.scene_name}, {said}", rows)
 
 
 def _work(stats: dict[str, Any], would_pay: str = "") -> list[Row]:
@@ -89,45 +89,45 @@ def _mechanism(run: Run) -> Mechanism | None:
         return None
 
 
-def forces_card(found: MotionForces) -> Card:
+def forces_summary(found: MotionForces) -> Summary:
     """Return what a motion asks of motors, loops and joints."""
     rows: list[Row] = [
         ("instants", f"{len(found.t)}, from t = {found.t[0]:g} to {found.t[-1]:g} s"),
-        ("largest |tau|", quantities(found.actuated, np.abs(found.tau).max(axis=0))),
+        ("largest |tau|", format_quantities(found.actuated, np.abs(found.tau).max(axis=0))),
         ("loop_forces", list(found.loop_forces)),
         ("joint_forces", list(found.joint_forces)),
     ]
     rows += [("exceeded", f"{x['motor']}: {x['most']:.4g} at t = {x['t_most']:.4g} s, its limit is {x['limit']:.4g}")
              for x in found.exceeded]  # fmt: skip
-    return Card(f"MotionForces of {found.name}, {found.status}: {found.message}", rows)
+    return Summary(f"MotionForces of {found.name}, {found.status}: {found.message}", rows)
 
 
-def state_card(state: State) -> Card:
+def state_summary(state: State) -> Summary:
     """Return where a simulator is, or a run was."""
     mechanism = state.mechanism
     tree = mechanism.tree
     rows: list[Row] = [
-        ("q_tree", quantities(mechanism.coordinates, state.q_tree, tree.units())),
-        ("v_tree", quantities(mechanism.coordinates, state.v_tree, tree.units("/s"))),
+        ("q_tree", format_quantities(mechanism.coordinates, state.q_tree, tree.units())),
+        ("v_tree", format_quantities(mechanism.coordinates, state.v_tree, tree.units("/s"))),
         ("independent q", _list(mechanism.independent)),
     ]
     rows += [("w", f"up to {_largest(state.w):.3g}")] if np.any(state.w) else []
-    return Card(f"State of {mechanism.name} at t = {state.t:g} s", rows)
+    return Summary(f"State of {mechanism.name} at t = {state.t:g} s", rows)
 
 
-def simulator_card(simulator: Simulator) -> Card:
+def simulator_summary(simulator: Simulator) -> Summary:
     """Return what a simulator steps, and where it is."""
     scene = simulator.scene
     motors = simulator.mechanism.actuated
     rows: list[Row] = [
-        ("formulation", formulation_of(scene.plain(), exact=not np.any(simulator.state.w))),
-        *state_card(simulator.state).rows,
+        ("formulation", formulation_of(scene.to_dict(), exact=not np.any(simulator.state.w))),
+        *state_summary(simulator.state).rows,
         ("motors", _list(motors)),
     ]
     with suppress(InputError):  # within a step, as from an event's function, it counts on
         stats = simulator.stats
         rows += _work(stats) if stats["rhs"] else []
-    return Card(f"Simulator of {scene.name} at t = {simulator.state.t:g} s", rows)
+    return Summary(f"Simulator of {scene.name} at t = {simulator.state.t:g} s", rows)
 
 
 def _list(names: tuple[str, ...]) -> str:

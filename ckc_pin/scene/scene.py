@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.base.toml import by_coordinate, convert, read_text, read_toml
 from ckc_pin.base.validation import require_kind, require_table
 from ckc_pin.control.spec import FeedbackSpec
@@ -23,7 +23,7 @@ from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_p
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
-from ckc_pin.scene.summary import scene_card
+from ckc_pin.scene.summary import scene_summary
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "as_toml", "load_scene", "scene_names", "with_changes"]
 
@@ -35,7 +35,7 @@ CHANGES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
 
 
 @dataclass(frozen=True, repr=False)
-class Scene(Shown):
+class Scene(HasSummary):
     """A checked scene and where its files are.
 
     Attributes
@@ -51,11 +51,11 @@ class Scene(Shown):
     name: str
     sources: Sources
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return scene_card(self)
+        return scene_summary(self)
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the scene as resolved, as plain data without absent values."""
         found: dict[str, Any] = msgspec.msgpack.decode(self._packed)
         return found

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ckc_pin.base.summary import Card, Row
+from ckc_pin.base.summary import Row, Summary
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.mechanism.generators import GeneratorSpec
 
 if TYPE_CHECKING:
     from ckc_pin.scene.scene import Scene
 
-__all__ = ["formulation_of", "scene_card"]
+__all__ = ["formulation_of", "scene_summary"]
 
 
-def scene_card(scene: Scene) -> Card:
+def scene_summary(scene: Scene) -> Summary:
     """Return what a scene says."""
     spec = scene.spec
     made = f"{spec.mechanism.generator}, N = {spec.mechanism.N}" if isinstance(spec.mechanism, GeneratorSpec) else ""
     start = spec.initial.at or [f"{name} = {value:g}" for name, value in spec.initial.q.items()]
     rows: list[Row] = [
         ("mechanism", made or str(spec.mechanism)),
-        ("formulation", formulation_of(scene.plain(), exact=not any(spec.initial.w or ()))),
+        ("formulation", formulation_of(scene.to_dict(), exact=not any(spec.initial.w or ()))),
         ("t_end", f"{spec.t_end:g} s"),
         ("starts", f"at {start}" if isinstance(start, str) else start),
     ]
@@ -29,7 +29,7 @@ def scene_card(scene: Scene) -> Card:
     rows += [("with rates", rates)] if rates else []
     rows += [("method", f"{spec.solver.method}, rtol = {spec.solver.rtol:g}"), ("control", _control(spec.controller))]
     rows += [("event", f"{event.of} of {event.coordinate or 'the mechanism'}") for event in spec.event]
-    return Card(f"Scene {scene.name}", rows)
+    return Summary(f"Scene {scene.name}", rows)
 
 
 def _control(spec: ControllerSpec | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ckc_pin.base.atomic_files import written_whole
-from ckc_pin.base.summary import eigenvalues_text
+from ckc_pin.base.summary import format_eigenvalues
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -19,7 +19,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.interrupt import interrupt_again
-from ckc_pin.base.summary import Card, Shown
+from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.base.validation import a_kind, is_number
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.point_path import PointPath
@@ -48,7 +48,7 @@ BETWEEN = 9  # steps from a multiplier to the unit circle
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Floquet(Shown):
+class Floquet(HasSummary):
     """A periodic motion to first order.
 
     Attributes
@@ -79,11 +79,11 @@ class Floquet(Shown):
     period: float
     run: Run
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return floquet_card(self)
+        return floquet_summary(self)
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return it as JSON has it, complex numbers as [re, im]."""
         return {
             "name": self.run.scene_name,
@@ -132,7 +132,7 @@ def floquet(
     if period < LEAST:
         raise InputError(f"period = {period:g} s is none: nothing moves in less than {LEAST:g} s")
     given = as_scene(scene, changes, "floquet")
-    loaded = make_scene(with_changes(given.plain(), {"t_end": float(period)}), given.name, given.sources)
+    loaded = make_scene(with_changes(given.to_dict(), {"t_end": float(period)}), given.name, given.sources)
     mechanism = scene_mechanism(loaded)
     if mechanism.rooted:
         raise InputError(
@@ -245,7 +245,9 @@ def _from_coordinates(scene: Scene, mechanism: Mechanism) -> Scene:
     start = find_start(mechanism, scene)
     q = mechanism.tree.named(mechanism.tree.to_coordinates(start.at.q_tree))
     return make_scene(
-        with_changes(scene.plain(), {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}), scene.name, scene.sources
+        with_changes(scene.to_dict(), {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}),
+        scene.name,
+        scene.sources,
     )
 
 
@@ -278,11 +280,11 @@ def _miss(run: Run, period: float) -> float:
     return largest
 
 
-def floquet_card(found: Floquet) -> Card:
+def floquet_summary(found: Floquet) -> Summary:
     """Return the multipliers of a periodic motion, and what they say."""
-    return Card(f"Floquet of {found.run.scene_name}, period {found.period:.9g} s", [
+    return Summary(f"Floquet of {found.run.scene_name}, period {found.period:.9g} s", [
         ("states", list(found.states)),
-        ("multipliers", eigenvalues_text(found.multipliers)),
+        ("multipliers", format_eigenvalues(found.multipliers)),
         ("verdict", multipliers_say(found)),
     ])  # fmt: skip
 
@@ -305,7 +307,7 @@ def floquet_text(found: Floquet) -> Text:
     return Text(
         f"Motion of {found.run.scene_name}, period {found.period:.9g} s\n"
         f"  states  {', '.join(found.states)}\n"
-        f"  Floquet multipliers {eigenvalues_text(found.multipliers)}; {multipliers_say(found)}"
+        f"  Floquet multipliers {format_eigenvalues(found.multipliers)}; {multipliers_say(found)}"
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import written_whole
-from ckc_pin.base.summary import Card, Row, Shown, quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_callable, require_kind, require_path
 from ckc_pin.base.values import lazy
 from ckc_pin.control.controllers import Controller, Law
@@ -36,7 +36,7 @@ RATES = ("q", "q_dot")  # of which an event's time is known to change
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensitivities(Shown):
+class Sensitivities(HasSummary):
     """A run with its derivatives by parameters, at fixed times.
 
     Attributes
@@ -65,9 +65,9 @@ class Sensitivities(Shown):
     end_time: Array | None
     sensitivity_parameters: tuple[SensitivityParameter, ...]
 
-    def card(self) -> Card:
+    def summary(self) -> Summary:
         """Return what there is to see of it."""
-        return sensitivities_card(self)
+        return sensitivities_summary(self)
 
     @property
     def t(self) -> Array:
@@ -112,7 +112,7 @@ class Sensitivities(Shown):
             found |= {f"point:{name}.{axis}": moved[:, k] for k, axis in enumerate("xyz")}
         return found
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return them as JSON has them; a row of each list an instant, by coordinate and parameter."""
         run = self.run
         names = {"coordinates": run.coordinates, "independent": run.independent, "actuated": run.actuated}
@@ -321,7 +321,7 @@ def _end_time(ready: Prepared) -> Array | None:
     return found
 
 
-def sensitivities_card(found: Sensitivities) -> Card:
+def sensitivities_summary(found: Sensitivities) -> Summary:
     """Return how far each parameter moves the independent coordinates, and the points, at most along the run."""
     run = found.run
     tree, at = run.mechanism.tree, [run.coordinates.index(name) for name in run.independent]
@@ -335,10 +335,10 @@ def sensitivities_card(found: Sensitivities) -> Card:
         unit = key_unit(run.mechanism, name)
         most = [np.abs(found.q_tree[:, j, k]).max() for j in at]
         most += [np.linalg.norm(moved[:, :, k], axis=1).max() for moved in found.points.values()]
-        rows.append((f"by {name}", quantities(names, np.array(most), [per(one, unit) for one in units], 4)))
+        rows.append((f"by {name}", format_quantities(names, np.array(most), [per(one, unit) for one in units], 4)))
     if found.end_time is not None:
         shown = [f"{x:.4g} {per('s', key_unit(run.mechanism, name))}" for name, x in
                  zip(found.parameters, found.end_time.tolist(), strict=True)]  # fmt: skip
         rows.append(("the end comes later by", shown))
     said = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"
-    return Card(f"Sensitivities of {run.scene_name}, {said}", rows)
+    return Summary(f"Sensitivities of {run.scene_name}, {said}", rows)

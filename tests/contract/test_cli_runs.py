@@ -222,7 +222,7 @@ def test_numpy_values_change_a_scene_like_pythons() -> None:
     spec = load_scene("five_bar/tracking", changes).spec
     assert (spec.t_end, spec.solver.max_rhs) == (0.5, 7)
     assert spec.controller is not None
-    assert load_scene("five_bar/tracking", changes).plain()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
+    assert load_scene("five_bar/tracking", changes).to_dict()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
 
 
 def test_a_scene_is_complete() -> None:

@@ -121,7 +121,7 @@ def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Pat
     found = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
     assert list(found) == ["name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"]
     assert found["stable"] is None
-    assert found == floquet("bricard/period", float(PERIOD)).plain()
+    assert found == floquet("bricard/period", float(PERIOD)).to_dict()
     # one freedom without damping: the area of pushes stays, and one along the motion comes back as it was
     monodromy = np.array(found["monodromy"])
     assert np.linalg.det(monodromy) == pytest.approx(1.0, abs=1e-7)

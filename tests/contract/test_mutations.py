@@ -141,4 +141,4 @@ def test_run_files(tmp_path: Path) -> None:
 
 def _read(path: Path) -> None:
     run = Run.load(path)
-    to_json(run.summary()), run.card().text(), profile_table(run), run.loop_forces(), run.points
+    to_json(run.to_dict()), run.summary().text(), profile_table(run), run.loop_forces(), run.points

@@ -13,7 +13,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, Run, Simulator, State, Terms, check, load, load_scene, simulate
-from ckc_pin.base.summary import Card, in_notebook
+from ckc_pin.base.summary import Summary, in_notebook
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.view.inline import Figures, Playback
 from tests.conftest import assert_close
@@ -50,7 +50,7 @@ def test_a_repr_is_one_screen_and_says_what_it_is(name: str) -> None:
         assert not re.search(r"0x[0-9a-f]{6}|array\(|object at", shown)
         html = value._repr_html_()
         assert html.startswith("<div><strong>")
-        assert html.count("<tr>") == len(value.card().rows) >= 3
+        assert html.count("<tr>") == len(value.summary().rows) >= 3
 
 
 def test_others_are_one_screen_too() -> None:
@@ -67,15 +67,15 @@ def test_others_are_one_screen_too() -> None:
 
 def test_a_card_breaks_between_items_counts_what_it_leaves_out_and_moves_no_cursor() -> None:
     items = [f"joint_{k} = {k}.5 rad" for k in range(40)]
-    card = Card("a\x1b[2J", [("all", items), ("said", "word " * 60)])
-    whole, clipped = card.text(60, None).split("\n"), card.text(60).split("\n")
+    summary = Summary("a\x1b[2J", [("all", items), ("said", "word " * 60)])
+    whole, clipped = summary.text(60, None).split("\n"), summary.text(60).split("\n")
     assert whole[0] == clipped[0] == "a\\x1b[2J"
     assert max(map(len, whole)) <= 60
     assert all(any(item in line for line in whole) for item in items)
     shown = [item for item in items if any(f"{item}" in line for line in clipped)]
     assert 0 < len(shown) < len(items)
     assert f"and {len(items) - len(shown)} more" in "\n".join(clipped)
-    assert "<b>" not in Card("<b>", [("<b>", ["<b>"]), ("x", "<b>")]).html()
+    assert "<b>" not in Summary("<b>", [("<b>", ["<b>"]), ("x", "<b>")]).html()
 
 
 def test_names_are_never_broken_and_have_units(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,7 +73,7 @@ def test_saved_and_loaded_is_equal_field_by_field(tracked: Run, saved: Path) -> 
             assert np.array_equal(ours, theirs), field.name
         else:
             assert ours == theirs, field.name
-    assert loaded.summary() == tracked.summary()
+    assert loaded.to_dict() == tracked.to_dict()
 
 
 def test_a_number_that_is_not_finite_comes_back(tracked: Run, tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_number_that_is_not_finite_comes_back(tracked: Run, tmp_path: Path) ->
 
 def test_a_run_whose_file_names_no_terms_is_shown(tracked: Run) -> None:
     stats = {name: value for name, value in tracked.stats.items() if name != "terms"}
-    shown = dataclasses.replace(tracked, stats=stats).card()
+    shown = dataclasses.replace(tracked, stats=stats).summary()
     assert dict(shown.rows)["terms"] == "pinocchio"
 
 

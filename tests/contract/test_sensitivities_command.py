@@ -1,4 +1,4 @@
-"""What `ckc sensitivities` promises: keys and shapes, the card, files, how it ends, and what it refuses."""
+"""What `ckc sensitivities` promises: keys and shapes, the summary, files, how it ends, and what it refuses."""
 
 from __future__ import annotations
 

@@ -229,7 +229,7 @@ def test_a_run_with_the_mechanism_of_another_is_refused(tmp_path: Path) -> None:
     other = load("slider_crank").sources.texts
     _with_meta(path, lambda meta: meta.update(texts=other))
     with pytest.raises(InputError, match=r"damaged: the run's coordinates are theta_1, .*, its mechanism's crank"):
-        Run.load(path).summary()
+        Run.load(path).to_dict()
 
 
 def test_a_message_is_one_line_that_no_terminal_obeys() -> None:

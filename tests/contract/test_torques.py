@@ -150,7 +150,7 @@ def test_a_motor_that_turns_too_fast_is_named(geared: Path) -> None:
     assert_close(run.motor_rates, run.v_tree @ TURNS.T, 1e-12)
     fastest = np.abs(run.motor_rates).max(axis=0)
     assert fastest[0] > 5.0
-    assert run.too_fast() == run.summary()["too_fast"] == {"left": fastest[0]}
+    assert run.too_fast() == run.to_dict()["too_fast"] == {"left": fastest[0]}
 
 
 # --- torques of a file -----------------------------------------------------------------------------

@@ -92,7 +92,7 @@ def kinetic(run: Run) -> Array:
 def swing(folder: Path, closed: Closed, *, damped: bool = True, **changes: Any) -> Run:
     """From rest, no control, from files as a user writes them."""
     mechanism = closed.mechanism
-    spec = mechanism.spec.plain()
+    spec = mechanism.spec.to_dict()
     if not damped:
         spec["spring"] = [msgspec.to_builtins(msgspec.structs.replace(s, damping=0.0)) for s in SPRINGS]
     start = dict(zip(mechanism.independent, mechanism.independent_part(mechanism.q_tree), strict=True))

@@ -203,6 +203,6 @@ def test_it_shows_itself_on_a_few_lines(tmp_path: Path) -> None:
 
 
 def test_json_has_complex_numbers_as_pairs(tmp_path: Path) -> None:
-    plain = floquet(written(tmp_path, g, 0.05), PERIOD).plain()
+    plain = floquet(written(tmp_path, g, 0.05), PERIOD).to_dict()
     assert set(plain) == {"name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"}
     assert all(len(pair) == 2 for pair in plain["multipliers"])

@@ -131,7 +131,7 @@ def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
 
 def on_span(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
     """Return the changes that make all runs of a scene comparable: one span, its instants, no event that ends it."""
-    events = [{**event, "stop": False} for event in scene.plain().get("event", [])]
+    events = [{**event, "stop": False} for event in scene.to_dict().get("event", [])]
     return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
 
 

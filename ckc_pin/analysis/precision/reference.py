@@ -157,7 +157,7 @@ def _end(scene: Scene, seconds: float) -> tuple[float, str]:
     if not any(event.stop for event in scene.spec.event):
         return t_end, ""
     formulation = "spf, w" if off_manifold(scene) else "dae"
-    own = {"event": scene.plain()["event"]}
+    own = {"event": scene.to_dict()["event"]}
     _, run = move(_tight(scene, formulation, "auto", t_end, seconds / 3, **own), seconds, most=1)
     met = [event for event in run.events if event["stop"]] if run is not None else []
     if not met or not met[-1]["t"] > 0:

@@ -74,4 +74,4 @@ def off_manifold(scene: Scene) -> bool:
 
 def changed(scene: Scene, changes: Mapping[str, Any]) -> Scene:
     """Return a scene with values replaced by dotted key; None removes a key."""
-    return make_scene(with_changes(scene.plain(), changes), scene.name, scene.sources)
+    return make_scene(with_changes(scene.to_dict(), changes), scene.name, scene.sources)

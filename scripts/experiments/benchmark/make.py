@@ -205,7 +205,7 @@ def _left_out(works: list[Work], quick: bool, memory: Memory) -> list[LeftOut]:
     for name in scenes:
         try:
             scene = load_scene(name)
-            content = [scene.plain(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
+            content = [scene.to_dict(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
         except CkcError as error:  # robots that are not installed
             found.append(LeftOut(scene=name, what=left_out.MISSING, reason=str(error)))
         else:

@@ -27,7 +27,7 @@ def stamp(*content: Any) -> str:
 def work_stamp(work: Work, version: str = "") -> str:
     """Return a hash of what a run of a work depends on: scene, texts, code, versions, machine."""
     scene = work.load()
-    return stamp(scene.plain(), {**work.mechanism.sources.texts, **scene.sources.texts}, version, work.terms)
+    return stamp(scene.to_dict(), {**work.mechanism.sources.texts, **scene.sources.texts}, version, work.terms)
 
 
 @cache
