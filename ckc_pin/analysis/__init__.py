@@ -1,1 +1,1 @@
-"""What a mechanism can do and where it fails: singularities, maps, certificates; what each setting of a run costs."""
+"""What a mechanism can do and where it fails: singularities, maps; what each setting of a run costs."""

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
-from ckc_pin.analysis.certificate import certify, rest_height, sublevel_set
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.sources import Sources
 from ckc_pin.ensembles.importance import importance
@@ -16,6 +15,7 @@ from ckc_pin.ensembles.spec import sweep_of
 from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.view.ensemble_figures import draw_basins, draw_fan, draw_importance
+from scripts.experiments.certificate.certificate import certify, rest_height, sublevel_set
 from scripts.experiments.chart import shrink
 from scripts.experiments.paper.set_point_experiments import load_case
 

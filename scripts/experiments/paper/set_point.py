@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.certificate import Certificate
-from ckc_pin.analysis.gradient import Bound
 from ckc_pin.base.arrays import Array
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
+from scripts.experiments.certificate.certificate import Certificate
+from scripts.experiments.certificate.gradient_bounds import Bound
 from scripts.experiments.pages import said
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import Record

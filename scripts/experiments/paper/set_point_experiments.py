@@ -9,9 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.certificate import Certificate, certify, level_of, sublevel_set
-from ckc_pin.analysis.gradient import Bound, chart_step, explore_branch, gradient_bounds
-from ckc_pin.analysis.walk import follow, margin
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
@@ -23,6 +20,9 @@ from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
 from ckc_pin.scene.scene import load_scene
+from scripts.experiments.certificate.branch_walk import follow, margin
+from scripts.experiments.certificate.certificate import Certificate, certify, level_of, sublevel_set
+from scripts.experiments.certificate.gradient_bounds import Bound, chart_step, explore_branch, gradient_bounds
 from scripts.experiments.paper.lyapunov import Record, record
 from scripts.experiments.paper.solutions import Equilibrium, equilibria
 

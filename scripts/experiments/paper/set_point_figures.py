@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.certificate import Certificate, rest_height, sublevel_set
-from ckc_pin.analysis.gradient import Bound
 from ckc_pin.base.arrays import Array
 from ckc_pin.run.run import Run
 from ckc_pin.view.labels import symbol, with_unit
+from scripts.experiments.certificate.certificate import Certificate, rest_height, sublevel_set
+from scripts.experiments.certificate.gradient_bounds import Bound
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.set_point_experiments import Case

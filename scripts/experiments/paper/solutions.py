@@ -11,14 +11,14 @@ from typing import Literal
 
 import numpy as np
 
-from ckc_pin.analysis.certificate import rest_height
-from ckc_pin.analysis.walk import follow, same_configuration
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from scripts.experiments.certificate.branch_walk import follow, same_configuration
+from scripts.experiments.certificate.certificate import rest_height
 
 __all__ = ["Equilibrium", "equilibria"]
 

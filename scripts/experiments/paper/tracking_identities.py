@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.walk import follow, margin
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import spf_z_dot
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from scripts.experiments.certificate.branch_walk import follow, margin
 
 __all__ = ["Skewness", "claimed_form", "defect", "printed_form", "rate_form", "skewness"]
 

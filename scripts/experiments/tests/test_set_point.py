@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin.analysis.certificate import Certificate
-from ckc_pin.analysis.gradient import chart_step, explore_branch, gradient_bounds
 from ckc_pin.errors import InputError
 from ckc_pin.run.simulate import simulate
+from scripts.experiments.certificate.certificate import Certificate
+from scripts.experiments.certificate.gradient_bounds import chart_step, explore_branch, gradient_bounds
 from scripts.experiments.paper import set_point
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import derivative, record
@@ -25,7 +25,7 @@ from scripts.experiments.paper.set_point_experiments import (
     gradient_error,
     load_case,
 )
-from tests.analysis.set_point import five_bar_gradient, five_bar_U
+from scripts.experiments.tests.set_point_cases import five_bar_gradient, five_bar_U
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import Pair, assert_close
 

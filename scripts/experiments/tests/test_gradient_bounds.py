@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 
 from ckc_pin import Mechanism, load
-from ckc_pin.analysis.gradient import Bound, bound_along, chart_step, explore_branch, gradient_bounds
-from ckc_pin.analysis.walk import margin, margin_gradient
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
-from tests.analysis.set_point import five_bar_border, five_bar_gradient, pendulum
+from scripts.experiments.certificate.branch_walk import margin, margin_gradient
+from scripts.experiments.certificate.gradient_bounds import (
+    Bound,
+    bound_along,
+    chart_step,
+    explore_branch,
+    gradient_bounds,
+)
+from scripts.experiments.tests.set_point_cases import five_bar_border, five_bar_gradient, pendulum
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import Pair, assert_close
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ckc_pin.analysis.walk import Height, follow
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from scripts.experiments.certificate.branch_walk import Height, follow
 
 __all__ = ["End", "Explored", "explore"]
 

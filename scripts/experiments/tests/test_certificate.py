@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.analysis.certificate import certify, level_of, rest_height
-from ckc_pin.analysis.walk import follow
 from ckc_pin.control import SetPoint
 from ckc_pin.kinematics.branches import assembly_branches
-from tests.analysis.set_point import (
+from scripts.experiments.certificate.branch_walk import follow
+from scripts.experiments.certificate.certificate import certify, level_of, rest_height
+from scripts.experiments.tests.set_point_cases import (
     NEAR,
     G,
     at_rest,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ckc_pin.analysis.explored import explore
-from ckc_pin.analysis.walk import follow, least, margin, same_configuration, way
 from ckc_pin.kinematics.sigma import sigma
-from tests.analysis.set_point import pendulum
+from scripts.experiments.certificate.branch_walk import follow, least, margin, same_configuration, way
+from scripts.experiments.certificate.exploration import explore
+from scripts.experiments.tests.set_point_cases import pendulum
 from tests.conftest import Pair, assert_close
 
 

@@ -12,14 +12,14 @@ from functools import cache
 
 import numpy as np
 
-from ckc_pin.analysis.explored import Explored, explore
-from ckc_pin.analysis.walk import Border, follow, least, margin, way
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.desired import Desired
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from scripts.experiments.certificate.branch_walk import Border, follow, least, margin, way
+from scripts.experiments.certificate.exploration import Explored, explore
 
 __all__ = ["Bound", "bound_along", "chart_step", "explore_branch", "gradient_bounds", "symmetric_least"]
 
@@ -35,7 +35,7 @@ class Bound:
     Attributes
     ----------
     margin : float
-        s_min, see `ckc_pin.analysis.walk.margin`.
+        s_min, see `scripts.experiments.certificate.branch_walk.margin`.
     norm : float
         Largest spectral norm |dh/dq|, the paper's M_1: N m/rad between angles.
     norm_q : (d,) array

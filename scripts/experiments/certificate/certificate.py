@@ -19,9 +19,6 @@ from typing import Literal
 
 import numpy as np
 
-from ckc_pin.analysis.explored import Explored, explore
-from ckc_pin.analysis.gradient import symmetric_least
-from ckc_pin.analysis.walk import Border, follow, least, margin, same_configuration
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
@@ -29,6 +26,9 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start
+from scripts.experiments.certificate.branch_walk import Border, follow, least, margin, same_configuration
+from scripts.experiments.certificate.exploration import Explored, explore
+from scripts.experiments.certificate.gradient_bounds import symmetric_least
 
 __all__ = ["Certificate", "SublevelSet", "certify", "level_of", "rest_height", "sublevel_set"]
 
@@ -55,7 +55,7 @@ class Certificate:
         Of K_P + sym dh/dq on the set, N m/rad between angles; NaN where the set reaches a singular
         configuration, at which h has no derivative.
     least_margin : float
-        Least |s| on the set, see `ckc_pin.analysis.walk.margin`.
+        Least |s| on the set, see `scripts.experiments.certificate.branch_walk.margin`.
     safe_level : float
         The level up to which the set around q_d is as the argument needs it, J, by the lattice; at most `level`.
     worst_q : (d,) array
