@@ -44,7 +44,7 @@ __all__ = ["derivatives_of", "find_sensitivity_parameters"]
 
 OTHERWISE = 1e-3  # rad, or of the mechanism's size: another value, to see whether it moves with that too
 NEARBY = 1e-7  # the same: how far a stop is moved to see whether the assembled start follows
-FARTHER = 1e-4  # the same where the start is at the stop
+STEPS_AT_STOP = (1e-4, 1e-5, 1e-6)  # the same where the start is at the stop
 SCENE_ROOTS = ("controller", "initial")
 
 
@@ -216,16 +216,17 @@ def at_assembled_stop(
     if not np.isfinite(value):  # the stop of a joint that cannot move
         return x
     at_stop = abs(float(mechanism.tree.to_coordinates(mechanism.q_tree)[k]) - value) <= NEARBY * reach[k]
-    step = FARTHER if at_stop else NEARBY  # an assembly may leave a joint beyond its stop by a little
+    # An assembly may leave a joint beyond its stop by a little, and does not move where it cannot come back to it.
+    steps = STEPS_AT_STOP if at_stop else (NEARBY,)
 
-    def follows(by: float) -> bool:
+    def follows(step: float) -> bool:
         try:
-            there = changed({**given, x.name: value + by * float(reach[k])})
+            there = changed({**given, x.name: value + step * float(reach[k])})
         except CkcError:
             return True
-        return bool(np.abs(there.tree.difference(mechanism.q_tree, there.q_tree) / reach).max() > 0.1 * step)
+        return bool(np.abs(there.tree.difference(mechanism.q_tree, there.q_tree) / reach).max() > 0.1 * abs(step))
 
-    ways = [follows(by) for by in (-step, step)]
+    ways = [any(follows(side * step) for step in steps) for side in (-1, 1)]
     if all(ways):
         raise InputError(
             f"sensitivities: {x.name}: q_guess leads beyond this stop, and how the configuration that is assembled "
