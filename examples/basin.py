@@ -20,7 +20,7 @@ def main():
         "five_bar/set_point",
         {"initial.q.theta_1": {"grid": GRID}, "initial.q.theta_3": {"grid": GRID}},
         {"settled": {"of": "settled", "tolerance": 1e-2}, "end": "q_tree"},
-        changes={
+        overrides={
             "formulation": "reduced",
             "initial": {"q": {"theta_1": -1.4, "theta_3": -1.7}},  # instead of the scene's equilibrium
             "t_end": 5.0,

@@ -45,8 +45,8 @@ def design() -> tuple[ckc_pin.LinearModel, Regulator]:
 def hold(regulator: Regulator | None) -> ckc_pin.Run:
     """Run the five-bar from a start off the point. Without a regulator, the constant torques of the point act."""
     start = {name: POINT[name] + OFFSET[name] for name in POINT}
-    changes = {"formulation": "reduced", "t_end": 4.0, "controller": None, "initial": {"q": start}}
-    return ckc_pin.simulate("five_bar/swing", changes, controller=regulator)
+    overrides = {"formulation": "reduced", "t_end": 4.0, "controller": None, "initial": {"q": start}}
+    return ckc_pin.simulate("five_bar/swing", overrides, controller=regulator)
 
 
 @look()

@@ -25,8 +25,8 @@ class ComputedTorque:
 
 @look()
 def main():
-    changes = {"formulation": "reduced", "initial": {"at": "equilibrium"}, "t_end": 3.0}
-    run = ckc_pin.simulate("five_bar/swing", changes, controller=ComputedTorque())
+    overrides = {"formulation": "reduced", "initial": {"at": "equilibrium"}, "t_end": 3.0}
+    run = ckc_pin.simulate("five_bar/swing", overrides, controller=ComputedTorque())
     q = run.q_tree[:, [run.column(name) for name in run.independent]]
     decay = (1 + RATE * run.t) * np.exp(-RATE * run.t)
     exact = TARGET + (q[0] - TARGET) * decay[:, np.newaxis]

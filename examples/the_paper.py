@@ -24,8 +24,8 @@ def main():
         for ax in (angles, torques):
             ax.set_prop_cycle(color=COLOURS[:2])  # one colour per arm, for both formulations
         ends = []
-        for (name, changes), style in zip(FORMULATIONS.items(), LOOKS, strict=True):
-            run = ckc_pin.simulate(f"five_bar/{case}", changes)
+        for (name, overrides), style in zip(FORMULATIONS.items(), LOOKS, strict=True):
+            run = ckc_pin.simulate(f"five_bar/{case}", overrides)
             q = run.q_tree[:, [run.column(joint) for joint in run.independent]]
             angles.plot(run.t, q, **style, label=[f"{joint}, {name}" for joint in ("θ₁", "θ₃")])
             torques.plot(run.t, run.u, **style)

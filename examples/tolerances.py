@@ -16,7 +16,7 @@ LENGTHS = {"joint.theta_2.xyz.x": 0.2794, "joint.tip_left_fixed.xyz.x": 0.3048,
 MASSES = {"link.link_1.mass": 0.2451, "link.link_2.mass": 0.2611,
           "link.link_3.mass": 0.2352, "link.link_4.mass": 0.2611}  # fmt: skip
 LENGTH_SIGMA, MASS_SIGMA = 2e-4, 0.005  # standard deviations: m, and relative
-CHANGES = {"formulation": "reduced", "controller.model": "mechanism.toml", "t_end": 3.0, "solver.rtol": 1e-7}
+OVERRIDES = {"formulation": "reduced", "controller.model": "mechanism.toml", "t_end": 3.0, "solver.rtol": 1e-7}
 
 
 def tip_position(q_tree, left):
@@ -30,14 +30,14 @@ def sweep(lengths, masses):
     variables = {name: {"normal": [x, LENGTH_SIGMA]} for name, x in LENGTHS.items() if lengths}
     variables |= {name: {"normal": [x, MASS_SIGMA * x]} for name, x in MASSES.items() if masses}
     results = ckc_pin.ensemble("five_bar/set_point", variables, {"end": "q_tree", "u": "u"}, members=40, seed=3,
-                             changes=CHANGES)  # fmt: skip
+                             overrides=OVERRIDES)  # fmt: skip
     left = [results[name].to_numpy() if lengths else LENGTHS[name] for name in list(LENGTHS)[:2]]
     return results, tip_position(results["end"].to_numpy(), left)
 
 
 @look()
 def main():
-    drawn = ckc_pin.simulate("five_bar/set_point", CHANGES)
+    drawn = ckc_pin.simulate("five_bar/set_point", OVERRIDES)
     target = tip_position(drawn.q_tree[-1], list(LENGTHS.values())[:2])
     figure, ax = plt.subplots(figsize=(5.2, 4.0), layout="constrained")
     spread = {}

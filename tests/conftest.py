@@ -97,11 +97,11 @@ def run() -> Callable[..., Run]:
     """`simulate` with a memory: run(scene, formulation="dae", solver__rtol=1e-10) is computed once."""
     done: dict[tuple[Any, ...], Run] = {}
 
-    def run(scene: str, **changes: Any) -> Run:
+    def run(scene: str, **overrides: Any) -> Run:
         terms = os.environ.get("XDG_CACHE_HOME", "")  # what is compiled there
-        key = (terms, scene, *sorted((name, repr(value)) for name, value in changes.items()))
+        key = (terms, scene, *sorted((name, repr(value)) for name, value in overrides.items()))
         if key not in done:
-            done[key] = simulate(scene, {name.replace("__", "."): value for name, value in changes.items()})
+            done[key] = simulate(scene, {name.replace("__", "."): value for name, value in overrides.items()})
         return done[key]
 
     return run

@@ -32,7 +32,7 @@ from ckc_pin.run.runnable import require_runnable
 from ckc_pin.run.warnings import check_desired, desired_warnings, limit_warnings
 from ckc_pin.scene.initial import Start
 from ckc_pin.scene.parts import in_samples, scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import CHANGES, Scene, load_scene, names_a_scene
+from ckc_pin.scene.scene import OVERRIDES, Scene, load_scene, names_a_scene
 from ckc_pin.scene.spec import TermsOf
 
 __all__ = ["Check", "check"]
@@ -109,7 +109,7 @@ class Check(HasSummary):
 
 
 def check(
-    what: Mechanism | Scene | str | Path, changes: Mapping[str, Any] | None = None, *, branches: bool = False
+    what: Mechanism | Scene | str | Path, overrides: Mapping[str, Any] | None = None, *, branches: bool = False
 ) -> Check:
     """Check a mechanism, or a scene with its mechanism.
 
@@ -117,7 +117,7 @@ def check(
     ----------
     what : Mechanism, Scene, str or Path
         "five_bar" is a mechanism, "five_bar/tracking" and "x.scene.toml" are scenes.
-    changes : mapping, optional
+    overrides : mapping, optional
         With a name: of a scene as `load_scene` takes them, of a mechanism as `load` does.
     branches : bool
         List the assembly branches too (small mechanisms).
@@ -129,12 +129,12 @@ def check(
     """
     require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
     require_flag(branches, "check: branches")
-    if changes is not None:
-        require_table(changes, "check: changes", CHANGES)
+    if overrides is not None:
+        require_table(overrides, "check: overrides", OVERRIDES)
     if isinstance(what, str | Path):
-        what = load_scene(what, changes) if names_a_scene(str(what)) else load(what, changes)
-    elif changes:
-        raise InputError("check: changes go with a name; a Scene or a Mechanism is complete")
+        what = load_scene(what, overrides) if names_a_scene(str(what)) else load(what, overrides)
+    elif overrides:
+        raise InputError("check: overrides go with a name; a Scene or a Mechanism is complete")
     if isinstance(what, Mechanism):
         outside = limit_warnings(what, what.q_tree, "the assembled configuration")
         found = _mechanism_check(what, None, outside, "auto", what.name)

@@ -11,10 +11,10 @@ from typing import Any
 
 from ckc_pin.errors import InputError
 
-__all__ = ["read_changes", "read_table"]
+__all__ = ["read_overrides", "read_table"]
 
 
-def read_changes(option: str, settings: Iterable[str]) -> dict[str, Any]:
+def read_overrides(option: str, settings: Iterable[str]) -> dict[str, Any]:
     """Read KEY=VALUE settings; a value is TOML where it can be, else a plain string.
 
     Raises
@@ -22,13 +22,13 @@ def read_changes(option: str, settings: Iterable[str]) -> dict[str, Any]:
     InputError
         No `=`, or an empty part in the key.
     """
-    changes: dict[str, Any] = {}
+    overrides: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             raise InputError(f"{option} {setting}: write KEY=VALUE, e.g. solver.rtol=1e-10")
-        changes[key.strip()] = _value(text)
-    return changes
+        overrides[key.strip()] = _value(text)
+    return overrides
 
 
 def _value(text: str) -> Any:

@@ -11,7 +11,7 @@ import click
 import ckc_pin
 from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_table
 from ckc_pin.cli.signals import interrupts
@@ -34,17 +34,17 @@ __all__ = ["inverse"]
     shell_complete=options.complete_scenes,
     help="A scene with a desired motion, or a run: its file or its folder.",
 )
-@options.changes
+@options.overrides
 @options.out(help="Folder for inverse.npz.")
 @options.figures
 @options.as_json
-def inverse(what: str, changes: tuple[str, ...], out: Path | None, figures: bool, as_json: bool) -> None:
+def inverse(what: str, overrides: tuple[str, ...], out: Path | None, figures: bool, as_json: bool) -> None:
     """Motor torques, loop and joint forces along a motion. The scene's desired one, or that of a run."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
     with ProgressBar(what) as progress:
-        found = ckc_pin.inverse_dynamics(what, read_changes("--set", changes), progress=progress)
+        found = ckc_pin.inverse_dynamics(what, read_overrides("--set", overrides), progress=progress)
     if out is not None:
         _write(found, out, figures)
     if as_json:

@@ -12,7 +12,7 @@ import click
 import ckc_pin
 from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes, read_table
+from ckc_pin.cli.arguments import read_overrides, read_table
 from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
@@ -50,7 +50,7 @@ OF_MODEL = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # not always w
     type=float,
     help="Instead along the scene's motion, which comes back after this time: monodromy matrix, Floquet multipliers.",
 )
-@options.changes
+@options.overrides
 @click.option(
     "--out",
     metavar="DIR",
@@ -59,7 +59,7 @@ OF_MODEL = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # not always w
 )
 @options.as_json
 def linearize(
-    what: str, at: str | None, period: float | None, changes: tuple[str, ...], out: Path | None, as_json: bool
+    what: str, at: str | None, period: float | None, overrides: tuple[str, ...], out: Path | None, as_json: bool
 ) -> None:
     """Linear model in minimal coordinates: A, B, C, D, modes. Exact, about a state of rest or of a run."""
     if at is not None and period is not None:
@@ -68,14 +68,14 @@ def linearize(
         make_folder(out)
     if period is not None:
         with ProgressBar(what) as progress:
-            found = ckc_pin.floquet(what, period, read_changes("--set", changes), progress)
+            found = ckc_pin.floquet(what, period, read_overrides("--set", overrides), progress)
         if out is not None:
             _write_floquet(found, out)
         _print(found.to_dict() if as_json else floquet_text(found), out)
         return
     with Working(f"linearizing {what}"):
-        model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_changes("--set", changes))
-    runs, modes = 0 if out is None else _write(model, what, changes, out), len(model.modes)
+        model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_overrides("--set", overrides))
+    runs, modes = 0 if out is None else _write(model, what, overrides, out), len(model.modes)
     barred = "rigid ones do not, nor any whose swing the loops do not follow, nor more than twelve"
     more = "" if runs == modes else f"; {runs} of {modes} modes can be played: {barred}"
     _print(linear_plain(model) if as_json else linear_text(model), out, more)
@@ -111,7 +111,7 @@ def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
         found.run.save(out / "run.npz")
 
 
-def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out: Path) -> int:
+def _write(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...], out: Path) -> int:
     """Save the model and its modes in the place of those of before, whatever signals come, then draw them.
 
     Returns how many modes are runs.
@@ -130,7 +130,7 @@ def _write(model: ckc_pin.LinearModel, what: str, changes: tuple[str, ...], out:
                 run.save(out / f"mode_{number}.npz")
         locus = None
         try:
-            locus = ckc_pin.gain_locus(what, changes=read_changes("--set", changes))
+            locus = ckc_pin.gain_locus(what, overrides=read_overrides("--set", overrides))
         except CkcError as error:
             errors().print(f"no root locus: {error}")
         try:

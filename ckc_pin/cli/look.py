@@ -8,7 +8,7 @@ import click
 
 import ckc_pin
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes, read_table
+from ckc_pin.cli.arguments import read_overrides, read_table
 from ckc_pin.cli.output import LONG, Working, errors, print_json, print_summary, print_table
 from ckc_pin.cli.tables import check_plain, terms_plain, terms_table
 
@@ -45,17 +45,17 @@ def list_(as_json: bool) -> None:
     shell_complete=options.complete_scenes,
     help="A shipped name, a folder or a file; of a folder, the mechanism.",
 )
-@options.changes
+@options.overrides
 @click.option("--branches", is_flag=True, help="List the assembly branches too.")
 @options.as_json
-def check(what: str, changes: tuple[str, ...], branches: bool, as_json: bool) -> None:
+def check(what: str, overrides: tuple[str, ...], branches: bool, as_json: bool) -> None:
     """Freedoms, rank, redundant rows, partition.
 
     Of a scene whether a run begins at all, whether its desired trajectory stays in the workspace, and whether its
     controller is stable about the target or along that trajectory.
     """
     with Working(f"checking {what}"):
-        found = ckc_pin.check(what, read_changes("--set", changes), branches=branches)
+        found = ckc_pin.check(what, read_overrides("--set", overrides), branches=branches)
     if as_json:
         print_json(check_plain(found))
     else:

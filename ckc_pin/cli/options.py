@@ -17,8 +17,22 @@ from ckc_pin.errors import InputError
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-__all__ = ["PATH", "as_json", "changes", "check_speed", "complete_scenes", "examples", "figures", "mechanism",
-           "open_browser", "out", "overwrite", "port", "require_folder", "runs"]  # fmt: skip
+__all__ = [
+    "PATH",
+    "as_json",
+    "check_speed",
+    "complete_scenes",
+    "examples",
+    "figures",
+    "mechanism",
+    "open_browser",
+    "out",
+    "overrides",
+    "overwrite",
+    "port",
+    "require_folder",
+    "runs",
+]  # fmt: skip
 
 
 class _Path(click.Path):
@@ -66,9 +80,9 @@ def _completed(names: list[str], incomplete: str) -> list[CompletionItem]:
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
-changes = click.option(
+overrides = click.option(
     "--set",
-    "changes",
+    "overrides",
     metavar="KEY=VALUE",
     multiple=True,
     help="Change a key of the scene, or a number of the mechanism; may be given many times.",

@@ -15,7 +15,7 @@ import click
 import ckc_pin
 from ckc_pin.base.atomic_files import alone_in, write_whole
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import LONG, ProgressBar, errors, kept, make_folder, on_terminal, print_json, print_table
 from ckc_pin.cli.signals import interrupts
@@ -43,17 +43,17 @@ __all__ = ["report"]
     shell_complete=options.complete_scenes,
     help="Scenes, or mechanisms for their default scenes.",
 )
-@options.changes
+@options.overrides
 @click.option("--budget", metavar="SECONDS", type=float, default=20.0, help="What each scene may take.")
 @options.out(help="Folder for report.md, rows.csv and the figures.")
 @options.as_json
-def report(scenes: tuple[str, ...], changes: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
+def report(scenes: tuple[str, ...], overrides: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
     """Error against run time of your own scenes. Formulations, methods and tolerances, and which of them to take."""
     from ckc_pin.analysis.precision import precision_plain, work_precision
 
     if not 0 < budget < float("inf"):
         raise InputError(f"--budget {budget:g}: a number of seconds above zero is needed")
-    loaded = [ckc_pin.load_scene(name, read_changes("--set", changes)) for name in scenes]
+    loaded = [ckc_pin.load_scene(name, read_overrides("--set", overrides)) for name in scenes]
     mechanisms = [prepare(scene).mechanism for scene in loaded]  # what is wrong with one is told before the first
     if out is not None:
         make_folder(out)

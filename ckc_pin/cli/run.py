@@ -14,7 +14,7 @@ import ckc_pin
 from ckc_pin.base.atomic_files import alone_in, write_whole
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import DONE, STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
@@ -39,7 +39,7 @@ __all__ = ["run"]
     shell_complete=options.complete_scenes,
     help="A shipped name or a file; or a mechanism's name or folder, for its default scene.",
 )
-@options.changes
+@options.overrides
 @options.out(help="Folder for run.npz and the scene as resolved.")
 @options.figures
 @click.option("--profile", is_flag=True, help="Print which terms were evaluated, how often.")
@@ -52,7 +52,7 @@ __all__ = ["run"]
 @options.as_json
 def run(
     what: str,
-    changes: tuple[str, ...],
+    overrides: tuple[str, ...],
     out: Path | None,
     figures: bool,
     profile: bool,
@@ -65,7 +65,7 @@ def run(
     """Simulate a scene. Its outcome is printed; --out DIR keeps it."""
     options.require_folder(out, figures)
     _check_view_options(meshcat, speed, port, open_browser)
-    scene = ckc_pin.load_scene(what, read_changes("--set", changes))
+    scene = ckc_pin.load_scene(what, read_overrides("--set", overrides))
     for warning in run_warnings(scene):
         errors().print(f"warning: {warning}")
     if out is not None:

@@ -11,7 +11,7 @@ import click
 import ckc_pin
 from ckc_pin.base.atomic_files import alone_in
 from ckc_pin.cli import options
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
@@ -36,19 +36,19 @@ __all__ = ["sensitivities"]
     required=True,
     help="Numbers of the mechanism, of the controller or of the start, as link.rod.mass or initial.q.crank.",
 )
-@options.changes
+@options.overrides
 @options.out(help="Folder for sensitivities.npz and run.npz.")
 @options.figures
 @options.as_json
 def sensitivities(
-    scene: str, parameters: tuple[str, ...], changes: tuple[str, ...], out: Path | None, figures: bool, as_json: bool
+    scene: str, parameters: tuple[str, ...], overrides: tuple[str, ...], out: Path | None, figures: bool, as_json: bool
 ) -> None:
     """How a run changes with parameters, to first order. Exact, through impacts and sticking."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
     with ProgressBar(scene) as progress:
-        found = ckc_pin.sensitivities(scene, parameters, read_changes("--set", changes), progress)
+        found = ckc_pin.sensitivities(scene, parameters, read_overrides("--set", overrides), progress)
     if out is not None:
         _write(found, out, figures)
     if as_json:

@@ -23,7 +23,7 @@ from ckc_pin.ensembles.spec import read_sweep, scene_path, sweep_of
 from ckc_pin.ensembles.store import RESULTS, Store, require_libraries
 from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.errors import InputError
-from ckc_pin.scene.scene import CHANGES, as_toml
+from ckc_pin.scene.scene import OVERRIDES, as_toml
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -60,7 +60,7 @@ def ensemble(
     *,
     members: int | None = None,
     seed: int = 0,
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     threads: int | None = None,
     workers: int | None = None,
@@ -85,7 +85,7 @@ def ensemble(
     members : int, optional
         How many, at each point of what is crossed; absent where nothing is drawn at random.
     seed : int
-    changes : mapping, optional
+    overrides : mapping, optional
         Of the scene, for all members.
     out : str or Path, optional
         A folder, which gets ``results.zarr``; a sweep that is there is gone on with. Absent: in memory.
@@ -118,14 +118,14 @@ def ensemble(
     UserWarning
         Files in `out` were damaged or missing: which members were computed again, and why.
     """
-    _require_tables(scene, variables, outputs, changes)
+    _require_tables(scene, variables, outputs, overrides)
     _require_means(out, threads, workers, scheduler, chunk, progress)
     require_libraries()
     import xarray as xr
 
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
-        "scene": str(scene), "seed": as_toml(seed), "changes": as_toml(changes or {}),
+        "scene": str(scene), "seed": as_toml(seed), "overrides": as_toml(overrides or {}),
         "variables": {name: _plain(x) for name, x in variables.items()},
         "outputs": {name: _plain(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
@@ -149,13 +149,13 @@ def ensemble(
     return found.load() if out is None else found
 
 
-def _require_tables(scene: Any, variables: Any, outputs: Any, changes: Any) -> None:
+def _require_tables(scene: Any, variables: Any, outputs: Any, overrides: Any) -> None:
     """Refuse what says what to run, where it is of the wrong kind (InputError); what is in it is checked later."""
     require_kind(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
     require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
     require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
-    if changes is not None:
-        require_table(changes, "ensemble: changes", CHANGES)
+    if overrides is not None:
+        require_table(overrides, "ensemble: overrides", OVERRIDES)
 
 
 def _require_means(out: Any, threads: Any, workers: Any, scheduler: Any, chunk: Any, progress: Any) -> None:

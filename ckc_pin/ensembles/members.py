@@ -62,7 +62,7 @@ class Members:
     Parameters
     ----------
     scene : str or Path
-    changes : mapping
+    overrides : mapping
         Of the scene, for all members.
     names : sequence of str
         The variables.
@@ -81,18 +81,18 @@ class Members:
     def __init__(
         self,
         scene: str | Path,
-        changes: Mapping[str, Any],
+        overrides: Mapping[str, Any],
         names: tuple[str, ...],
         outputs: Mapping[str, str | OutputSpec | Function],
         count: int,
         threads: int,
     ) -> None:
-        self.scene_name, self._changes, self.names = scene, dict(changes), names
+        self.scene_name, self._overrides, self.names = scene, dict(overrides), names
         self._threads = threads
-        self.scene: Scene = load_scene(scene, changes)
+        self.scene: Scene = load_scene(scene, overrides)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
-        self._vectors = check_names(scene, self._changes, self.scene, self.mechanism, names)
+        self._vectors = check_names(scene, self._overrides, self.scene, self.mechanism, names)
         self._outputs = outputs
         self.outputs = Outputs(outputs, self.ready)
         self._require_one_time()
@@ -100,7 +100,7 @@ class Members:
         self._varied = Varied(self.mechanism, [names[k] for k in self._parameters])
         self._library = self._terms(count)
         self.terms = "pinocchio" if self._library is None else "generated"
-        self._changes["solver.terms"] = self.terms
+        self._overrides["solver.terms"] = self.terms
         self.shapes = self._shapes()
         self.batched = self._can_be_batched()
         self._batch: Any = None
@@ -130,20 +130,20 @@ class Members:
         rhs += self._run_singly(np.flatnonzero(status == PENDING), values, status, message, outputs)
         return Chunk(first, values, status, message, outputs, rhs)
 
-    def changes_of(self, values: Array) -> dict[str, Any]:
-        """Return a member's changes of the scene, by which `simulate` and `ckc run` do the same."""
-        changes = dict(self._changes)
+    def overrides_of(self, values: Array) -> dict[str, Any]:
+        """Return a member's overrides. `simulate` and `ckc run` do the same run with them."""
+        overrides = dict(self._overrides)
         for name, value in zip(self.names, values, strict=True):
             vector = self._vectors.get(name)
             if vector is not None:  # the scene gives it whole
                 of, at = vector
-                whole = list(changes.get(of, self.scene.spec.parameters[of]))
+                whole = list(overrides.get(of, self.scene.spec.parameters[of]))
                 whole[at] = float(value)
-                changes[of] = whole
+                overrides[of] = whole
             else:
                 whole_number = float(value).is_integer() and abs(value) < MAX_INTEGER and not is_parameter(name)
-                changes[name] = int(value) if whole_number else float(value)
-        return changes
+                overrides[name] = int(value) if whole_number else float(value)
+        return overrides
 
     @property
     def instants(self) -> Array:
@@ -233,7 +233,7 @@ class Members:
                 raise KeyboardInterrupt
 
         try:
-            ready = prepare(load_scene(self.scene_name, self.changes_of(values)))
+            ready = prepare(load_scene(self.scene_name, self.overrides_of(values)))
             rows, ended, message = run_rows(ready, require_not_cancelled)
         except CkcError as error:
             return FAILED, str(error), 0

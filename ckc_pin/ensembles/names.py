@@ -16,7 +16,7 @@ __all__ = ["check_names"]
 
 
 def check_names(
-    scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, mechanism: Mechanism, names: tuple[str, ...]
+    scene_name: str | Path, overrides: Mapping[str, Any], scene: Scene, mechanism: Mechanism, names: tuple[str, ...]
 ) -> dict[str, tuple[str, int]]:
     """Refuse variables that are none; return those that are components of what the scene gives whole."""
     present = values_of(mechanism.spec, mechanism.urdf)
@@ -33,7 +33,7 @@ def check_names(
             vectors[name] = (of, AXES.index(axis))
     for name in names:
         if not is_parameter(name):
-            _try_key(scene_name, changes, scene, mechanism, name)
+            _try_key(scene_name, overrides, scene, mechanism, name)
     return vectors
 
 
@@ -47,7 +47,9 @@ def _refuse_distribution(scene: Scene, mechanism: Mechanism, present: Mapping[st
         raise InputError(f"{scene.name}: variables: {of}: unknown key {kind!r}; valid: {', '.join(KINDS)}")
 
 
-def _try_key(scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, mechanism: Mechanism, name: str) -> None:
+def _try_key(
+    scene_name: str | Path, overrides: Mapping[str, Any], scene: Scene, mechanism: Mechanism, name: str
+) -> None:
     """A key of the scene: one that takes a number."""
     for table, names in (
         ("initial.q.", mechanism.coordinates),
@@ -57,10 +59,10 @@ def _try_key(scene_name: str | Path, changes: Mapping[str, Any], scene: Scene, m
             if name.removeprefix(table) not in names:
                 says = f"variables: {name!r}: no such coordinate; there are {', '.join(names)}"
                 raise InputError(f"{scene.name}: {says}")
-            load_scene(scene_name, {**changes, name: 1.0})  # refused as a single run is: q beside initial.at
+            load_scene(scene_name, {**overrides, name: 1.0})  # refused as a single run is: q beside initial.at
             return
     try:
-        load_scene(scene_name, {**changes, name: 1})
+        load_scene(scene_name, {**overrides, name: 1})
     except InputError as error:
         if "greater than" in str(error) or "at least" in str(error) or "less than" in str(error):
             return

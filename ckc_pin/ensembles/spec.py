@@ -163,9 +163,9 @@ class SweepSpec(_Spec, frozen=True):
     seed
         Of what is drawn.
         ``seed = 1``
-    changes
+    overrides
         Of the scene, for all members, by dotted key.
-        ``changes = {t_end = 0.5, "solver.rtol" = 1e-6}``
+        ``overrides = {t_end = 0.5, "solver.rtol" = 1e-6}``
     """
 
     scene: str
@@ -173,7 +173,7 @@ class SweepSpec(_Spec, frozen=True):
     outputs: dict[str, str | OutputSpec]
     members: Count | None = None
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
-    changes: dict[str, Any] = {}
+    overrides: dict[str, Any] = {}
 
 
 def read_sweep(path: str | Path) -> tuple[SweepSpec, Sources]:
@@ -186,7 +186,7 @@ def read_sweep(path: str | Path) -> tuple[SweepSpec, Sources]:
     """
     path = Path(path)
     data = read_toml(read_text(path, "sweep"), str(path))
-    by_coordinate(data, "changes")
+    by_coordinate(data, "overrides")
     return sweep_of(data, Sources(str(path), path.parent)), Sources(str(path), path.parent)
 
 

@@ -46,11 +46,11 @@ class SweepTask:
 
     def members(self, threads: int) -> Members:
         """Prepare its members."""
-        changes = dict(self.spec.changes)
+        overrides = dict(self.spec.overrides)
         if self.terms is not None:
-            changes["solver.terms"] = self.terms
+            overrides["solver.terms"] = self.terms
         outputs = {**self.spec.outputs, **self.functions}
-        return Members(self.scene, changes, tuple(self.spec.variables), outputs, self.variables().count, threads)
+        return Members(self.scene, overrides, tuple(self.spec.variables), outputs, self.variables().count, threads)
 
     def variables(self) -> Variables:
         """Return its variables."""

@@ -39,7 +39,7 @@ def save_worst(members: Members, results: xr.Dataset, name: str, out: Path, most
         values = np.array([float(results[array_name(variable)][k]) for variable in members.names])
         folder = out / f"worst_{array_name(name)}_{k}"
         try:
-            run = simulate(members.scene_name, members.changes_of(values))
+            run = simulate(members.scene_name, members.overrides_of(values))
         except CkcError:
             continue
         if run.status == "interrupted":

@@ -15,7 +15,7 @@ from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.freedoms import count_freedoms
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Changes
+from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.tree import Tree
@@ -126,7 +126,7 @@ def _gauss_newton(
     return q
 
 
-def assembled(spec: MechanismSpec, sources: Sources, changes: Changes | None = None) -> Mechanism:
+def assembled(spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
     """Assemble a mechanism from what its files say, with numbers changed by name.
 
     Raises
@@ -134,7 +134,7 @@ def assembled(spec: MechanismSpec, sources: Sources, changes: Changes | None = N
     MechanismError
         Unknown names, loops that cannot be closed from q_guess, coordinates that cannot serve as q.
     """
-    linkage = Linkage(spec, sources, changes)
+    linkage = Linkage(spec, sources, overrides)
     tree, closure, size = linkage.tree, linkage.closure, linkage.size
     with one_blas_thread():
         guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)

@@ -18,7 +18,7 @@ from ckc_pin.kinematics.assembly import assembled
 from ckc_pin.mechanism.generators import GeneratorSpec
 from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Changes
+from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec
 
 __all__ = ["as_mechanism", "build", "load"]
@@ -29,7 +29,7 @@ _built: dict[Any, Mechanism] = {}  # never handed out, only copied
 _building = Lock()
 
 
-def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Mechanism:
+def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
     Parameters
@@ -37,7 +37,7 @@ def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Me
     name : str, Path or GeneratorSpec
         For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
         usual number of links.
-    changes : mapping, optional
+    overrides : mapping, optional
         Numbers that are other ones, by name, e.g. ``{"link.link_2.mass": 0.3}``.
 
     Raises
@@ -48,23 +48,23 @@ def load(name: str | Path | GeneratorSpec, changes: Changes | None = None) -> Me
         A mechanism that cannot exist as described.
     """
     require_kind(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*texts_of(name), None if changes is None else _as_read(changes))
+    return build(*texts_of(name), None if overrides is None else _as_read(overrides))
 
 
-def _as_read(changes: Any) -> Changes:
+def _as_read(overrides: Any) -> Overrides:
     """Return numbers by name as a file has them: Python's, three of them as a tuple (InputError)."""
     takes = 'a table of numbers by name, three of a vector, as {"link.link_2.mass": 0.3}'
-    require_table(changes, "load: changes", takes)
+    require_table(overrides, "load: overrides", takes)
     found: dict[str, Any] = {}
-    for name, given in changes.items():
+    for name, given in overrides.items():
         value = given.tolist() if isinstance(given, np.generic | np.ndarray) else given
         several = isinstance(value, list | tuple)
         for x in value if several else (value,):
             if not is_number(x) or not abs(x) <= sys.float_info.max:
-                raise InputError(f"load: changes: {name} = {given!r:.80}; it takes {takes}")
+                raise InputError(f"load: overrides: {name} = {given!r:.80}; it takes {takes}")
         found[name] = tuple(map(float, value)) if several else float(value)
         if several and len(value) != 3:
-            raise InputError(f"load: changes: {name}: {len(value)} numbers were given; a vector has three")
+            raise InputError(f"load: overrides: {name}: {len(value)} numbers were given; a vector has three")
     return found
 
 
@@ -81,18 +81,18 @@ def as_mechanism(given: Any, who: str) -> Mechanism:
     return given if isinstance(given, Mechanism) else load(given)
 
 
-def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechanism:
+def build(text: str, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
     """Build a mechanism from the text of its file; the text is kept among its sources.
 
     One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
     many a run.
     """
     sources.texts[MECHANISM_FILE] = text
-    key = (text, sources.name, sources.folder, tuple(sorted((changes or {}).items())))
+    key = (text, sources.name, sources.folder, tuple(sorted((overrides or {}).items())))
     built = _built.get(key)
     if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
         return deepcopy(built, {id(built.sources): sources})
-    mechanism = _build(text, sources, changes)
+    mechanism = _build(text, sources, overrides)
     with _building:
         _built[key] = deepcopy(mechanism)
         while len(_built) > MOST_KEPT:
@@ -100,9 +100,9 @@ def build(text: str, sources: Sources, changes: Changes | None = None) -> Mechan
     return mechanism
 
 
-def _build(text: str, sources: Sources, changes: Changes | None) -> Mechanism:
+def _build(text: str, sources: Sources, overrides: Overrides | None) -> Mechanism:
     data = read_toml(text, sources.name)
     by_coordinate(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
     with sources.naming():
-        return assembled(spec, sources, changes)
+        return assembled(spec, sources, overrides)

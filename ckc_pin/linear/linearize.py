@@ -36,7 +36,7 @@ from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import CHANGES, Scene, load_scene, make_scene, names_a_scene, with_changes
+from ckc_pin.scene.scene import OVERRIDES, Scene, apply_overrides, load_scene, make_scene, names_a_scene
 
 __all__ = ["At", "linearize"]
 
@@ -70,20 +70,20 @@ class _Subject:
 
 
 def linearize(
-    what: Mechanism | Scene | str | Path, at: At = "equilibrium", changes: Mapping[str, Any] | None = None
+    what: Mechanism | Scene | str | Path, at: At = "equilibrium", overrides: Mapping[str, Any] | None = None
 ) -> LinearModel:
     """Linearize a mechanism, exactly, in minimal coordinates.
 
     Parameters
     ----------
     what : Mechanism, Scene, str or Path
-        As `check` takes it. Of a mechanism's name with `changes` or an instant, its default scene.
+        As `check` takes it. Of a mechanism's name with `overrides` or an instant, its default scene.
     at : "equilibrium", "assembled", "target", float or {coordinate: value}
         The stable equilibrium reached from q_guess, motors at rest; an instant of the scene's run, s; or at rest the
         configuration as assembled, or one as `terms` takes it, held by stops that joints rest on, by the least torques
         of the motors, shared as in a run, and where these fail by friction; or the target of the scene's set point,
         with the torques of that.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values of the scene by dotted key, e.g. ``{"friction_smoothing": 0.01}``.
 
     Returns
@@ -110,10 +110,10 @@ def linearize(
     """
     takes = "a mechanism or a scene: itself, its name or path"
     require_kind(what, (Mechanism, Scene, str, Path), "linearize: what", takes)
-    if changes is not None:
-        require_table(changes, "linearize: changes", CHANGES)
+    if overrides is not None:
+        require_table(overrides, "linearize: overrides", OVERRIDES)
     with one_blas_thread():
-        subject = _subject(what, at, changes)
+        subject = _subject(what, at, overrides)
         if subject.mechanism.d == 0:
             raise InputError(f"{subject.mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
         if isinstance(at, Mapping):
@@ -131,14 +131,14 @@ def linearize(
         raise _no_state(at)
 
 
-def _subject(what: Mechanism | Scene | str | Path, at: At, changes: Mapping[str, Any] | None) -> _Subject:
+def _subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
     if isinstance(what, str | Path):
         timed = not isinstance(at, Mapping | str)
-        if not (names_a_scene(str(what)) or changes or timed):
+        if not (names_a_scene(str(what)) or overrides or timed):
             return _Subject(load(what), None)
-        what = load_scene(what, changes)
-    elif changes:
-        raise InputError("linearize: changes go with a name; a Scene or a Mechanism is complete")
+        what = load_scene(what, overrides)
+    elif overrides:
+        raise InputError("linearize: overrides go with a name; a Scene or a Mechanism is complete")
     return _Subject(scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
 
 
@@ -315,8 +315,8 @@ def _run_to(scene: Scene, t: float) -> Run:
     t_end = scene.spec.t_end
     if not 0 <= t <= t_end:
         raise InputError(f"t = {t:.15g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:.15g} s")
-    changes = {"t_end": max(t, min(MOMENT, t_end))}
-    run = simulate(make_scene(with_changes(scene.to_dict(), changes), scene.name, scene.sources))
+    overrides = {"t_end": max(t, min(MOMENT, t_end))}
+    run = simulate(make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources))
     if run.status == "interrupted":
         raise interrupt_again(run.message)
     if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):

@@ -65,7 +65,7 @@ class GainLocus(HasSummary):
 
 
 def gain_locus(
-    what: Scene | str | Path, gain: str | None = None, changes: Mapping[str, Any] | None = None
+    what: Scene | str | Path, gain: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> GainLocus | None:
     """Return the locus of a scene's closed loop over a gain.
 
@@ -75,7 +75,7 @@ def gain_locus(
         A scene, itself, its name or path.
     gain : "K_P", "K_V", "K_D" or "Lambda", optional
         One of its controller's; absent, K_P of a set point and K_D of tracking.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values of the scene by dotted key; with a name.
 
     Returns
@@ -97,9 +97,9 @@ def gain_locus(
     if not isinstance(what, Scene):
         if not names_a_scene(str(what)):
             return None
-        what = load_scene(what, changes)
-    elif changes:
-        raise InputError("gain_locus: changes go with a name; a Scene is complete")
+        what = load_scene(what, overrides)
+    elif overrides:
+        raise InputError("gain_locus: overrides go with a name; a Scene is complete")
     mechanism = scene_mechanism(what)
     law = scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):

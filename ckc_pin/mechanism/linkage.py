@@ -13,7 +13,7 @@ from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.motors import motors_of
-from ckc_pin.mechanism.parameters import Changes, changed
+from ckc_pin.mechanism.parameters import Overrides, changed
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.spec_parts import CouplingSpec
 from ckc_pin.mechanism.springs import Springs
@@ -34,7 +34,7 @@ class Linkage:
         The content of ``mechanism.toml``.
     sources : Sources
         Where the texts of its URDFs come from.
-    changes : mapping
+    overrides : mapping
         Numbers that are other ones, by name (`mechanism.parameters`).
 
     Raises
@@ -57,11 +57,11 @@ class Linkage:
     warnings : list of str
     """
 
-    def __init__(self, spec: MechanismSpec, sources: Sources, changes: Changes | None = None) -> None:
+    def __init__(self, spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> None:
         text, urdf = merge(_tree_texts(spec, sources))
         self.warnings = list(urdf.warnings)
-        if changes:
-            spec, warnings = changed(spec, urdf.root, changes, sources.name)
+        if overrides:
+            spec, warnings = changed(spec, urdf.root, overrides, sources.name)
             self.warnings += warnings
             text = ElementTree.tostring(urdf.root, encoding="unicode")
         self.spec, self.sources, self.urdf = spec, sources, urdf

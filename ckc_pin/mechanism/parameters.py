@@ -19,7 +19,7 @@ from ckc_pin.mechanism.urdf_checks import INERTIA, LIMITS, check_inertial, check
 __all__ = [
     "AXES",
     "ROOTS",
-    "Changes",
+    "Overrides",
     "Value",
     "changed",
     "is_parameter",
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 Value = float | tuple[float, float, float]
-Changes = Mapping[str, Value]
+Overrides = Mapping[str, Value]
 
 ROOTS = ("gravity", "link", "joint", "loop", "coupling", "spring", "force", "motor")
 AXES = "xyz"
@@ -73,7 +73,7 @@ def values_of(spec: MechanismSpec, urdf: ElementTree.Element) -> dict[str, Value
 
 
 def changed(
-    spec: MechanismSpec, urdf: ElementTree.Element, changes: Changes, source: str
+    spec: MechanismSpec, urdf: ElementTree.Element, overrides: Overrides, source: str
 ) -> tuple[MechanismSpec, list[str]]:
     """Change numbers of a mechanism: the elements of `urdf` in place, its file's in what is returned.
 
@@ -92,8 +92,8 @@ def changed(
         Unknown names (those there are are listed), values that are none, bodies that cannot be.
     """
     present = values_of(spec, urdf)
-    require_known(changes, with_components(present), f"{source}: parameters")
-    whole = _whole(present, changes, source)
+    require_known(overrides, with_components(present), f"{source}: parameters")
+    whole = _whole(present, overrides, source)
     data = spec.to_dict()
     links = {link.attrib["name"]: link for link in urdf.findall("link")}
     joints = {joint.attrib["name"]: joint for joint in urdf.findall("joint")}
@@ -169,21 +169,21 @@ def require_known(names: Iterable[str], known: Mapping[str, Value], where: str, 
         raise InputError(f"{where}: no {name!r}; {there}")
 
 
-def _whole(present: Mapping[str, Value], changes: Changes, source: str) -> dict[str, Value]:
+def _whole(present: Mapping[str, Value], overrides: Overrides, source: str) -> dict[str, Value]:
     """Put components into what they are of, and check how many numbers each name takes."""
     whole: dict[str, Value] = {}
-    for name, value in changes.items():
+    for name, value in overrides.items():
         _require_numbers(name, value, source)
         if name in present:
             three = isinstance(present[name], tuple)
             if three != isinstance(value, tuple):
                 raise InputError(f"{source}: parameters: {name} takes {'three numbers' if three else 'one number'}")
             whole[name] = value
-    for name, value in changes.items():
+    for name, value in overrides.items():
         if name in present:
             continue
         of, _, axis = name.rpartition(".")
-        if of in changes:
+        if of in overrides:
             raise InputError(f"{source}: parameters: {of} and {name} are both given; give one of them")
         if isinstance(value, tuple):
             raise InputError(f"{source}: parameters: {name} takes one number")

@@ -37,7 +37,7 @@ from ckc_pin.run.run import Run, Status
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.output_instants import output_instants
 from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import CHANGES, Scene, as_scene, make_scene, with_changes
+from ckc_pin.scene.scene import OVERRIDES, Scene, apply_overrides, as_scene, make_scene
 
 __all__ = ["inverse_dynamics"]
 
@@ -59,7 +59,7 @@ class _Instant:
 
 def inverse_dynamics(
     what: Scene | Run | str | Path,
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     *,
     progress: Callable[[float, float], None] | None = None,
 ) -> MotionForces:
@@ -71,7 +71,7 @@ def inverse_dynamics(
         A scene, its shipped name or its path: the motion is what its controller wants (``controller.desired``,
         of coordinates or of a point; of a set point, to rest there), on the assembly branch of its start. Or a run,
         its file or its folder: the motion is the recorded one.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values of the scene, of a run's scene too, by dotted key, e.g. ``{"controller.torque_limit": 3.0}``.
     progress : callable, optional
         Called as progress(t, t_end).
@@ -99,13 +99,13 @@ def inverse_dynamics(
     if isinstance(what, str | Path) and _names_a_run(str(what)):
         what = Run.load(what)
     if not isinstance(what, Run):
-        what = as_scene(what, changes, "inverse_dynamics")
-    elif changes is not None:
-        require_table(changes, "inverse_dynamics: changes", CHANGES)
+        what = as_scene(what, overrides, "inverse_dynamics")
+    elif overrides is not None:
+        require_table(overrides, "inverse_dynamics: overrides", OVERRIDES)
     require_callable(progress, "inverse_dynamics: progress", "a function of (t, t_end)")
     with one_blas_thread():
         if isinstance(what, Run):
-            scene, mechanism = _scene_of(what, changes or {}), what.mechanism
+            scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
             actuation = scene_actuation(scene, mechanism)
             motion, t_end = _recorded(what, mechanism), float(what.t[-1])
         else:
@@ -120,12 +120,12 @@ def _names_a_run(name: str) -> bool:
     return name.endswith(".npz") or isfile(Path(name) / "run.npz")
 
 
-def _scene_of(run: Run, changes: Mapping[str, Any]) -> Scene:
+def _scene_of(run: Run, overrides: Mapping[str, Any]) -> Scene:
     """Return the scene of a run, with its motor limits or others."""
-    if any(key.partition(".")[0] == "mechanism" for key in changes):
+    if any(key.partition(".")[0] == "mechanism" for key in overrides):
         raise InputError("mechanism: the motion of a run is its own mechanism's; give a scene to take another")
     sources = Sources(run.scene_name, None, run.texts)
-    return make_scene(with_changes(run.scene, changes), run.scene_name, sources)
+    return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources)
 
 
 def _along(

@@ -79,14 +79,14 @@ class Ivp(Protocol):
         """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
 
 
-def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) -> Ivp:
+def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Ivp:
     """Return a scene's motion as an initial value problem.
 
     Parameters
     ----------
     scene : Scene, str or Path
         A scene, its shipped name or its path; its solver and its events have no meaning here.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values by dotted key.
 
     Raises
@@ -103,7 +103,7 @@ def as_ivp(scene: Scene | str | Path, changes: Mapping[str, Any] | None = None) 
     >>> solution = solve_ivp(problem.f, problem.t_span, problem.y0, "LSODA", rtol=1e-8, atol=1e-10)
     >>> problem.terms(2.0, solution.y[:, -1]).q_tree
     """
-    scene = as_scene(scene, changes, "as_ivp")
+    scene = as_scene(scene, overrides, "as_ivp")
     spec, mechanism = scene.spec, scene_mechanism(scene)
     if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
         raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")

@@ -116,8 +116,8 @@ class Run(HasSummary):
 
         InputError: it is not the one that the numbers are of.
         """
-        changes = plain_values(self.scene.get("parameters", {}))
-        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), changes)
+        overrides = plain_values(self.scene.get("parameters", {}))
+        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), overrides)
         for what in ("coordinates", "independent", "actuated"):
             own, theirs = getattr(self, what), getattr(mechanism, what)
             if own != theirs:

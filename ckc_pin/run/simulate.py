@@ -41,7 +41,7 @@ SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
 
 def simulate(
     scene: Scene | str | Path,
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     *,
     controller: Controller | TorqueController | Sampled | Law | None = None,
     events: Sequence[Event] = (),
@@ -55,7 +55,7 @@ def simulate(
     ----------
     scene : Scene, str or Path
         A scene, its shipped name ("five_bar/tracking"), or its path.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     controller : Controller, TorqueController, Sampled or function, optional
         An object with a method u(t, terms) or tau(t, terms), or a plain function u(t, terms), whose u is eq. 6's force
@@ -84,7 +84,7 @@ def simulate(
     KeyboardInterrupt
         It was interrupted before the first output instant was recorded.
     """
-    scene = as_scene(scene, changes, "simulate")
+    scene = as_scene(scene, overrides, "simulate")
     require_callable(progress, "simulate: progress", "a function of (t, t_end)")
     require_callable(on_output, "simulate: on_output", "a function of (t, q_tree)")
     require_flag(profile, "simulate: profile")

@@ -23,7 +23,7 @@ from ckc_pin.run.stop_reasons import PAUSE, Stop, explain
 from ckc_pin.run.summary import simulator_summary
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import scene_controller
-from ckc_pin.scene.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
 
 __all__ = ["Simulator"]
 
@@ -38,7 +38,7 @@ class Simulator(HasSummary):
     scene : Scene, str or Path
         A scene, its shipped name, or its path. Its t_end and output_dt have no meaning here, and its
         controller does not act; of that table the torque limit holds.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     events : sequence of Event, optional
         Event functions of the state, beside the scene's events.
@@ -83,11 +83,11 @@ class Simulator(HasSummary):
     def __init__(
         self,
         scene: Scene | str | Path,
-        changes: Mapping[str, Any] | None = None,
+        overrides: Mapping[str, Any] | None = None,
         *,
         events: Sequence[Event] = (),
     ) -> None:
-        scene = as_scene(scene, changes, "Simulator")
+        scene = as_scene(scene, overrides, "Simulator")
         self.scene = scene
         self._ready = prepare(scene, events=events, free=True)
         self._loop = self._ready.loop
@@ -227,7 +227,7 @@ class Simulator(HasSummary):
         if not isinstance(table, Mapping):
             raise InputError(f"reset: {table!r:.80} is no State and no table as a scene's [initial]")
         scene = self._ready.scene
-        data = with_changes(scene.to_dict(), {"initial": table})
+        data = apply_overrides(scene.to_dict(), {"initial": table})
         return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 
     def _require_dt(self, dt: Any) -> float:

@@ -14,7 +14,7 @@ from ckc_pin.control.torques import Torques
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Changes
+from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.scene.initial import branch, is_chart
 from ckc_pin.scene.scene import Scene
 
@@ -26,10 +26,10 @@ def scene_mechanism(scene: Scene) -> Mechanism:
     return changed_mechanism(scene, scene.spec.parameters)
 
 
-def changed_mechanism(scene: Scene, changes: Changes) -> Mechanism:
+def changed_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
     """Load the mechanism that a scene names with these parameters in the place of the scene's own."""
     mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, changes)
+    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, overrides)
 
 
 def _beside(scene: Scene, name: str) -> str | Path:

@@ -25,13 +25,13 @@ from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
 from ckc_pin.scene.summary import scene_summary
 
-__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "as_toml", "load_scene", "scene_names", "with_changes"]
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "apply_overrides", "as_scene", "as_toml", "load_scene", "scene_names"]
 
 SUFFIX = ".scene.toml"
 DEFAULT = "default"
 BY_NAME = (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("parameters",))  # tables with dots in keys
 TAKES = 'a scene: its shipped name, as "five_bar/swing", its path, or what load_scene returns'
-CHANGES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
+OVERRIDES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
 
 
 @dataclass(frozen=True, repr=False)
@@ -110,14 +110,14 @@ def _default(folder: Path) -> Path:
     raise InputError(f"{folder}: no scene, *{SUFFIX}, says what to run; ckc new NAME makes a folder with one to copy")
 
 
-def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     """Load a scene by shipped name or path.
 
     Parameters
     ----------
     name : str or Path
         ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``; names of the mechanism's numbers too, e.g.
         ``{"link.link_2.mass": 0.3}``.
 
@@ -127,12 +127,12 @@ def load_scene(name: str | Path, changes: Mapping[str, Any] | None = None) -> Sc
         A missing file, malformed TOML, an unknown key, a wrong type or value.
     """
     require_kind(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
-    if changes is not None:
-        require_table(changes, "load_scene: changes", CHANGES)
+    if overrides is not None:
+        require_table(overrides, "load_scene: overrides", OVERRIDES)
     path = scene_file(name)
     called = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), called)
-    return make_scene(with_changes(data, changes or {}), _called(name, path), Sources(called, path.parent))
+    return make_scene(apply_overrides(data, overrides or {}), _called(name, path), Sources(called, path.parent))
 
 
 def _called(name: str | Path, path: Path) -> str:
@@ -143,14 +143,14 @@ def _called(name: str | Path, path: Path) -> str:
     return path.parent.resolve().name + ("" if scene == DEFAULT else f"/{scene}")
 
 
-def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
-    """Return the scene that a public function was given: as it is, or loaded by name or path, with changes.
+def as_scene(given: Any, overrides: Mapping[str, Any] | None, who: str) -> Scene:
+    """Return the scene that a public function was given: as it is, or loaded by name or path, with overrides.
 
     Parameters
     ----------
     given
         What it was given.
-    changes : mapping or None
+    overrides : mapping or None
         They go with a name or path.
     who : str
         The function.
@@ -158,7 +158,7 @@ def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
     Raises
     ------
     InputError, MechanismError
-        No scene; changes of a Scene, which is complete; what `load_scene` raises.
+        No scene; overrides for a Scene, which is complete; what `load_scene` raises.
     """
     if isinstance(given, Mechanism):
         folder = given.sources.folder
@@ -170,12 +170,12 @@ def as_scene(given: Any, changes: Mapping[str, Any] | None, who: str) -> Scene:
             + (f"; those of {given.name}: {names}" if names else "")
         )
     require_kind(given, (Scene, str, Path), f"{who}: scene", TAKES)
-    if changes is not None:
-        require_table(changes, f"{who}: changes", CHANGES)
+    if overrides is not None:
+        require_table(overrides, f"{who}: overrides", OVERRIDES)
     if not isinstance(given, Scene):
-        return load_scene(given, changes)
-    if changes:
-        raise InputError(f"{who}: changes go with the name of a scene; a Scene is complete")
+        return load_scene(given, overrides)
+    if overrides:
+        raise InputError(f"{who}: overrides go with the name of a scene; a Scene is complete")
     return given
 
 
@@ -222,7 +222,7 @@ def _check_event(event: EventSpec, where: str) -> None:
         raise InputError(f"{where}: of = {event.of!r} needs a value greater than 0: no singular value is ever below 0")
 
 
-def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scene's data with values replaced by dotted key; None removes a key.
 
     A name of the mechanism's numbers stands for its entry in the table of parameters; so does a coordinate's in those
@@ -231,7 +231,7 @@ def with_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, 
     changed = deepcopy(data)
     for path in BY_NAME:
         by_coordinate(changed, *path)
-    for key, value in changes.items():
+    for key, value in overrides.items():
         *tables, last = _place_of(f"parameters.{key}" if is_parameter(key) else key)
         at = changed
         for k, table in enumerate(tables):

@@ -18,7 +18,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Changes, split_component, split_name
+from ckc_pin.mechanism.parameters import Overrides, split_component, split_name
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.mechanism.spec import FrameSpec
 from ckc_pin.native.variation import Effect, Lock, Place
@@ -34,7 +34,7 @@ Twist = tuple[Array, Array]  # angular, linear: of the frame at a joint's origin
 
 
 def effects_of(
-    mechanism: Mechanism, actuation: Actuation, name: str, given: Changes, changed: Callable[[Changes], Mechanism]
+    mechanism: Mechanism, actuation: Actuation, name: str, given: Overrides, changed: Callable[[Overrides], Mechanism]
 ) -> tuple[Effect, ...]:
     """Return what a number does; nothing where the motion does not depend on it.
 
@@ -45,9 +45,9 @@ def effects_of(
     name : str
         Of a single number: of a vector's, with its component.
     given : mapping
-        The scene's own changes of its numbers.
+        The scene's own overrides of parameters.
     changed : callable
-        Makes the mechanism of other changes.
+        Rebuilds the mechanism with other overrides.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def effects_of(
 
 
 def _of_link(
-    mechanism: Mechanism, name: str, key: str, k: int, given: Changes, changed: Callable[[Changes], Mechanism]
+    mechanism: Mechanism, name: str, key: str, k: int, given: Overrides, changed: Callable[[Overrides], Mechanism]
 ) -> Iterator[Effect]:
     """A new mass is the same body of another density; a new centre takes the inertia along."""
     body = _Body(mechanism, name)

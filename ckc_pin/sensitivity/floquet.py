@@ -33,7 +33,7 @@ from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import Progress, simulate
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
-from ckc_pin.scene.scene import Scene, as_scene, make_scene, with_changes
+from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
 from ckc_pin.sensitivity.parameters import derivatives_of
 from ckc_pin.sensitivity.sensitivities import sensitivities
 
@@ -99,7 +99,7 @@ class Floquet(HasSummary):
 def floquet(
     scene: Scene | str | Path,
     period: float,
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Floquet:
     """Return the monodromy matrix and the Floquet multipliers of a scene's motion, which is periodic from its start.
@@ -109,7 +109,7 @@ def floquet(
     scene : str, Path or Scene
     period : float
         s.
-    changes : mapping, optional
+    overrides : mapping, optional
         As of `simulate`.
     progress : callable, optional
         Called as progress(t, period) along the variational equations, every 0.05 s or so.
@@ -131,8 +131,8 @@ def floquet(
         raise InputError(f"period = {period:g}: a positive number of seconds is needed")
     if period < LEAST:
         raise InputError(f"period = {period:g} s is none: nothing moves in less than {LEAST:g} s")
-    given = as_scene(scene, changes, "floquet")
-    loaded = make_scene(with_changes(given.to_dict(), {"t_end": float(period)}), given.name, given.sources)
+    given = as_scene(scene, overrides, "floquet")
+    loaded = make_scene(apply_overrides(given.to_dict(), {"t_end": float(period)}), given.name, given.sources)
     mechanism = scene_mechanism(loaded)
     if mechanism.rooted:
         raise InputError(
@@ -245,7 +245,7 @@ def _from_coordinates(scene: Scene, mechanism: Mechanism) -> Scene:
     start = find_start(mechanism, scene)
     q = mechanism.tree.named(mechanism.tree.to_coordinates(start.at.q_tree))
     return make_scene(
-        with_changes(scene.to_dict(), {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}),
+        apply_overrides(scene.to_dict(), {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}),
         scene.name,
         scene.sources,
     )

@@ -23,7 +23,7 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import (
     ROOTS,
-    Changes,
+    Overrides,
     Value,
     is_parameter,
     parts_of,
@@ -148,9 +148,9 @@ def require_known_motion(
 
 def require_movable(
     mechanism: Mechanism,
-    given: Changes,
+    given: Overrides,
     parameters: Sequence[SensitivityParameter],
-    changed: Callable[[Changes], Mechanism],
+    changed: Callable[[Overrides], Mechanism],
 ) -> None:
     """Refuse a length that redundant rows allow no other value of: the changed mechanism would not move at all.
 
@@ -158,10 +158,10 @@ def require_movable(
     ----------
     mechanism : Mechanism
     given : mapping
-        The scene's own changes of its numbers.
+        The scene's own overrides of parameters.
     parameters : sequence of SensitivityParameter
     changed : callable
-        Makes the mechanism of other changes.
+        Rebuilds the mechanism with other overrides.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def require_movable(
 
 
 def at_assembled_stop(
-    mechanism: Mechanism, given: Changes, x: SensitivityParameter, changed: Callable[[Changes], Mechanism]
+    mechanism: Mechanism, given: Overrides, x: SensitivityParameter, changed: Callable[[Overrides], Mechanism]
 ) -> SensitivityParameter:
     """Mark the parameter of a stop that the assembled start touches: the start then follows the stop one way only.
 
@@ -198,10 +198,10 @@ def at_assembled_stop(
     ----------
     mechanism : Mechanism
     given : mapping
-        The scene's own changes of its numbers.
+        The scene's own overrides of parameters.
     x : SensitivityParameter
     changed : callable
-        Makes the mechanism of other changes.
+        Rebuilds the mechanism with other overrides.
 
     Raises
     ------
@@ -246,12 +246,12 @@ def find_sensitivity_parameters(
     controller: object,
     actuation: Actuation,
     names: Sequence[str],
-    changed: Callable[[Changes], Mechanism],
+    changed: Callable[[Overrides], Mechanism],
     q_tree: Array,
 ) -> list[SensitivityParameter]:
     """Look names up; a vector's stands for its three components.
 
-    `changed` makes the mechanism of other changes; `q_tree` is q' at the start.
+    `changed` rebuilds the mechanism with other overrides; `q_tree` is q' at the start.
 
     Raises
     ------
@@ -291,9 +291,9 @@ def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> It
     gains = {"K_P": "gain_q", "K_V": "gain_q_dot"} if type(controller) is SetPoint else {}
     gains = {"Lambda": "gain_q", "K_D": "gain_q_dot"} if type(controller) is Tracking else gains
     for key, kind in gains.items():
-        changes = {f"controller.{key}": each} if isinstance(getattr(spec, key), float | int) else {}
-        changes |= {f"controller.{key}.{name}": np.diag(each[k]) for k, name in enumerate(mechanism.independent)}
-        for name, gain in changes.items():
+        overrides = {f"controller.{key}": each} if isinstance(getattr(spec, key), float | int) else {}
+        overrides |= {f"controller.{key}.{name}": np.diag(each[k]) for k, name in enumerate(mechanism.independent)}
+        for name, gain in overrides.items():
             yield SensitivityParameter(name, (Effect(kind, 0, gain.ravel(order="F")),))
     if type(controller) is SetPoint and compensated_at(mechanism, controller).size:
         for k, name in enumerate(mechanism.independent):

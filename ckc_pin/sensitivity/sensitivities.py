@@ -154,7 +154,7 @@ class Sensitivities(HasSummary):
 def sensitivities(
     scene: Scene | str | Path,
     parameters: Sequence[str],
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     *,
     controller: Controller | Sampled | Law | None = None,
@@ -177,7 +177,7 @@ def sensitivities(
         ``initial.q.NAME``, ``initial.q_dot.NAME``. A vector stands for its components, which have ``.x``, ``.y`` and
         ``.z`` behind.
         A controller with a `model` keeps it; eq. 14 without one compensates what the changed mechanism needs.
-    changes : mapping, optional
+    overrides : mapping, optional
         As of `simulate`.
     progress : callable, optional
         As of `simulate`.
@@ -202,7 +202,7 @@ def sensitivities(
     MechanismError
         As `simulate`.
     """
-    scene = as_scene(scene, changes, "sensitivities")
+    scene = as_scene(scene, overrides, "sensitivities")
     require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
     parameters = [parameters] if isinstance(parameters, str | bytes) else parameters
     require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)

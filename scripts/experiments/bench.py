@@ -39,13 +39,13 @@ def least(what: Callable[[], Any], times: int) -> float:
     return min(repeat(what, timer=process_time, repeat=times, number=1))
 
 
-def ready(scene: str, changes: dict[str, Any] | None = None, **options: Any) -> Prepared:
-    return prepare(load_scene(scene, changes), **options)
+def ready(scene: str, overrides: dict[str, Any] | None = None, **options: Any) -> Prepared:
+    return prepare(load_scene(scene, overrides), **options)
 
 
-def run_seconds(scene: str, changes: dict[str, Any] | None = None, times: int = 5) -> float:
+def run_seconds(scene: str, overrides: dict[str, Any] | None = None, times: int = 5) -> float:
     """Of a prepared scene, s."""
-    prepared = ready(scene, changes)
+    prepared = ready(scene, overrides)
     return least(lambda: run_prepared(prepared), times)
 
 
@@ -86,8 +86,8 @@ def own_controller() -> float:
     return 1e6 * spent / float(prepared.loop.stats()["rhs"])
 
 
-def step_us(scene: str, changes: dict[str, Any] | None = None) -> float:
-    simulator = Simulator(scene, changes)
+def step_us(scene: str, overrides: dict[str, Any] | None = None) -> float:
+    simulator = Simulator(scene, overrides)
     u = np.zeros(simulator.mechanism.d)
 
     def steps() -> None:

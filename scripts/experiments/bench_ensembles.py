@@ -43,8 +43,8 @@ def timed(members: Members, values: Array) -> tuple[float, float, Array]:
 def ours(
     rtol: float, terms: str, threads: int, values: Array, names: tuple[str, ...] = START
 ) -> tuple[float, float, Array]:
-    changes = {"solver.rtol": rtol, "solver.terms": terms}
-    return timed(Members(SCENE, changes, names, {"end": "q_tree"}, len(values), threads), values)
+    overrides = {"solver.rtol": rtol, "solver.terms": terms}
+    return timed(Members(SCENE, overrides, names, {"end": "q_tree"}, len(values), threads), values)
 
 
 def table(count: int, threads: int) -> None:

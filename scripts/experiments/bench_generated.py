@@ -27,8 +27,8 @@ SWING_MS = ((1e-3, 0.12), (1e-6, 0.2), (1e-9, 0.35))
 TERMS = ("generated", "pinocchio")
 
 
-def _loop(scene: str, terms: str, changes: dict[str, Any]) -> Any:
-    prepared = ready(scene, {**changes, "solver.terms": terms})
+def _loop(scene: str, terms: str, overrides: dict[str, Any]) -> Any:
+    prepared = ready(scene, {**overrides, "solver.terms": terms})
     prepared.begin()
     return prepared.loop
 
@@ -92,11 +92,11 @@ def compile_seconds(name: str) -> Measured:
     return times[0], times[1]
 
 
-def run_ms(scene: str, changes: dict[str, Any]) -> Measured:
+def run_ms(scene: str, overrides: dict[str, Any]) -> Measured:
     """The loop's own time, the least of several runs."""
     found = []
     for terms in TERMS:
-        prepared = ready(scene, {**changes, "solver.terms": terms})
+        prepared = ready(scene, {**overrides, "solver.terms": terms})
         found.append(1e3 * min(float(run_prepared(prepared).stats["wall_s"]) for _ in range(9)))
     return found[0], found[1]
 

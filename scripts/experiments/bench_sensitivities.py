@@ -26,8 +26,8 @@ def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[
 
     The least of several, taken in turns.
     """
-    changes = {"formulation": "dae", "solver.rtol": rtol, "solver.terms": terms}
-    runs = [ready(scene, changes, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)]
+    overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.terms": terms}
+    runs = [ready(scene, overrides, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)]
     seconds: list[list[float]] = [[] for _ in runs]
     for _ in range(TIMES):
         for run, found in zip(runs, seconds, strict=True):

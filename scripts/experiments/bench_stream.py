@@ -18,7 +18,7 @@ import ckc_pin
 from ckc_pin.view.live import live_view
 
 SCENE = "five_bar/tracking"
-CHANGES = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.output_dt": 1e-3, "t_end": 3.0}
+OVERRIDES = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.output_dt": 1e-3, "t_end": 3.0}
 VIEWERS: dict[str, float | None] = {  # s from a frame to its answer
     "no view": None,
     "no viewer": None,
@@ -53,7 +53,7 @@ asyncio.run(look(sys.argv[1], float(sys.argv[2])))
 
 def measure(name: str) -> tuple[float, float, str]:
     """Right-hand sides per second of one run, by the clock and by the processor; frames that the viewer was sent."""
-    scene = ckc_pin.load_scene(SCENE, CHANGES)
+    scene = ckc_pin.load_scene(SCENE, OVERRIDES)
     viewer, pause = None, VIEWERS[name]
     with ExitStack() as stack:
         view = None if name == "no view" else stack.enter_context(live_view(scene, None))
@@ -76,7 +76,7 @@ def measure(name: str) -> tuple[float, float, str]:
 
 def main(runs: int) -> None:
     """Print a Markdown table."""
-    print(f"{SCENE}, {CHANGES}\n")
+    print(f"{SCENE}, {OVERRIDES}\n")
     print("| viewer | per second of the clock | of the processor | share | frames |\n|---|---|---|---|---|")
     columns = ["viewer", "clock", "processor", "frames"]
     rounds = pd.DataFrame([(name, *measure(name)) for _ in range(runs) for name in VIEWERS], columns=columns)

@@ -46,8 +46,8 @@ def main(library: Path) -> int:
     counter = CDLL(str(library)).allocations
     counter.restype = c_long
     bad = 0
-    for scene, changes, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
-        ready = prepare(load_scene(scene, changes), derivatives=derivatives_of(parameters) if parameters else None)
+    for scene, overrides, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
+        ready = prepare(load_scene(scene, overrides), derivatives=derivatives_of(parameters) if parameters else None)
         loop = ready.loop
         instants = np.linspace(0.0, 0.3, 31)
         rows = np.empty((40, loop.width))
@@ -64,7 +64,7 @@ def main(library: Path) -> int:
         stretch(0.1)  # whatever grows has grown
         few, short, once = stretch(0.12)
         many, long, often = stretch(0.3)
-        print(f"{scene} {changes or ''} {' '.join(parameters)}: {few} allocations in {short} steps, {many} in {long}")
+        print(f"{scene} {overrides or ''} {' '.join(parameters)}: {few} allocations in {short} steps, {many} in {long}")
         jacobians = often / once if once and ready.scene.spec.controller else 1.0
         bad += many > few * jacobians or long < 2 * short
     return 1 if bad else 0

@@ -42,8 +42,8 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
         "worst": {"of": "error", "reduce": "max_abs"}, "rms": {"of": "error", "reduce": "rms"},
         "late": {"of": "theta_1", "reduce": "end"}, "error": {"of": "error", "reduce": "trajectory"},
     }  # fmt: skip
-    found = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, changes=TRACKING)
-    exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, changes=TRACKING)
+    found = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, overrides=TRACKING)
+    exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, overrides=TRACKING)
     change = found["error"] - exact["error"][0]
     draw_fan(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
     lines = ["| joint | rms error, exact lengths (rad) | change by wrong lengths: 95 % stay below, the most (rad) |",
@@ -53,7 +53,7 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
         nominal_rms = float(exact["rms"].sel(independent=name)[0])
         lines.append(f"| {name} | {nominal_rms:.2e} | {float(most.quantile(0.95)):.2e}, {float(most.max()):.2e} |")
     data = {"scene": "five_bar/tracking", "variables": variables, "outputs": {"late": "theta_1"}, "seed": 1,
-            "members": members, "changes": dict(TRACKING)}  # fmt: skip
+            "members": members, "overrides": dict(TRACKING)}  # fmt: skip
     weighed = importance(
         SweepTask(sweep_of(data, Sources("study", Path())), "study", "five_bar/tracking", None), weighed_by
     )
@@ -73,7 +73,7 @@ def basin(out: Path, count: int) -> str:
     names = ("initial.q.theta_1", "initial.q.theta_3")
     found = ckc_pin.ensemble(
         "five_bar/set_point", dict.fromkeys(names, grid), {"end": "q_tree", "settled": "settled", "u": "max_abs_u"},
-        changes={"formulation": "reduced", "initial": {"q": HANGING}, "solver.rtol": 1e-6, "t_end": 10.0},
+        overrides={"formulation": "reduced", "initial": {"q": HANGING}, "solver.rtol": 1e-6, "t_end": 10.0},
     )  # fmt: skip
     for name in names:
         found[name].attrs["units"] = "rad"

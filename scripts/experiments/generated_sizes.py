@@ -147,8 +147,8 @@ def ring(n: int, folder: Path) -> Path:
 
 
 def _rhs_s(scene: str, library: Library | None) -> float:
-    changes: dict[str, Any] = {"formulation": "dae", "solver.method": "DOP853", "solver.terms": "pinocchio"}
-    ready = prepare(load_scene(scene, changes), free=True, library=library)
+    overrides: dict[str, Any] = {"formulation": "dae", "solver.method": "DOP853", "solver.terms": "pinocchio"}
+    ready = prepare(load_scene(scene, overrides), free=True, library=library)
     ready.begin()
     states = motion(ready.loop)
     return min(float(ready.loop.seconds(states, ROUNDS)) for _ in range(REPEATS))

@@ -75,5 +75,5 @@ def _words(joint: str) -> str:
     return joint.removesuffix("_joint").replace("_", " ")
 
 
-def _lift(changes: Mapping[str, object]) -> ckc_pin.Run:
-    return ckc_pin.simulate("two_ur5/lift", {"solver.output_dt": 0.01, "solver.rtol": 1e-9, **changes})
+def _lift(overrides: Mapping[str, object]) -> ckc_pin.Run:
+    return ckc_pin.simulate("two_ur5/lift", {"solver.output_dt": 0.01, "solver.rtol": 1e-9, **overrides})

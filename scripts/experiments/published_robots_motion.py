@@ -72,10 +72,10 @@ def given_back(draft: Draft) -> float:
         scene = Path(folder) / "default.scene.toml"
         scene.write_text(SCENE, encoding="utf-8")
         mechanism = ckc_pin.load(Path(folder))
-        changes = {} if mechanism.rooted else _swing(mechanism)
+        overrides = {} if mechanism.rooted else _swing(mechanism)
         pushed = ckc_pin.simulate(scene, controller=_push(mechanism)) if mechanism.rooted else None
-        motion = ckc_pin.inverse_dynamics(pushed or scene, None if pushed else changes)
-        run = ckc_pin.simulate(scene, changes, controller=_Torques(Table(motion.t, motion.tau)))
+        motion = ckc_pin.inverse_dynamics(pushed or scene, None if pushed else overrides)
+        run = ckc_pin.simulate(scene, overrides, controller=_Torques(Table(motion.t, motion.tau)))
     for part in (motion, run):
         if part.status != "done":
             raise NumericalError(part.message)
@@ -84,7 +84,7 @@ def given_back(draft: Draft) -> float:
 
 
 def _swing(mechanism: Mechanism) -> dict[str, Any]:
-    """Changes of the scene: what the independent coordinates shall do, and how they start."""
+    """Overrides of the scene: what the independent coordinates shall do, and how they start."""
     tree, names = mechanism.tree, mechanism.independent
     offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.reach)
     desired = {name: {"offset": offset[name], "harmonics": [[amplitude[name], RATE, 0.0]]} for name in names}

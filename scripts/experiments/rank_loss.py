@@ -66,8 +66,8 @@ def crossings(loops: Sequence[int], tolerances: Sequence[float], formulation: st
     """Run every N at every tolerance for ten seconds."""
     for N in loops:
         for rtol in tolerances:
-            changes = {"mechanism.N": N, "solver.rtol": rtol, "formulation": formulation}
-            run = simulate("n_four_bar", {**changes, "t_end": T_END, "solver.output_dt": T_END})
+            overrides = {"mechanism.N": N, "solver.rtol": rtol, "formulation": formulation}
+            run = simulate("n_four_bar", {**overrides, "t_end": T_END, "solver.output_dt": T_END})
             t = float(run.t[-1])
             error = float(np.hypot(*(run.points["B0"][-1][:2] - np.array(first_top_pin(N, t)))))
             yield Crossing(N, rtol, run.status, t, error, run.stats["rhs"])

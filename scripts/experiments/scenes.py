@@ -20,13 +20,13 @@ SPAN = 0.3
 SMOOTH = 0.1  # rad/s: joints that stick are no function of t and y
 
 
-def off(scene: str, changes: dict[str, Any]) -> tuple[float, str]:
+def off(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
     """Largest error of q' and v' over a run, by the tolerance and the largest value; and the method of the steps."""
-    run = simulate(scene, changes)
-    problem = as_ivp(scene, changes)
+    run = simulate(scene, overrides)
+    problem = as_ivp(scene, overrides)
     rows = np.linspace(0, len(run.t) - 1, 5).astype(int)
     # the scenes of eq. 8 are stiff in z alone, by 1 / epsilon
-    method = "Radau" if changes.get("spf_coordinates") == "z" or scene.startswith("flyball") else "DOP853"
+    method = "Radau" if overrides.get("spf_coordinates") == "z" or scene.startswith("flyball") else "DOP853"
     found = solve_ivp(problem.f, (0.0, run.t[-1]), problem.y0, method, t_eval=run.t[rows], rtol=TIGHT, atol=TIGHT / 100)
     assert found.success, found.message
     error = 0.0
@@ -46,11 +46,11 @@ def main() -> int:
             for scene in scenes:
                 cells = []
                 smooth = {"friction_smoothing": SMOOTH} if load(name).joints.friction.any() else {}
-                for changes in FORMULATIONS.values():
+                for overrides in FORMULATIONS.values():
                     span = SPANS.get(name, SPAN)
                     try:
                         error, method = off(
-                            f"{name}/{scene}", {**changes, **smooth, "t_end": span, "solver.output_dt": span / 20}
+                            f"{name}/{scene}", {**overrides, **smooth, "t_end": span, "solver.output_dt": span / 20}
                         )
                     except InputError:
                         cells.append("refused")

@@ -81,10 +81,10 @@ def _bounces(ax: Any) -> None:
         (place / "friction.toml").write_text(
             f'{text}\n[[force]]\njoint = "theta_1"\nvalue = {PUSH}\n', encoding="utf-8"
         )
-        changes = {"controller": None, "t_end": 2.0, "initial.q_dot.theta_1": -1.0,
+        overrides = {"controller": None, "t_end": 2.0, "initial.q_dot.theta_1": -1.0,
                    **{f"parameters.joint.theta_{k}.friction": 0.0 for k in (1, 2, 3, 4)},
                    "parameters.joint.theta_1.restitution": BOUNCY}  # fmt: skip
-        run = ckc_pin.simulate(place / "friction.scene.toml", changes)
+        run = ckc_pin.simulate(place / "friction.scene.toml", overrides)
     events = [e for e in run.events if e["coordinate"] == "theta_1" and e["of"] == "stop"]
     times = np.array([e["t"] for e in events if e["name"].endswith("bounces")])
     between = np.diff(times)

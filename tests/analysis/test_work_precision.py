@@ -21,7 +21,7 @@ from ckc_pin.analysis.precision.motion import INSTANTS, Motion
 from ckc_pin.analysis.precision.mujoco import model_of
 from ckc_pin.analysis.precision.reference import Reference, confirm, find_reference
 from ckc_pin.analysis.precision.settings import settings
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.formats.exporting import export
 from ckc_pin.scene.parts import scene_mechanism
 from tests.analysis.swing_table import START, pendulum, write_table
@@ -48,15 +48,15 @@ def reference_of(found: WorkPrecision) -> Reference:
     return found.reference
 
 
-def of_scene(scene: str | Path, changes: dict[str, Any] | None = None, seconds: float = 3.0) -> Reference:
-    loaded = load_scene(scene, changes)
+def of_scene(scene: str | Path, overrides: dict[str, Any] | None = None, seconds: float = 3.0) -> Reference:
+    loaded = load_scene(scene, overrides)
     reference = find_reference(loaded, scene_mechanism(loaded), seconds)
     assert isinstance(reference, Reference), reference
     return reference
 
 
 def again(scene: str | Path, row: PrecisionRow, t_end: float) -> Any:
-    return simulate(scene, {**row.changes, "t_end": t_end, "solver.output_dt": t_end / INSTANTS})
+    return simulate(scene, {**row.overrides, "t_end": t_end, "solver.output_dt": t_end / INSTANTS})
 
 
 # --- references ------------------------------------------------------------------------------------
@@ -90,10 +90,10 @@ def test_the_reference_of_the_five_bar_is_the_one_in_numpy() -> None:
 
 def test_off_the_manifold_the_reference_is_the_spfs_own() -> None:
     """Eq. 8 as printed, in NumPy and by SciPy; the reduced model is another motion, and told as one."""
-    changes = {"formulation": "spf", "initial.w": [0.01, -0.005], "epsilon": 0.05, "t_end": 0.3}
-    found = work_precision("five_bar/swing", changes, budget=BUDGET)
+    overrides = {"formulation": "spf", "initial.w": [0.01, -0.005], "epsilon": 0.05, "t_end": 0.3}
+    found = work_precision("five_bar/swing", overrides, budget=BUDGET)
     reference = reference_of(found)
-    problem = as_ivp("five_bar/swing", {**changes, "spf_coordinates": "z"})
+    problem = as_ivp("five_bar/swing", {**overrides, "spf_coordinates": "z"})
     solved = solve_ivp(problem.f, (0.0, 0.3), problem.y0, "DOP853", t_eval=reference.t, rtol=1e-11, atol=1e-13)
     q_tree = np.array([problem.terms(t, y).q_tree for t, y in zip(reference.t, solved.y.T, strict=True)])
     assert_close(reference.motion.q_tree, q_tree, 1e-9)
@@ -227,7 +227,7 @@ def test_a_small_budget_leaves_out_rows_and_says_so() -> None:
 def test_a_scenes_own_atol_goes_with_its_rtol() -> None:
     scene = load_scene("five_bar/swing", {"solver.atol": 1e-3})
     for setting in settings(scene):
-        assert setting.changes(scene)["solver.atol"] == pytest.approx(setting.rtol / 100)
+        assert setting.overrides(scene)["solver.atol"] == pytest.approx(setting.rtol / 100)
 
 
 def test_what_only_a_dae_has_is_to_be_taken_out(found: WorkPrecision) -> None:
@@ -236,9 +236,11 @@ def test_what_only_a_dae_has_is_to_be_taken_out(found: WorkPrecision) -> None:
         "five_bar/swing", {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0]}
     )
     for setting in settings(scene):
-        taken_out = [key for key, x in setting.changes(scene).items() if x is None]
+        taken_out = [key for key, x in setting.overrides(scene).items() if x is None]
         assert taken_out == ([] if setting.formulation == "dae" else ["solver.baumgarte"])
-    row = replace(found.rows[0], changes={"formulation": "reduced", "solver.baumgarte": None}, error=1e-5, wall_s=1e-9)
+    row = replace(
+        found.rows[0], overrides={"formulation": "reduced", "solver.baumgarte": None}, error=1e-5, wall_s=1e-9
+    )
     advice = advise([row], 1e-12)[0]
     assert (advice.options, advice.removed) == (["formulation=reduced"], ["solver.baumgarte"])
 
@@ -263,7 +265,7 @@ def test_the_advised_options_meet_the_error(found: WorkPrecision, table: Path) -
     assert [advice.target for advice in found.advice] == [1e-3, 1e-6, 1e-9]
     for advice in found.advice:
         assert advice.row is not None, advice.reason
-        run = simulate(table, {**read_changes("--set", advice.options), "solver.output_dt": 1.5 / INSTANTS})
+        run = simulate(table, {**read_overrides("--set", advice.options), "solver.output_dt": 1.5 / INSTANTS})
         assert np.abs(run.q_tree - q_tree).max() <= advice.target
         assert np.abs(run.v_tree - v_tree).max() <= advice.target * max(1.0, np.abs(v_tree).max())
         assert run.scene["formulation"] == str(advice.row.formulation).partition(",")[0]
@@ -301,7 +303,7 @@ def test_mujocos_error_falls_with_its_step(found: WorkPrecision, table: Path) ->
     assert list(steps) == sorted(steps, reverse=True)
     assert all(later < earlier for earlier, later in pairwise(errors))
     assert errors[-1] < errors[0] / 8
-    assert all(row.formulation is None and row.rtol is None and not row.changes for row in rows)
+    assert all(row.formulation is None and row.rtol is None and not row.overrides for row in rows)
 
 
 def test_mujoco_is_left_out_where_it_cannot() -> None:

@@ -147,13 +147,13 @@ def test_at_its_dead_centre_a_rocker_drives_nothing(tmp_path: Path) -> None:
     driven.write_text(driven.read_text().replace("[q_guess]", 'actuated = ["rocker"]\n\n[q_guess]'))
     desired_crank = {"offset": dead, "harmonics": [[0.3, np.pi, -np.pi / 2]]}
     controller = {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": {"crank": desired_crank}}
-    changes = {"controller": controller, "t_end": 1.0, "solver.output_dt": 0.1}
-    found = inverse_dynamics(tmp_path / "bar" / "turning.scene.toml", changes)
+    overrides = {"controller": controller, "t_end": 1.0, "solver.output_dt": 0.1}
+    found = inverse_dynamics(tmp_path / "bar" / "turning.scene.toml", overrides)
     assert found.status == "stopped"
     assert "the motion along" in found.message
     assert "held by no actuator at t = 0.5 s" in found.message
     assert_close(found.t, [0.0, 0.1, 0.2, 0.3, 0.4], 1e-15)
-    crank = inverse_dynamics("four_bar/turning", changes)
+    crank = inverse_dynamics("four_bar/turning", overrides)
     assert crank.status == "done"
     assert_close(crank.a_tree[:5], found.a_tree, 1e-12)
     for k, t in enumerate(found.t):
@@ -182,8 +182,8 @@ def test_a_rod_from_the_world_pulls_it_as_it_pulls_the_coupler(tmp_path: Path) -
             "desired": {"crank": desired_crank, "rocker": quiet},
         }
         initial = {"at": "assembled"}
-        changes = {"controller": controller, "initial": initial, "t_end": 0.5, "solver.output_dt": 0.05}
-        forces.append(inverse_dynamics(folder / "turning.scene.toml", changes))
+        overrides = {"controller": controller, "initial": initial, "t_end": 0.5, "solver.output_dt": 0.05}
+        forces.append(inverse_dynamics(folder / "turning.scene.toml", overrides))
     on_world, on_coupler = (found.loop_wrenches["rod"] for found in forces)
     assert_close(on_world[:, :3], -on_coupler[:, :3], 1e-11)
     assert_close(on_world[:, 3:], 0, 1e-11)
@@ -267,8 +267,8 @@ def test_block_with_rotor_damper_friction_and_spring(tmp_path: Path) -> None:
 
 def test_recorded_motion_with_friction(tmp_path: Path) -> None:
     """It slides and sticks; the rail carries the block whatever friction does."""
-    changes = {"controller.K_D": 10.0, "t_end": 3.0, "controller.torque_limit": 60.0}
-    recorded = ckc_pin.simulate(lift(tmp_path), changes)
+    overrides = {"controller.K_D": 10.0, "t_end": 3.0, "controller.torque_limit": 60.0}
+    recorded = ckc_pin.simulate(lift(tmp_path), overrides)
     assert {event["name"] for event in recorded.events} == {"slide slides", "slide sticks"}
     found = inverse_dynamics(recorded)
     assert_close(found.tau, recorded.tau, 1e-12)

@@ -146,8 +146,8 @@ def test_small_motions_converge_to_it_at_order_two(case: str, tmp_path: Path) ->
     misses = []
     for size in (4e-3, 2e-3, 1e-3):
         q = {name: float(x + size * dx) for name, x, dx in zip(model.states[:d], rest, start, strict=True)}
-        changes = {"t_end": 0.4, "initial": {"q": q}, "formulation": "reduced", "solver.rtol": 1e-12}
-        run = simulate(scene, changes)
+        overrides = {"t_end": 0.4, "initial": {"q": q}, "formulation": "reduced", "solver.rtol": 1e-12}
+        run = simulate(scene, overrides)
         wanted = expm(0.4 * model.A) @ np.concatenate([size * start, np.zeros(d)])
         moved = run.q_tree[-1][[model.coordinates.index(name) for name in model.states[:d]]] - rest
         misses.append(float(np.abs(moved - wanted[:d]).max()))
@@ -193,7 +193,7 @@ def test_friction_is_smoothed_or_locks(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no freedom is left.*crank.*friction_smoothing"):
         linearize(scene)
     free = linearize(str(_scene(coupled_four_bar(tmp_path / "smooth"), tmp_path / "smooth")))
-    smooth = linearize(scene, changes={"friction_smoothing": smoothing})
+    smooth = linearize(scene, overrides={"friction_smoothing": smoothing})
     extra = -free.B[1, 0] * 0.3 / smoothing  # -F / s on the crank, which the motor turns too
     assert smooth.inputs == ("crank",)
     agree(smooth.A - free.A, np.array([[0, 0], [0, extra]]), 1e-9)

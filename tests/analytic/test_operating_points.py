@@ -38,10 +38,10 @@ def test_motors_that_cannot_hold_it_are_named(tmp_path: Path) -> None:
     mechanism = load(str(tmp_path / "mechanism.toml"))
     with pytest.raises(InputError, match=r"nothing holds .* it has no motors.*along crank"):
         linearize(mechanism, {"crank": 0.9})
-    changes = {"controller": {"type": "set_point", "K_P": 1.0, "K_V": 1.0, "q_d": {"theta_1": -1.2, "theta_3": -1.6},
+    overrides = {"controller": {"type": "set_point", "K_P": 1.0, "K_V": 1.0, "q_d": {"theta_1": -1.2, "theta_3": -1.6},
                               "torque_limit": 1e-3}}  # fmt: skip
     with pytest.raises(InputError, match=r"theta_1 would need .* its limit is 0\.001"):
-        linearize("five_bar/swing", {"theta_1": -1.0, "theta_3": -1.9}, changes)
+        linearize("five_bar/swing", {"theta_1": -1.0, "theta_3": -1.9}, overrides)
 
 
 def test_an_instant_of_a_run_is_its_state() -> None:

@@ -228,8 +228,8 @@ def test_bad_paths(pair, desired, says):
 
 
 def test_a_scene_with_a_path_runs():
-    changes = {"controller.desired": {"point": "tip", "circle": CIRCLE}, "t_end": 3.0, "solver.rtol": 1e-6}
-    scene = load_scene("five_bar/tracking", changes)
+    overrides = {"controller.desired": {"point": "tip", "circle": CIRCLE}, "t_end": 3.0, "solver.rtol": 1e-6}
+    scene = load_scene("five_bar/tracking", overrides)
     finished = simulate(scene)
     x = 0.15 - 0.42j + 0.06 * np.exp(1j * (2.0 * finished.t + 0.4))
     reached = np.array([finished.mechanism.point_positions(q)["tip"] for q in finished.q_tree])

@@ -48,8 +48,8 @@ def test_the_largest_factor_is_scipys(seed: int, late: int) -> None:
         wanted[:4, -2:], wanted[4:6, :4], wanted[6:, 4:-2] = B, K, np.eye(2 * late - 2)
     else:
         wanted += B @ K
-    changes = {**TARGET, "controller.K_P": float(gains[0]), "controller.K_V": float(gains[1])}
-    found = stability(*controlled("five_bar/set_point", changes), 1.0, sampling=(period, late * period))
+    overrides = {**TARGET, "controller.K_P": float(gains[0]), "controller.K_V": float(gains[1])}
+    found = stability(*controlled("five_bar/set_point", overrides), 1.0, sampling=(period, late * period))
     assert found.sampled
     assert found.multiplier == pytest.approx(np.abs(np.linalg.eigvals(wanted)).max(), rel=1e-9)
 
@@ -70,9 +70,9 @@ def test_a_sampled_set_point_is_the_matrix_of_its_samples(delay: float) -> None:
     matrix = sampled_loop(loop, period, delay)
 
     m = int(np.floor(delay / period + 1e-9))
-    changes = {**target, "initial": start, "t_end": count * period, "solver.output_dt": period, "solver.rtol": 1e-12,
+    overrides = {**target, "initial": start, "t_end": count * period, "solver.output_dt": period, "solver.rtol": 1e-12,
                "formulation": "reduced"}  # fmt: skip
-    run = simulate("five_bar/set_point", changes, controller=Sampled(law, period, delay))
+    run = simulate("five_bar/set_point", overrides, controller=Sampled(law, period, delay))
     at = m + 1 if delay else 0  # from here on what is under way came from samples
     x = np.hstack([run.q_tree[:, [0, 2]] - q_d, run.v_tree[:, [0, 2]]])
     under_way = (len(matrix) - 4) // 2

@@ -30,8 +30,8 @@ CONTROLLED = [
 LONG_ENOUGH = 4  # times the slowest decay: errors fall to a fiftieth
 
 
-def controlled(name: str, changes: dict[str, Any] | None = None) -> tuple[Mechanism, Any]:
-    scene = load_scene(name, changes)
+def controlled(name: str, overrides: dict[str, Any] | None = None) -> tuple[Mechanism, Any]:
+    scene = load_scene(name, overrides)
     mechanism = scene_mechanism(scene)
     return mechanism, scene_controller(scene, mechanism)
 
@@ -119,15 +119,15 @@ def waves(frequency: float, amplitude: float = 0.2) -> dict[str, Any]:
     }
 
 
-def growth_by_runs(changes: dict[str, Any], t_end: float, off: float = 1e-6) -> float:
+def growth_by_runs(overrides: dict[str, Any], t_end: float, off: float = 1e-6) -> float:
     """Errors of the five-bar's tracking at the end by those at the start, each measured by the root of eq. 18."""
-    mechanism, law = controlled("five_bar/tracking", changes)
+    mechanism, law = controlled("five_bar/tracking", overrides)
     start, names, ends = np.concatenate(law.desired(0.0)[:2]), mechanism.independent, []
     exact = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.atol": 1e-14, "t_end": t_end}
     for step in np.vstack([np.zeros(4), off * np.eye(4)]):
         x = (start + step).tolist()
         at = {"q": dict(zip(names, x[:2], strict=True)), "q_dot": dict(zip(names, x[2:], strict=True))}
-        run = simulate("five_bar/tracking", {**changes, **exact, "initial": at, "solver.output_dt": t_end})
+        run = simulate("five_bar/tracking", {**overrides, **exact, "initial": at, "solver.output_dt": t_end})
         ends.append(np.concatenate([run.q_tree[-1][[0, 2]], run.v_tree[-1][[0, 2]]]))
     motion = np.array([(end - ends[0]) / off for end in ends[1:]]).T
     roots = []
@@ -140,13 +140,13 @@ def growth_by_runs(changes: dict[str, Any], t_end: float, off: float = 1e-6) -> 
 
 
 @pytest.mark.parametrize(
-    ("changes", "t_end"),
+    ("overrides", "t_end"),
     [({}, 3.0), ({}, 2.2), (waves(2 * np.pi * 24), 2.0), (waves(37.0, 0.3) | {"controller.K_D": 2.0}, 1.7)],
 )
-def test_growth_is_what_runs_do(changes: dict[str, Any], t_end: float) -> None:
+def test_growth_is_what_runs_do(overrides: dict[str, Any], t_end: float) -> None:
     """The nonlinear error of runs that start a little off; of a motion that comes round 48 times, too."""
-    found = stability(*controlled("five_bar/tracking", changes), t_end)
-    assert found.growth == pytest.approx(growth_by_runs(changes, t_end), rel=6e-3)
+    found = stability(*controlled("five_bar/tracking", overrides), t_end)
+    assert found.growth == pytest.approx(growth_by_runs(overrides, t_end), rel=6e-3)
     assert found.stable == (found.growth < 1)  # type: ignore[operator]
 
 
@@ -160,8 +160,8 @@ def test_growth_does_not_depend_on_when_the_motion_ends(t_end: float) -> None:
 
 def test_a_long_motion_has_its_slowest_decay() -> None:
     """Errors fall by more than numbers have room for; a mechanism that stands still has constant rates."""
-    changes = waves(0.0) | {"controller.Lambda": 3.0, "controller.K_D": 5.0}
-    found = stability(*controlled("five_bar/tracking", changes), 2000.0)
+    overrides = waves(0.0) | {"controller.Lambda": 3.0, "controller.K_D": 5.0}
+    found = stability(*controlled("five_bar/tracking", overrides), 2000.0)
     assert found.growth == 0.0
     assert found.eigenvalues is not None
     assert found.slowest == pytest.approx(-1 / found.eigenvalues.real.max(), rel=5e-3)

@@ -24,8 +24,8 @@ NAMES = ("theta_1", "theta_3")
 HANGING = np.array([-1.434, -1.707])
 
 
-def verdict(name: str, changes: dict[str, Any]) -> Stability:
-    found = check(load_scene(name, changes)).stability
+def verdict(name: str, overrides: dict[str, Any]) -> Stability:
+    found = check(load_scene(name, overrides)).stability
     assert found is not None
     return found
 
@@ -34,12 +34,12 @@ def target(q_d: Array) -> dict[str, Any]:
     return {"controller.q_d": dict(zip(NAMES, q_d.tolist(), strict=True))}
 
 
-def copied(folder: Path, *changes: tuple[str, str]) -> Path:
+def copied(folder: Path, *edits: tuple[str, str]) -> Path:
     """Another five-bar."""
     path = folder / "other"
     shutil.copytree(library() / "five_bar", path)
     text = (path / "mechanism.toml").read_text("utf-8")
-    for old, new in changes:
+    for old, new in edits:
         assert old in text
         text = text.replace(old, new)
     (path / "mechanism.toml").write_text(text, "utf-8")
@@ -56,13 +56,13 @@ def test_on_another_branch_it_is_the_target_there(seed: int) -> None:
     mechanism = load("five_bar")
     other = mechanism.tree.named(mechanism.tree.to_coordinates(assembly_branches(mechanism)[1].q_tree))
     q_d = HANGING + random.uniform(-0.2, 0.2, 2)
-    changes = {**target(q_d), "initial": {"q": other}, "controller.K_P": float(random.uniform(0.5, 2.0))}
-    found = verdict("five_bar/set_point", changes)
+    overrides = {**target(q_d), "initial": {"q": other}, "controller.K_P": float(random.uniform(0.5, 2.0))}
+    found = verdict("five_bar/set_point", overrides)
     assert found.stable
     assert found.offset == pytest.approx([0.0, 0.0], abs=1e-12)
     assert found.slowest is not None
     exact = {"formulation": "reduced", "t_end": 16 * found.slowest, "solver.rtol": 1e-10}
-    run = simulate("five_bar/set_point", {**changes, **exact})
+    run = simulate("five_bar/set_point", {**overrides, **exact})
     errors = np.abs(run.q_tree[:, [0, 2]] - q_d).max(axis=1)
     assert run.q_tree[-1][1] == pytest.approx(2.6, abs=0.3)
     assert errors[-1] < 1e-5 * errors[0]
@@ -93,16 +93,16 @@ def test_with_another_model_it_rests_where_a_run_ends(seed: int, tmp_path: Path)
     pull = f"gravity = [{random.uniform(-9, 9):.3f}, {random.uniform(-18, 9):.3f}, 0.0]"
     model = copied(tmp_path, ("gravity = [0.0, -9.81, 0.0]", pull))
     gains = {"controller.K_P": float(random.uniform(1.5, 5.0)), "controller.model": str(model / "mechanism.toml")}
-    changes = {**target(HANGING + random.uniform(-0.3, 0.3, 2)), **gains}
-    scene = load_scene("five_bar/set_point", changes)
+    overrides = {**target(HANGING + random.uniform(-0.3, 0.3, 2)), **gains}
+    scene = load_scene("five_bar/set_point", overrides)
     said = check(scene)
     found = said.stability
     assert found is not None
     assert found.stable
     assert found.least_K_P is None
     assert any("rests off its target" in warning for warning in said.warnings)
-    run = simulate("five_bar/set_point", {**changes, "t_end": 30.0, "formulation": "reduced"})
-    off = run.q_tree[-1][[0, 2]] - list(changes["controller.q_d"].values())
+    run = simulate("five_bar/set_point", {**overrides, "t_end": 30.0, "formulation": "reduced"})
+    off = run.q_tree[-1][[0, 2]] - list(overrides["controller.q_d"].values())
     assert np.abs(off).max() > 0.05
     assert found.offset == pytest.approx(off, abs=1e-6)
 
@@ -110,8 +110,8 @@ def test_with_another_model_it_rests_where_a_run_ends(seed: int, tmp_path: Path)
 def test_a_model_too_far_from_the_mechanism_leaves_no_rest_near_the_target(tmp_path: Path) -> None:
     """Newton's method from the target would end at some other equilibrium; following it says that there is none."""
     model = copied(tmp_path, ("gravity = [0.0, -9.81, 0.0]", "gravity = [0.0, 200.0, 0.0]"))
-    changes = target(np.array([-0.9, -2.2])) | {"controller.K_P": 0.3}
-    found = verdict("five_bar/set_point", {**changes, "controller.model": str(model / "mechanism.toml")})
+    overrides = target(np.array([-0.9, -2.2])) | {"controller.K_P": 0.3}
+    found = verdict("five_bar/set_point", {**overrides, "controller.model": str(model / "mechanism.toml")})
     assert found.stable is None
     assert "has no rest near its target" in str(found.reason)
 
@@ -179,14 +179,14 @@ def test_where_the_run_is_refused_nothing_is_said_to_be_stable(tmp_path: Path) -
     assert "a run does not begin: actuated: theta_1 cannot hold every freedom" in str(found.reason)
 
 
-def on_its_way(changes: dict[str, Any], t_end: float) -> tuple[dict[str, Any], Tracking]:
+def on_its_way(overrides: dict[str, Any], t_end: float) -> tuple[dict[str, Any], Tracking]:
     """Tracking of the five-bar that starts on its desired motion."""
-    scene = load_scene("five_bar/tracking", changes)
+    scene = load_scene("five_bar/tracking", overrides)
     law = scene_controller(scene, load("five_bar"))
     assert isinstance(law, Tracking)
     q, q_dot, _ = (dict(zip(NAMES, x.tolist(), strict=True)) for x in law.desired(0.0))
     exact = {"formulation": "reduced", "solver.rtol": 1e-10, "t_end": t_end}
-    return {**changes, **exact, "initial": {"q": q, "q_dot": q_dot}}, law
+    return {**overrides, **exact, "initial": {"q": q, "q_dot": q_dot}}, law
 
 
 DRIVEN = [
@@ -197,10 +197,10 @@ DRIVEN = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "rel"), DRIVEN, ids=lambda x: str(x)[:40])
-def test_what_takes_a_motion_off_the_desired_one_is_what_a_run_shows(changes: dict[str, Any], rel: float) -> None:
+@pytest.mark.parametrize(("overrides", "rel"), DRIVEN, ids=lambda x: str(x)[:40])
+def test_what_takes_a_motion_off_the_desired_one_is_what_a_run_shows(overrides: dict[str, Any], rel: float) -> None:
     """Samples, delay, another model, friction; up to what is not linear in it."""
-    on_it, law = on_its_way(waves(6.0) | changes, 2.0)
+    on_it, law = on_its_way(waves(6.0) | overrides, 2.0)
     found, run = verdict("five_bar/tracking", on_it), simulate("five_bar/tracking", on_it)
     wanted = np.array([law.desired(float(t))[0] for t in run.t])
     off = np.abs(run.q_tree[:, [0, 2]] - wanted).max(axis=0)

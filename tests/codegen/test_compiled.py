@@ -86,10 +86,10 @@ RUNS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "changes"), RUNS)
-def test_runs_end_where_they_did(scene: str, changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("scene", "overrides"), RUNS)
+def test_runs_end_where_they_did(scene: str, overrides: dict[str, Any]) -> None:
     """After nearly the same steps, to ten times what a step may be off."""
-    ours, theirs = (simulate(scene, {**changes, "solver.terms": terms}) for terms in ("generated", "pinocchio"))
+    ours, theirs = (simulate(scene, {**overrides, "solver.terms": terms}) for terms in ("generated", "pinocchio"))
     assert (ours.stats["terms"], theirs.stats["terms"]) == ("generated", "pinocchio")
     assert (ours.status, len(ours.t), len(ours.events)) == (theirs.status, len(theirs.t), len(theirs.events))
     assert abs(ours.stats["steps"] - theirs.stats["steps"]) <= 0.1 * theirs.stats["steps"]
@@ -101,8 +101,8 @@ def test_runs_end_where_they_did(scene: str, changes: dict[str, Any]) -> None:
 
 def test_a_loss_of_rank_is_passed_as_before() -> None:
     """Next to it elimination without pivoting would lose its digits: the core takes over."""
-    changes = {"formulation": "dae", "solver.rtol": 1e-8}
-    ours, theirs = (simulate("n_four_bar", {**changes, "solver.terms": x}) for x in ("generated", "pinocchio"))
+    overrides = {"formulation": "dae", "solver.rtol": 1e-8}
+    ours, theirs = (simulate("n_four_bar", {**overrides, "solver.terms": x}) for x in ("generated", "pinocchio"))
     assert ours.status == theirs.status == "done"
     assert np.abs(ours.q_tree[-1] - theirs.q_tree[-1]).max() < 1e-6
 
@@ -119,30 +119,30 @@ def test_a_long_run_compiles_on_its_way(tmp_path: Path, monkeypatch: pytest.Monk
     """Once it has cost what compiling does, and from where it is; the motion is the same."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(RUNNING, "REPAYS", 300)
-    scene, changes = "five_bar/set_point", {"formulation": "reduced", "solver.rtol": 1e-9}
-    usual = simulate(scene, {**changes, "solver.terms": "pinocchio"})
+    scene, overrides = "five_bar/set_point", {"formulation": "reduced", "solver.rtol": 1e-9}
+    usual = simulate(scene, {**overrides, "solver.terms": "pinocchio"})
     assert usual.stats["rhs_by_terms"] == {"pinocchio": usual.stats["rhs"]}
-    long = simulate(scene, changes)
+    long = simulate(scene, overrides)
     by_terms = long.stats["rhs_by_terms"]
     assert long.stats["terms"] == "generated"
     assert 300 <= by_terms["pinocchio"] < 330  # up to the end of a step
     assert sum(by_terms.values()) == long.stats["rhs"] <= 1.1 * usual.stats["rhs"]
     assert f"compiled after {by_terms['pinocchio']}" in repr(long)
     assert_close(long.q_tree, usual.q_tree, 1e-8)
-    assert simulate(scene, changes).stats["rhs_by_terms"] == {"generated": pytest.approx(long.stats["rhs"], rel=0.1)}
+    assert simulate(scene, overrides).stats["rhs_by_terms"] == {"generated": pytest.approx(long.stats["rhs"], rel=0.1)}
 
 
 def test_a_run_that_is_nearly_done_does_not_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    changes = {"formulation": "reduced", "solver.rtol": 1e-9}
-    usual = simulate("five_bar/set_point", changes)
+    overrides = {"formulation": "reduced", "solver.rtol": 1e-9}
+    usual = simulate("five_bar/set_point", overrides)
     monkeypatch.setattr(RUNNING, "REPAYS", usual.stats["rhs"] - 30)
-    late = simulate("five_bar/set_point", changes)
+    late = simulate("five_bar/set_point", overrides)
     assert late.stats["rhs_by_terms"] == usual.stats["rhs_by_terms"]
     assert np.array_equal(late.q_tree, usual.q_tree)
     monkeypatch.setattr(RUNNING, "REPAYS", 300)
     monkeypatch.setattr("ckc_pin.codegen.library._compiler", lambda fuses: None)  # and neither does one that cannot
-    late = simulate("five_bar/set_point", changes)
+    late = simulate("five_bar/set_point", overrides)
     assert np.array_equal(late.q_tree, usual.q_tree)
 
 
@@ -190,8 +190,8 @@ def slider_crank(folder: Path, rod: float) -> Path:
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_a_rod_without_mass_moves_with_its_loop(tmp_path: Path, formulation: str) -> None:
     """D' is singular, eq. 1 is not: the crank's speed is what the energy says."""
-    changes = {"formulation": formulation, "solver.terms": "generated"}
-    run = simulate(slider_crank(tmp_path, 0.0), changes)
+    overrides = {"formulation": formulation, "solver.terms": "generated"}
+    run = simulate(slider_crank(tmp_path, 0.0), overrides)
     assert run.status == "done"
     assert set(run.stats["rhs_by_terms"]) == {"generated"}
 

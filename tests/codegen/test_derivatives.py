@@ -74,8 +74,8 @@ def test_linear_models_by_compiled_terms_are_those_by_pinocchios(name: str, tmp_
 @pytest.mark.parametrize("speed", [0.0, 0.3])
 def test_what_baumgarte_adds_is_there_where_nothing_has_drifted(speed: float) -> None:
     """The right-hand side is eq. 1's there, but not how it changes."""
-    changes = {"formulation": "dae", "solver.baumgarte": [5.0, 0.0], "solver.projection": False}
-    scene = load_scene("five_bar/swing", {**changes, "solver.terms": "pinocchio"})
+    overrides = {"formulation": "dae", "solver.baumgarte": [5.0, 0.0], "solver.projection": False}
+    scene = load_scene("five_bar/swing", {**overrides, "solver.terms": "pinocchio"})
     found = []
     for library in (compiled(scene_mechanism(scene)), None):
         ready = prepare(scene, library=library)

@@ -38,16 +38,16 @@ def masses(scene: str, random: np.random.Generator) -> dict[str, float]:
 def test_status_and_right_hand_sides_are_those_of_pinocchios_terms(scene: str, formulation: str) -> None:
     random = np.random.default_rng(3)
     for _ in range(SETS):
-        changes: dict[str, Any] = {**masses(scene, random), "formulation": formulation, "controller": None}
-        changes |= {"t_end": SCENES[scene], "solver.rtol": float(random.choice([1e-6, 1e-8, 1e-10]))}
-        theirs, ours = (simulate(scene, {**changes, "solver.terms": x}) for x in ("pinocchio", "generated"))
+        overrides: dict[str, Any] = {**masses(scene, random), "formulation": formulation, "controller": None}
+        overrides |= {"t_end": SCENES[scene], "solver.rtol": float(random.choice([1e-6, 1e-8, 1e-10]))}
+        theirs, ours = (simulate(scene, {**overrides, "solver.terms": x}) for x in ("pinocchio", "generated"))
         assert ours.status == theirs.status == "done"
-        assert ours.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1), changes
+        assert ours.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1), overrides
 
 
-@pytest.mark.parametrize("changes", [LIGHT_LEG, STOPPED], ids=["light leg", "false reason"])
-def test_the_general_elimination_takes_over_and_is_counted(changes: dict[str, float]) -> None:
-    wanted = {**changes, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
+@pytest.mark.parametrize("overrides", [LIGHT_LEG, STOPPED], ids=["light leg", "false reason"])
+def test_the_general_elimination_takes_over_and_is_counted(overrides: dict[str, float]) -> None:
+    wanted = {**overrides, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
     theirs, ours = (simulate("stewart", {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated"))
     assert ours.status == theirs.status == "done"
     by_terms = ours.stats["rhs_by_terms"]
@@ -58,8 +58,8 @@ def test_the_general_elimination_takes_over_and_is_counted(changes: dict[str, fl
 @pytest.mark.parametrize("scene", SCENES)
 def test_masses_of_the_files_are_eliminated_as_compiled(scene: str) -> None:
     for formulation in ("dae", "reduced"):
-        changes = {"formulation": formulation, "controller": None, "t_end": 0.3, "solver.terms": "generated"}
-        run = simulate(scene, changes)
+        overrides = {"formulation": formulation, "controller": None, "t_end": 0.3, "solver.terms": "generated"}
+        run = simulate(scene, overrides)
         assert run.stats["rhs_by_terms"] == {"generated": run.stats["rhs"]}
 
 
@@ -80,24 +80,26 @@ def test_a_library_does_not_depend_on_the_masses_it_was_first_asked_for_with(
 ) -> None:
     """Neither its order of elimination nor whether it can be checked: rounding with these masses is 1e-9."""
     names = []
-    for k, changes in enumerate([{}, STOPPED]):
+    for k, overrides in enumerate([{}, STOPPED]):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(k)))
-        names.append(Path(compiled(load("stewart", changes)).path).name)
+        names.append(Path(compiled(load("stewart", overrides)).path).name)
     assert names[0] == names[1]
 
 
 def test_each_member_of_an_ensemble_is_judged_by_its_own_masses() -> None:
     """A member is the run with its numbers to the bit, whichever thread it is in and whatever ran there before."""
-    changes: dict[str, Any] = {"formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-9}
-    changes["solver.terms"] = "generated"
+    overrides: dict[str, Any] = {"formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-9}
+    overrides["solver.terms"] = "generated"
     light = {name: [1e-6, 1.0] for name in LIGHT_LEG}
     one, two = (
-        ensemble("stewart", light, {"end": "q_tree"}, changes=changes, threads=threads, progress=False)["end"].values
+        ensemble("stewart", light, {"end": "q_tree"}, overrides=overrides, threads=threads, progress=False)[
+            "end"
+        ].values
         for threads in (1, 2)
     )
     assert np.array_equal(one, two)
     for k, (piston, cylinder) in enumerate([(a, b) for a in (1e-6, 1.0) for b in (1e-6, 1.0)]):
-        run = simulate("stewart", {**changes, "link.piston_1.mass": piston, "link.cylinder_1.mass": cylinder})
+        run = simulate("stewart", {**overrides, "link.piston_1.mass": piston, "link.cylinder_1.mass": cylinder})
         assert np.array_equal(one[k], run.q_tree[-1])
 
 

@@ -20,10 +20,15 @@ K_P, K_V = 30.0, 4.0
 
 
 def five_bar(formulation: str, controlled: bool) -> Any:
-    changes: dict[str, Any] = {"formulation": formulation, "solver.terms": "generated", "solver.rtol": 1e-12}
+    overrides: dict[str, Any] = {"formulation": formulation, "solver.terms": "generated", "solver.rtol": 1e-12}
     if controlled:
-        changes["controller"] = {"type": "set_point", "K_P": K_P, "K_V": K_V, "q_d": {"theta_1": -1.2, "theta_3": -1.6}}
-    return started("five_bar/swing", changes).loop
+        overrides["controller"] = {
+            "type": "set_point",
+            "K_P": K_P,
+            "K_V": K_V,
+            "q_d": {"theta_1": -1.2, "theta_3": -1.6},
+        }
+    return started("five_bar/swing", overrides).loop
 
 
 def control(controlled: bool, q: Any, q_dot: Any) -> Any:
@@ -115,8 +120,8 @@ def dae(mechanism: str, terms: str, folder: Path) -> Any:
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_an_implicit_run_counts_no_right_hand_sides_for_its_jacobians(formulation: str) -> None:
-    changes = {"formulation": formulation, "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 1.0}
-    ours, theirs = (simulate("five_bar/swing", {**changes, "solver.terms": x}) for x in ("generated", "pinocchio"))
+    overrides = {"formulation": formulation, "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 1.0}
+    ours, theirs = (simulate("five_bar/swing", {**overrides, "solver.terms": x}) for x in ("generated", "pinocchio"))
     assert ours.stats["jacobians"] == theirs.stats["jacobians"] > 0
     assert np.abs(ours.q_tree[-1] - theirs.q_tree[-1]).max() < 1e-5
     assert ours.stats["differences"] == theirs.stats["differences"] == 0

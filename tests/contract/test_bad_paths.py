@@ -16,7 +16,7 @@ from tests.contract.helpers.command import ckc
 SWING = "five_bar/swing"
 BAD_PATHS = ["a" * 5000, f"{'a' * 300}/b", "a\0b", "a\ud800b"]
 SHORT: dict[str, Any] = {"t_end": 0.01, "solver.terms": "pinocchio"}
-SWEEP: dict[str, Any] = {"outputs": {"e": "energy"}, "changes": SHORT, "progress": False}
+SWEEP: dict[str, Any] = {"outputs": {"e": "energy"}, "overrides": SHORT, "progress": False}
 
 
 @pytest.fixture(scope="module")

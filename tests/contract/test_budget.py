@@ -35,8 +35,8 @@ class NanAfter:
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 def test_nan_from_a_controller_is_named_and_everything_before_is_kept(formulation: str, tmp_path: Path) -> None:
-    changes = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 0.01}
-    run = simulate("five_bar/swing", changes, controller=NanAfter(0.203))
+    overrides = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 0.01}
+    run = simulate("five_bar/swing", overrides, controller=NanAfter(0.203))
     assert run.status == "stopped"
     assert "u is not finite" in run.message
     assert 0.2 <= run.t[-1] <= 0.203
@@ -52,8 +52,8 @@ def test_min_step_ends_a_run_that_needs_shorter_ones() -> None:
         def u(self, t: float, terms: Terms) -> Any:
             return np.array([1.0, -1.0])
 
-    changes = {"formulation": "reduced", "solver.min_step": 1e-4}
-    run = simulate("five_bar/swing", changes, controller=Push())
+    overrides = {"formulation": "reduced", "solver.min_step": 1e-4}
+    run = simulate("five_bar/swing", overrides, controller=Push())
     assert run.status == "stopped"
     assert "the step fell below min_step = 0.0001 s" in run.message
     assert 0.2 < run.t[-1] < 0.25

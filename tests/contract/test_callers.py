@@ -41,9 +41,9 @@ class Own:
         return self.inner.u(t, terms)
 
 
-@pytest.mark.parametrize(("scene", "changes"), SCENES, ids=str)
-def test_it_is_called_once_an_evaluation_with_the_terms_of_its_state(scene, changes):
-    loaded = load_scene(scene, changes)
+@pytest.mark.parametrize(("scene", "overrides"), SCENES, ids=str)
+def test_it_is_called_once_an_evaluation_with_the_terms_of_its_state(scene, overrides):
+    loaded = load_scene(scene, overrides)
     own = Own(prepare(loaded).controller)
     theirs, mine = simulate(loaded), simulate(loaded, controller=own)
     assert np.abs(mine.q_tree - theirs.q_tree).max() <= 1e-7
@@ -169,8 +169,8 @@ def test_callers_controllers_in_threads_get_their_own_terms():
             def u(self, t: float, terms: Terms) -> Any:
                 return terms.h + terms.D @ (20.0 * (target - terms.q) - 5.0 * terms.q_dot)
 
-        changes = {"formulation": "reduced", "t_end": 0.3}
-        return simulate("five_bar/set_point", changes, controller=Own()).q_tree
+        overrides = {"formulation": "reduced", "t_end": 0.3}
+        return simulate("five_bar/set_point", overrides, controller=Own()).q_tree
 
     alone = [run(number) for number in range(4)]
     with ThreadPoolExecutor(4) as pool:

@@ -20,9 +20,9 @@ from tests.contract.helpers.command import ckc
 HANGING = {"theta_1": -1.434, "theta_2": 0.248, "theta_3": -1.707, "theta_4": -0.248}
 
 
-def edit(path: Path, *changes: tuple[str, str]) -> None:
+def edit(path: Path, *edits: tuple[str, str]) -> None:
     text = path.read_text(encoding="utf-8")
-    for old, new in changes:
+    for old, new in edits:
         assert old in text
         text = text.replace(old, new, 1)
     path.write_text(text, encoding="utf-8")
@@ -46,15 +46,15 @@ def warnings(what: str) -> list[str]:
     return found
 
 
-# --- changes on the way ----------------------------------------------------------------------------
+# --- overrides on the way ----------------------------------------------------------------------------
 
 
-def test_a_check_takes_changes_as_a_run_does() -> None:
+def test_check_takes_overrides_as_a_run_does() -> None:
     """Of a scene its keys and numbers of the mechanism, of a mechanism those numbers."""
-    changes = {"controller.K_P": 2.0, "link.link_2.mass": 0.3}
-    line = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
+    overrides = {"controller.K_P": 2.0, "link.link_2.mass": 0.3}
+    line = [word for key, value in overrides.items() for word in ("--set", f"{key}={value}")]
     of_command = ckc("check", "five_bar/set_point", *line, "--json").json
-    of_python, of_scene = check("five_bar/set_point", changes), check(load_scene("five_bar/set_point", changes))
+    of_python, of_scene = check("five_bar/set_point", overrides), check(load_scene("five_bar/set_point", overrides))
     assert of_command == json.loads(to_json(check_plain(of_python))) == json.loads(to_json(check_plain(of_scene)))
     assert of_python.stability is not None
     assert of_python.stability.least_eigenvalue != check("five_bar/set_point").stability.least_eigenvalue  # type: ignore[union-attr]
@@ -64,8 +64,8 @@ def test_a_check_takes_changes_as_a_run_does() -> None:
     assert check("five_bar", lighter).mass == pytest.approx(check("five_bar").mass - by_hand + 0.0625)
 
 
-def test_changes_that_go_with_nothing_are_refused() -> None:
-    with pytest.raises(InputError, match="check: changes go with a name"):
+def test_overrides_without_a_name_are_refused() -> None:
+    with pytest.raises(InputError, match="check: overrides go with a name"):
         check(load("five_bar"), {"link.link_2.mass": 0.3})
     answer = ckc("check", "five_bar", "--set", "t_end=3")
     assert answer.code == 2

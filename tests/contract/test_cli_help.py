@@ -8,7 +8,7 @@ import pytest
 
 from ckc_pin.base.summary import to_json
 from ckc_pin.cli.app import COMMANDS
-from ckc_pin.cli.arguments import read_changes
+from ckc_pin.cli.arguments import read_overrides
 from tests.contract.helpers.command import ckc
 
 
@@ -38,7 +38,7 @@ def test_help_of_every_command_has_an_example(name: str) -> None:
 
 
 def test_values_of_settings() -> None:
-    read = read_changes(
+    read = read_overrides(
         "--set",
         [
             "a=1",

@@ -99,8 +99,8 @@ def test_a_limit_on_motors_elsewhere(bar: Path) -> None:
     old = 'actuated = ["theta_1", "theta_3"]'
     assert old in text
     (bar / "mechanism.toml").write_text(text.replace(old, 'actuated = ["theta_4", "theta_2"]'), encoding="utf-8")
-    changes = {"t_end": 0.1, "controller.torque_limit": 4.0}
-    found = simulate(bar / "tracking.scene.toml", changes)
+    overrides = {"t_end": 0.1, "controller.torque_limit": 4.0}
+    found = simulate(bar / "tracking.scene.toml", overrides)
     assert np.abs(found.tau).max() == 4.0
     for k in range(len(found.t)):
         rho = FIVE_BAR.rho(found.q_tree[k])
@@ -213,29 +213,29 @@ def test_an_interrupt_in_a_controller_keeps_what_there_is() -> None:
 
 
 def test_numpy_values_change_a_scene_like_pythons() -> None:
-    changes = {
+    overrides = {
         "t_end": np.float64(0.5),
         "solver.max_rhs": np.int64(7),
         "controller.K_D": 2.0 * np.eye(2),
         "controller.Lambda": {"theta_1": np.float64(1.0), "theta_3": 1},
     }
-    spec = load_scene("five_bar/tracking", changes).spec
+    spec = load_scene("five_bar/tracking", overrides).spec
     assert (spec.t_end, spec.solver.max_rhs) == (0.5, 7)
     assert spec.controller is not None
-    assert load_scene("five_bar/tracking", changes).to_dict()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
+    assert load_scene("five_bar/tracking", overrides).to_dict()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
 
 
 def test_a_scene_is_complete() -> None:
     scene = load_scene("five_bar/swing", {"t_end": 0.01})
     assert simulate(scene).t[-1] == 0.01
-    with pytest.raises(InputError, match="changes go with the name of a scene"):
+    with pytest.raises(InputError, match="overrides go with the name of a scene"):
         simulate(scene, {"t_end": 1.0})
 
 
-@pytest.mark.parametrize("changes", [{}, {"solver.output_dt": 0.3}, {"solver.output_dt": 7.0}, {"t_end": 1e-9}])
-def test_output_instants(changes: dict[str, Any]) -> None:
-    found = simulate("five_bar/swing", {"t_end": 1.0, "formulation": "reduced", **changes})
-    t_end, dt = changes.get("t_end", 1.0), changes.get("solver.output_dt", 0.01)
+@pytest.mark.parametrize("overrides", [{}, {"solver.output_dt": 0.3}, {"solver.output_dt": 7.0}, {"t_end": 1e-9}])
+def test_output_instants(overrides: dict[str, Any]) -> None:
+    found = simulate("five_bar/swing", {"t_end": 1.0, "formulation": "reduced", **overrides})
+    t_end, dt = overrides.get("t_end", 1.0), overrides.get("solver.output_dt", 0.01)
     assert found.t[0] == 0.0
     assert found.t[-1] == t_end
     inner = found.t[:-1]

@@ -102,7 +102,7 @@ COMMANDS = {
 SWEEP = """
 scene = "five_bar/swing"
 members = 20
-[changes]
+[overrides]
 t_end = 0.1
 [variables]
 "initial.q.theta_1" = {uniform = [-1.9, -0.9]}

@@ -150,11 +150,11 @@ def test_two_crossings_in_one_step(formulation: str, motion: Callable[[float], A
     value = float(motion(turn)[1]) - np.sign(motion(turn)[1] - motion(turn - 0.02)[1]) * 2e-4
     wanted = [t for t in _roots(lambda t: float(motion(t)[1] - value)) if abs(t - turn) < 0.02]
     assert len(wanted) == 2
-    changes = {"formulation": formulation, "t_end": T_END, "event": [{"coordinate": "theta_2", "value": value}]}
-    loose = simulate("five_bar/swing", {**changes, "solver.rtol": 1e-5, "solver.output_dt": T_END})
+    overrides = {"formulation": formulation, "t_end": T_END, "event": [{"coordinate": "theta_2", "value": value}]}
+    loose = simulate("five_bar/swing", {**overrides, "solver.rtol": 1e-5, "solver.output_dt": T_END})
     assert T_END / loose.stats["steps"] > 2 * (wanted[1] - wanted[0])
     assert len([t for t in _times(loose) if abs(t - turn) < 0.02]) == 2
-    tight = simulate("five_bar/swing", {**changes, **TIGHT})
+    tight = simulate("five_bar/swing", {**overrides, **TIGHT})
     assert_close([t for t in _times(tight) if abs(t - turn) < 0.02], wanted, 1e-9)  # 0.01 of slope: 1e-11 rad
 
 
@@ -171,7 +171,7 @@ def test_margins_and_functions_are_located(formulation: str, motion: Callable[[f
         return float(FIVE_BAR.potential_energy(y[:4]))
 
     values = [float(np.median([f(t) for t in np.linspace(0, T_END, 50)])) for f in (margin, margin_of_j, energy)]
-    changes = {
+    overrides = {
         **TIGHT,
         "formulation": formulation,
         "t_end": T_END,
@@ -184,7 +184,7 @@ def test_margins_and_functions_are_located(formulation: str, motion: Callable[[f
 
     start = load("five_bar").kinematics(simulate("five_bar/swing", {"t_end": 1e-6}).q_tree[0])
     start = Terms(load("five_bar"), start, np.zeros(4)).potential_energy
-    run = simulate("five_bar/swing", changes, events=[Event(fallen), Event(lambda t, terms: t - 0.25, name="clock")])
+    run = simulate("five_bar/swing", overrides, events=[Event(fallen), Event(lambda t, terms: t - 0.25, name="clock")])
     for of, function, value in zip(
         ("sigma_min_phi_z", "sigma_min_J", "function"), (margin, margin_of_j, energy), values, strict=True
     ):
@@ -207,10 +207,10 @@ def test_events_do_not_change_the_motion() -> None:
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_an_event_that_is_far_from_happening_is_not_looked_for(formulation: str, either_terms: str) -> None:
     """A coordinate's value is ruled out by what a step knows already: after the first no state in between is closed."""
-    changes: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
-    plain = simulate("five_bar/swing", changes, profile=True)
+    overrides: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
+    plain = simulate("five_bar/swing", overrides, profile=True)
     far = [{"coordinate": "theta_2", "value": 50.0}, {"coordinate": "theta_1", "of": "q_dot", "value": 1e3}]
-    observed = simulate("five_bar/swing", {**changes, "event": far}, profile=True)
+    observed = simulate("five_bar/swing", {**overrides, "event": far}, profile=True)
     assert observed.events == []
     placed = {"pinocchio": "J", "generated": "phi"}[either_terms]  # written out, phi comes with J
     assert observed.profile[placed]["calls"] < 1.1 * plain.profile[placed]["calls"]
@@ -326,15 +326,15 @@ def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_events_between_a_simulators_steps(formulation: str) -> None:
     """One that stops ends the step early, and does not happen again at once."""
-    changes = {
+    overrides = {
         "solver.rtol": 1e-10,
         "formulation": formulation,
         "t_end": 0.5,
         "event": [{"coordinate": "theta_2", "value": 0.5}],
     }
     bell = Event(lambda t, terms: t - 0.1, stop=True, name="bell")
-    wanted = simulate("five_bar/swing", changes, events=[Event(lambda t, terms: t - 0.1)]).events
-    simulator = Simulator("five_bar/swing", changes, events=[bell])
+    wanted = simulate("five_bar/swing", overrides, events=[Event(lambda t, terms: t - 0.1)]).events
+    simulator = Simulator("five_bar/swing", overrides, events=[bell])
     stops = []
     while simulator.state.t < 0.5:
         end = min(simulator.state.t + 0.03, 0.5)

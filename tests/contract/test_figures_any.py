@@ -21,7 +21,7 @@ def stewart() -> ckc_pin.Run:
 
 
 @pytest.mark.parametrize(
-    ("changes", "title"),
+    ("overrides", "title"),
     [
         ({"joint.crank.damping": 0.0}, "energy drift"),
         ({"joint.crank.damping": 0.1}, "energy change"),
@@ -29,9 +29,9 @@ def stewart() -> ckc_pin.Run:
         ({"friction_smoothing": 0.1, "joint.crank.friction": 0.1}, "energy change"),
     ],
 )
-def test_what_dampers_take_is_no_drift(changes, title):
+def test_what_dampers_take_is_no_drift(overrides, title):
     """Drift is what an integrator does to an energy that should stay."""
-    run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, **changes})
+    run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, **overrides})
     titles = [ax.get_title("left") for ax in draw(run)["motion"].axes]
     assert [said for said in titles if "energy" in said] == [f"c)  {title}"]
 

@@ -253,6 +253,6 @@ def test_what_moves_freely_needs_no_motor(tmp_path: Path) -> None:
     assert_close(found.tau, recorded.tau, 1e-12)
 
 
-def test_changes_go_with_a_name() -> None:
-    with pytest.raises(InputError, match="changes go with the name of a scene"):
+def test_overrides_need_a_name() -> None:
+    with pytest.raises(InputError, match="overrides go with the name of a scene"):
         inverse_dynamics(ckc_pin.load_scene("five_bar/tracking"), {"t_end": 1.0})

@@ -84,7 +84,7 @@ def test_what_cannot_be_drawn_or_played_is_refused() -> None:
     with pytest.raises(InputError, match="give it alone"):
         plot(model, model)
     with pytest.raises(InputError, match="a Scene is complete"):
-        gain_locus(scene, changes={"controller.K_P": 1.0})
+        gain_locus(scene, overrides={"controller.K_P": 1.0})
     for number in ("a", 0, 1.5, None, 3):
         with pytest.raises(InputError, match="five_bar has modes 1 to 2"):
             model.sway(number)  # type: ignore[arg-type]

@@ -86,8 +86,8 @@ def elbow_of(frame: dict) -> np.ndarray:
     return np.array(placed["matrix"][12:15])
 
 
-def seen_live(viewer: Viewer, changes: dict[str, Any]) -> tuple[ckc_pin.Run, list[dict]]:
-    scene = ckc_pin.load_scene(SWING, changes)
+def seen_live(viewer: Viewer, overrides: dict[str, Any]) -> tuple[ckc_pin.Run, list[dict]]:
+    scene = ckc_pin.load_scene(SWING, overrides)
     with live_view(scene, None) as view:
         assert view is not None
         thread, seen = beside(view.server.url, viewer)

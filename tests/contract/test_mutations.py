@@ -107,14 +107,14 @@ def _check(data: Any, name: str, folder: Path) -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_bytes(file: str, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
     r, whole = random.Random(3), (bar / file).read_bytes()
-    changes = {"t_end": 0.01, "solver.max_rhs": 200, "solver.output_dt": 0.005}
+    overrides = {"t_end": 0.01, "solver.max_rhs": 200, "solver.output_dt": 0.005}
     for _ in range(100):
         content = bytearray(whole)
         for _ in range(r.choice([1, 1, 3])):
             k = r.randrange(len(content))
             content[k : k + r.choice([0, 1, 1, 30])] = bytes([r.choice(BYTES)]) * r.choice([0, 1, 2])
         (bar / file).write_bytes(content)
-        used_or_refused(simulate, bar / "swing.scene.toml", changes)
+        used_or_refused(simulate, bar / "swing.scene.toml", overrides)
         used_or_refused(load, bar)
     assert capfd.readouterr() == ("", "")
 

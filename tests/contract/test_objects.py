@@ -120,10 +120,10 @@ def test_the_state_at_an_instant_is_the_nearest_output(swing: Run) -> None:
 @pytest.mark.parametrize("velocity", ["rho", "actual"])
 def test_a_simulator_goes_on_from_a_state_of_a_run(velocity: str) -> None:
     """Also off the manifold, where the velocity that C takes is another than the motion's."""
-    changes = {"formulation": "spf", "epsilon": 0.1, "initial.w": [0.01, -0.02], "coriolis_velocity": velocity,
+    overrides = {"formulation": "spf", "epsilon": 0.1, "initial.w": [0.01, -0.02], "coriolis_velocity": velocity,
                "t_end": 0.2, "solver.rtol": 1e-10, "solver.output_dt": 0.1}  # fmt: skip
-    run = simulate(SWING, changes)
-    simulator = Simulator(SWING, changes)
+    run = simulate(SWING, overrides)
+    simulator = Simulator(SWING, overrides)
     own, theirs = simulator.step(dt=0.1), run.sel(t=0.1)
     assert np.abs(theirs.w).max() > 1e-3
     assert_close(theirs.q_tree, own.q_tree, 1e-8)

@@ -133,10 +133,10 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("changes", "says"), REFUSED, ids=[str(changes) for changes, _ in REFUSED])
-def test_what_cannot_be_is_refused_by_name(changes: dict[str, object], says: str) -> None:
+@pytest.mark.parametrize(("overrides", "says"), REFUSED, ids=[str(overrides) for overrides, _ in REFUSED])
+def test_what_cannot_be_is_refused_by_name(overrides: dict[str, object], says: str) -> None:
     with pytest.raises(CkcError, match=r"parameters|not closed") as error:
-        ckc_pin.simulate("five_bar/swing", changes)
+        ckc_pin.simulate("five_bar/swing", overrides)
     assert says in str(error.value)
 
 

@@ -133,8 +133,8 @@ def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
 
 
 def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
-    changes = {"controller.desired.theta_1.harmonics": [[2.2, 10.0, 0.0]], "t_end": 0.3, "formulation": "reduced"}
-    drawing = scene([ckc_pin.simulate("five_bar/tracking", changes)])
+    overrides = {"controller.desired.theta_1.harmonics": [[2.2, 10.0, 0.0]], "t_end": 0.3, "formulation": "reduced"}
+    drawing = scene([ckc_pin.simulate("five_bar/tracking", overrides)])
     (animation,) = [c for c in drawing if c["type"] == "set_animation"]
     (hidden,) = [a for a in animation["animations"] if a["path"].endswith("/desired")]
     (track,) = hidden["clip"]["tracks"]

@@ -20,8 +20,8 @@ LIFT = {"t_end": 0.5, "solver.rtol": 1e-10, "solver.output_dt": 0.05}
 PRELOAD = {"left_elbow_joint": 10.0, "right_shoulder_pan_joint": -5.0}
 
 
-def lift(**changes: Any) -> Run:
-    return simulate("two_ur5/lift", {**LIFT, **{name.replace("__", "."): x for name, x in changes.items()}})
+def lift(**overrides: Any) -> Run:
+    return simulate("two_ur5/lift", {**LIFT, **{name.replace("__", "."): x for name, x in overrides.items()}})
 
 
 def transmission(mechanism: Mechanism, q_tree: Array) -> Array:
@@ -95,8 +95,8 @@ def test_limits(plain: Run, limit: float) -> None:
 def test_what_is_out_of_reach_is_missed_by_least() -> None:
     """Where no tau within limits gives u: hardly further from it than any, each row measured by its size."""
     limit = 12.0
-    changes = {"t_end": 1e-3, "controller.torque_limit": limit}
-    run, free = simulate("two_ur5/lift", changes), simulate("two_ur5/lift", {"t_end": 1e-3})
+    overrides = {"t_end": 1e-3, "controller.torque_limit": limit}
+    run, free = simulate("two_ur5/lift", overrides), simulate("two_ur5/lift", {"t_end": 1e-3})
     assert np.abs(free.tau[0]).max() > 20
     T = transmission(run.mechanism, run.q_tree[0])
     rows = 1 / np.linalg.norm(T, axis=1)

@@ -19,7 +19,7 @@ from tests.contract.helpers.under_way import under_way
 PLAIN = {"status", "message", "scenes", "written"}
 SECTION = {"scene", "status", "message", "reference", "model_difference", "rows", "advice", "notes", "seconds"}
 REFERENCE = {"of", "confirmed_by", "rtol", "accuracy", "t_end", "t", "q_tree", "v_tree"}
-ROW = """program formulation method rtol dt changes status reason error error_q error_v resolved rhs steps used wall_s
+ROW = """program formulation method rtol dt overrides status reason error error_q error_v resolved rhs steps used wall_s
          setup_s"""
 ADVICE = {"target", "set", "remove", "reason", "wall_s", "error", "mujoco"}
 

@@ -113,8 +113,8 @@ def test_a_model_and_a_trajectory_travel_along(bar: Path, tmp_path: Path) -> Non
     t = np.linspace(0, 1, 21)
     rows = [f"{x},{-1.4 + 0.1 * x**3},{-1.7}" for x in t]
     (bar / "way.csv").write_text("\n".join(["t,theta_1,theta_3", *rows]), encoding="utf-8")
-    changes = {"t_end": 0.02, "controller.model": "heavy.toml", "controller.desired": {"file": "way.csv"}}
-    finished = simulate(bar / "tracking.scene.toml", changes)
+    overrides = {"t_end": 0.02, "controller.model": "heavy.toml", "controller.desired": {"file": "way.csv"}}
+    finished = simulate(bar / "tracking.scene.toml", overrides)
     loaded = Run.load(finished.save(tmp_path / "run.npz"))
     assert loaded.texts["way.csv"].startswith("t,theta_1,theta_3")
     assert 'value="0.3"' in loaded.texts["model/heavy.urdf"]
@@ -181,11 +181,11 @@ def test_an_interrupted_write_leaves_the_old_file(tracked: Run, saved: Path, mon
 Contents = dict[str, Any]
 
 
-def _meta(**changes: Any) -> Callable[[Contents], None]:
+def _meta(**overrides: Any) -> Callable[[Contents], None]:
     """Change what the file says beside its arrays; None takes a key away."""
 
     def change(content: Contents) -> None:
-        meta = json.loads(content["meta"].tobytes()) | changes
+        meta = json.loads(content["meta"].tobytes()) | overrides
         content["meta"] = np.frombuffer(
             json.dumps({k: v for k, v in meta.items() if v is not None}).encode(), dtype=np.uint8
         )

@@ -64,7 +64,7 @@ def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Ar
 def test_the_loop_in_numpy(scene: str, period: float, delay: float, formulation: str) -> None:
     t_end = 15 * period
     instants, states, acts = loop(LAWS[scene], period, delay, t_end)
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": t_end,
         "solver.rtol": 1e-11,
@@ -72,7 +72,7 @@ def test_the_loop_in_numpy(scene: str, period: float, delay: float, formulation:
         "controller.sample_time": period,
         "controller.delay": delay,
     }
-    run = simulate(f"five_bar/{scene}", changes)
+    run = simulate(f"five_bar/{scene}", overrides)
     assert run.status == "done", run.message
     rows = [run.at(t) for t in instants]
     assert_close(run.t[rows], instants, 1e-12)
@@ -91,13 +91,13 @@ def test_the_loop_in_numpy(scene: str, period: float, delay: float, formulation:
 def test_the_continuous_controller_in_the_limit(scene: str) -> None:
     """First order: half the sample time and delay, half the difference."""
     t_end = 0.04 if scene == "set_point" else 0.02
-    changes = {"formulation": "reduced", "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": 0.01}
-    exact = simulate(f"five_bar/{scene}", changes)
+    overrides = {"formulation": "reduced", "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": 0.01}
+    exact = simulate(f"five_bar/{scene}", overrides)
     periods = np.array([1e-3, 5e-4, 2.5e-4]) / (1 if scene == "set_point" else 2)
     gaps = []
     for period in periods:
         sampled = {"controller.sample_time": period, "controller.delay": period}
-        gaps.append(np.abs(simulate(f"five_bar/{scene}", {**changes, **sampled}).q_tree - exact.q_tree).max())
+        gaps.append(np.abs(simulate(f"five_bar/{scene}", {**overrides, **sampled}).q_tree - exact.q_tree).max())
     orders = np.log2(np.array(gaps[:-1]) / np.array(gaps[1:]))
     assert gaps[-1] > 1e-6
     assert abs(orders[-1] - 1) < 0.15
@@ -105,14 +105,14 @@ def test_the_continuous_controller_in_the_limit(scene: str) -> None:
 
 
 def test_a_sampled_controller_from_python() -> None:
-    changes = {"formulation": "reduced", "t_end": 0.01}
+    overrides = {"formulation": "reduced", "t_end": 0.01}
     scene = load_scene("five_bar/tracking")
     inner = scene_controller(scene, scene_mechanism(scene))
     assert inner is not None
     own = Sampled(inner, 5e-4, 2e-4)
-    shipped = simulate("five_bar/tracking", {**changes, "controller.sample_time": 5e-4, "controller.delay": 2e-4})
+    shipped = simulate("five_bar/tracking", {**overrides, "controller.sample_time": 5e-4, "controller.delay": 2e-4})
     for _ in range(2):  # a run leaves nothing behind
-        run = simulate("five_bar/tracking", changes, controller=own)
+        run = simulate("five_bar/tracking", overrides, controller=own)
         assert_close(run.q_tree, shipped.q_tree, 1e-9)
         assert_close(run.u, shipped.u, 1e-6)
         assert run.lyapunov is not None
@@ -175,7 +175,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "says"), BAD, ids=[" ".join(changes) for changes, _ in BAD])
-def test_a_bad_clock_in_a_scene(changes: tuple[str, ...], says: str, bar: Path) -> None:
-    words = [word for change in changes for word in ("--set", f"controller.{change}")]
+@pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(overrides) for overrides, _ in BAD])
+def test_a_bad_clock_in_a_scene(overrides: tuple[str, ...], says: str, bar: Path) -> None:
+    words = [word for change in overrides for word in ("--set", f"controller.{change}")]
     expect(Bad("clock", ("run", "bar/tracking.scene.toml", *words), [says]), bar)

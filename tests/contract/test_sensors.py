@@ -135,7 +135,7 @@ def test_sensors(scene: str, name: str) -> None:
     """Both laws see what is measured; terms are those where the loops close at it."""
     keys, formulation = SENSORS[name], FORMULATIONS[len(name) % 3]
     period = 0.002 if scene == "set_point" else 0.0005
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 8 * period,
         "solver.rtol": 1e-11,
@@ -143,9 +143,9 @@ def test_sensors(scene: str, name: str) -> None:
         "controller.sample_time": period,
         "controller.sensor": table(keys),
     }
-    run = simulate(f"five_bar/{scene}", changes)
+    run = simulate(f"five_bar/{scene}", overrides)
     assert_is(run, *loop(LAWS[scene], Seen(period, **keys), 33))
-    exact = simulate(f"five_bar/{scene}", {**changes, "controller.sensor": None})
+    exact = simulate(f"five_bar/{scene}", {**overrides, "controller.sensor": None})
     assert np.abs(run.tau - exact.tau).max() > 1e-3
     assert run.stats["python_calls"] == 0
 
@@ -162,7 +162,7 @@ DRIVES: dict[str, dict[str, Any]] = {
 def test_drives(formulation: str, name: str) -> None:
     keys, period = DRIVES[name], 0.002
     given = {k: {m: x for m, x in v.items() if x} if isinstance(v, dict) else v for k, v in table(keys).items()}
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 10 * period,
         "solver.rtol": 1e-11,
@@ -172,7 +172,7 @@ def test_drives(formulation: str, name: str) -> None:
         "controller.drive": given,
         "controller.sensor": {"resolution": 1e-3},
     }
-    run = simulate("five_bar/set_point", changes)
+    run = simulate("five_bar/set_point", overrides)
     rate, step = keys.get("torque_rate", np.inf), np.array(keys.get("torque_resolution", 0.0))
     step = np.where(step > 0, step, 1e-300)  # floor(x / 1e-300) overflows nothing here, and changes nothing
     law, seen = LAWS["set_point"], Seen(period, resolution=1e-3)
@@ -208,7 +208,7 @@ def test_a_controller_of_ones_own_sees_what_is_measured(formulation: str, contro
     keys = {"resolution": 1e-3, "rate": "difference", "filter": 0.003}
     period = 0.002
     own = Sampled(controller, period, period / 4, keys, {"torque_resolution": 1e-3})
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 8 * period,
         "solver.rtol": 1e-11,
@@ -219,7 +219,7 @@ def test_a_controller_of_ones_own_sees_what_is_measured(formulation: str, contro
     }
     states, torques = loop(Own.of, Seen(period, **keys), 33, 1, step=1e-3)
     for _ in range(2):  # a run leaves nothing behind
-        assert_is(simulate("five_bar/swing", changes, controller=own), states, torques)
+        assert_is(simulate("five_bar/swing", overrides, controller=own), states, torques)
 
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
@@ -228,7 +228,7 @@ def test_a_wrong_model_sees_it_too(tmp_path: Path, convention: str) -> None:
     from tests.regression.test_control import heavy_model
 
     period, keys = 0.0005, {"resolution": 5e-3, "rate": "difference"}
-    changes = {
+    overrides = {
         "t_end": 8 * period,
         "solver.rtol": 1e-11,
         "solver.output_dt": period / 4,
@@ -238,7 +238,7 @@ def test_a_wrong_model_sees_it_too(tmp_path: Path, convention: str) -> None:
         "controller.model": heavy_model(tmp_path, "value|i[xyz][xyz]"),
     }
     law = tracking(FIVE_BAR.heavier(1.2, 1.2))
-    assert_is(simulate("five_bar/tracking", changes), *loop(law, Seen(period, **keys), 33))
+    assert_is(simulate("five_bar/tracking", overrides), *loop(law, Seen(period, **keys), 33))
 
 
 def test_noise_is_normal_and_a_matter_of_its_seed() -> None:
@@ -277,22 +277,22 @@ def test_noise_is_normal_and_a_matter_of_its_seed() -> None:
 
 def test_without_sensors_nothing_changes() -> None:
     """An empty table is no sensor: the same numbers, and as many right-hand sides."""
-    changes = {"t_end": 0.02, "controller.sample_time": 0.001}
-    plain = simulate("five_bar/set_point", changes)
-    empty = simulate("five_bar/set_point", {**changes, "controller.sensor": {}, "controller.drive": {}})
+    overrides = {"t_end": 0.02, "controller.sample_time": 0.001}
+    plain = simulate("five_bar/set_point", overrides)
+    empty = simulate("five_bar/set_point", {**overrides, "controller.sensor": {}, "controller.drive": {}})
     assert np.array_equal(plain.q_tree, empty.q_tree)
     assert plain.stats["rhs"] == empty.stats["rhs"]
 
 
 def test_a_measurement_that_no_configuration_has() -> None:
-    changes = {"t_end": 0.05, "controller.sample_time": 0.001, "controller.sensor": {"q_noise": 30.0}}
+    overrides = {"t_end": 0.05, "controller.sample_time": 0.001, "controller.sensor": {"q_noise": 30.0}}
     with pytest.raises(NumericalError, match="the loops do not close at what the sensors say of q"):
-        simulate("five_bar/tracking", changes)
+        simulate("five_bar/tracking", overrides)
 
 
-def _set(*changes: str) -> tuple[str, ...]:
+def _set(*overrides: str) -> tuple[str, ...]:
     clock = ("--set", "controller.sample_time=0.001")
-    return ("run", "bar/tracking.scene.toml", *clock, *(w for c in changes for w in ("--set", f"controller.{c}")))
+    return ("run", "bar/tracking.scene.toml", *clock, *(w for c in overrides for w in ("--set", f"controller.{c}")))
 
 
 JOINTS = "theta_1, theta_3"

@@ -36,8 +36,8 @@ def assert_same(ours: State, theirs: State, tolerance: float = 0.0) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_free_swing_is_the_whole_run(formulation: str) -> None:
-    changes = {**TIGHT, "formulation": formulation, "t_end": 0.5, "solver.output_dt": 0.01}
-    run, simulator = simulate("five_bar/swing", changes), Simulator("five_bar/swing", changes)
+    overrides = {**TIGHT, "formulation": formulation, "t_end": 0.5, "solver.output_dt": 0.01}
+    run, simulator = simulate("five_bar/swing", overrides), Simulator("five_bar/swing", overrides)
     start = simulator.state.terms.energy
     for k in range(1, len(run.t)):
         state = simulator.step(None if k % 2 else NO_FORCE, 0.01)
@@ -49,7 +49,7 @@ def test_a_free_swing_is_the_whole_run(formulation: str) -> None:
 
 
 def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
-    changes = {
+    overrides = {
         **TIGHT,
         "formulation": "spf",
         "epsilon": 0.02,
@@ -58,7 +58,7 @@ def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
         "solver.output_dt": 0.01,
     }
     for coordinates in ("w", "z"):
-        given = {**changes, "spf_coordinates": coordinates}
+        given = {**overrides, "spf_coordinates": coordinates}
         run, simulator = simulate("five_bar/swing", given), Simulator("five_bar/swing", given)
         for k in range(1, 11):
             state = simulator.step(None, 0.01)
@@ -73,9 +73,9 @@ def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_the_u_of_a_sampled_run_gives_that_run(formulation: str) -> None:
     period = 0.001
-    changes = {**TIGHT, "formulation": formulation, "t_end": 0.05, "solver.output_dt": period}
-    run = simulate("five_bar/tracking", {**changes, "controller.sample_time": period})
-    simulator = Simulator("five_bar/tracking", changes)
+    overrides = {**TIGHT, "formulation": formulation, "t_end": 0.05, "solver.output_dt": period}
+    run = simulate("five_bar/tracking", {**overrides, "controller.sample_time": period})
+    simulator = Simulator("five_bar/tracking", overrides)
     assert simulator.controller is not None
     for k in range(50):
         u = simulator.controller.u(simulator.state.t, simulator.state.terms)
@@ -105,11 +105,11 @@ class Push:
 @pytest.mark.parametrize("formulation", ["reduced", "spf"])
 def test_it_stops_where_simulate_stops(formulation: str) -> None:
     u = np.array([1.0, -1.0])
-    changes = {"formulation": formulation, "t_end": 2.0, "solver.output_dt": 0.01}
-    run = simulate("five_bar/swing", changes, controller=Push(u))
+    overrides = {"formulation": formulation, "t_end": 2.0, "solver.output_dt": 0.01}
+    run = simulate("five_bar/swing", overrides, controller=Push(u))
     assert run.status == "stopped"
     assert "singular" in run.message
-    simulator = Simulator("five_bar/swing", changes)
+    simulator = Simulator("five_bar/swing", overrides)
     with pytest.raises(NumericalError, match="singular") as error:
         _push_on(simulator, u, 200)
     assert error.value.t == simulator.state.t
@@ -119,17 +119,17 @@ def test_it_stops_where_simulate_stops(formulation: str) -> None:
 
 @pytest.mark.parametrize("u", [None, NO_FORCE], ids=["None", "zeros"])
 def test_what_moves_freely_passes_where_the_free_run_passes(u: Array | None) -> None:
-    changes = {
+    overrides = {
         **TIGHT,
         "formulation": "reduced",
         "t_end": 0.5,
         "initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0},
         "solver.output_dt": 0.02,
     }
-    run = simulate("five_bar/swing", changes)
+    run = simulate("five_bar/swing", overrides)
     assert run.status == "done"
     assert run.stats["switches"] > 0
-    simulator = Simulator("five_bar/swing", changes)
+    simulator = Simulator("five_bar/swing", overrides)
     for k in range(1, len(run.t)):
         state = simulator.step(u, 0.02)
         assert_close(state.q_tree, run.q_tree[k], 1e-6)
@@ -163,11 +163,11 @@ def test_a_step_is_cheap() -> None:
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 def test_a_u_that_stays_costs_hardly_more_than_the_run(formulation: str) -> None:
     """Steps of the method reach beyond those of the caller while nothing changes."""
-    changes = {"formulation": formulation, "t_end": 1.0}
-    simulator, u = Simulator("five_bar/swing", changes), np.array([0.05, -0.02])
+    overrides = {"formulation": formulation, "t_end": 1.0}
+    simulator, u = Simulator("five_bar/swing", overrides), np.array([0.05, -0.02])
     for _ in range(1000):
         simulator.step(u, 1e-3)
-    assert simulator.stats["rhs"] <= 3 * simulate("five_bar/swing", changes, controller=Push(u)).stats["rhs"]
+    assert simulator.stats["rhs"] <= 3 * simulate("five_bar/swing", overrides, controller=Push(u)).stats["rhs"]
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
@@ -343,5 +343,5 @@ def test_limits_of_torque_hold() -> None:
 def test_a_scene_is_complete() -> None:
     scene = load_scene("five_bar/swing")
     assert Simulator(scene).step(None, 0.01).t == 0.01
-    with pytest.raises(InputError, match="changes go with the name of a scene"):
+    with pytest.raises(InputError, match="overrides go with the name of a scene"):
         Simulator(scene, {"formulation": "dae"})

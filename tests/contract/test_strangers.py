@@ -38,10 +38,10 @@ WORDS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "says"), WORDS, ids=lambda x: str(x)[:40])
-def test_a_scene_out_of_range_is_refused_in_words(changes: dict[str, Any], says: str) -> None:
+@pytest.mark.parametrize(("overrides", "says"), WORDS, ids=lambda x: str(x)[:40])
+def test_a_scene_out_of_range_is_refused_in_words(overrides: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError) as error:
-        simulate("five_bar/swing", changes)
+        simulate("five_bar/swing", overrides)
     assert says in str(error.value)
 
 
@@ -156,13 +156,13 @@ def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
 
 def test_what_an_output_callback_does_to_its_array_is_its_own_affair() -> None:
     """It was a view of what the run records."""
-    changes = {"t_end": 0.02}
+    overrides = {"t_end": 0.02}
 
     def spoil(t: float, q_tree: Any) -> None:
         q_tree[:] = np.nan
 
-    spoilt = simulate("five_bar/swing", changes, on_output=spoil)
-    assert np.array_equal(spoilt.q_tree, simulate("five_bar/swing", changes).q_tree)
+    spoilt = simulate("five_bar/swing", overrides, on_output=spoil)
+    assert np.array_equal(spoilt.q_tree, simulate("five_bar/swing", overrides).q_tree)
 
 
 def test_a_state_cannot_be_changed() -> None:

@@ -88,8 +88,8 @@ class Spring:
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_controller_of_torques(geared: Path, formulation: str, named: bool) -> None:
-    changes = {"formulation": formulation, "t_end": 0.3, "solver.rtol": 1e-11, "solver.output_dt": 0.1}
-    run = simulate(geared / "swing.scene.toml", changes, controller=Spring(named))
+    overrides = {"formulation": formulation, "t_end": 0.3, "solver.rtol": 1e-11, "solver.output_dt": 0.1}
+    run = simulate(geared / "swing.scene.toml", overrides, controller=Spring(named))
     assert run.actuated == ("left", "belt")
     states = motion(start_of(run), run.t, Spring.of)
     assert_close(run.q_tree[:, Q], states[:, :2], 1e-9)
@@ -101,8 +101,8 @@ def test_a_controller_of_torques(geared: Path, formulation: str, named: bool) ->
 
 
 def test_sampled_torques_stay_while_u_does_not(geared: Path) -> None:
-    changes = {"formulation": "dae", "t_end": 0.1, "solver.rtol": 1e-11, "solver.output_dt": 0.01}
-    run = simulate(geared / "swing.scene.toml", changes, controller=Sampled(Spring(True), 0.02, 0.01))
+    overrides = {"formulation": "dae", "t_end": 0.1, "solver.rtol": 1e-11, "solver.output_dt": 0.01}
+    run = simulate(geared / "swing.scene.toml", overrides, controller=Sampled(Spring(True), 0.02, 0.01))
     y, acts = start_of(run), np.zeros(2)
     for k in range(10):
         if k % 2 == 0:
@@ -136,8 +136,12 @@ def test_a_swing_driven_by_torques_needs_no_q(geared: Path) -> None:
     """Where phi_z becomes singular the reduced model goes on in other coordinates, as the DAE does."""
     runs = []
     for formulation in ("reduced", "dae"):
-        changes = {"formulation": formulation, "solver.rtol": 1e-10, "initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0}}
-        simulator = Simulator(geared / "swing.scene.toml", changes)
+        overrides = {
+            "formulation": formulation,
+            "solver.rtol": 1e-10,
+            "initial.q_dot": {"theta_1": 9.0, "theta_3": -9.0},
+        }
+        simulator = Simulator(geared / "swing.scene.toml", overrides)
         for _ in range(25):
             state = simulator.step(tau={"left": 1e-3}, dt=0.02)
         runs.append((state, simulator.stats))
@@ -170,14 +174,14 @@ def csv(folder: Path, values: Array) -> None:
 def test_torques_of_a_file(geared: Path, formulation: str, interpolation: str) -> None:
     values = VALUES if interpolation == "hold" else 0.3 * VALUES  # on a line a limit would be met in between
     csv(geared, values)
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 0.2,
         "solver.rtol": 1e-11,
         "solver.output_dt": 0.01,
         "controller": {"type": "torques", "file": "drive.csv", "interpolation": interpolation},
     }
-    run = simulate(geared / "swing.scene.toml", changes)
+    run = simulate(geared / "swing.scene.toml", overrides)
 
     def tau(t: float, q_tree: Array, q_dot: Array) -> Array:
         if interpolation == "linear":
@@ -200,13 +204,13 @@ def test_torques_of_a_file(geared: Path, formulation: str, interpolation: str) -
 
 
 def test_names_with_commas_are_quoted_as_programs_do(geared: Path) -> None:
-    changes = {"t_end": 0.15, "controller": {"type": "torques", "file": "drive.csv"}, "solver.terms": "pinocchio"}
+    overrides = {"t_end": 0.15, "controller": {"type": "torques", "file": "drive.csv"}, "solver.terms": "pinocchio"}
     csv(geared, VALUES)
-    wanted = simulate(geared / "swing.scene.toml", changes)
+    wanted = simulate(geared / "swing.scene.toml", overrides)
     mechanism, drive = geared / "mechanism.toml", geared / "drive.csv"
     mechanism.write_text(mechanism.read_text("utf-8").replace('"left"', '"left, upper"'), "utf-8")
     drive.write_text(drive.read_text("utf-8").replace("left", '"left, upper"').replace("belt", '"belt"'), "utf-8")
-    found = simulate(geared / "swing.scene.toml", changes)
+    found = simulate(geared / "swing.scene.toml", overrides)
     assert found.actuated == ("left, upper", "belt")
     assert np.array_equal(found.q_tree, wanted.q_tree)
 

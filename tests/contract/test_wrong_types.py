@@ -69,8 +69,8 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "simulate a number": (lambda: simulate(3), "simulate: scene: 3 was given; it takes a scene"),
     "simulate a run": (lambda: simulate(run()), "simulate: scene: a Run was given"),
-    "changes as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: changes: 't_end=1' was given"),
-    "changes by number": (lambda: simulate(SWING, {3: 4}), "changes, a key: 3 was given; it takes a table"),
+    "overrides as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: overrides: 't_end=1' was given"),
+    "overrides by number": (lambda: simulate(SWING, {3: 4}), "overrides, a key: 3 was given; it takes a table"),
     "progress of nothing": (
         lambda: simulate(SWING, SHORT, progress=lambda: None),
         r"simulate: progress: a function of other arguments was given; it takes a function of \(t, t_end\)",
@@ -145,13 +145,13 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "on_output": (lambda: simulate(SWING, SHORT, on_output=3), r"on_output: 3 was given; .* \(t, q_tree\)"),
     "profile": (lambda: simulate(SWING, SHORT, profile="no"), "profile: 'no' was given; it takes True or False"),
     "load": (lambda: load(None), "load: name: None was given; it takes a mechanism's shipped name or its path"),
-    "load with words": (lambda: load("five_bar", {MASS: "x"}), "load: changes: link.link_2.mass = 'x'; it takes"),
-    "load with a flag": (lambda: load("five_bar", {MASS: True}), "load: changes: link.link_2.mass = True; it takes"),
-    "load with no number": (lambda: load("five_bar", {MASS: np.nan}), "load: changes: link.link_2.mass = nan; it"),
-    "load beyond numbers": (lambda: load("five_bar", {MASS: 10**400}), "load: changes: link.link_2.mass = 1000"),
+    "load with words": (lambda: load("five_bar", {MASS: "x"}), "load: overrides: link.link_2.mass = 'x'; it takes"),
+    "load with a flag": (lambda: load("five_bar", {MASS: True}), "load: overrides: link.link_2.mass = True; it takes"),
+    "load with no number": (lambda: load("five_bar", {MASS: np.nan}), "load: overrides: link.link_2.mass = nan; it"),
+    "load beyond numbers": (lambda: load("five_bar", {MASS: 10**400}), "load: overrides: link.link_2.mass = 1000"),
     "load half a vector": (lambda: load("five_bar", {"gravity": [0, 0]}), "gravity: 2 numbers were given; a vector"),
-    "load a number": (lambda: load("five_bar", 3), "load: changes: 3 was given; it takes a table of numbers by name"),
-    "load by number": (lambda: load("five_bar", {3: 1.0}), "load: changes, a key: 3 was given"),
+    "load a number": (lambda: load("five_bar", 3), "load: overrides: 3 was given; it takes a table of numbers by name"),
+    "load by number": (lambda: load("five_bar", {3: 1.0}), "load: overrides, a key: 3 was given"),
     "torques in words": (lambda: Simulator(SWING).step(None, 0.01, tau={"theta_1": "0.5"}), "tau: .* is no table of"),
     "torques as flags": (lambda: Simulator(SWING).step(None, 0.01, tau={"theta_1": True}), "tau: .* is no table of"),
     "load a scene by name": (lambda: load(SWING), "'five_bar/swing' is a scene; its mechanism is 'five_bar'"),
@@ -173,7 +173,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "as_ivp": (lambda: ckc_pin.as_ivp(five_bar()), "as_ivp: a Mechanism was given"),
     "inverse dynamics": (lambda: ckc_pin.inverse_dynamics(3), "inverse_dynamics: scene: 3 was given"),
     "linearize": (lambda: ckc_pin.linearize(3), "linearize: what: 3 was given; it takes a mechanism or a scene"),
-    "linearize with words": (lambda: ckc_pin.linearize(SWING, 0.1, "t_end=1"), "linearize: changes: 't_end=1' was"),
+    "linearize with words": (lambda: ckc_pin.linearize(SWING, 0.1, "t_end=1"), "linearize: overrides: 't_end=1' was"),
     "a period of words": (lambda: ckc_pin.floquet(SWING, "1 s"), "floquet: period: '1 s' was given; .* of seconds"),
     "floquet of a run": (lambda: ckc_pin.floquet(run(), 1.0), "floquet: scene: a Run was given; it takes a scene"),
     "no list of names": (lambda: ckc_pin.sensitivities(SWING, 5), r"sensitivities: parameters: 5 .*\[\"link.link_2"),
@@ -183,7 +183,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "an output": (lambda: ckc_pin.ensemble(SWING, {}, ["u"]), "ensemble: outputs: a list was given; .* a table by"),
     "threads": (lambda: ckc_pin.ensemble(SWING, {}, {}, threads=0.5), "threads: 0.5 was given; .* a whole number"),
     "no chunk": (lambda: ckc_pin.ensemble(SWING, {}, {}, chunk=0), "ensemble: chunk: 0 was given; .* at least 1"),
-    "Simulator": (lambda: Simulator(SWING, 3), "Simulator: changes: 3 was given"),
+    "Simulator": (lambda: Simulator(SWING, 3), "Simulator: overrides: 3 was given"),
     "Point": (lambda: ckc_pin.Point("five_bar", "tip"), "Point: mechanism: 'five_bar' was given; it takes a Mechanism"),
     "Run.load": (lambda: Run.load(3), "Run.load: path: 3 was given"),
     "Run.save": (lambda: run().save(3), "Run.save: path: 3 was given"),
@@ -216,7 +216,7 @@ def test_numbers_of_numpy_and_lists_are_taken_as_pythons() -> None:
     pair = np.array([-1.5, -1.0])
     taken = ckc_pin.ensemble(
         SWING, {"initial.q.theta_1": {"uniform": pair}}, {"e": "energy"}, members=np.int64(2), seed=np.int32(3),
-        changes={"t_end": np.float64(0.01), "solver.terms": "pinocchio"}, progress=False,
+        overrides={"t_end": np.float64(0.01), "solver.terms": "pinocchio"}, progress=False,
     )  # fmt: skip
     assert taken.sizes["member"] == 2
     assert (np.abs(taken["initial.q.theta_1"] + 1.25) <= 0.25).all()
@@ -229,13 +229,13 @@ def test_a_plain_function_is_a_controller_as_good_as_an_object() -> None:
         def __call__(self, t: float, terms: Terms) -> Any:
             return law(t, terms)
 
-    changes = {"t_end": 0.3, "formulation": "reduced"}
-    wanted = simulate(SWING, changes, controller=Own())
+    overrides = {"t_end": 0.3, "formulation": "reduced"}
+    wanted = simulate(SWING, overrides, controller=Own())
     for own in (law, lambda t, terms: -terms.q_dot, Called()):
-        found = simulate(SWING, changes, controller=own)
+        found = simulate(SWING, overrides, controller=own)
         assert np.array_equal(found.q_tree, wanted.q_tree)
         assert np.array_equal(found.u, wanted.u)
-    sampled = [simulate(SWING, changes, controller=Sampled(own, 0.01)) for own in (Own(), law)]
+    sampled = [simulate(SWING, overrides, controller=Sampled(own, 0.01)) for own in (Own(), law)]
     assert np.array_equal(sampled[0].q_tree, sampled[1].q_tree)
     assert np.abs(sampled[0].u[-1]).max() > 1e-3
 

@@ -41,9 +41,9 @@ def exact() -> Exact:
 
 def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]:
     """Largest errors of (q, q_dot) at the steps and at three instants within each."""
-    changes = {f"solver.{key}": value for key, value in solver.items()}
+    overrides = {f"solver.{key}": value for key, value in solver.items()}
     start = {"theta_1": float(START[0]), "theta_3": float(START[1])}
-    ready = prepare(load_scene("five_bar/swing", {"formulation": formulation, "initial.q": start, **changes}))
+    ready = prepare(load_scene("five_bar/swing", {"formulation": formulation, "initial.q": start, **overrides}))
 
     def error(t: float, q_tree: Array, v_tree: Array) -> Array:
         gap = np.abs(np.concatenate([q_tree[Q], v_tree[Q]]) - exact(t))

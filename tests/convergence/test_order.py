@@ -57,14 +57,14 @@ def exact() -> dict[bool, Exact]:
 
 def ready_at(formulation: str, **solver: Any) -> Prepared:
     """A loop whose loops are closed to rounding, whatever rtol."""
-    changes: dict[str, Any] = {"formulation": "spf" if OFF[formulation] else formulation, "epsilon": EPSILON}
+    overrides: dict[str, Any] = {"formulation": "spf" if OFF[formulation] else formulation, "epsilon": EPSILON}
     if OFF[formulation]:
-        changes |= {"initial.w": W.tolist(), "spf_coordinates": "z" if formulation == "eq. 8" else "w"}
+        overrides |= {"initial.w": W.tolist(), "spf_coordinates": "z" if formulation == "eq. 8" else "w"}
     q, q_dot = ({"theta_1": float(x[0]), "theta_3": float(x[1])} for x in (START, RATE))
-    changes |= {"initial.q": q, "initial.q_dot": q_dot, **{f"solver.{key}": value for key, value in solver.items()}}
+    overrides |= {"initial.q": q, "initial.q_dot": q_dot, **{f"solver.{key}": value for key, value in solver.items()}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop_tables, "SLACK", 0.0)
-        return prepare(load_scene("five_bar/swing", changes))
+        return prepare(load_scene("five_bar/swing", overrides))
 
 
 def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int) -> tuple[float, float]:

@@ -22,14 +22,14 @@ from tests.ensembles.test_sweep import results, written
 
 VARIABLES = {"initial.q.theta_1": {"uniform": [-1.9, -0.9]}}
 OUTPUTS: dict[str, Any] = {"end": "q_tree", "path": {"of": "theta_1", "reduce": "trajectory"}, "drift": "energy_drift"}
-CHANGES = {"t_end": 0.02, "solver.terms": "pinocchio", "solver.output_dt": 0.01}
+OVERRIDES = {"t_end": 0.02, "solver.terms": "pinocchio", "solver.output_dt": 0.01}
 DAMAGES = 40
 
 
 def ensemble(out: Path) -> xr.Dataset:
     return ckc_pin.ensemble(
-        "five_bar/swing", VARIABLES, OUTPUTS, members=13, seed=3, changes=CHANGES, progress=False, chunk=5, threads=1,
-        out=out,
+        "five_bar/swing", VARIABLES, OUTPUTS, members=13, seed=3, overrides=OVERRIDES, progress=False, chunk=5,
+        threads=1, out=out,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from tests.contract.test_parameters import folder
 
 FILE = """
 scene = "own/default.scene.toml"
-[changes]
+[overrides]
 initial.at = "assembled"
 t_end = 0.001
 [variables]
@@ -30,7 +30,7 @@ energy = "energy"
 def written(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
     folder(at / "own")
     path = at / "own.sweep.toml"
-    path.write_text(FILE.format(epsilon=epsilon).replace("[changes]", "members = 2\n[changes]"))
+    path.write_text(FILE.format(epsilon=epsilon).replace("[overrides]", "members = 2\n[overrides]"))
     return path
 
 

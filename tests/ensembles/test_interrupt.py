@@ -103,7 +103,7 @@ def test_an_interrupt_of_the_run_that_finds_shapes_is_not_lost(monkeypatch: pyte
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
         ckc_pin.ensemble(
             "five_bar/swing", {"initial.q.theta_1": [-1.5]}, {"end": lambda run: run.t[-1]},
-            changes={"solver.terms": "pinocchio"},
+            overrides={"solver.terms": "pinocchio"},
         )  # fmt: skip
 
 

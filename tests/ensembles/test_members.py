@@ -1,4 +1,4 @@
-"""Each member does what a single run of the same changes does, whoever else is there and however it is run."""
+"""Each member does what a single run of the same overrides does, whoever else is there and however it is run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OUTPUTS = {"end": "q_tree", "rate": "v_tree", "drift": "energy_drift"}
 HANGING = {"initial.q.theta_1": -1.434, "initial.q.theta_3": -1.707}
 SWING = {"t_end": 0.5, "solver.rtol": 1e-9, "solver.terms": "pinocchio"}
 
-# scene, changes, variables with their ranges, whether they are put into a loop that is there
+# scene, overrides, variables with their ranges, whether they are put into a loop that is there
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]], bool]] = {
     "starts": ("five_bar/swing", {}, {"initial.q.theta_1": (-1.9, -0.9), "initial.q_dot.theta_3": (-1, 1)}, True),
     "masses": ("five_bar/swing", {}, {"link.link_2.mass": (0.1, 0.5), "link.link_3.com.y": (-0.05, 0.05)}, True),
@@ -44,21 +44,21 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]], bool
 
 
 def prepared(case: str, threads: int = 2, **outputs: Any) -> tuple[Members, np.ndarray[Any, Any]]:
-    scene, changes, ranges, _ = CASES[case]
-    members = Members(scene, {**SWING, **changes}, tuple(ranges), {**OUTPUTS, **outputs}, 6, threads)
+    scene, overrides, ranges, _ = CASES[case]
+    members = Members(scene, {**SWING, **overrides}, tuple(ranges), {**OUTPUTS, **outputs}, 6, threads)
     low, high = np.array(list(ranges.values())).T
     return members, np.random.default_rng(5).uniform(low, high, (6, len(ranges)))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_member_is_a_run_of_its_changes(case: str) -> None:
+def test_member_equals_a_run_with_its_overrides(case: str) -> None:
     members, values = prepared(case)
     assert members.batched == CASES[case][3]
     found = members.run(0, values)
     assert found.status.tolist() == [DONE] * 6, found.message
     assert np.ptp(found.outputs["end"], axis=0).max() > 1e-4  # the variables matter
     for k, value in enumerate(values):
-        run = ckc_pin.simulate(members.scene_name, members.changes_of(value))
+        run = ckc_pin.simulate(members.scene_name, members.overrides_of(value))
         assert np.abs(found.outputs["end"][k] - run.q_tree[-1]).max() < CLOSE
         assert np.abs(found.outputs["rate"][k] - run.v_tree[-1]).max() < 10 * CLOSE
 
@@ -81,27 +81,27 @@ def test_springs_forces_and_lengths_are_varied_too(tmp_path: Path) -> None:
               "spring.1.damping": (0.05, 0.2), "force.0.value": (-0.3, 0.3), "loop.knee.length": (0.48, 0.52),
               "loop.knee.frame_a.xyz.y": (-0.02, 0.02), "joint.elbow.xyz.x": (0.38, 0.42), "link.arm.mass": (1, 2),
               "link.rod.com.y": (-0.02, 0.02), "spring.0.rest_length": (0, 0.2)}  # fmt: skip
-    changes = {"t_end": 0.5, "solver.rtol": 1e-9, "initial.at": None, "initial.q.elbow": 0.35}
-    members = Members(at, changes, tuple(ranges), {"end": "q_tree"}, 6, 2)
+    overrides = {"t_end": 0.5, "solver.rtol": 1e-9, "initial.at": None, "initial.q.elbow": 0.35}
+    members = Members(at, overrides, tuple(ranges), {"end": "q_tree"}, 6, 2)
     low, high = np.array(list(ranges.values())).T
     values = np.random.default_rng(5).uniform(low, high, (6, len(ranges)))
     assert members.batched
     found = members.run(0, values)
     for k, value in enumerate(values):
-        run = ckc_pin.simulate(at, members.changes_of(value))
+        run = ckc_pin.simulate(at, members.overrides_of(value))
         assert np.abs(found.outputs["end"][k] - run.q_tree[-1]).max() < CLOSE
 
 
-def test_a_table_among_the_changes_takes_the_place_of_the_scenes() -> None:
+def test_a_table_among_the_overrides_replaces_the_scenes_table() -> None:
     """As in a single run: nothing stays of the table that was there, which says another start."""
     scene = "five_bar/tracking"
-    changes = {"t_end": 0.1, "initial": {"q": {"theta_1": -1.0, "theta_3": -2.0}}}
+    overrides = {"t_end": 0.1, "initial": {"q": {"theta_1": -1.0, "theta_3": -2.0}}}
     assert ckc_pin.load_scene(scene).spec.initial.at == "equilibrium"
     found = ckc_pin.ensemble(
-        scene, {"link.link_2.mass": [0.2, 0.3]}, {"end": "q_tree"}, changes=changes, progress=False
+        scene, {"link.link_2.mass": [0.2, 0.3]}, {"end": "q_tree"}, overrides=overrides, progress=False
     )
     for k, mass in enumerate((0.2, 0.3)):
-        run = ckc_pin.simulate(scene, {**changes, "link.link_2.mass": mass})
+        run = ckc_pin.simulate(scene, {**overrides, "link.link_2.mass": mass})
         assert np.abs(found["end"][k] - run.q_tree[-1]).max() < CLOSE
 
 
@@ -137,7 +137,7 @@ def test_reductions_are_those_of_the_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scene", "changes", "name", "values"),
+    ("scene", "overrides", "name", "values"),
     [
         ("five_bar/set_point", {"t_end": 0.3}, "controller.q_d.theta_1", [0.6, 0.7]),
         ("five_bar/tracking", {"t_end": 0.3}, "controller.desired.theta_3.offset", [0.7, 0.9]),
@@ -146,16 +146,16 @@ def test_reductions_are_those_of_the_run() -> None:
     ],
 )
 def test_reductions_are_over_the_members_own_instants_and_from_its_own_desired_motion(
-    scene: str, changes: dict[str, Any], name: str, values: list[float]
+    scene: str, overrides: dict[str, Any], name: str, values: list[float]
 ) -> None:
     kept: dict[str, Any] = {
         how: OutputSpec(of="error", reduce=how) for how in ("integral", "max_abs", "mean", "rms", "end")
     }
-    changes = {"solver.terms": "pinocchio", **changes}
-    members = Members(scene, changes, (name,), kept, 1, 1)
+    overrides = {"solver.terms": "pinocchio", **overrides}
+    members = Members(scene, overrides, (name,), kept, 1, 1)
     found = members.run(0, np.array(values)[:, None]).outputs
     for k, value in enumerate(values):
-        run = ckc_pin.simulate(scene, {**changes, name: value})
+        run = ckc_pin.simulate(scene, {**overrides, name: value})
         q_d = run.scene["controller"].get("q_d") or {}
         wanted = [[q_d[x] for x in run.independent] if q_d else desired(run, t) for t in run.t]
         error = run.q_tree[:, members.mechanism.partition.q] - np.array(wanted)
@@ -216,17 +216,17 @@ def test_an_unphysical_member_of_a_batch_is_failed_and_the_others_are_not() -> N
     found = members.run(0, values)  # a warning of NumPy's would be an error here
     assert found.status.tolist() == [DONE, FAILED, FAILED, found.status[3], FAILED]
     assert "negative mass" in found.message[1]
-    massless = ckc_pin.simulate("five_bar/swing", members.changes_of(values[3]))
+    massless = ckc_pin.simulate("five_bar/swing", members.overrides_of(values[3]))
     assert np.array_equal(found.outputs["end"][3], massless.q_tree[-1])
 
 
 def test_events_end_members_and_give_their_times() -> None:
-    changes = {**SWING, "event": [{"coordinate": "theta_1", "value": -1.2, "stop": True}]}
-    members = Members("five_bar/swing", changes, ("initial.q.theta_3",), {"when": "event.0", "t": "t"}, 2, 1)
+    overrides = {**SWING, "event": [{"coordinate": "theta_1", "value": -1.2, "stop": True}]}
+    members = Members("five_bar/swing", overrides, ("initial.q.theta_3",), {"when": "event.0", "t": "t"}, 2, 1)
     values = np.array([[-1.2], [-1.1]])
     found = members.run(0, values)
     for k, value in enumerate(values):
-        run = ckc_pin.simulate("five_bar/swing", members.changes_of(value))
+        run = ckc_pin.simulate("five_bar/swing", members.overrides_of(value))
         assert found.outputs["when"][k] == pytest.approx(run.events[0]["t"], abs=1e-8)
         assert found.outputs["t"][k] == found.outputs["when"][k]
         assert found.message[k].startswith("stopped by the event at t = ")
@@ -256,19 +256,19 @@ def test_what_is_not_there_is_refused(names: tuple[str, ...], outputs: dict[str,
 @pytest.mark.parametrize("at", ["equilibrium", "assembled"])
 @pytest.mark.parametrize("name", ["initial.q.theta_1", "initial.q.theta_2"])
 def test_a_start_that_a_run_refuses_is_refused_of_an_ensemble(name: str, at: str) -> None:
-    changes = {**SWING, "initial": {"at": at}}
+    overrides = {**SWING, "initial": {"at": at}}
     with pytest.raises(ckc_pin.InputError) as of_run:
-        ckc_pin.simulate("five_bar/swing", {**changes, name: -1.2})
+        ckc_pin.simulate("five_bar/swing", {**overrides, name: -1.2})
     with pytest.raises(ckc_pin.InputError) as of_ensemble:
-        ckc_pin.ensemble("five_bar/swing", {name: [-1.2]}, {"end": "q_tree"}, changes=changes, progress=False)
+        ckc_pin.ensemble("five_bar/swing", {name: [-1.2]}, {"end": "q_tree"}, overrides=overrides, progress=False)
     assert str(of_ensemble.value) == str(of_run.value)
     assert str(of_run.value) == f'five_bar/swing: initial: give either at = "{at}" or q, not both'
 
 
 def test_whole_numbers_beyond_64_bits_are_taken_as_in_a_run() -> None:
     members = Members("five_bar/swing", SWING, ("initial.q_dot.theta_1", "solver.max_rhs"), OUTPUTS, 1, 1)
-    assert members.changes_of(np.array([1e20, 200.0]))["initial.q_dot.theta_1"] == 1e20
-    ckc_pin.load_scene("five_bar/swing", members.changes_of(np.array([1e20, 200.0])))
+    assert members.overrides_of(np.array([1e20, 200.0]))["initial.q_dot.theta_1"] == 1e20
+    ckc_pin.load_scene("five_bar/swing", members.overrides_of(np.array([1e20, 200.0])))
 
 
 def test_an_output_that_raises_fails_its_member_only() -> None:
@@ -302,7 +302,7 @@ def test_a_number_that_is_zero_varies_though_terms_without_it_are_in_the_cache()
     assert members.batched
     found = members.run(0, values)
     for k, value in enumerate(values):
-        changes = SWING | dict(zip(names, value.tolist(), strict=True))
+        overrides = SWING | dict(zip(names, value.tolist(), strict=True))
         np.testing.assert_allclose(
-            found.outputs["end"][k], ckc_pin.simulate("five_bar/swing", changes).q_tree[-1], atol=CLOSE
+            found.outputs["end"][k], ckc_pin.simulate("five_bar/swing", overrides).q_tree[-1], atol=CLOSE
         )

@@ -14,7 +14,7 @@ CELL = """import ckc_pin
 
 found = ckc_pin.ensemble(
     "five_bar/swing", {"initial.q.theta_1": {"uniform": [-1.3, -1.0]}}, {"end": "q_tree"}, members=24, seed=1, chunk=8,
-    changes={"t_end": 0.1, "solver.terms": "pinocchio"},
+    overrides={"t_end": 0.1, "solver.terms": "pinocchio"},
 )
 found.sizes["member"]"""
 

@@ -28,7 +28,7 @@ FILE = """
 scene = "five_bar/swing"
 members = {members}
 seed = 1
-[changes]
+[overrides]
 t_end = {t_end}
 solver.rtol = 1e-6
 solver.output_dt = 0.1
@@ -152,7 +152,11 @@ def test_a_store_that_could_not_be_begun_is_no_obstacle(tmp_path: Path) -> None:
 
 def test_a_kill_while_a_store_is_begun_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: Any = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
-    rest: dict[str, Any] = {"changes": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False, "out": tmp_path}
+    rest: dict[str, Any] = {
+        "overrides": {"t_end": 0.01, "solver.terms": "pinocchio"},
+        "progress": False,
+        "out": tmp_path,
+    }
 
     def killed(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
@@ -216,7 +220,7 @@ def test_bad_input_is_one_message(tmp_path: Path, more: str, options: list[str],
 
 def test_a_scheduler_that_does_not_answer_is_asked_for_nothing_else() -> None:
     given = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
-    rest: dict[str, Any] = {"changes": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False}
+    rest: dict[str, Any] = {"overrides": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False}
     for address in ("nonsense://x", "tcp://127.0.0.1:9"):
         with pytest.raises(InputError, match="does not answer within"):
             ckc_pin.ensemble(*given, **rest, scheduler=address)
@@ -268,7 +272,7 @@ def wait_for(there: Callable[[], bool]) -> None:
 
 
 def test_workers_that_die_cost_nothing_that_is_finished(tmp_path: Path) -> None:
-    rest: dict[str, Any] = {"members": 4, "changes": {"t_end": 0.1, "solver.terms": "pinocchio"}, "progress": False}
+    rest: dict[str, Any] = {"members": 4, "overrides": {"t_end": 0.1, "solver.terms": "pinocchio"}, "progress": False}
     given = ("five_bar/swing", {"initial.q.theta_1": {"uniform": [-1.5, -1.0]}})
     outputs: dict[str, Any] = {"end": "q_tree", "die": Dies(tmp_path / "dies")}
     whole = ckc_pin.ensemble(*given, outputs, **rest)

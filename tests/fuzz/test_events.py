@@ -17,7 +17,7 @@ from scripts.experiments.fuzz.read import read
 from scripts.experiments.fuzz.record import ALLOWED, DOUBTFUL
 
 RTOL = 1e-7
-CHANGES: dict[str, Any] = {
+OVERRIDES: dict[str, Any] = {
     "formulation": "reduced",
     "t_end": 0.6,
     "solver.rtol": RTOL,
@@ -31,7 +31,7 @@ ASKED = [{"of": "q", "coordinate": "theta_2", "value": 1.0}, {"of": "q_dot", "co
 @cache
 def seen() -> Run:
     """A motion with crossings of an angle and of a rate, both ways."""
-    run = ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": ASKED})
+    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": ASKED})
     assert {(e["of"], e["direction"]) for e in run.events} == {("q", -1), ("q", 1), ("q_dot", -1), ("q_dot", 1)}
     return run
 
@@ -74,10 +74,10 @@ def test_events_are_where_the_judge_is_on_their_value() -> None:
 def test_a_value_short_of_a_turn_is_crossed_twice_and_one_beyond_it_never() -> None:
     first = next(event["t"] for event in seen().events if event["of"] == "q_dot")
     stop = [{**ASKED[1], "stop": True}]
-    turn = float(ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": stop}).q_tree[-1, 0])
+    turn = float(ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": stop}).q_tree[-1, 0])
     inner, outer = turn - 1e-8, turn + 1e-8
     asked = [{"of": "q", "coordinate": "theta_1", "value": value} for value in (inner, outer)]
-    run = ckc_pin.simulate("five_bar/swing", {**CHANGES, "event": [ASKED[1], *asked]})
+    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": [ASKED[1], *asked]})
     assert on_both_sides(run, "theta_1", first, inner, outer) == ""
     beside = [event for event in run.events if event["of"] == "q" and event["t"] < 0.1]
     assert len(beside) == 2
@@ -92,5 +92,5 @@ def test_a_value_short_of_a_turn_is_crossed_twice_and_one_beyond_it_never() -> N
 @pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
 @pytest.mark.parametrize("seed", range(4))
 def test_values_beside_a_turn(formulation: str, seed: int) -> None:
-    motion = Motion(seed, "five_bar", "five_bar/swing", {**CHANGES, "formulation": formulation})
+    motion = Motion(seed, "five_bar", "five_bar/swing", {**OVERRIDES, "formulation": formulation})
     assert beside_a_turn(motion, seen().coordinates) == ""

@@ -47,7 +47,7 @@ def test_the_five_bar_moves_right_from_anywhere(
 ) -> None:
     if sigma(ckc_pin.load("five_bar"), np.array([q_1, q_3])).verdict != "converged":
         return
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 1.0,
         "solver.rtol": 10**digits,
@@ -55,7 +55,7 @@ def test_the_five_bar_moves_right_from_anywhere(
         "solver.max_rhs": 200_000,
         "initial": {"q": {"theta_1": q_1, "theta_3": q_3}, "q_dot": {"theta_1": rate_1, "theta_3": rate_3}},
     }
-    record, _ = run_motion(Motion(0, "five_bar", "five_bar/swing", changes))
+    record, _ = run_motion(Motion(0, "five_bar", "five_bar/swing", overrides))
     assert record.verdict in ("done", "stopped", "refused"), record
 
 
@@ -67,7 +67,7 @@ SAMPLED = {**SET_POINT, "sample_time": 0.004, "delay": 0.0068}
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 def test_controlled_motions_are_judged(controller: dict[str, Any], formulation: str) -> None:
     """With the control law read anew: a law of other gains, limits or delays is not that of the run."""
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 0.3,
         "solver.rtol": 1e-7,
@@ -75,7 +75,7 @@ def test_controlled_motions_are_judged(controller: dict[str, Any], formulation: 
         "initial": {"q": {"theta_1": -1.0, "theta_3": 1.5}, "q_dot": {"theta_1": 1.0, "theta_3": 3.0}},
         "controller": controller,
     }
-    record, run = run_motion(Motion(0, "five_bar", "five_bar/swing", changes))
+    record, run = run_motion(Motion(0, "five_bar", "five_bar/swing", overrides))
     assert run is not None
     assert (record.verdict, record.why, record.unresolved) == ("done", "", 0)
     assert record.pieces >= 3
@@ -102,7 +102,9 @@ def test_a_force_that_is_off_moves_otherwise() -> None:
 def test_the_suite_sees_a_run_that_is_off() -> None:
     """A run at 1e-3 passed off as one at 1e-9 is found out."""
     with drawn(10, "shipped", "five_bar") as motion:
-        coarse = replace(motion, changes={**motion.changes, "formulation": "dae", "solver.rtol": 1e-3, "t_end": 1.0})
+        coarse = replace(
+            motion, overrides={**motion.overrides, "formulation": "dae", "solver.rtol": 1e-3, "t_end": 1.0}
+        )
         record, run = run_motion(coarse)
     assert record.verdict == "done"
     assert run is not None

@@ -16,7 +16,7 @@ from scripts.experiments.fuzz.reversal import INSTANTS, reversal
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
 def test_a_motion_goes_back_along_its_past(formulation: str) -> None:
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 0.6,
         "solver.rtol": 1e-7,
@@ -24,7 +24,7 @@ def test_a_motion_goes_back_along_its_past(formulation: str) -> None:
         "initial": {"q": {"theta_1": -1.0, "theta_3": 1.5}, "q_dot": {"theta_1": 1.0, "theta_3": 3.0}},
         "controller": None,
     }
-    motion = Motion(0, "five_bar", "five_bar/swing", changes)
+    motion = Motion(0, "five_bar", "five_bar/swing", overrides)
     record, run = run_motion(motion, thorough=True)
     assert run is not None
     assert (record.verdict, record.why) == ("done", "")

@@ -31,20 +31,20 @@ def met(events: list[Table], name: str) -> list[tuple[float, int]]:
     return [(event["t"], event["direction"]) for event in events if event["name"] == name]
 
 
-def step_through(scene: Path, changes: Table, t_end: float, events: list[Event]) -> list[Table]:
-    simulator = Simulator(scene, changes, events=events)
+def step_through(scene: Path, overrides: Table, t_end: float, events: list[Event]) -> list[Table]:
+    simulator = Simulator(scene, overrides, events=events)
     for t in np.linspace(0.0, t_end, 8)[1:]:
         while simulator.state.t < t - 1e-9:
             simulator.step(None, t - simulator.state.t)
     return simulator.events
 
 
-def from_all_callers(scene: Path, changes: Table, t_end: float, own: list[Event]) -> list[list[Table]]:
+def from_all_callers(scene: Path, overrides: Table, t_end: float, own: list[Event]) -> list[list[Table]]:
     """The events that `simulate`, a `Simulator` and `sensitivities` report."""
     return [
-        simulate(scene, changes, events=own).events,
-        step_through(scene, changes, t_end, own),
-        sensitivities(scene, ["link.block.mass"], changes, events=own).run.events,
+        simulate(scene, overrides, events=own).events,
+        step_through(scene, overrides, t_end, own),
+        sensitivities(scene, ["link.block.mass"], overrides, events=own).run.events,
     ]
 
 
@@ -62,8 +62,8 @@ def test_an_event_that_an_impact_jumps_over_is_at_the_impact(scene_of: Make, for
     events = [rate_event(value), rate_event(value, -1), rate_event(beyond), rate_event(-beyond)]
     own = [Event(lambda t, terms: terms.q_dot[0] ** 3 - value**3, name="own")]
     for max_step in (10.0, 0.3 * x / v):
-        changes = {"formulation": formulation, "event": events, "solver.max_step": max_step}
-        for found in from_all_callers(scene, changes, 2 * x / v, own):
+        overrides = {"formulation": formulation, "event": events, "solver.max_step": max_step}
+        for found in from_all_callers(scene, overrides, 2 * x / v, own):
             hit = (pytest.approx(x / v, abs=1e-10), 1)
             assert met(found, f"x's rate = {value:g}") == [hit], "rising, once"
             assert met(found, "own") == [hit]
@@ -77,15 +77,15 @@ def test_a_run_that_a_jump_stops_ends_with_the_state_after(scene_of: Make, formu
     """Also at the start, where a run begins against a stop."""
     scene = slider(scene_of, x, -2.0, "stops = true\nrestitution = 0.5\n", 1.0)
     for event, own in (([rate_event(0.3, 1, True)], []), ([], [Event(lambda t, y: y.q_dot[0] - 0.3, 1, True, "own")])):
-        changes = {"formulation": formulation, "event": event}
-        run = simulate(scene, changes, events=own)
-        varied = sensitivities(scene, ["initial.q_dot.x", "joint.x.restitution"], changes, events=own)
+        overrides = {"formulation": formulation, "event": event}
+        run = simulate(scene, overrides, events=own)
+        varied = sensitivities(scene, ["initial.q_dot.x", "joint.x.restitution"], overrides, events=own)
         for one in (run, varied.run):
             assert one.message.startswith("stopped by the event")
             assert one.t[-1] == pytest.approx(x / 2.0, abs=1e-11)
             assert np.all(np.diff(one.t) > 0.0)
             assert one.v_tree[-1] == pytest.approx([1.0])
-        simulator = Simulator(scene, changes, events=own)
+        simulator = Simulator(scene, overrides, events=own)
         assert simulator.step(None, 0.9).v_tree == pytest.approx([1.0])
         assert simulator.state.t == pytest.approx(x / 2.0, abs=1e-11)
         assert simulator.step(None, 0.5).t == pytest.approx(x / 2.0 + 0.5), "it does not happen again"
@@ -100,9 +100,9 @@ def test_a_jump_where_friction_of_another_joint_changes_too(scene_of: Make, form
     joints = '[[joint]]\nname = "x"\nstops = true\nrestitution = 0.5\n[[joint]]\nname = "y"\nfriction = 0.5\n'
     start = "q = {x = 1.0, y = 0.0}\nq_dot = {x = -1.0, y = 0.5}\n"
     scene = scene_of(urdf, "gravity = [0, 0, 0]\n" + joints, start, 3.0)
-    changes = {"formulation": formulation, "event": [rate_event(0.2), rate_event(0.0, joint="y")]}
+    overrides = {"formulation": formulation, "event": [rate_event(0.2), rate_event(0.0, joint="y")]}
     own = [Event(lambda t, terms: terms.q_dot[0] + terms.q_dot[1] - 0.2, name="own")]
-    for found in (simulate(scene, changes, events=own).events, step_through(scene, changes, 3.0, own)):
+    for found in (simulate(scene, overrides, events=own).events, step_through(scene, overrides, 3.0, own)):
         assert met(found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
         assert met(found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
         assert met(found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
@@ -115,8 +115,8 @@ def test_a_ball_that_bounces_turns_at_each_impact_and_apex(scene_of: Make, formu
     own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     flights = 2 * fall * e ** np.arange(1, 60)
     impacts, apexes = fall + np.r_[0.0, np.cumsum(flights)], fall + np.cumsum(flights) - flights / 2
-    changes = {"formulation": formulation, "event": [rate_event(0.0)], "solver.rtol": 1e-10}
-    for found in from_all_callers(scene, changes, 1.8, own):
+    overrides = {"formulation": formulation, "event": [rate_event(0.0)], "solver.rtol": 1e-10}
+    for found in from_all_callers(scene, overrides, 1.8, own):
         bounces = sum(event["name"] == "x bounces" for event in found)
         for name in ("own", "x's rate = 0"):
             here = met(found, name)
@@ -133,8 +133,8 @@ def test_a_body_that_hands_on_all_its_speed_comes_to_rest_once(scene_of: Make) -
     own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     for formulation in FORMULATIONS:
         for t_end in (1.5, 2.0, 3.3):
-            changes = {"formulation": formulation, "t_end": t_end, "event": [rate_event(0.0, joint="a")]}
-            run = simulate(scene, changes, events=own)
+            overrides = {"formulation": formulation, "t_end": t_end, "event": [rate_event(0.0, joint="a")]}
+            run = simulate(scene, overrides, events=own)
             assert met(run.events, "a's rate = 0") == met(run.events, "own") == [(pytest.approx(1.0, abs=1e-10), -1)]
 
 
@@ -176,7 +176,7 @@ def test_joints_that_others_at_rest_hold_come_to_rest_once(rtol: float) -> None:
     """Friction in two joints of the five-bar stops all four, from the rate that an impact gave them."""
     names = [f"theta_{k}" for k in (1, 2, 3, 4)]
     own = [Event(lambda t, terms, k=k: terms.v_tree[k], name=name) for k, name in enumerate(names)]  # type: ignore[misc]
-    changes = {
+    overrides = {
         "controller": None,
         "t_end": 1.0,
         "solver.rtol": rtol,
@@ -185,7 +185,7 @@ def test_joints_that_others_at_rest_hold_come_to_rest_once(rtol: float) -> None:
     }
     counts = {"theta_1": [1, -1], "theta_2": [-1, 1], "theta_3": [1], "theta_4": [1, -1]}
     for formulation in FORMULATIONS:
-        run = simulate("five_bar/friction", {**changes, "formulation": formulation}, events=own)
+        run = simulate("five_bar/friction", {**overrides, "formulation": formulation}, events=own)
         assert np.abs(run.v_tree[-1]).max() < 1e-12
         impact = next(event["t"] for event in run.events if event["name"] == "theta_1 bounces")
         rest = next(event["t"] for event in run.events if event["name"] == "theta_1 sticks")

@@ -131,8 +131,8 @@ def test_energy_falls_by_the_work_of_smoothed_friction(with_joints: Callable[...
     """The integral of F tanh(v / rate) v by Simpson's rule over close output instants."""
     F, rate, step = 0.02, 0.3, 1e-3
     scene = with_joints("five_bar", {name: {"friction": F} for name in ("theta_1", "theta_4")}) / "swing.scene.toml"
-    changes = {"formulation": formulation, "friction_smoothing": rate, "t_end": 1.0}
-    run = simulate(scene, {**changes, "solver.rtol": 1e-10, "solver.output_dt": step})
+    overrides = {"formulation": formulation, "friction_smoothing": rate, "t_end": 1.0}
+    run = simulate(scene, {**overrides, "solver.rtol": 1e-10, "solver.output_dt": step})
     v = run.v_tree[:, [run.coordinates.index(name) for name in ("theta_1", "theta_4")]]
     work = simpson((F * np.tanh(v / rate) * v).sum(axis=1), dx=step)
     assert work > 0.01
@@ -146,7 +146,7 @@ def test_dissipated_is_unknown_with_smoothed_friction(with_joints: Callable[...,
     scene = folder / "swing.scene.toml"
     found = ensemble(
         scene, {"friction_smoothing": [0.1]}, {"end": "dissipated", "most": {"of": "dissipated", "reduce": "max"},
-        "path": {"of": "dissipated", "reduce": "trajectory"}}, changes={"t_end": 0.01}, progress=False,
+        "path": {"of": "dissipated", "reduce": "trajectory"}}, overrides={"t_end": 0.01}, progress=False,
     )  # fmt: skip
     assert simulate(scene, {"t_end": 0.01}).dissipated is not None
     assert simulate(scene, {"t_end": 0.01, "friction_smoothing": 0.1}).dissipated is None

@@ -45,14 +45,14 @@ def alike(runs: dict[str, Run], tolerance: float) -> None:
 def test_a_five_bar_with_friction_in_four_joints(with_joints: Made, seed: int) -> None:
     rng = np.random.default_rng(seed)
     folder = rubbing(with_joints)
-    changes = {
+    overrides = {
         "solver.rtol": 1e-12,
         "t_end": 3.0,
         "initial.q.theta_1": float(rng.uniform(-1.9, -0.9)),
         "initial.q.theta_3": float(rng.uniform(-2.2, -1.2)),
         "initial.q_dot": {"theta_1": float(rng.uniform(-2, 2)), "theta_3": float(rng.uniform(-2, 2))},
     }
-    runs = {f: simulate(folder / "swing.scene.toml", {**changes, "formulation": f}) for f in FORMULATIONS}
+    runs = {f: simulate(folder / "swing.scene.toml", {**overrides, "formulation": f}) for f in FORMULATIONS}
     assert len(runs["dae"].events) > 8
     alike(runs, 1e-8)
 
@@ -86,8 +86,8 @@ def stepped(q_tree: Array, duration: float, steps: int) -> Array:
 def test_a_delta_falls_on_its_stops(with_joints: Made, restitution: float) -> None:
     joints = {name: {"stops": True, "restitution": restitution} for name in STOPS}
     folder = with_joints("delta", joints, STOPS)
-    changes = {"solver.rtol": 1e-10, "t_end": 0.6}
-    runs = {f: simulate(folder / "default.scene.toml", {**changes, "formulation": f}) for f in FORMULATIONS}
+    overrides = {"solver.rtol": 1e-10, "t_end": 0.6}
+    runs = {f: simulate(folder / "default.scene.toml", {**overrides, "formulation": f}) for f in FORMULATIONS}
     assert any(event["of"] == "stop" for event in runs["dae"].events)
     alike(runs, 1e-8)
     for name, (lower, upper) in STOPS.items():
@@ -135,9 +135,9 @@ def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float
     """It starts at rest, held by all four joints, and what is sampled lets it go at an instant of the clock."""
     scene = rubbing(with_joints) / "set_point.scene.toml"
     compiled(load(scene.parent))
-    changes = {f"controller.{key}": value for key, value in clock.items()}
+    overrides = {f"controller.{key}": value for key, value in clock.items()}
     runs = [
-        simulate(scene, {**changes, "formulation": f, "solver.terms": terms, "t_end": 1.0, "solver.rtol": 1e-10})
+        simulate(scene, {**overrides, "formulation": f, "solver.terms": terms, "t_end": 1.0, "solver.rtol": 1e-10})
         for f in ("dae", "reduced")
         for terms in ("pinocchio", "generated")
     ]

@@ -47,8 +47,8 @@ def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_mechanisms_rub_and_stop(seed: int, tmp_path: Path) -> None:
-    scene, changes = rubbing(seed, tmp_path / "random")
-    runs = [simulate(scene, {**changes, "formulation": formulation}) for formulation in ("dae", "reduced")]
+    scene, overrides = rubbing(seed, tmp_path / "random")
+    runs = [simulate(scene, {**overrides, "formulation": formulation}) for formulation in ("dae", "reduced")]
     for run in runs:
         assert run.status == "done", run.message
         assert run.max_phi < 1e-9 * max(1.0, run.mechanism.size)

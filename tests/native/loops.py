@@ -9,13 +9,13 @@ from ckc_pin.run.ivp import Ivp, as_ivp
 from ckc_pin.run.prepare import Prepared, prepare
 
 
-def started(scene: str, changes: dict[str, Any] | None = None) -> Prepared:
+def started(scene: str, overrides: dict[str, Any] | None = None) -> Prepared:
     """Return a scene with its loop at the start."""
-    ready = prepare(load_scene(scene, changes))
+    ready = prepare(load_scene(scene, overrides))
     ready.begin()
     return ready
 
 
-def both(scene: str, changes: dict[str, Any] | None = None) -> tuple[Prepared, Ivp]:
+def both(scene: str, overrides: dict[str, Any] | None = None) -> tuple[Prepared, Ivp]:
     """Return a scene with its loop at the start, and its motion in NumPy."""
-    return started(scene, changes), as_ivp(scene, changes)
+    return started(scene, overrides), as_ivp(scene, overrides)

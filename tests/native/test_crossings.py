@@ -14,9 +14,9 @@ from tests.regression.test_reference_cases import first_top_pin
 T_END = 3.0  # with three positions where the rods lie flat
 
 
-def _row_of_squares(N, rtol, **changes):
+def _row_of_squares(N, rtol, **overrides):
     scene = {"mechanism.N": N, "t_end": T_END, "solver.output_dt": 0.1, "solver.rtol": rtol}
-    return simulate("n_four_bar", {**scene, **changes})
+    return simulate("n_four_bar", {**scene, **overrides})
 
 
 @pytest.mark.parametrize(("N", "rtol"), [(1, 1e-7), (2, 1e-9), (5, 1e-11), (20, 1e-8)])
@@ -48,10 +48,10 @@ def test_a_budget_ends_a_run_with_crossings_where_it_is_used_up():
 @pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-10])
 def test_positions_that_only_come_near_are_passed_in_ordinary_steps(rtol):
     """Two arms on a bar come near a loss of rank several times in two seconds; the reduced model watches nothing."""
-    changes = {"t_end": 0.8, "solver.rtol": rtol, "solver.output_dt": 0.1}
-    run = simulate("two_ur5", changes)
+    overrides = {"t_end": 0.8, "solver.rtol": rtol, "solver.output_dt": 0.1}
+    run = simulate("two_ur5", overrides)
     assert run.status == "done", run.message
-    reduced = simulate("two_ur5", {**changes, "formulation": "reduced", "solver.rtol": min(rtol, 1e-9)})
+    reduced = simulate("two_ur5", {**overrides, "formulation": "reduced", "solver.rtol": min(rtol, 1e-9)})
     assert np.abs(run.q_tree - reduced.q_tree).max() < 1e3 * rtol
 
 

@@ -89,10 +89,12 @@ STATES = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "changes"), STATES, ids=lambda x: x if isinstance(x, str) else x.get("formulation"))
-def test_jacobians_of_right_hand_sides_are_exact(scene: str, changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("scene", "overrides"), STATES, ids=lambda x: x if isinstance(x, str) else x.get("formulation")
+)
+def test_jacobians_of_right_hand_sides_are_exact(scene: str, overrides: dict[str, Any]) -> None:
     """Without generated terms, controllers included: along motions of closed loops, off rest."""
-    ready = started(scene, {**changes, "solver.terms": "pinocchio", "solver.rtol": 1e-12})
+    ready = started(scene, {**overrides, "solver.terms": "pinocchio", "solver.rtol": 1e-12})
     loop, mechanism, random = ready.loop, ready.mechanism, np.random.default_rng(3)
     n, tree, d = mechanism.n, mechanism.tree, mechanism.d
     reduced = len(loop.y) == 2 * d
@@ -124,8 +126,8 @@ def test_only_what_a_caller_wrote_is_differentiated_by_differences() -> None:
         def u(self, t: float, terms: Any) -> Any:
             return -3.0 * terms.q_dot
 
-    changes = {"formulation": "reduced", "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 0.5}
-    theirs = simulate("five_bar/swing", changes, controller=Own()).stats
+    overrides = {"formulation": "reduced", "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 0.5}
+    theirs = simulate("five_bar/swing", overrides, controller=Own()).stats
     assert theirs["differences"] == theirs["jacobians"] > 0
-    ours = simulate("five_bar/tracking", changes).stats
+    ours = simulate("five_bar/tracking", overrides).stats
     assert ours["differences"] == 0 < ours["jacobians"]

@@ -21,8 +21,8 @@ OFF = {"formulation": "spf", "initial.w": [0.01, -0.02], "epsilon": 1e-2}
 SPREAD = 0.02  # rad or m, and their rates, around the start
 
 
-def _are_the_same(scene, changes, spread=SPREAD, tolerance=1e-10):
-    ready, ivp = both(scene, {**changes, "solver.rtol": 1e-10})  # z closed as well as the reference closes it
+def _are_the_same(scene, overrides, spread=SPREAD, tolerance=1e-10):
+    ready, ivp = both(scene, {**overrides, "solver.rtol": 1e-10})  # z closed as well as the reference closes it
     random = np.random.default_rng(0)
     for k in range(20):
         t, y = 0.01 * k, ivp.y0 + spread * random.standard_normal(len(ivp.y0)) * (k > 0)
@@ -31,16 +31,16 @@ def _are_the_same(scene, changes, spread=SPREAD, tolerance=1e-10):
         assert np.abs(found - wanted).max() <= tolerance * max(1.0, np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("changes", FORMULATIONS, ids=lambda changes: changes["formulation"])
+@pytest.mark.parametrize("overrides", FORMULATIONS, ids=lambda overrides: overrides["formulation"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_right_hand_sides_are_those_of_numpy(scene, changes):
+def test_right_hand_sides_are_those_of_numpy(scene, overrides):
     if _joints(scene).friction.any():  # joints that stick are no function of t and y
-        changes = {**changes, "friction_smoothing": 0.1}
-    if changes["formulation"] == "dae" and scene.split("/")[0] in ("bricard", "talos"):
+        overrides = {**overrides, "friction_smoothing": 0.1}
+    if overrides["formulation"] == "dae" and scene.split("/")[0] in ("bricard", "talos"):
         # off the closure redundant rows contradict each other, and either takes its own part of them
-        _are_the_same(scene, changes, spread=0.0)
+        _are_the_same(scene, overrides, spread=0.0)
     else:
-        _are_the_same(scene, changes, tolerance=1e-8)
+        _are_the_same(scene, overrides, tolerance=1e-8)
 
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
@@ -70,13 +70,13 @@ def test_a_free_roots_rates_whatever_its_quaternion_has_become(name):
 
 
 @pytest.mark.parametrize(
-    ("scene", "changes"),
+    ("scene", "overrides"),
     [("five_bar/tracking", {"formulation": "dae"}), ("five_bar/tracking", {}), ("three_rrr/circle", {}),
      ("five_bar/swing", {**OFF, "spf_coordinates": "z"}), ("stewart/wave", {"formulation": "dae"})],
 )  # fmt: skip
-def test_jacobians_are_those_of_the_reference(scene, changes):
+def test_jacobians_are_those_of_the_reference(scene, overrides):
     """Against central differences of the NumPy right-hand side."""
-    ready, ivp = both(scene, changes)
+    ready, ivp = both(scene, overrides)
     y, h = ivp.y0 + 0.01 * np.random.default_rng(0).standard_normal(len(ivp.y0)), 1e-6
     found = ready.loop.jacobian(0.1, y)
     wanted = np.transpose([(ivp.f(0.1, y + step) - ivp.f(0.1, y - step)) / (2 * h) for step in h * np.eye(len(y))])
@@ -107,9 +107,9 @@ def test_the_modes_of_a_dae_are_those_of_the_reduced_model(scene):
     assert np.sort(found[:fast].real) == pytest.approx(np.sort(wanted[:fast].real), rel=0.05)
 
 
-@pytest.mark.parametrize("changes", FORMULATIONS, ids=lambda changes: changes["formulation"])
-def test_states_that_are_none_are_refused(changes):
-    loop = started("five_bar/swing", changes).loop
+@pytest.mark.parametrize("overrides", FORMULATIONS, ids=lambda overrides: overrides["formulation"])
+def test_states_that_are_none_are_refused(overrides):
+    loop = started("five_bar/swing", overrides).loop
     y = loop.y
     for bad in (np.nan, np.inf):
         with pytest.raises(ValueError, match="y: a number is not finite"):

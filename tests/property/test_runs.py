@@ -40,7 +40,7 @@ def test_every_formulation_moves_the_same(tmp_path: Path, world: tuple[LoopType,
     kind, seed, free, redundant = world
     closed = closed_mechanism(kind, seed, free=free, redundant=redundant)
     ways = WAYS if free else WAYS | EQ_8
-    runs = {name: swing(tmp_path, closed, **changes) for name, changes in ways.items()}
+    runs = {name: swing(tmp_path, closed, **overrides) for name, overrides in ways.items()}
     dae = runs.pop("dae")
     assert np.abs(dae.q_tree[-1] - dae.q_tree[0]).max() > 0.05  # it moves
     for name, run in runs.items():
@@ -89,7 +89,7 @@ def kinetic(run: Run) -> Array:
     return np.array([t.energy - t.potential_energy for t in terms])
 
 
-def swing(folder: Path, closed: Closed, *, damped: bool = True, **changes: Any) -> Run:
+def swing(folder: Path, closed: Closed, *, damped: bool = True, **overrides: Any) -> Run:
     """From rest, no control, from files as a user writes them."""
     mechanism = closed.mechanism
     spec = mechanism.spec.to_dict()
@@ -109,6 +109,6 @@ def swing(folder: Path, closed: Closed, *, damped: bool = True, **changes: Any) 
         )
     for prefix in closed.world.stands:
         (folder / prefix).write_text(closed.world.urdf(prefix), "utf-8")
-    run = simulate(folder / "swing.scene.toml", changes)
+    run = simulate(folder / "swing.scene.toml", overrides)
     assert run.status == "done", run.message
     return run

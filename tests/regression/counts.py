@@ -40,8 +40,8 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
 
 def measured(name: str) -> dict[str, int]:
     """Make a run and return its counts."""
-    scene, changes = RUNS[name]
-    run = simulate(scene, {"solver.rtol": 1e-8, "solver.atol": 1e-10, **changes})
+    scene, overrides = RUNS[name]
+    run = simulate(scene, {"solver.rtol": 1e-8, "solver.atol": 1e-10, **overrides})
     assert run.status == "done"
     return {count: int(run.stats[count]) for count in COUNTED}
 

@@ -59,10 +59,12 @@ def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical
     assert np.ptp(run.v_tree[:, 3]) > 1e-3  # it does not just spin
 
 
-@pytest.mark.parametrize("changes", [{"formulation": "reduced"}, {"formulation": "spf"}, {"initial.at": "equilibrium"}])
-def test_what_needs_numbers_q_is_refused(top: Path, changes: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    "overrides", [{"formulation": "reduced"}, {"formulation": "spf"}, {"initial.at": "equilibrium"}]
+)
+def test_what_needs_numbers_q_is_refused(top: Path, overrides: dict[str, str]) -> None:
     with pytest.raises(InputError, match=r"hold a free root in part.*runs as a DAE"):
-        simulate(top / "default.scene.toml", changes)
+        simulate(top / "default.scene.toml", overrides)
 
 
 def test_check_says_so(top: Path) -> None:

@@ -148,7 +148,7 @@ def test_as_printed_stalls_at_the_singular_configuration(run: Callable[..., Run]
 def test_set_point_control_goes_on_in_other_coordinates_where_phi_z_is_singular(sampled: dict[str, float]) -> None:
     """It looks at q and q_dot alone, and u acts on their joints: as the DAE, which needs no q to go on."""
     names = ("theta_1", "theta_3")
-    changes = {
+    overrides = {
         "t_end": 1.0,
         "solver.rtol": 1e-10,
         "initial": {"q": dict(zip(names, (-0.93414013, -0.41820761), strict=True)),
@@ -156,7 +156,7 @@ def test_set_point_control_goes_on_in_other_coordinates_where_phi_z_is_singular(
         "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01,
                        "q_d": {"theta_1": -1.2, "theta_3": 1.9}, **sampled},
     }  # fmt: skip
-    reduced, spf, dae = (simulate("five_bar/swing", {**changes, "formulation": x}) for x in ("reduced", "spf", "dae"))
+    reduced, spf, dae = (simulate("five_bar/swing", {**overrides, "formulation": x}) for x in ("reduced", "spf", "dae"))
     assert min(abs(FIVE_BAR.s(q_tree)) for q_tree in dae.q_tree) < 0.05
     assert dae.status == "done"
     for run in (reduced, spf):

@@ -86,11 +86,11 @@ def test_rounding_does_not_shorten_steps(scene: str, rtol: float, t_end: float) 
 
 def test_a_crank_that_has_turned_often_is_rounded_as_its_angle_is() -> None:
     """After 16 turns the rod's angle, where it passes zero, is not known to 1e-13 of itself: no step can mend that."""
-    changes = {"t_end": 5.0, "solver.output_dt": 0.5, "solver.method": "DOP853"}
-    tight = simulate("slider_crank", {**changes, "formulation": "reduced", "solver.rtol": 1e-13})
+    overrides = {"t_end": 5.0, "solver.output_dt": 0.5, "solver.method": "DOP853"}
+    tight = simulate("slider_crank", {**overrides, "formulation": "reduced", "solver.rtol": 1e-13})
     assert (tight.status, tight.message) == ("done", "reached t_end")
     assert tight.stats["rhs"] <= 20_000
-    dae = simulate("slider_crank", {**changes, "formulation": "dae", "solver.rtol": 1e-13})
+    dae = simulate("slider_crank", {**overrides, "formulation": "dae", "solver.rtol": 1e-13})
     assert_close(tight.q_tree, dae.q_tree, 1e-10)
 
 

@@ -24,9 +24,9 @@ from tests.regression.reference import trajectory
 # --- IDA, independent of every step of ours ---------------------------------------------------------
 
 
-def ida(scene: str, changes: dict[str, Any], rtol: float, times: Array) -> tuple[Array, Array]:
+def ida(scene: str, overrides: dict[str, Any], rtol: float, times: Array) -> tuple[Array, Array]:
     """(q', v') at times, by SUNDIALS on the NumPy terms."""
-    problem = as_ivp(scene, changes)
+    problem = as_ivp(scene, overrides)
     assert isinstance(problem, Dae)
     form = Stabilised(problem)
     form.begin(math.inf)
@@ -47,9 +47,9 @@ def ida(scene: str, changes: dict[str, Any], rtol: float, times: Array) -> tuple
     ],
 )
 def test_ida_agrees_with_the_projected_dae(scene: str, t_end: float, q_error: float, rate_error: float) -> None:
-    changes = {"formulation": "dae", "t_end": t_end, "solver.output_dt": t_end / 7}
-    ours = simulate(scene, {**changes, "solver.rtol": 1e-11})
-    q_tree, v_tree = ida(scene, changes, 1e-10, ours.t)
+    overrides = {"formulation": "dae", "t_end": t_end, "solver.output_dt": t_end / 7}
+    ours = simulate(scene, {**overrides, "solver.rtol": 1e-11})
+    q_tree, v_tree = ida(scene, overrides, 1e-10, ours.t)
     np.testing.assert_allclose(q_tree, ours.q_tree, rtol=0, atol=q_error)
     np.testing.assert_allclose(v_tree, ours.v_tree, rtol=0, atol=rate_error)
 
@@ -79,8 +79,8 @@ def test_what_drifts_is_damped_by_baumgarte_and_closed_by_projection(run: Callab
 
 def test_baumgarte_decays_as_it_says() -> None:
     """Off the closure by hand: phi follows phi_ddot + 2 alpha phi_dot + beta^2 phi = 0, critically damped."""
-    changes = {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0], "solver.rtol": 1e-11}
-    ready = prepare(load_scene("five_bar/swing", changes))
+    overrides = {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0], "solver.rtol": 1e-11}
+    ready = prepare(load_scene("five_bar/swing", overrides))
     q_tree = ready.start.at.q_tree + np.array([1e-4, 0.0, 0.0, 0.0])
     at = ready.mechanism.kinematics(q_tree)
     ready.begin(Start(at, np.zeros(2), np.zeros(2), np.zeros(4)))
@@ -90,7 +90,7 @@ def test_baumgarte_decays_as_it_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("overrides", "said"),
     [
         ({"formulation": "spf", "solver.baumgarte": [1.0, 1.0]}, 'baumgarte is for formulation = "dae"'),
         ({"formulation": "dae", "solver.baumgarte": [1.0, 1.0]}, "give projection = false"),
@@ -98,9 +98,9 @@ def test_baumgarte_decays_as_it_says() -> None:
         ({"formulation": "dae", "solver.projection": False, "solver.baumgarte": [1.0, -1.0]}, "baumgarte"),
     ],
 )
-def test_what_does_not_go_together(changes: dict[str, object], said: str) -> None:
+def test_what_does_not_go_together(overrides: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        simulate("five_bar/swing", changes)
+        simulate("five_bar/swing", overrides)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_constant_u_does_the_work_that_is_gained_where_q_is_no_chart(
 ) -> None:
     """phi_z passes through singular configurations, where a velocity closed by z alone may be anything."""
     names = ("theta_1", "theta_3")
-    changes = {
+    overrides = {
         "formulation": "dae",
         "t_end": 1.0,
         "solver.output_dt": 1e-4,
@@ -126,7 +126,7 @@ def test_a_constant_u_does_the_work_that_is_gained_where_q_is_no_chart(
         "controller": {"type": "set_point", "K_P": 0.1, "K_V": 0.01, "sample_time": 1.0,
                        "q_d": {"theta_1": -1.2, "theta_3": 1.9}},
     }  # fmt: skip
-    run = simulate("five_bar/swing", changes)
+    run = simulate("five_bar/swing", overrides)
     assert run.status == "done"
     margin = [abs(FIVE_BAR.s(q_tree)) for q_tree in run.q_tree]
     assert min(margin) < 1e-3 < max(margin)
@@ -158,8 +158,13 @@ def by_slider(folder: Path, pin: str = 'type = "point_2d"\n') -> str:
 def test_a_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) -> None:
     """From every coordinate, with redundant rows too; as the one whose q is the crank does."""
     scene = by_slider(tmp_path, pin)
-    changes = {"initial": {"q": {**IN_LINE, "rod": off}}, "solver.rtol": 1e-10, "t_end": 0.5, "solver.output_dt": 0.05}
-    ours, theirs = simulate(scene, changes), simulate("slider_crank", {**changes, "formulation": "dae"})
+    overrides = {
+        "initial": {"q": {**IN_LINE, "rod": off}},
+        "solver.rtol": 1e-10,
+        "t_end": 0.5,
+        "solver.output_dt": 0.05,
+    }
+    ours, theirs = simulate(scene, overrides), simulate("slider_crank", {**overrides, "formulation": "dae"})
     assert ours.status == "done"
     assert np.ptp(ours["crank"]) > 0.5
     for name in IN_LINE:

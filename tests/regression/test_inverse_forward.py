@@ -30,7 +30,7 @@ ROUNDED = 1e-9  # of the largest row of J: a row of zeros
 
 
 def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, Any]:
-    """Changes of a scene: every independent coordinate swings about where the mechanism is assembled."""
+    """Overrides of a scene: every independent coordinate swings about where the mechanism is assembled."""
     numbers = mechanism.tree.named(mechanism.tree.to_coordinates(mechanism.q_tree))
     reach = mechanism.tree.named(mechanism.tree.reach)
     desired, rates = {}, {}
@@ -86,9 +86,9 @@ class Prescribed:
         return self.table(t)[0]
 
 
-def assert_integrates_back(scene: str | Path, changes: dict[str, Any], found: MotionForces) -> None:
+def assert_integrates_back(scene: str | Path, overrides: dict[str, Any], found: MotionForces) -> None:
     """The run of those efforts, open loop, has the motion that was asked for."""
-    run = ckc_pin.simulate(scene, changes, controller=Prescribed(found))
+    run = ckc_pin.simulate(scene, overrides, controller=Prescribed(found))
     assert run.status == "done", run.message
     assert_close(run.t, found.t, 0)
     for ours, theirs in ((run.q_tree, found.q_tree), (run.v_tree, found.v_tree)):
@@ -106,11 +106,11 @@ def test_shipped_scenes_at_each_instant(scene: str) -> None:
 
 @pytest.mark.parametrize("name", shipped())
 def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
-    changes = waves(scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
-    found = inverse_dynamics(name, changes)
+    overrides = waves(scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
+    found = inverse_dynamics(name, overrides)
     assert found.status == "done"
     assert_gives_back(found)
-    assert_integrates_back(name, changes, found)
+    assert_integrates_back(name, overrides, found)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -118,13 +118,13 @@ def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> No
     """A free root that the loops leave free is held by no motor: refused, by name."""
     scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
     mechanism = scene_mechanism(ckc_pin.load_scene(scene))
-    changes = waves(mechanism, 0.1)
+    overrides = waves(mechanism, 0.1)
     if mechanism.splits_root or mechanism.rooted:
         says = "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+.* is held by none"
         with pytest.raises(InputError, match=says):
-            inverse_dynamics(scene, changes)
+            inverse_dynamics(scene, overrides)
         return
-    found = inverse_dynamics(scene, changes)
+    found = inverse_dynamics(scene, overrides)
     assert found.status == "done"
     assert_gives_back(found)
-    assert_integrates_back(scene, changes, found)
+    assert_integrates_back(scene, overrides, found)

@@ -68,12 +68,12 @@ def written(draft: Draft, folder: Path) -> Path:
 
 def assert_swings_as_it_should(draft: Draft, folder: Path) -> None:
     scene = written(draft, folder)
-    changes = waves(load(folder / "mechanism.toml"), 0.1)
-    found = inverse_dynamics(scene, changes)
+    overrides = waves(load(folder / "mechanism.toml"), 0.1)
+    found = inverse_dynamics(scene, overrides)
     assert found.status == "done"
     assert abs(found.tau).max() > 0.0
     assert_gives_back(found)
-    assert_integrates_back(scene, changes, found)
+    assert_integrates_back(scene, overrides, found)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -47,13 +47,13 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "changes"), RUNS, ids=str)
-def test_a_run_is_the_motion_of_its_equations(scene, changes):
-    run = simulate(scene, changes)
+@pytest.mark.parametrize(("scene", "overrides"), RUNS, ids=str)
+def test_a_run_is_the_motion_of_its_equations(scene, overrides):
+    run = simulate(scene, overrides)
     assert run.status == "done"
-    problem = as_ivp(scene, changes)
+    problem = as_ivp(scene, overrides)
     times = run.t[:: len(run.t) // 4]
-    method = "Radau" if changes.get("spf_coordinates") == "z" else "DOP853"
+    method = "Radau" if overrides.get("spf_coordinates") == "z" else "DOP853"
     found = solve_ivp(problem.f, problem.t_span, problem.y0, method, times, rtol=TIGHT, atol=TIGHT / 100)
     assert found.success
     for t, y in zip(times, found.y.T, strict=True):
@@ -74,7 +74,7 @@ def test_a_sampled_controller_is_no_function_of_time_and_state():
         as_ivp("five_bar/set_point", {"controller.sample_time": 0.01})
 
 
-def test_changes_go_with_a_name():
+def test_overrides_need_a_name():
     with pytest.raises(InputError, match="a Scene is complete"):
         as_ivp(load_scene("five_bar/swing"), {"t_end": 1.0})
 

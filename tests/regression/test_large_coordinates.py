@@ -62,11 +62,11 @@ def test_a_crank_turns_on(scene: str, formulation: str) -> None:
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("turns", TURNS)
 def test_turns_before_the_start_change_nothing(turns: int, formulation: str) -> None:
-    changes = {"formulation": formulation, "t_end": 2.0, "solver.rtol": 1e-8}
+    overrides = {"formulation": formulation, "t_end": 2.0, "solver.rtol": 1e-8}
     at, more = np.pi / 2, 2 * np.pi * turns
-    wanted = ckc_pin.simulate("four_bar/turning", changes)
+    wanted = ckc_pin.simulate("four_bar/turning", overrides)
     given = dict(zip(wanted.coordinates, wanted.q_tree[0], strict=True)) | {"crank": at + more}
-    found = ckc_pin.simulate("four_bar/turning", changes | {"initial": {"q": given, "q_dot": {"crank": 12.0}}})
+    found = ckc_pin.simulate("four_bar/turning", overrides | {"initial": {"q": given, "q_dot": {"crank": 12.0}}})
     assert found.status == "done", found.message
     rounded = 1e-5 * turns / TURNS[-1]  # what an angle of so many turns is rounded to, magnified by the motion
     assert abs(found["crank"][-1] - more - wanted["crank"][-1]) < 1e-6 + rounded
@@ -77,7 +77,7 @@ def test_turns_before_the_start_change_nothing(turns: int, formulation: str) -> 
 def test_it_falls_from_the_origin_as_from_afar(falling: str, formulation: str) -> None:
     """The centre of mass falls as Galileo says, and what turns about it does not know where it is."""
     start = {"a": 1.0, "root.x": 0.0, "root.y": 0.0, "root.z": 0.0, "root.rx": 0.0, "root.ry": 0.0, "root.rz": 0.0}
-    changes = {
+    overrides = {
         "formulation": formulation,
         "t_end": 2.0,
         "solver.rtol": 1e-9,
@@ -85,13 +85,13 @@ def test_it_falls_from_the_origin_as_from_afar(falling: str, formulation: str) -
         "initial.q_dot.a": 5.0,
     }
     near, far = (
-        ckc_pin.simulate(falling, changes | {"initial.q": start | {"root.x": x, "root.y": x}}) for x in (0.0, 3000.0)
+        ckc_pin.simulate(falling, overrides | {"initial.q": start | {"root.x": x, "root.y": x}}) for x in (0.0, 3000.0)
     )
     assert (near.status, far.status) == ("done", "done"), far.message
     for name in ("a", "b", "c", "root.rz"):
         assert abs(near[name][-1] - far[name][-1]) < 1e-6
     assert abs(far["root.y"][-1] - near["root.y"][-1] - 3000.0) < 1e-6
-    long = ckc_pin.simulate(falling, changes | {"initial.q": start, "t_end": 30.0, "solver.output_dt": 1.0})
+    long = ckc_pin.simulate(falling, overrides | {"initial.q": start, "t_end": 30.0, "solver.output_dt": 1.0})
     assert long.status == "done", long.message
     assert long["root.y"][-1] < -4000
 

@@ -26,8 +26,8 @@ ALLOWED = 50  # bytes a step: the smallest array, kept at each, takes 130
 @pytest.mark.parametrize("name", RUNS)
 def test_memory_does_not_grow_with_steps(name: str) -> None:
     """Python's own; that the loop in C++ allocates nothing a step, scripts/check_native counts."""
-    scene, changes = RUNS[name]
-    ready = prepare(load_scene(scene, {"t_end": 3.0, **changes}))
+    scene, overrides = RUNS[name]
+    ready = prepare(load_scene(scene, {"t_end": 3.0, **overrides}))
     ready.begin()
     rows = np.empty((2, ready.loop.width))
     ready.loop.record(np.array([ready.scene.spec.t_end]), rows)

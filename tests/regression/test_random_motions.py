@@ -17,7 +17,7 @@ def start(q: tuple[float, ...], q_dot: tuple[float, ...], names: tuple[str, ...]
     return {"initial": {"q": dict(zip(names, q, strict=True)), "q_dot": dict(zip(names, q_dot, strict=True))}}
 
 
-# scene, formulation, rtol, changes; the energy may be off by so many rtol of the largest kinetic energy
+# scene, formulation, rtol, overrides; the energy may be off by so many rtol of the largest kinetic energy
 CASES = {
     # the last stage was on another branch, with a number that was not finite
     "a chart that ends": (
@@ -75,9 +75,9 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_energy_is_kept(case: str) -> None:
-    scene, formulation, rtol, changes = CASES[case]
-    changes = {"t_end": 4.0, "solver.output_dt": 0.02, **changes, "formulation": formulation, "solver.rtol": rtol}
-    run = simulate(scene, changes)
+    scene, formulation, rtol, overrides = CASES[case]
+    overrides = {"t_end": 4.0, "solver.output_dt": 0.02, **overrides, "formulation": formulation, "solver.rtol": rtol}
+    run = simulate(scene, overrides)
     assert run.status == "done", run.message
     off = np.abs(run.energy - run.energy[0]).max()
     assert off <= 100 * rtol * max(1.0, kinetic(run).max())
@@ -92,8 +92,8 @@ def test_three_formulations_are_as_good_as_each_other() -> None:
         q_dot = tuple(random.uniform(-15, 15, 2))
         rtol = 10 ** random.uniform(-9, -3)
         for formulation in off:
-            changes = {**start(q, q_dot), "formulation": formulation, "solver.rtol": rtol, "t_end": 1.0}
-            run = simulate("five_bar/swing", changes)
+            overrides = {**start(q, q_dot), "formulation": formulation, "solver.rtol": rtol, "t_end": 1.0}
+            run = simulate("five_bar/swing", overrides)
             assert run.status == "done", run.message
             off[formulation].append(np.abs(run.energy - run.energy[0]).max() / (rtol * max(1.0, kinetic(run).max())))
     medians = [float(np.median(values)) for values in off.values()]
@@ -103,11 +103,11 @@ def test_three_formulations_are_as_good_as_each_other() -> None:
 
 def test_a_reduced_run_stops_where_z_is_not_known_to_the_tolerance() -> None:
     """Towards the flat four-bars rounding is magnified by phi_z: it took 400,000 right-hand sides to say so."""
-    changes = {
+    overrides = {
         "formulation": "reduced", "t_end": 0.13, "solver.rtol": 4.5e-10,
         "initial": {"q": {"theta_0": 0.056536358472135895}, "q_dot": {"theta_0": 0.0}},
     }  # fmt: skip
-    run = simulate("n_four_bar", changes)
+    run = simulate("n_four_bar", overrides)
     assert run.status == "stopped"
     assert "phi_z" in run.message
     assert run.t[-1] > 0.0995
@@ -117,7 +117,7 @@ def test_a_reduced_run_stops_where_z_is_not_known_to_the_tolerance() -> None:
 
 def test_a_motion_that_runs_away_is_no_singular_chart() -> None:
     """It said that phi_z's least singular value is nan: sampled velocity feedback that is too strong for its period."""
-    changes = {
+    overrides = {
         "formulation": "dae", "t_end": 1.4, "solver.rtol": 2e-5,
         "initial": {"q": {"crank": 4.0}, "q_dot": {"crank": 0.0}},
         "controller": {
@@ -125,7 +125,7 @@ def test_a_motion_that_runs_away_is_no_singular_chart() -> None:
             "q_d": {"crank": 3.9961850746563043}, "sample_time": 0.004195423552193236,
         },
     }  # fmt: skip
-    run = simulate("slider_crank", changes)
+    run = simulate("slider_crank", overrides)
     assert run.status == "stopped"
     assert "runs away" in run.message
     assert "nan" not in run.message

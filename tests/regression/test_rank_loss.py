@@ -17,9 +17,9 @@ from tests.regression.test_reference_cases import first_top_pin
 # --- flat every half turn ------------------------------------------------------------------------
 
 
-def n_four_bar(N: int, rtol: float, **changes: Any) -> Run:
+def n_four_bar(N: int, rtol: float, **overrides: Any) -> Run:
     scene = {"mechanism.N": N, "solver.rtol": rtol, "solver.output_dt": 10.0, "t_end": 10.0}
-    return simulate("n_four_bar", {**scene, **{key.replace("__", "."): value for key, value in changes.items()}})
+    return simulate("n_four_bar", {**scene, **{key.replace("__", "."): value for key, value in overrides.items()}})
 
 
 @pytest.mark.parametrize(("N", "rtol"), [(1, 1e-5), (2, 1e-11), (7, 1e-8)])
@@ -206,7 +206,7 @@ def test_branches_that_only_come_near_are_not_mistaken_for_crossing(tmp_path: Pa
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_a_run_without_a_crossing_evaluates_nothing_more(scene: str, rtol: float) -> None:
     """Three to begin, twelve a step, one where its end was put on the closure, three for the output inside the last."""
-    changes = {"formulation": "dae", "solver.rtol": rtol, "solver.method": "DOP853", "t_end": 1.0}
-    stats = simulate(scene, {**changes, "solver.output_dt": 1.0}).stats
+    overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.method": "DOP853", "t_end": 1.0}
+    stats = simulate(scene, {**overrides, "solver.output_dt": 1.0}).stats
     tries = stats["steps"] + stats["rejected"]
     assert 12 * tries <= stats["rhs"] <= 12 * tries + stats["steps"] + 6

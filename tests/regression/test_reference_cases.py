@@ -64,12 +64,12 @@ def test_bricard_from_the_command_line() -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_bricard_swings_over_and_back_in_its_period(formulation: str) -> None:
-    changes: dict[str, Any] = {"formulation": formulation, "t_end": 1.1 * BRICARD_PERIOD}
-    changes["event"] = [
+    overrides: dict[str, Any] = {"formulation": formulation, "t_end": 1.1 * BRICARD_PERIOD}
+    overrides["event"] = [
         {"coordinate": "hinge_1", "of": "q_dot", "value": 0.0, "direction": 1},
         {"coordinate": "hinge_1", "of": "q_dot", "value": 0.0, "direction": -1},
     ]
-    run = simulate("bricard", changes)
+    run = simulate("bricard", overrides)
     assert run.status == "done", run.message
     half, whole = sorted(event["t"] for event in run.events)
     assert half == pytest.approx(BRICARD_PERIOD / 2, abs=1e-8)
@@ -226,7 +226,7 @@ length = 1.0
 
 def test_trial_stages_far_away_are_not_followed() -> None:
     """At 1e-3 a step proposes stages 1e5 turns of the crank away: following sigma there took a minute."""
-    changes = {"formulation": "reduced", "t_end": 5.0, "solver.method": "DOP853", "solver.rtol": 1e-3}
-    run = simulate("slider_crank", changes)
+    overrides = {"formulation": "reduced", "t_end": 5.0, "solver.method": "DOP853", "solver.rtol": 1e-3}
+    run = simulate("slider_crank", overrides)
     assert run.status == "done"
     assert run.stats["newton"] < 4 * run.stats["rhs"]

@@ -72,8 +72,8 @@ def test_torques_of_a_motion_give_it_back(tmp_path: Path) -> None:
     """To rounding too, with loops that close to six digits."""
     scene = bennett(tmp_path / "rounded", 6) / "default.scene.toml"
     scene.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n')
-    changes = waves(load(scene.parent), 0.1)
-    assert_integrates_back(scene, changes, inverse_dynamics(scene, changes))
+    overrides = waves(load(scene.parent), 0.1)
+    assert_integrates_back(scene, overrides, inverse_dynamics(scene, overrides))
 
 
 def test_of_coordinates_as_good_as_each_other_rounding_chooses_none() -> None:

@@ -115,8 +115,8 @@ def drift(run: Run) -> float:
 @pytest.mark.parametrize("name", FREE)
 def test_energy_is_kept(name: str, formulation: str) -> None:
     t_end = FREE[name]
-    changes = {"formulation": formulation, "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": t_end / 100}
-    run = simulate(name, changes)
+    overrides = {"formulation": formulation, "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": t_end / 100}
+    run = simulate(name, overrides)
     assert run.status == "done", run.message
     assert drift(run) <= (1e-7 if name == "bricard" else 3e-8)  # Bricard's phi_z comes nearest to singular
     assert run.max_phi <= 1e-10
@@ -247,14 +247,14 @@ def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
 
 def test_redundant_rows_are_off_together_or_not_at_all() -> None:
     """w of Bricard's hinge has four freedoms for five rows."""
-    changes = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
+    overrides = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
     with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):
-        simulate("bricard", {**changes, "initial.w": [1e-3] * 5})
+        simulate("bricard", {**overrides, "initial.w": [1e-3] * 5})
     bricard, moves = mechanism("bricard"), np.array([1e-3, 0.0, 2e-3, 1e-3, 0.0])
     moves[bricard.partition.q] = 0.0  # the start's own
     off = bricard.assembled.moved(moves)
     assert np.abs(off.phi).max() > 1e-4
-    run = simulate("bricard", {**changes, "initial.w": off.phi.tolist()})
+    run = simulate("bricard", {**overrides, "initial.w": off.phi.tolist()})
     assert run.status == "done"
     assert np.abs(run.phi[0] - off.phi).max() <= 1e-12
     assert np.abs(run.phi[-1]).max() < 0.7 * np.abs(off.phi).max()

@@ -60,22 +60,22 @@ def test_the_dae_does_as_well(
 def test_what_becomes_stiff_on_the_way_is_noticed() -> None:
     """A damper that grips while the spring beside it, stretched at the start, still pushes: at first modes grow."""
     case = next(case for case in GROUPS["spring"]() if case.name == "line 1e+06 N/m, damped")
-    longer = {**case.changes, "t_end": 0.4, "solver.output_dt": 0.1}
-    auto, explicit = run_case(replace(case, changes=longer, how=(How("dae"), How("dae", "DOP853"))))
+    longer = {**case.overrides, "t_end": 0.4, "solver.output_dt": 0.1}
+    auto, explicit = run_case(replace(case, overrides=longer, how=(How("dae"), How("dae", "DOP853"))))
     assert (auto.method, auto.verdict, explicit.verdict) == ("auto: Radau", "within", "within")
     assert auto.rhs < 0.6 * explicit.rhs
 
 
 def test_a_controller_of_the_callers_costs_as_many_right_hand_sides() -> None:
     """Its gradient is known to nobody: the Jacobian is made of differences, as with eq. 14's own."""
-    changes = {"formulation": "reduced", "t_end": 3.0}
-    known = simulate("five_bar/set_point", changes)
+    overrides = {"formulation": "reduced", "t_end": 3.0}
+    known = simulate("five_bar/set_point", overrides)
 
     class Own:
         def u(self, t: float, terms: Terms) -> Array:
             return terms.h - 10.0 * (terms.q - TARGET) - 10.0 * terms.q_dot
 
-    own = simulate("five_bar/set_point", changes, controller=Own())
+    own = simulate("five_bar/set_point", overrides, controller=Own())
     assert known.status == own.status == "done"
     assert known.stats["method"] == own.stats["method"] == "Radau"
     assert own.stats["rhs"] <= 1.2 * known.stats["rhs"]

@@ -94,10 +94,10 @@ solver.terms = "pinocchio"
 """
 
 
-def written(folder: Path, changes: dict[str, float] | None = None, *, stop: bool = False, controlled: bool = False,
+def written(folder: Path, overrides: dict[str, float] | None = None, *, stop: bool = False, controlled: bool = False,
             formulation: str = "dae", t_end: float = 1.0, more: str = "") -> str:  # fmt: skip
     """Write the files; return the scene's path."""
-    x = {**NUMBERS, **(changes or {})}
+    x = {**NUMBERS, **(overrides or {})}
     mass, inertia = x["link.crank.mass"], 0.03 * x["link.crank.mass"] / NUMBERS["link.crank.mass"]  # one density
     links = [
         LINK.format(name="crank", x=0.2, y=0.01, mass=mass, i=inertia),
@@ -137,11 +137,11 @@ def differentiated(folder: Path, name: str, h: float, read: Any = None, **kind: 
     """The derivative of runs by one number, by Richardson's extrapolation of central differences."""
 
     def value(x: float) -> Any:
-        run = simulate(written(folder, {**kind.get("changes", {}), name: x}, **rest), TIGHT)
+        run = simulate(written(folder, {**kind.get("overrides", {}), name: x}, **rest), TIGHT)
         return np.stack([run.q_tree, run.v_tree]) if read is None else read(run)
 
-    rest = {key: x for key, x in kind.items() if key != "changes"}
-    at = {**NUMBERS, **kind.get("changes", {})}[name]
+    rest = {key: x for key, x in kind.items() if key != "overrides"}
+    at = {**NUMBERS, **kind.get("overrides", {})}[name]
     one, two, four = ((value(at + x) - value(at - x)) / (2 * x) for x in (h, h / 2, h / 4))
     first, second = (4 * two - one) / 3, (4 * four - two) / 3
     return (16 * second - first) / 15

@@ -36,15 +36,15 @@ def test_an_impact_at_the_start(formulation: str, tmp_path: Path) -> None:
 
 
 def test_an_impact_at_the_start_in_a_loop(tmp_path: Path) -> None:
-    changes = {"joint.c.restitution": 0.4, "initial.q_dot.a": 1.5}
-    start = simulate(written(tmp_path / "x", changes), {"t_end": 1e-9}).q_tree[0]
-    changes["joint.c.upper"] = float(start[2])
+    overrides = {"joint.c.restitution": 0.4, "initial.q_dot.a": 1.5}
+    start = simulate(written(tmp_path / "x", overrides), {"t_end": 1e-9}).q_tree[0]
+    overrides["joint.c.upper"] = float(start[2])
     names = ["link.crank.mass", "spring.0.stiffness", "initial.q_dot.a", "joint.c.restitution"]
-    found = sensitivities(written(tmp_path / "x", changes, stop=True, t_end=0.3), names, TIGHT)
+    found = sensitivities(written(tmp_path / "x", overrides, stop=True, t_end=0.3), names, TIGHT)
     assert found.run.events[0]["name"] == "c bounces"
     for k, name in enumerate(names):
-        h = 1e-3 * max(0.3, {**NUMBERS, **changes}[name])
-        wanted = differentiated(tmp_path / "y", name, h, changes=changes, stop=True, t_end=0.3)
+        h = 1e-3 * max(0.3, {**NUMBERS, **overrides}[name])
+        wanted = differentiated(tmp_path / "y", name, h, overrides=overrides, stop=True, t_end=0.3)
         ours = np.stack([found.q_tree[:, :, k], found.v_tree[:, :, k]])
         assert np.abs(ours - wanted)[:, 1:].max() <= 1e-7 * np.abs(wanted).max(), name
 
@@ -118,16 +118,16 @@ def test_a_start_without_a_derivative_is_named(
 def test_joints_that_only_move_together_turn_round_together(seed: int) -> None:
     """Whatever the tolerance is: a loop of one freedom that rubs in three of its joints has a derivative everywhere."""
     rng = np.random.default_rng(seed)
-    changes: dict[str, Any] = {
+    overrides: dict[str, Any] = {
         f"joint.{name}.friction": rng.uniform(0.05, 0.5) for name in ("crank", "coupler", "rocker")
     }
-    changes |= {"initial.q_dot.crank": rng.uniform(-5.0, 5.0), "t_end": 3.0, "formulation": "dae"}
+    overrides |= {"initial.q_dot.crank": rng.uniform(-5.0, 5.0), "t_end": 3.0, "formulation": "dae"}
     names = ["link.coupler_link.mass", "initial.q_dot.crank", "joint.rocker.friction"]
-    wanted = sensitivities("four_bar/turning", names, {**changes, **TIGHT})
+    wanted = sensitivities("four_bar/turning", names, {**overrides, **TIGHT})
     turns = [event for event in wanted.run.events if "slides" in event["name"] and event["t"] > 0.0]
     assert len(turns) >= 3
     for rtol in (1e-2, 1e-4, 1e-6, 1e-8):
-        found = sensitivities("four_bar/turning", names, {**changes, "solver.rtol": rtol})
+        found = sensitivities("four_bar/turning", names, {**overrides, "solver.rtol": rtol})
         assert found.run.status == "done", rtol
         assert np.abs(found.q_tree - wanted.q_tree).max() <= 100 * rtol * np.abs(wanted.q_tree).max(), rtol
 
@@ -160,18 +160,18 @@ def test_an_event_of_a_free_root_in_the_worlds_axes(tmp_path: Path) -> None:
 def test_a_start_where_q_is_no_chart_tells_what_does_not_hang_on_it(tmp_path: Path) -> None:
     """The slider-crank with the slider as q, crank and rod in line: lengths there move the crank without bound."""
     scene = by_slider(tmp_path)
-    changes = {"initial": {"q": IN_LINE}, "t_end": 0.3, "solver.rtol": 1e-10, "solver.output_dt": 0.05}
-    found = sensitivities(scene, ["gravity.y", "link.rod_link.mass"], changes)
-    same = sensitivities("slider_crank", ["gravity.y", "link.rod_link.mass"], {**changes, "formulation": "dae"})
+    overrides = {"initial": {"q": IN_LINE}, "t_end": 0.3, "solver.rtol": 1e-10, "solver.output_dt": 0.05}
+    found = sensitivities(scene, ["gravity.y", "link.rod_link.mass"], overrides)
+    same = sensitivities("slider_crank", ["gravity.y", "link.rod_link.mass"], {**overrides, "formulation": "dae"})
     assert np.abs(found.q_tree - same.q_tree).max() <= 1e-8 * np.abs(same.q_tree).max()
     with pytest.raises(NumericalError, match="at the start phi_z is singular: slider does not determine the others"):
-        sensitivities(scene, ["loop.slider_pin.frame_a.xyz.x"], changes)
+        sensitivities(scene, ["loop.slider_pin.frame_a.xyz.x"], overrides)
 
 
 def test_a_start_at_an_equilibrium_beside_others_is_refused(tmp_path: Path) -> None:
-    changes = {"initial": {"at": "equilibrium"}, "parameters": {"gravity": [0.0, 0.0, 0.0]}, "t_end": 0.1}
+    overrides = {"initial": {"at": "equilibrium"}, "parameters": {"gravity": [0.0, 0.0, 0.0]}, "t_end": 0.1}
     with pytest.raises(NumericalError, match="an equilibrium beside which there are others"):
-        sensitivities("five_bar/swing", ["link.link_2.mass"], changes)
+        sensitivities("five_bar/swing", ["link.link_2.mass"], overrides)
 
 
 EVENT = '[[event]]\nof = "q_dot"\ncoordinate = "x"\nvalue = 0.2\nstop = true\n'

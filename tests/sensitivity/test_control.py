@@ -18,9 +18,9 @@ from tests.sensitivity.changed import TIGHT
 CLOSE = 1e-8  # of the largest
 
 
-def agree(scene: str, values: dict[str, float], changes: dict[str, Any]) -> None:
+def agree(scene: str, values: dict[str, float], overrides: dict[str, Any]) -> None:
     """In the coordinates of joints, their rates, u and tau; `values`: of the parameters."""
-    found = sensitivities(scene, list(values), changes)
+    found = sensitivities(scene, list(values), overrides)
     assert found.run.status == "done"
     run = found.run
     free = run.mechanism.tree.free_coordinates
@@ -33,7 +33,7 @@ def agree(scene: str, values: dict[str, float], changes: dict[str, Any]) -> None
     }
     for k, (name, value) in enumerate(values.items()):
         h = 1e-2 * max(1.0, abs(value))
-        runs = [[simulate(scene, {**changes, name: value + x}) for x in (h / s, -h / s)] for s in (1, 2, 4)]
+        runs = [[simulate(scene, {**overrides, name: value + x}) for x in (h / s, -h / s)] for s in (1, 2, 4)]
         for part, (ours, read) in parts.items():
             if part == "tau" and len(run.actuated) > len(run.independent):  # motors that share u
                 assert np.isnan(ours).all()
@@ -55,19 +55,19 @@ def test_of_tracking_controls_gains(terms: str, formulation: str, each: bool) ->
     gains = {"controller.Lambda": 1.0, "controller.K_D": 10.0}
     spec = ckc_pin.load_scene("five_bar/tracking").spec.controller
     assert (spec.Lambda, spec.K_D) == tuple(gains.values())
-    changes = {**TIGHT, "formulation": formulation, "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
+    overrides = {**TIGHT, "formulation": formulation, "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
     if each:
-        changes |= {name: {"theta_1": gain, "theta_3": gain} for name, gain in gains.items()}
+        overrides |= {name: {"theta_1": gain, "theta_3": gain} for name, gain in gains.items()}
         gains = {"controller.Lambda.theta_3": 1.0, "controller.K_D.theta_1": 10.0}
-    agree("five_bar/tracking", gains, changes)
+    agree("five_bar/tracking", gains, overrides)
 
 
 @pytest.mark.parametrize("terms", ["pinocchio", "generated"])
 def test_of_a_set_points_target(terms: str) -> None:
     """Where what it compensates moves with it."""
     q_d = dict(ckc_pin.load_scene("five_bar/set_point").spec.controller.q_d)
-    changes = {**TIGHT, "formulation": "reduced", "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
-    agree("five_bar/set_point", {f"controller.q_d.{name}": value for name, value in q_d.items()}, changes)
+    overrides = {**TIGHT, "formulation": "reduced", "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
+    agree("five_bar/set_point", {f"controller.q_d.{name}": value for name, value in q_d.items()}, overrides)
 
 
 @pytest.mark.parametrize("scene", ["delta/circle", "stewart/wave", "two_ur5/lift"])
@@ -75,9 +75,9 @@ def test_of_tracking_with_a_free_root(scene: str) -> None:
     ready = ckc_pin.load_scene(scene)
     name = ckc_pin.load(scene.split("/")[0]).independent[1]
     start = (ready.spec.initial.q_dot or {}).get(name, 0.0)
-    changes = {**TIGHT, "formulation": "reduced", "t_end": 0.1, "solver.output_dt": 0.05, "solver.terms": "pinocchio"}
+    overrides = {**TIGHT, "formulation": "reduced", "t_end": 0.1, "solver.output_dt": 0.05, "solver.terms": "pinocchio"}
     gain = float(ready.spec.controller.K_D)
-    agree(scene, {f"initial.q_dot.{name}": start, "controller.K_D": gain}, changes)
+    agree(scene, {f"initial.q_dot.{name}": start, "controller.K_D": gain}, overrides)
 
 
 REDUNDANT = """
@@ -114,8 +114,8 @@ def test_of_a_limit_that_other_motors_make_up_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])
 def test_redundant_motors_that_do_not_reach_u_stop_it(method: str, formulation: str, tmp_path: Path) -> None:
-    changes = {"t_end": 0.3, "solver.method": method, "formulation": formulation}
-    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], changes)
+    overrides = {"t_end": 0.3, "solver.method": method, "formulation": formulation}
+    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], overrides)
     assert found.run.status == "stopped"
     assert "motors at their limits do not reach what is wanted of them together" in found.run.message
 
@@ -160,10 +160,10 @@ def test_of_sampled_controllers(formulation: str, terms: str) -> None:
 def test_of_samples_that_ask_for_more_than_there_is() -> None:
     """A torque at its limit does not answer until the sample that brings it back."""
     limited = {"controller.torque_limit": 2.0, "controller.sample_time": 0.01}
-    changes = {**TIGHT, **limited, "formulation": "reduced", "t_end": 0.5, "solver.output_dt": 0.1}
-    run = simulate("five_bar/set_point", changes)
+    overrides = {**TIGHT, **limited, "formulation": "reduced", "t_end": 0.5, "solver.output_dt": 0.1}
+    run = simulate("five_bar/set_point", overrides)
     assert np.abs(run.tau).max() == 2.0 > np.abs(run.tau[-1]).max()
-    agree("five_bar/set_point", OF_SET_POINT, changes)
+    agree("five_bar/set_point", OF_SET_POINT, overrides)
 
 
 # --- a caller's own --------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class Spring:
     ("formulation", "sampled"), [("dae", False), ("reduced", False), ("spf", False), ("dae", True)]
 )
 def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
-    changes = {
+    overrides = {
         **TIGHT,
         "formulation": formulation,
         "t_end": 0.15,
@@ -193,12 +193,12 @@ def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
     own = with_components(values_of(loaded.spec, loaded.urdf))
     values |= {name: own[name] for name in values if name in own}
     law = ckc_pin.Sampled(Spring(), 0.01) if sampled else Spring()
-    found = ckc_pin.sensitivities("five_bar/swing", list(values), changes, controller=law)
+    found = ckc_pin.sensitivities("five_bar/swing", list(values), overrides, controller=law)
     assert found.run.status == "done"
     for k, (name, value) in enumerate(values.items()):
         h = 2e-3 * max(0.3, abs(value))
         runs = [
-            [simulate("five_bar/swing", {**changes, name: value + x}, controller=law) for x in (h / s, -h / s)]
+            [simulate("five_bar/swing", {**overrides, name: value + x}, controller=law) for x in (h / s, -h / s)]
             for s in (1, 2, 4)
         ]
         for part in ("q_tree", "v_tree", "u"):
@@ -216,12 +216,14 @@ def test_a_callers_controller_that_looks_at_terms() -> None:
     def compensated(t: float, terms: ckc_pin.Terms) -> np.ndarray:
         return terms.h - 2.0 * terms.q_dot
 
-    changes = {**TIGHT, "t_end": 0.2}
+    overrides = {**TIGHT, "t_end": 0.2}
     with pytest.raises(InputError, match=r"link\.link_2\.mass: the controller looks at terms of the mechanism"):
-        ckc_pin.sensitivities("five_bar/swing", ["link.link_2.mass"], changes, controller=compensated)
+        ckc_pin.sensitivities("five_bar/swing", ["link.link_2.mass"], overrides, controller=compensated)
     name = "initial.q_dot.theta_3"
-    found = ckc_pin.sensitivities("five_bar/swing", [name], changes, controller=compensated)
-    one, two = (simulate("five_bar/swing", {**changes, name: x}, controller=compensated).q_tree for x in (1e-4, -1e-4))
+    found = ckc_pin.sensitivities("five_bar/swing", [name], overrides, controller=compensated)
+    one, two = (
+        simulate("five_bar/swing", {**overrides, name: x}, controller=compensated).q_tree for x in (1e-4, -1e-4)
+    )
     assert np.abs(found.q_tree[:, :, 0] - (one - two) / 2e-4).max() <= 1e-6 * np.abs(one - two).max() / 2e-4
 
 

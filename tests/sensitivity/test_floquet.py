@@ -127,13 +127,13 @@ def test_a_motion_that_keeps_its_energy_is_never_said_to_be_unstable(rtol: float
     assert found.multipliers == pytest.approx([1.0, 1.0], abs=0.01)
 
 
-def on_its_way(changes: dict[str, Any]) -> dict[str, Any]:
+def on_its_way(overrides: dict[str, Any]) -> dict[str, Any]:
     """Tracking of the five-bar that starts on its desired motion."""
-    scene = load_scene("five_bar/tracking", changes)
+    scene = load_scene("five_bar/tracking", overrides)
     law = scene_controller(scene, scene_mechanism(scene))
     assert isinstance(law, Tracking)
     q, q_dot, _ = (dict(zip(("theta_1", "theta_3"), x.tolist(), strict=True)) for x in law.desired(0.0))
-    return {**changes, "initial": {"q": q, "q_dot": q_dot}, "formulation": "reduced", "solver.rtol": 1e-10}
+    return {**overrides, "initial": {"q": q, "q_dot": q_dot}, "formulation": "reduced", "solver.rtol": 1e-10}
 
 
 def test_of_tracking_pushes_die_out_as_lambda_says() -> None:
@@ -147,11 +147,11 @@ def test_of_tracking_pushes_die_out_as_lambda_says() -> None:
 
 def test_what_drives_the_motion_has_to_come_back_too() -> None:
     """sin^3 t is where it began after half of its period, at the same rate, and goes the other way from there."""
-    changes = {"controller.desired.theta_1": {"offset": -1.4, "harmonics": [[0.15, 1.0, 0.0], [-0.05, 3.0, 0.0]]},
+    overrides = {"controller.desired.theta_1": {"offset": -1.4, "harmonics": [[0.15, 1.0, 0.0], [-0.05, 3.0, 0.0]]},
                "controller.desired.theta_3": {"offset": -1.7}}  # fmt: skip
     with pytest.raises(InputError, match=r"period = 3\.14\d+ s is none: .* the desired motion is off by 0\.\d+"):
-        floquet("five_bar/tracking", np.pi, on_its_way(changes))
-    assert floquet("five_bar/tracking", 2 * np.pi, on_its_way(changes)).stable
+        floquet("five_bar/tracking", np.pi, on_its_way(overrides))
+    assert floquet("five_bar/tracking", 2 * np.pi, on_its_way(overrides)).stable
 
 
 def test_in_no_time_nothing_comes_back(tmp_path: Path) -> None:
@@ -179,16 +179,16 @@ def test_of_a_sampled_loop_that_rests(samples: int, stable: bool, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("overrides", "says"),
     [
         ({"sample_time": 1e-3}, r"controller\.sample_time: period = 6\.28318531 s is 6283\.18531 samples; the motion"),
         ({"sample_time": 10.0}, r"controller\.sample_time: period = 6\.28318531 s is 0\.628318531 samples"),
         ({"sample_time": np.pi / 500, "delay": 1e-3}, r"controller\.delay: what is on its way at the end of a period"),
     ],
 )
-def test_samples_that_do_not_come_back_are_refused(changes: dict[str, float], says: str) -> None:
+def test_samples_that_do_not_come_back_are_refused(overrides: dict[str, float], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        floquet("five_bar/tracking", 2 * np.pi, {f"controller.{name}": x for name, x in changes.items()})
+        floquet("five_bar/tracking", 2 * np.pi, {f"controller.{name}": x for name, x in overrides.items()})
 
 
 def test_what_has_no_derivatives_is_refused_before_anything_is_run() -> None:

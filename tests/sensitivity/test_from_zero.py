@@ -15,11 +15,11 @@ from tests.sensitivity.changed import TIGHT, written
 CLOSE = 1e-6  # of the largest: one-sided differences
 
 
-def one_sided(scene: str, name: str, changes: dict[str, Any]) -> Any:
+def one_sided(scene: str, name: str, overrides: dict[str, Any]) -> Any:
     """From 0 on, by Richardson's extrapolation."""
 
     def value(x: float) -> Any:
-        run = simulate(scene, {**changes, name: x})
+        run = simulate(scene, {**overrides, name: x})
         assert run.status == "done"
         return np.concatenate([run.q_tree, run.v_tree], axis=1)
 
@@ -28,9 +28,9 @@ def one_sided(scene: str, name: str, changes: dict[str, Any]) -> Any:
     return (4 * (2 * four - two) - (2 * two - one)) / 3
 
 
-def compare(scene: str, name: str, changes: dict[str, Any]) -> None:
-    found = sensitivities(scene, [name], {**changes, name: 0.0})
-    wanted = one_sided(scene, name, changes)
+def compare(scene: str, name: str, overrides: dict[str, Any]) -> None:
+    found = sensitivities(scene, [name], {**overrides, name: 0.0})
+    wanted = one_sided(scene, name, overrides)
     assert np.abs(wanted).max() > 1e-3
     ours = np.concatenate([found.q_tree, found.v_tree], axis=1)[:, :, 0]
     assert np.abs(ours - wanted).max() <= CLOSE * np.abs(wanted).max()
@@ -43,11 +43,11 @@ def test_of_a_mass_that_is_changed_to_zero(given: dict[str, Any], tmp_path: Path
 
 
 def test_of_a_mass_whose_inertia_is_given(tmp_path: Path) -> None:
-    changes = {**TIGHT, "link.crank.inertia.izz": 0.02}
+    overrides = {**TIGHT, "link.crank.inertia.izz": 0.02}
     name, h, scene = "link.crank.mass", 2e-3, written(tmp_path)
-    found = sensitivities(scene, [name], changes).v_tree[:, :, 0]
-    one, two = ((simulate(scene, {**changes, name: 1.3 + x}).v_tree
-                 - simulate(scene, {**changes, name: 1.3 - x}).v_tree) / (2 * x) for x in (h, h / 2))  # fmt: skip
+    found = sensitivities(scene, [name], overrides).v_tree[:, :, 0]
+    one, two = ((simulate(scene, {**overrides, name: 1.3 + x}).v_tree
+                 - simulate(scene, {**overrides, name: 1.3 - x}).v_tree) / (2 * x) for x in (h, h / 2))  # fmt: skip
     assert np.abs(found - (4 * two - one) / 3).max() <= 1e-8 * np.abs(found).max()
 
 

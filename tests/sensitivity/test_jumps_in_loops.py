@@ -15,7 +15,7 @@ FOLDER = "tests/sensitivity/loops"
 HEIGHT = "link.la1.com.z"
 
 
-def differentiated(name: str, changes: dict[str, Any], h: float = 1e-4) -> np.ndarray:
+def differentiated(name: str, overrides: dict[str, Any], h: float = 1e-4) -> np.ndarray:
     """Of the last state, by the height of a link's centre: differences of runs, extrapolated once."""
     urdf = ElementTree.parse(f"{FOLDER}/{name}/{name}.urdf")
     origin = urdf.find("link[@name='la1']/inertial/origin")
@@ -23,7 +23,7 @@ def differentiated(name: str, changes: dict[str, Any], h: float = 1e-4) -> np.nd
     z = float(origin.attrib["xyz"].split()[2])
 
     def end(by: float) -> np.ndarray:
-        run = simulate(f"{FOLDER}/{name}", {**changes, HEIGHT: z + by})
+        run = simulate(f"{FOLDER}/{name}", {**overrides, HEIGHT: z + by})
         assert run.status == "done"
         return np.concatenate([run.q_tree[-1], run.v_tree[-1]])
 
@@ -42,17 +42,17 @@ def test_bounces_of_a_joint_while_another_touches(rtol: float) -> None:
 
     The differences know bounces to where they are taken to be over. Those of runs at 1e-8 meet another order of events.
     """
-    changes = {"solver.rtol": rtol, "solver.method": "Radau"}
-    found = ends(sensitivities(f"{FOLDER}/two_stops", [HEIGHT], changes))
-    wanted = differentiated("two_stops", {**changes, "solver.rtol": 1e-12})
+    overrides = {"solver.rtol": rtol, "solver.method": "Radau"}
+    found = ends(sensitivities(f"{FOLDER}/two_stops", [HEIGHT], overrides))
+    wanted = differentiated("two_stops", {**overrides, "solver.rtol": 1e-12})
     assert np.abs(found - wanted).max() <= 1e-3 * np.abs(wanted).max()
 
 
 @pytest.mark.parametrize("rtol", [1e-8, 1e-9, 1e-10, 1e-11, 1e-12])
 def test_an_inelastic_impact_that_a_joint_leaves_at_once(rtol: float) -> None:
     """By rounding it may be at its stop once more at that instant, and rests there: that is when it was thrown."""
-    changes = {"solver.rtol": rtol}
-    found = ends(sensitivities(f"{FOLDER}/inelastic", [HEIGHT], changes))
+    overrides = {"solver.rtol": rtol}
+    found = ends(sensitivities(f"{FOLDER}/inelastic", [HEIGHT], overrides))
     wanted = differentiated("inelastic", {"solver.rtol": 1e-12}, 1e-5)
     assert np.abs(found - wanted).max() <= 1e-5 * np.abs(wanted).max()
 
@@ -71,10 +71,10 @@ def test_what_has_come_to_rest_rests_with_every_parameter(rtol: float, more: lis
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_a_stop_that_a_joint_leaves_smoothly(rtol: float, formulation: str) -> None:
     """By rounding it touches and leaves again at that instant, without a speed: that has no time of its own."""
-    changes = {"solver.rtol": rtol, "formulation": formulation}
+    overrides = {"solver.rtol": rtol, "formulation": formulation}
     name = "initial.q_dot.j0_1"
     scene, start = f"{FOLDER}/left_smoothly", 0.4079220041557603
-    found = sensitivities(scene, [name], changes)
+    found = sensitivities(scene, [name], overrides)
     tight = {"solver.rtol": 1e-12, "formulation": formulation}
     ahead, behind = (simulate(scene, {**tight, name: start + h}) for h in (1e-5, -1e-5))
     wanted = np.concatenate([ahead.q_tree[-1] - behind.q_tree[-1], ahead.v_tree[-1] - behind.v_tree[-1]]) / 2e-5

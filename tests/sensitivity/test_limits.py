@@ -48,8 +48,8 @@ def test_of_a_dependent_joints_motor_at_its_limit(formulation: str, terms: str, 
     values |= {"controller.K_V": 1.0, "initial.q_dot.theta_1": 0.0}
     names = ["link.link_2.mass", "gravity.y", "joint.theta_2.xyz.x", "controller.K_P", "controller.K_V"]
     names += ["motor.theta_1.ratio", "motor.theta_2.ratio", "motor.theta_2.torque_limit", "initial.q_dot.theta_1"]
-    changes = {**TIGHT, "formulation": formulation, "solver.terms": terms, "t_end": 0.05, "solver.output_dt": 0.01}
-    found = sensitivities(scene, names, changes)
+    overrides = {**TIGHT, "formulation": formulation, "solver.terms": terms, "t_end": 0.05, "solver.output_dt": 0.01}
+    found = sensitivities(scene, names, overrides)
     assert found.run.status == "done"
     assert np.all(np.abs(found.run.tau[:, 1]) == 1.0)  # all the time
 
@@ -60,8 +60,8 @@ def test_of_a_dependent_joints_motor_at_its_limit(formulation: str, terms: str, 
     for k, name in enumerate(names):
         h = 1e-3 * max(0.3, abs(values[name]))
         one, two, four = (
-            (read(simulate(scene, {**changes, name: values[name] + x}))
-             - read(simulate(scene, {**changes, name: values[name] - x}))) / (2 * x)
+            (read(simulate(scene, {**overrides, name: values[name] + x}))
+             - read(simulate(scene, {**overrides, name: values[name] - x}))) / (2 * x)
             for x in (h, h / 2, h / 4)
         )  # fmt: skip
         wanted = (16 * (4 * four - two) - (4 * two - one)) / 45

@@ -20,14 +20,14 @@ CLOSE = 1e-8  # of the largest
 MOTION = ("q_tree", "v_tree")
 
 
-def differences(scene: str, name: str, h: float, changes: dict[str, Any], parts: tuple[str, ...] = MOTION) -> Any:
+def differences(scene: str, name: str, h: float, overrides: dict[str, Any], parts: tuple[str, ...] = MOTION) -> Any:
     """By the mechanism's own parameters, whose values tests/contract compares with files that say them."""
-    loaded = ckc_pin.load_scene(scene, changes)
+    loaded = ckc_pin.load_scene(scene, overrides)
     own = with_components(values_of(*_files(loaded)))[name]
     h *= max(0.25, abs(own))
 
     def value(x: float) -> Any:
-        run = simulate(scene, {**changes, name: x})
+        run = simulate(scene, {**overrides, name: x})
         assert run.status == "done"
         return np.concatenate([getattr(run, part) for part in parts], axis=1)
 
@@ -40,12 +40,12 @@ def _files(scene: Any) -> Any:
     return mechanism.spec, mechanism.urdf
 
 
-def agree(found: Sensitivities, scene: str, changes: dict[str, Any], *, parts: tuple[str, ...] = MOTION,
+def agree(found: Sensitivities, scene: str, overrides: dict[str, Any], *, parts: tuple[str, ...] = MOTION,
           h: float = 4e-4, tolerance: float = CLOSE, zero: tuple[str, ...] = ()) -> None:  # fmt: skip
     assert found.run.status == "done"
     ours = np.concatenate([getattr(found, part) for part in parts], axis=1)
     for k, name in enumerate(found.parameters):
-        wanted = differences(scene, name, h, changes, parts)
+        wanted = differences(scene, name, h, overrides, parts)
         assert name in zero or np.abs(wanted).max() > 1e-4, name
         assert np.abs(ours[:, :, k] - wanted).max() <= tolerance * max(1e-3, np.abs(wanted).max()), name
 
@@ -183,10 +183,10 @@ def test_lengths_that_cannot_be_other_ones_are_refused() -> None:
     """Bricard's linkage moves only because its lengths are special; its masses may be any."""
     mechanism = ckc_pin.load("bricard")
     start = dict(zip(mechanism.independent, mechanism.independent_part(mechanism.q_tree).tolist(), strict=True))
-    changes = {"t_end": 0.01, "initial": {"q": start}}
-    assert sensitivities("bricard", ["link.rod_1.mass"], changes).run.status == "done"
+    overrides = {"t_end": 0.01, "initial": {"q": start}}
+    assert sensitivities("bricard", ["link.rod_1.mass"], overrides).run.status == "done"
     with pytest.raises(InputError, match=r"joint\.hinge_2\.xyz\.x: with another value .* hinge_4\.e2\.b"):
-        sensitivities("bricard", ["joint.hinge_2.xyz.x"], changes)
+        sensitivities("bricard", ["joint.hinge_2.xyz.x"], overrides)
 
 
 def test_through_an_impact(tmp_path: Path) -> None:
@@ -207,8 +207,8 @@ def test_of_u(tmp_path: Path) -> None:
         "joint.theta_2.xyz.x",
         "initial.q_dot.theta_1",
     ]
-    changes = {**TIGHT, "t_end": 0.5, "solver.output_dt": 0.1}
-    found = sensitivities("five_bar/set_point", names, changes)
+    overrides = {**TIGHT, "t_end": 0.5, "solver.output_dt": 0.1}
+    found = sensitivities("five_bar/set_point", names, overrides)
     scene = ckc_pin.load_scene("five_bar/set_point").spec
     values = {"link.link_2.mass": values_of(*_mechanism("five_bar"))["link.link_2.mass"], "initial.q_dot.theta_1": 0.0}
     values |= {"joint.theta_2.xyz.x": values_of(*_mechanism("five_bar"))["joint.theta_2.xyz"][0]}  # type: ignore[index]
@@ -216,8 +216,8 @@ def test_of_u(tmp_path: Path) -> None:
     for name, own in values.items():
         h = 1e-3 * max(0.3, abs(own))  # type: ignore[arg-type]
         one, two, four = (
-            (simulate("five_bar/set_point", {**changes, name: own + x}).u  # type: ignore[operator]
-             - simulate("five_bar/set_point", {**changes, name: own - x}).u) / (2 * x)  # type: ignore[operator]
+            (simulate("five_bar/set_point", {**overrides, name: own + x}).u  # type: ignore[operator]
+             - simulate("five_bar/set_point", {**overrides, name: own - x}).u) / (2 * x)  # type: ignore[operator]
             for x in (h, h / 2, h / 4)
         )  # fmt: skip
         wanted = (16 * (4 * four - two) - (4 * two - one)) / 45

@@ -49,9 +49,9 @@ def test_a_joint_rests_whatever_the_changes_are(formulation: str, rtol: float, t
     (tmp_path / "held.toml").write_text(MECHANISM, encoding="utf-8")
     path = tmp_path / "held.scene.toml"
     path.write_text(SCENE, encoding="utf-8")
-    changes = {"formulation": formulation, "solver.rtol": rtol}
+    overrides = {"formulation": formulation, "solver.rtol": rtol}
     names = ["gravity.y", "initial.q.a", "joint.c.lower"]
-    found, plain = sensitivities(path, names, changes), simulate(path, changes)
+    found, plain = sensitivities(path, names, overrides), simulate(path, overrides)
     assert found.run.status == plain.status == "done"
     assert [event["name"] for event in found.run.events] == [event["name"] for event in plain.events] == ["c touches"]
     a, b, c = plain.q_tree[-1]

@@ -22,9 +22,9 @@ SOME = ["link.crank.mass", "loop.knee.frame_a.xyz.x", "joint.c.xyz.x", "spring.0
 
 def agree(found: Sensitivities, names: list[str], folder: Path, tolerance: float = CLOSE, **kind: Any) -> None:
     assert found.run.status == "done"
-    changes = {**NUMBERS, **kind.get("changes", {})}
+    overrides = {**NUMBERS, **kind.get("overrides", {})}
     for k, name in enumerate(names):
-        wanted = differentiated(folder, name, 1e-3 * max(0.3, abs(changes[name])), **kind)
+        wanted = differentiated(folder, name, 1e-3 * max(0.3, abs(overrides[name])), **kind)
         ours = np.stack([found.q_tree[:, :, k], found.v_tree[:, :, k]])
         assert np.abs(wanted).max() > 1e-4, name  # it matters
         assert np.abs(ours - wanted).max() <= tolerance * np.abs(wanted).max(), name
@@ -47,27 +47,27 @@ def test_of_gains_and_of_what_a_controller_compensates(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_through_an_impact(formulation: str, tmp_path: Path) -> None:
-    names, changes = [*SOME, "joint.c.restitution", "joint.c.upper"], {"joint.c.upper": 1.9}
+    names, overrides = [*SOME, "joint.c.restitution", "joint.c.upper"], {"joint.c.upper": 1.9}
     kind: dict[str, Any] = {"stop": True, "formulation": formulation}
-    found = sensitivities(written(tmp_path / "x", changes, **kind), names, TIGHT)
+    found = sensitivities(written(tmp_path / "x", overrides, **kind), names, TIGHT)
     assert any("bounces" in event["name"] for event in found.run.events)
-    agree(found, names, tmp_path / "y", changes=changes, **kind)
+    agree(found, names, tmp_path / "y", overrides=overrides, **kind)
 
 
 def test_through_an_impact_that_ends_at_the_stop(tmp_path: Path) -> None:
     """Held there for a while, then let go."""
-    names, changes = [*SOME, "joint.c.upper"], {"joint.c.upper": 1.9, "joint.c.restitution": 0.0}
-    found = sensitivities(written(tmp_path / "x", changes, stop=True), names, TIGHT)
+    names, overrides = [*SOME, "joint.c.upper"], {"joint.c.upper": 1.9, "joint.c.restitution": 0.0}
+    found = sensitivities(written(tmp_path / "x", overrides, stop=True), names, TIGHT)
     assert any("touches" in event["name"] for event in found.run.events)
-    agree(found, names, tmp_path / "y", tolerance=5e-8, changes=changes, stop=True)
+    agree(found, names, tmp_path / "y", tolerance=5e-8, overrides=overrides, stop=True)
 
 
 @pytest.mark.parametrize("friction", [0.8, 3.0])
 def test_through_slipping_and_sticking(friction: float, tmp_path: Path) -> None:
-    names, changes = [*SOME, "joint.a.friction"], {"joint.a.friction": friction}
-    found = sensitivities(written(tmp_path / "x", changes, t_end=2.0), names, TIGHT)
+    names, overrides = [*SOME, "joint.a.friction"], {"joint.a.friction": friction}
+    found = sensitivities(written(tmp_path / "x", overrides, t_end=2.0), names, TIGHT)
     assert any("slides" in event["name"] or "sticks" in event["name"] for event in found.run.events)
-    agree(found, names, tmp_path / "y", tolerance=5e-8, changes=changes, t_end=2.0)
+    agree(found, names, tmp_path / "y", tolerance=5e-8, overrides=overrides, t_end=2.0)
 
 
 def test_of_the_time_at_which_an_event_ends_a_run(tmp_path: Path) -> None:
@@ -83,10 +83,10 @@ def test_of_the_time_at_which_an_event_ends_a_run(tmp_path: Path) -> None:
 
 def test_through_changes_of_partition(tmp_path: Path) -> None:
     """The crank turns all the way round: what serves as q changes, the derivative does not."""
-    changes = {"formulation": "reduced", "initial.q_dot.crank": 12.0, "t_end": 1.0, **TIGHT}
+    overrides = {"formulation": "reduced", "initial.q_dot.crank": 12.0, "t_end": 1.0, **TIGHT}
     names = ["link.coupler_link.mass", "initial.q_dot.crank"]
-    dae = sensitivities("four_bar/turning", names, {**changes, "formulation": "dae"})
-    reduced = sensitivities("four_bar/turning", names, changes)
+    dae = sensitivities("four_bar/turning", names, {**overrides, "formulation": "dae"})
+    reduced = sensitivities("four_bar/turning", names, overrides)
     assert np.abs(dae.q_tree - reduced.q_tree).max() <= CLOSE * np.abs(dae.q_tree).max()
 
 
@@ -97,12 +97,12 @@ def test_where_the_motion_is_stiff(kind: str, tmp_path: Path) -> None:
         scene, names = tethered(tmp_path), ["link.body.mass", "gravity.x", "initial.q.root.z"]
     else:
         scene, names = written(tmp_path, formulation=kind), ["spring.0.damping", *STARTS]
-    changes = {**TIGHT, "solver.method": "Radau", "solver.rtol": 1e-9, "solver.atol": 1e-11}
-    implicit, explicit = (sensitivities(scene, names, x) for x in (changes, TIGHT))
+    overrides = {**TIGHT, "solver.method": "Radau", "solver.rtol": 1e-9, "solver.atol": 1e-11}
+    implicit, explicit = (sensitivities(scene, names, x) for x in (overrides, TIGHT))
     assert implicit.run.stats["method"] == "Radau"
     assert implicit.run.stats["differences"] == 0
     assert np.abs(implicit.q_tree - explicit.q_tree).max() <= 1e-6 * np.abs(explicit.q_tree).max()
-    plain = simulate(scene, changes).stats
+    plain = simulate(scene, overrides).stats
     assert implicit.run.stats["rhs"] <= 2 * plain["rhs"]
     assert implicit.run.stats["jacobians"] <= 2 * plain["jacobians"]
 
@@ -124,7 +124,7 @@ def test_what_is_no_parameter_is_refused_with_those_there_are(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("scene", "changes", "says"),
+    ("scene", "overrides", "says"),
     [
         ("five_bar/set_point", {"controller.sample_time": 0.01, "controller.sensor": {"resolution": 0.01}}, "sensor"),
         ("five_bar/swing", {"formulation": "spf", "spf_coordinates": "z"}, "eq. 8 as printed"),
@@ -133,19 +133,19 @@ def test_what_is_no_parameter_is_refused_with_those_there_are(tmp_path: Path) ->
         ("five_bar/tracking", {}, "controller.model"),
     ],
 )
-def test_motions_without_known_derivatives_are_refused(scene: str, changes: dict[str, Any], says: str) -> None:
+def test_motions_without_known_derivatives_are_refused(scene: str, overrides: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        sensitivities(scene, ["link.link_1.mass"], changes)
+        sensitivities(scene, ["link.link_1.mass"], overrides)
 
 
 @pytest.mark.parametrize("terms", ["pinocchio", "generated"])
 def test_of_the_start_under_tracking_control(terms: str) -> None:
     """By the exact derivatives of eq. 16, on the paper's five-bar."""
-    changes = {**TIGHT, "formulation": "reduced", "t_end": 1.0, "solver.terms": terms}
-    found = sensitivities("five_bar/tracking", ["initial.q_dot.theta_1"], changes)
+    overrides = {**TIGHT, "formulation": "reduced", "t_end": 1.0, "solver.terms": terms}
+    found = sensitivities("five_bar/tracking", ["initial.q_dot.theta_1"], overrides)
 
     def ended(h: float) -> Any:
-        run = simulate("five_bar/tracking", {**changes, "initial.q_dot.theta_1": h})
+        run = simulate("five_bar/tracking", {**overrides, "initial.q_dot.theta_1": h})
         return np.hstack([run.q_tree, run.v_tree, run.u])
 
     one, two, four = ((ended(h) - ended(-h)) / (2 * h) for h in (4e-3, 2e-3, 1e-3))
@@ -159,8 +159,8 @@ def test_of_the_start_under_tracking_control(terms: str) -> None:
 def test_of_a_start_at_the_equilibrium(tmp_path: Path) -> None:
     """Which moves with the mechanism: without control nothing else happens."""
 
-    def rest(changes: dict[str, float], folder: str) -> str:
-        text = written(tmp_path / folder, changes)
+    def rest(overrides: dict[str, float], folder: str) -> str:
+        text = written(tmp_path / folder, overrides)
         path = tmp_path / folder / "bars.scene.toml"
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("initial")]
         path.write_text("\n".join(['initial.at = "equilibrium"', *lines]) + "\n", encoding="utf-8")
@@ -172,8 +172,8 @@ def test_of_a_start_at_the_equilibrium(tmp_path: Path) -> None:
         h = 1e-3
 
         def at(x: float, name: str = name) -> Any:
-            changes = {**TIGHT, "t_end": 0.1}
-            return simulate(rest({name: NUMBERS[name] + x}, "y"), changes).q_tree[0]
+            overrides = {**TIGHT, "t_end": 0.1}
+            return simulate(rest({name: NUMBERS[name] + x}, "y"), overrides).q_tree[0]
 
         one, two, four = ((at(x) - at(-x)) / (2 * x) for x in (h, h / 2, h / 4))
         wanted = (16 * (4 * four - two) - (4 * two - one)) / 45

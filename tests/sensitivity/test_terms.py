@@ -23,8 +23,8 @@ def cache(writable_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(writable_cache))
 
 
-def both(scene: str, names: list[str], changes: dict[str, Any]) -> tuple[Sensitivities, Sensitivities]:
-    found = [sensitivities(scene, names, {**changes, "solver.terms": terms}) for terms in ("generated", "pinocchio")]
+def both(scene: str, names: list[str], overrides: dict[str, Any]) -> tuple[Sensitivities, Sensitivities]:
+    found = [sensitivities(scene, names, {**overrides, "solver.terms": terms}) for terms in ("generated", "pinocchio")]
     assert [x.run.stats["terms"] for x in found] == ["generated", "pinocchio"]
     return found[0], found[1]
 
@@ -68,10 +68,10 @@ def test_of_every_kind_of_number(formulation: str, tmp_path: Path) -> None:
 def test_a_right_hand_side_asks_once_how_it_changes(terms: str) -> None:
     """Whatever the number of parameters; to hold S to the tolerances takes a third more of them at the most."""
     names = ["link.link_2.mass", "initial.q.theta_1", "link.link_3.mass", "gravity.y", "link.link_2.com.x"]
-    changes = {"solver.rtol": 1e-9, "solver.terms": terms}
-    plain = simulate("five_bar/swing", changes).stats["rhs"]
+    overrides = {"solver.rtol": 1e-9, "solver.terms": terms}
+    plain = simulate("five_bar/swing", overrides).stats["rhs"]
     for count in (1, 2, 4, 5):  # along one direction, some of four, four, and four and one
-        run = sensitivities("five_bar/swing", names[:count], changes).run
+        run = sensitivities("five_bar/swing", names[:count], overrides).run
         asked = run.stats["changes_by_terms"]
         assert sum(asked.values()) == asked[terms] == run.stats["rhs"]
         assert run.stats["rhs"] <= 1.34 * plain
@@ -80,10 +80,10 @@ def test_a_right_hand_side_asks_once_how_it_changes(terms: str) -> None:
 def test_of_one_parameter_and_of_several_is_the_same() -> None:
     """One direction's code against that of four."""
     names = ["link.link_2.mass", "initial.q.theta_1", "link.link_3.mass", "gravity.y", "link.link_2.com.x"]
-    changes = {"solver.rtol": 1e-11, "solver.terms": "generated"}
-    together = sensitivities("five_bar/swing", names, changes)  # four, and one
+    overrides = {"solver.rtol": 1e-11, "solver.terms": "generated"}
+    together = sensitivities("five_bar/swing", names, overrides)  # four, and one
     for name in (names[0], names[-1]):
-        alone = sensitivities("five_bar/swing", [name], changes)
+        alone = sensitivities("five_bar/swing", [name], overrides)
         for coordinate in together.run.coordinates:
             curve = together.of(coordinate, name)
             assert np.abs(alone.of(coordinate, name) - curve).max() <= SAME * max(1e-3, np.abs(curve).max())
@@ -127,8 +127,8 @@ def test_under_control_and_through_impacts(tmp_path: Path) -> None:
     assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
     names = ["link.crank.mass", "joint.c.upper", "joint.c.restitution", "joint.c.xyz.x"]
     for restitution in (0.5, 0.0):  # it bounces; it stays there for a while
-        changes = {"joint.c.upper": 1.9, "joint.c.restitution": restitution}
-        found, other = both(written(tmp_path / f"stop{restitution}", changes, stop=True), names, TIGHT)
+        overrides = {"joint.c.upper": 1.9, "joint.c.restitution": restitution}
+        found, other = both(written(tmp_path / f"stop{restitution}", overrides, stop=True), names, TIGHT)
         same(found, other)
         assert found.run.stats["changes_by_terms"]["pinocchio"] == 0
 

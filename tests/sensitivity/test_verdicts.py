@@ -56,12 +56,12 @@ def test_connected_parts_that_turn_at_once_have_none(tmp_path: Path) -> None:
 
 def test_a_start_assembled_at_a_stop_has_no_derivative_by_the_stop(tmp_path: Path) -> None:
     scene = sliders(tmp_path, joint("x", restitution=0.5) + force("x", -2.0), upper=0.0)
-    changes = {**TIGHT, "initial": {"at": "assembled"}}
-    found = sensitivities(scene, ["joint.x.lower", "joint.x.upper"], changes)
+    overrides = {**TIGHT, "initial": {"at": "assembled"}}
+    found = sensitivities(scene, ["joint.x.lower", "joint.x.upper"], overrides)
     assert found.run.status == "stopped"
     assert "at the start: x is assembled at its stop, and with another joint.x.upper" in found.run.message
-    assert sensitivities(scene, ["joint.x.lower"], changes).run.status == "done"
-    moved = [simulate(scene, {**changes, "joint.x.upper": h}).q_tree[0, 0] for h in (-1e-3, 1e-3)]
+    assert sensitivities(scene, ["joint.x.lower"], overrides).run.status == "done"
+    moved = [simulate(scene, {**overrides, "joint.x.upper": h}).q_tree[0, 0] for h in (-1e-3, 1e-3)]
     assert moved == pytest.approx([-1e-3, 0.0], abs=1e-12)
 
 
@@ -174,13 +174,13 @@ def test_joints_locked_by_a_force_at_its_limit_have_no_derivative(of: str, formu
     else:
         parameter, more = "joint.x.friction", joint("x", friction=2.0) + force("x", 2.0)
     scene = sliders(tmp_path, more, upper=0.0, q_dot=(0.0, 1.0))
-    changes = {**TIGHT, "formulation": formulation}
-    found = sensitivities(scene, [parameter], changes)
+    overrides = {**TIGHT, "formulation": formulation}
+    found = sensitivities(scene, [parameter], overrides)
     assert found.run.status == "stopped"
     assert f"the force that holds x is at its limit, and with another {parameter}" in found.run.message
     value = 0.0 if of == "force" else 2.0
     above, below = (one_sided(scene, parameter, value, h) for h in (1e-5, -1e-5))
     assert np.abs(above - below).max() > 0.3
-    assert end(sensitivities(scene, ["gravity.y", "initial.q_dot.y"], changes), "initial.q_dot.y") == pytest.approx(
+    assert end(sensitivities(scene, ["gravity.y", "initial.q_dot.y"], overrides), "initial.q_dot.y") == pytest.approx(
         [0.0, 1.0, 0.0, 1.0], abs=1e-9
     )

@@ -37,12 +37,12 @@ class Advice:
     @property
     def options(self) -> list[str]:
         """The setting as options of `ckc run`."""
-        return [] if self.row is None else _options(self.row.changes)
+        return [] if self.row is None else _options(self.row.overrides)
 
     @property
     def removed(self) -> list[str]:
         """Keys to take out of the scene, which no option can."""
-        return [] if self.row is None else [key for key, x in self.row.changes.items() if x is None]
+        return [] if self.row is None else [key for key, x in self.row.overrides.items() if x is None]
 
 
 def advise(rows: Sequence[PrecisionRow], accuracy: float) -> list[Advice]:
@@ -77,5 +77,5 @@ def fastest(rows: Sequence[PrecisionRow], target: float, accuracy: float, progra
     return min(same, key=lambda each: each[:2])[2] if same else None
 
 
-def _options(changes: Mapping[str, Any]) -> list[str]:
-    return [f"{key}={x:.0e}" if isinstance(x, float) else f"{key}={x}" for key, x in changes.items() if x is not None]
+def _options(overrides: Mapping[str, Any]) -> list[str]:
+    return [f"{key}={x:.0e}" if isinstance(x, float) else f"{key}={x}" for key, x in overrides.items() if x is not None]

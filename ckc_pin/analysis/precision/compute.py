@@ -66,7 +66,7 @@ class WorkPrecision:
 
 def work_precision(
     scene: Scene | str | Path,
-    changes: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     *,
     budget: float = BUDGET,
     mjcf: str = "",
@@ -78,7 +78,7 @@ def work_precision(
     ----------
     scene : Scene, str or Path
         A scene, its shipped name or its path.
-    changes : mapping, optional
+    overrides : mapping, optional
         Values by dotted key.
     budget : float
         What it may take, s.
@@ -102,9 +102,9 @@ def work_precision(
     if not (np.isfinite(budget) and budget > 0):
         raise InputError(f"budget = {budget:g}: a number of seconds above zero is needed")
     if not isinstance(scene, Scene):
-        scene = load_scene(scene, changes)
-    elif changes:
-        raise InputError("work_precision: changes go with the name of a scene; a Scene is complete")
+        scene = load_scene(scene, overrides)
+    elif overrides:
+        raise InputError("work_precision: overrides go with the name of a scene; a Scene is complete")
     ready, found = prepare(scene), WorkPrecision(scene.name)
     began = perf_counter()
     try:
@@ -157,7 +157,7 @@ def _ours(
         elif left <= 0:
             motion = no_motion(*LATE)
         else:
-            limited = {**setting.changes(scene), **span, "solver.max_wall_s": min(limit, max(left, 0.01))}
+            limited = {**setting.overrides(scene), **span, "solver.max_wall_s": min(limit, max(left, 0.01))}
             motion, _ = move(changed(scene, limited), min(limit, left))
             if motion.status == "refused":
                 spent[setting.family] = ("refused", motion.reason)
@@ -174,7 +174,7 @@ def _ours(
                 formulation=setting.formulation,
                 method=setting.method,
                 rtol=setting.rtol,
-                changes=setting.changes(scene),
+                overrides=setting.overrides(scene),
             )
         )
     late = sum((row.status, row.reason) == LATE for row in found.rows)
@@ -201,7 +201,7 @@ def _judged(
     formulation: str | None = None,
     rtol: float | None = None,
     dt: float | None = None,
-    changes: dict[str, Any] | None = None,
+    overrides: dict[str, Any] | None = None,
 ) -> PrecisionRow:
     """Return the row of a motion; one that is not whole has no error."""
     whole = motion.status == "done" and len(motion.q_tree) == len(reference.t)
@@ -217,7 +217,7 @@ def _judged(
         method=method,
         rtol=rtol,
         dt=dt,
-        changes=changes or {},
+        overrides=overrides or {},
         status=status,
         reason=reason,
         error=error,
@@ -234,13 +234,13 @@ def _judged(
 
 def _without_w(found: WorkPrecision, scene: Scene, mechanism: Mechanism, reference: Reference) -> None:
     """Tell how far the motion with w = 0 is from the SPF's: a difference of models, which is in no row's error."""
-    changes = {
+    overrides = {
         **on_span(scene, reference.t_end, reference.dt),
         "initial.w": None,
         "formulation": "reduced",
         "solver.rtol": 1e-10,
     }
-    motion, _ = move(changed(scene, changes), 1.0, most=1)
+    motion, _ = move(changed(scene, overrides), 1.0, most=1)
     found.notes.append("the scene starts off phi = 0, where only the SPF can: compared with the SPF's own flow")
     if motion.status == "done":
         found.model_difference = float(apart(mechanism.tree, motion, reference.motion).scaled.max())

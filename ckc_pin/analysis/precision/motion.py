@@ -73,7 +73,7 @@ class PrecisionRow:
     method : str
     rtol, dt : float or None
         The tolerance, or the step, s.
-    changes : dict
+    overrides : dict
         The setting as values of the scene by dotted key; None: the key is to be taken out.
     status, reason, rhs, steps, used, wall_s, setup_s
         As in `Motion`.
@@ -90,7 +90,7 @@ class PrecisionRow:
     method: str
     rtol: float | None
     dt: float | None
-    changes: Mapping[str, Any]
+    overrides: Mapping[str, Any]
     status: str
     reason: str
     error: float | None
@@ -130,7 +130,7 @@ def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
 
 
 def on_span(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
-    """Return the changes that make all runs of a scene comparable: one span, its instants, no event that ends it."""
+    """Return the overrides that make all runs of a scene comparable: one span, its instants, no event that ends it."""
     events = [{**event, "stop": False} for event in scene.to_dict().get("event", [])]
     return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
 

@@ -94,7 +94,7 @@ def precision_markdown(every: Sequence[WorkPrecision], figures: Mapping[int, str
 
 def precision_csv(every: Sequence[WorkPrecision]) -> str:
     """Return all rows of comparisons as CSV; what there is not is empty."""
-    names = [field.name for field in fields(PrecisionRow) if field.name != "changes"]
+    names = [field.name for field in fields(PrecisionRow) if field.name != "overrides"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["scene", *names])

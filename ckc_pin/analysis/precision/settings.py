@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from ckc_pin.scene.scene import Scene, make_scene, with_changes
+from ckc_pin.scene.scene import Scene, apply_overrides, make_scene
 
 __all__ = ["FORMULATIONS", "Setting", "changed", "off_manifold", "settings"]
 
@@ -42,7 +42,7 @@ class Setting:
         """All but the tolerance."""
         return self.formulation, self.method
 
-    def changes(self, scene: Scene) -> dict[str, Any]:
+    def overrides(self, scene: Scene) -> dict[str, Any]:
         """Values of the scene by dotted key, those that a person would give with --set."""
         found = {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
         if scene.spec.solver.atol is not None:  # the scene's own goes with one rtol
@@ -72,6 +72,6 @@ def off_manifold(scene: Scene) -> bool:
     return any(scene.spec.initial.w or [])
 
 
-def changed(scene: Scene, changes: Mapping[str, Any]) -> Scene:
+def changed(scene: Scene, overrides: Mapping[str, Any]) -> Scene:
     """Return a scene with values replaced by dotted key; None removes a key."""
-    return make_scene(with_changes(scene.to_dict(), changes), scene.name, scene.sources)
+    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)

@@ -116,10 +116,10 @@ class Growth:
     reason: str = ""
 
 
-def measure(case: Case, family: Family, formulation: str, changes: Mapping[str, Any] | None = None) -> Growth:
+def measure(case: Case, family: Family, formulation: str, overrides: Mapping[str, Any] | None = None) -> Growth:
     """Time a right-hand side of a case, and count those of a run, all with the terms that every size can have."""
     row = Growth(family.key, formulation, getattr(case, family.along))
-    every = {**FORMULATIONS[formulation], "solver.method": "DOP853", "solver.terms": "pinocchio", **(changes or {})}
+    every = {**FORMULATIONS[formulation], "solver.method": "DOP853", "solver.terms": "pinocchio", **(overrides or {})}
     try:
         with tempfile.TemporaryDirectory() as folder:
             ready = prepare(load_scene(written(case, Path(folder)), every))

@@ -54,8 +54,8 @@ MODULES: Modules = {
 RUN = """
 import json, resource, sys
 import ckc_pin
-scene, changes = json.loads(sys.argv[1])
-ckc_pin.simulate(scene, changes)
+scene, overrides = json.loads(sys.argv[1])
+ckc_pin.simulate(scene, overrides)
 """
 LOADED = RUN + "print(json.dumps([name for name in json.loads(sys.argv[2]) if name in sys.modules]))"
 SWITCHED_ON = (
@@ -170,10 +170,10 @@ def _interpreter(code: str, *words: str) -> str:
     return done.stdout.splitlines()[-1]
 
 
-def terms_of(scene: str, changes: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
+def terms_of(scene: str, overrides: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
     """Measure what each term would cost beside a scene's right-hand side, at states of its motion."""
     try:
-        loaded = load_scene(scene, {**(changes or {}), "t_end": BRIEF})
+        loaded = load_scene(scene, {**(overrides or {}), "t_end": BRIEF})
         evaluated, ivp = _evaluated(loaded), as_ivp(loaded)
         states = _motion(ivp)
     except CkcError as error:

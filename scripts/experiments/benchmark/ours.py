@@ -48,7 +48,7 @@ def used_up(row: Row) -> bool:
 def compute(work: Work, setting: Setting, budget: float) -> Motion:
     """Run a work, stopped after a budget in s; its reason names the method that "auto" took."""
     scene = work.load()
-    limited = changed(scene, {**setting.changes(scene), "solver.terms": work.terms, "solver.max_wall_s": budget})
+    limited = changed(scene, {**setting.overrides(scene), "solver.terms": work.terms, "solver.max_wall_s": budget})
     motion, _ = move(limited, budget, fewest=2)
     if motion.status == "done":
         return replace(motion, reason=motion.used)

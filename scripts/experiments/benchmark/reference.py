@@ -72,7 +72,7 @@ def _row_of_squares(work: Work) -> Reference:
     """
     from scipy.special import ellipj, ellipk
 
-    N = int(work.changes["mechanism.N"])
+    N = int(work.overrides["mechanism.N"])
     k = GRAVITY * 3 * (3 * N + 1) / (2 * (4 * N + 1))
     stretch = np.sqrt(1 + 4 * k)
     m = 4 * k / (1 + 4 * k)  # Jacobi's imaginary transformation of -4 k

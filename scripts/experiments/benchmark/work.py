@@ -41,7 +41,7 @@ class Work:
     scene : str
     t_end : float
         s.
-    changes : mapping
+    overrides : mapping
         Values of the scene by dotted key.
     point : str or None
         The mechanism's point whose position is compared; None: all coordinates.
@@ -55,7 +55,7 @@ class Work:
     says: str
     scene: str
     t_end: float
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    overrides: Mapping[str, Any] = field(default_factory=dict)
     point: str | None = None
     quick: bool = False
     planar: bool = True
@@ -64,7 +64,7 @@ class Work:
         """Return the scene, with values of its solver and formulation: load(formulation="dae", solver__rtol=1e-6)."""
         own = {name.replace("__", "."): value for name, value in solver.items()}
         return load_scene(
-            self.scene, {**self.changes, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **own}
+            self.scene, {**self.overrides, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **own}
         )
 
     @cached_property

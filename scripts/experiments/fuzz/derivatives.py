@@ -49,7 +49,7 @@ class Draw:
     seed: int
     kind: str
     scene: Path
-    changes: dict[str, Any]
+    overrides: dict[str, Any]
     parameters: dict[str, float]  # name, and the value that it has
 
 
@@ -125,20 +125,20 @@ def draw(seed: int, folder: Path) -> Draw:
     moves = (random.random(mechanism.d) < 0.7) * (random.random() < 0.8)
     unit = reach[mechanism.partition.q]
     rates = (random.normal(size=mechanism.d) * moves * unit / pace).tolist()
-    changes: dict[str, Any] = {
+    overrides: dict[str, Any] = {
         "initial": {"q_dot": dict(zip(mechanism.independent, rates, strict=True))},
         "t_end": float(0.6 * pace * 10 ** random.uniform(-1, 0)),
         "formulation": "dae" if mechanism.splits_root else str(random.choice(["dae", "reduced"])),
         **LIMIT,
     }
-    changes["solver.output_dt"] = changes["t_end"] / INSTANTS
+    overrides["solver.output_dt"] = overrides["t_end"] / INSTANTS
     if mechanism.splits_root or random.random() < 0.4:
-        changes["initial"]["at"] = "assembled"
+        overrides["initial"]["at"] = "assembled"
     else:
         start = mechanism.independent_part(mechanism.q_tree).tolist()
-        changes["initial"]["q"] = dict(zip(mechanism.independent, start, strict=True))
-    parameters = _parameters(random, mechanism, changes["initial"]) if _scale(mechanism)[1] else {}
-    return Draw(seed, made.kind, folder, changes, parameters)
+        overrides["initial"]["q"] = dict(zip(mechanism.independent, start, strict=True))
+    parameters = _parameters(random, mechanism, overrides["initial"]) if _scale(mechanism)[1] else {}
+    return Draw(seed, made.kind, folder, overrides, parameters)
 
 
 def _parameters(random: np.random.Generator, mechanism: Mechanism, initial: Mapping[str, Any]) -> dict[str, float]:
@@ -212,9 +212,9 @@ def judge_columns(drawn: Draw) -> list[JudgedColumn]:
     """Ask for each parameter by itself and for all together, and compare with differences."""
     if not drawn.parameters:
         return []
-    changes = {**drawn.changes, "solver.rtol": RTOL_RUNS}
+    overrides = {**drawn.overrides, "solver.rtol": RTOL_RUNS}
     try:
-        run = ckc_pin.simulate(drawn.scene, changes)
+        run = ckc_pin.simulate(drawn.scene, overrides)
     except CkcError as error:
         return [_column(drawn, name, f"no run: {error}") for name in drawn.parameters]
     if run.status != "done":
@@ -224,7 +224,7 @@ def judge_columns(drawn: Draw) -> list[JudgedColumn]:
 
 
 def _column(drawn: Draw, name: str, verdict: str, judged: str = "undecided", **more: Any) -> JudgedColumn:
-    return JudgedColumn(drawn.seed, drawn.kind, drawn.changes["formulation"], name, verdict, judged, **more)
+    return JudgedColumn(drawn.seed, drawn.kind, drawn.overrides["formulation"], name, verdict, judged, **more)
 
 
 def _together(drawn: Draw, columns: Sequence[JudgedColumn]) -> list[JudgedColumn]:
@@ -233,7 +233,7 @@ def _together(drawn: Draw, columns: Sequence[JudgedColumn]) -> list[JudgedColumn
     if any(verdict not in ("derivative", "none") for verdict in alone):
         return []
     try:
-        found = ckc_pin.sensitivities(drawn.scene, list(drawn.parameters), {**drawn.changes, "solver.rtol": RTOL})
+        found = ckc_pin.sensitivities(drawn.scene, list(drawn.parameters), {**drawn.overrides, "solver.rtol": RTOL})
     except CkcError as error:
         return [_column(drawn, "all", f"refused: {error}")]
     verdict, expected = _verdict(found), "none" if "none" in alone else "derivative"
@@ -261,7 +261,7 @@ def _scale(mechanism: Mechanism) -> tuple[Array, Sequence[int]]:
 
 def _judge(drawn: Draw, name: str, run: ckc_pin.Run) -> JudgedColumn:
     try:
-        found = ckc_pin.sensitivities(drawn.scene, [name], {**drawn.changes, "solver.rtol": RTOL})
+        found = ckc_pin.sensitivities(drawn.scene, [name], {**drawn.overrides, "solver.rtol": RTOL})
     except CkcError as error:
         return _column(drawn, name, f"refused: {error}")
     verdict, note = _verdict(found), found.run.message
@@ -274,9 +274,9 @@ def _judge(drawn: Draw, name: str, run: ckc_pin.Run) -> JudgedColumn:
             t = float(found.run.t[-1])
             t_end = t + 1e-3 * (run.t[-1] - t)
             drawn = Draw(
-                drawn.seed, drawn.kind, drawn.scene, {**drawn.changes, "t_end": t_end, "solver.output_dt": t_end}, {}
+                drawn.seed, drawn.kind, drawn.scene, {**drawn.overrides, "t_end": t_end, "solver.output_dt": t_end}, {}
             )
-            here = ckc_pin.simulate(drawn.scene, {**drawn.changes, "solver.rtol": RTOL_RUNS})
+            here = ckc_pin.simulate(drawn.scene, {**drawn.overrides, "solver.rtol": RTOL_RUNS})
             sides = _sides(drawn, name, at, here)
     except _OneSideOnly as error:
         return _column(drawn, name, verdict, note=f"{note}; {error}")
@@ -331,7 +331,7 @@ def _side(drawn: Draw, name: str, at: float, h: float, base: ckc_pin.Run) -> _Si
 
 def _difference(drawn: Draw, name: str, at: float, h: float, base: ckc_pin.Run) -> Array:
     try:
-        run = ckc_pin.simulate(drawn.scene, {**drawn.changes, "solver.rtol": RTOL_RUNS, name: at + h})
+        run = ckc_pin.simulate(drawn.scene, {**drawn.overrides, "solver.rtol": RTOL_RUNS, name: at + h})
     except CkcError as error:
         raise _OneSideOnly(f"{name} {h:+.2g}: {error}") from error
     if run.status != "done":

@@ -97,20 +97,20 @@ def beside_a_turn(motion: Motion, coordinates: Sequence[str]) -> str:
     values. "" where that is right, or where the coordinate does not turn.
     """
     random = np.random.default_rng([motion.seed, 5])
-    changes = {key: value for key, value in motion.changes.items() if key != "event"} | {"controller": None}
-    changes["solver.rtol"] = min(TIGHT, changes["solver.rtol"])
+    overrides = {key: value for key, value in motion.overrides.items() if key != "event"} | {"controller": None}
+    overrides["solver.rtol"] = min(TIGHT, overrides["solver.rtol"])
     single = [name for name in coordinates if "." not in name]  # a free root's rates are not those of its coordinates
     if not single:
         return ""
     name = str(random.choice(single))
     rest = {"of": "q_dot", "coordinate": name, "value": 0.0}
     try:
-        to_turn = ckc_pin.simulate(motion.scene, {**changes, "event": [{**rest, "stop": True}]})
+        to_turn = ckc_pin.simulate(motion.scene, {**overrides, "event": [{**rest, "stop": True}]})
         values = _beside(to_turn, name)
         if values is None:
             return ""
         asked = [{"of": "q", "coordinate": name, "value": value} for value in values]
-        run = ckc_pin.simulate(motion.scene, {**changes, "event": [rest, *asked]})
+        run = ckc_pin.simulate(motion.scene, {**overrides, "event": [rest, *asked]})
     except CkcError:
         return ""
     return on_both_sides(run, name, float(to_turn.t[-1]), *values)

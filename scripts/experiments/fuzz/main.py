@@ -59,11 +59,11 @@ def one(seed: int, kind: str, name: str | None = None) -> Record:
 
 
 def show(seed: int, kind: str, name: str | None, *, shrunk: bool = False) -> None:
-    """One seed at length: its scene, its changes, its record."""
+    """One seed at length: its scene, its overrides, its record."""
     with drawn(seed, kind, name) as motion:
         motion = shrink(motion) if shrunk else motion
-        print(f"{motion.mechanism}: ckc_pin.simulate({motion.scene!r}, changes) with changes =")
-        pprint.pp(motion.changes, width=118, sort_dicts=False)
+        print(f"{motion.mechanism}: ckc_pin.simulate({motion.scene!r}, overrides) with overrides =")
+        pprint.pp(motion.overrides, width=118, sort_dicts=False)
         if kind == "random":
             for file in sorted(Path(motion.scene).iterdir()):
                 print(f"--- {file.name}\n{file.read_text(encoding='utf-8')}")

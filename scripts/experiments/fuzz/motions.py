@@ -1,4 +1,4 @@
-"""Random motions: start, speed, tolerance, formulation, events and control of a mechanism, as a scene's changes."""
+"""Random motions: start, speed, tolerance, formulation, events and control of a mechanism, as a scene's overrides."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Motion:
     seed: int
     mechanism: str
     scene: str
-    changes: dict[str, Any]
+    overrides: dict[str, Any]
 
 
 def shipped_motion(seed: int, name: str | None = None) -> Motion:
@@ -63,7 +63,7 @@ def shipped_motion(seed: int, name: str | None = None) -> Motion:
     weights = np.array([shipped.weight for shipped in SHIPPED.values()])
     drawn = str(random.choice(list(SHIPPED), p=weights / weights.sum()))
     name = name or drawn
-    return Motion(seed, name, SHIPPED[name].scene, _changes(random, ckc_pin.load(name), SHIPPED[name]))
+    return Motion(seed, name, SHIPPED[name].scene, _overrides(random, ckc_pin.load(name), SHIPPED[name]))
 
 
 def random_motion(seed: int, folder: Path) -> Motion:
@@ -72,11 +72,11 @@ def random_motion(seed: int, folder: Path) -> Motion:
     made = random_mechanism(seed)
     made.write(folder)
     about = _Shipped("", t_end=2.0, spread=1.0)
-    return Motion(seed, made.kind, str(folder), _changes(random, ckc_pin.load(folder), about))
+    return Motion(seed, made.kind, str(folder), _overrides(random, ckc_pin.load(folder), about))
 
 
-def _changes(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> dict[str, Any]:
-    changes: dict[str, Any] = {
+def _overrides(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> dict[str, Any]:
+    overrides: dict[str, Any] = {
         "formulation": str(random.choice(["reduced", "spf", "dae"])),
         "t_end": float(about.t_end * 10 ** random.uniform(-1, 0)),
         "solver.rtol": float(10 ** random.uniform(-10, -2)),
@@ -84,28 +84,28 @@ def _changes(random: np.random.Generator, mechanism: Mechanism, about: _Shipped)
         **BUDGET,
     }
     if mechanism.splits_root:
-        changes["formulation"] = "dae"
+        overrides["formulation"] = "dae"
     if random.random() < 0.2:
-        changes["solver.method"] = str(random.choice(["DOP853", "RK45", "Radau"]))
+        overrides["solver.method"] = str(random.choice(["DOP853", "RK45", "Radau"]))
     q, q_dot = _start(random, mechanism, about)
-    changes["initial"] = {"q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))}
+    overrides["initial"] = {"q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))}
     if q is None:
-        changes["initial"]["at"] = "assembled"
+        overrides["initial"]["at"] = "assembled"
     else:
-        changes["initial"]["q"] = dict(zip(mechanism.independent, q.tolist(), strict=True))
-    if changes["formulation"] == "spf":
-        changes["epsilon"] = float(10 ** random.uniform(-8, -1))
+        overrides["initial"]["q"] = dict(zip(mechanism.independent, q.tolist(), strict=True))
+    if overrides["formulation"] == "spf":
+        overrides["epsilon"] = float(10 ** random.uniform(-8, -1))
         if random.random() < 0.05 and not mechanism.redundant:
-            changes["initial"]["w"] = (random.uniform(-1, 1, mechanism.closure.rows) * 1e-3 * mechanism.size).tolist()
+            overrides["initial"]["w"] = (random.uniform(-1, 1, mechanism.closure.rows) * 1e-3 * mechanism.size).tolist()
     if random.random() < 1 / 3:
-        changes["event"] = _events(random, mechanism, q, q_dot)
+        overrides["event"] = _events(random, mechanism, q, q_dot)
     if q is not None and not mechanism.rooted and random.random() < 0.12:
-        changes["controller"] = _controller(random, mechanism, q)
-        if "sample_time" in changes["controller"]:  # every change of u is at an output instant
-            changes["solver.output_dt"] = changes["controller"]["sample_time"] / PER_SAMPLE
+        overrides["controller"] = _controller(random, mechanism, q)
+        if "sample_time" in overrides["controller"]:  # every change of u is at an output instant
+            overrides["solver.output_dt"] = overrides["controller"]["sample_time"] / PER_SAMPLE
     else:
-        changes["controller"] = None
-    return changes
+        overrides["controller"] = None
+    return overrides
 
 
 def _start(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> tuple[Array | None, Array]:

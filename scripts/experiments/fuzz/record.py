@@ -80,14 +80,15 @@ FIELDS = [field.name for field in fields(Record)]
 
 def run_motion(motion: Motion, *, thorough: bool = False) -> tuple[Record, Run | None]:
     """Run a motion and judge it, thoroughly by further runs too; what comes out but a CkcError is a finding."""
-    changes = motion.changes
+    overrides = motion.overrides
     record = Record(
-        motion.seed, motion.mechanism, motion.scene, changes["formulation"], changes.get("solver.method", "auto"),
-        changes["solver.rtol"], changes["t_end"], changes.get("controller") is not None, len(changes.get("event", [])),
+        motion.seed, motion.mechanism, motion.scene, overrides["formulation"], overrides.get("solver.method", "auto"),
+        overrides["solver.rtol"], overrides["t_end"], overrides.get("controller") is not None,
+        len(overrides.get("event", [])),
     )  # fmt: skip
     started = perf_counter()
     try:
-        run = ckc_pin.simulate(motion.scene, changes)
+        run = ckc_pin.simulate(motion.scene, overrides)
     except CkcError as error:
         record.status, record.message, record.verdict = "refused", str(error), "refused"
         record.seconds = perf_counter() - started
@@ -118,7 +119,7 @@ def _judge(record: Record, run: Run, motion: Motion, thorough: bool) -> None:
     if finite and not run.max_phi <= allowed:
         wrong = f"open by {run.max_phi:.2g}"
     if finite:
-        wrong = wrong or between_rows(run, motion.changes.get("event", []))
+        wrong = wrong or between_rows(run, motion.overrides.get("event", []))
     if finite and not run.w.any() and len(run.t) > 1:
         try:
             if mechanism.joints.friction.any():
@@ -137,7 +138,7 @@ def _judge(record: Record, run: Run, motion: Motion, thorough: bool) -> None:
 
 def _pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
     """Judge some pieces; what is wrong with them, if anything."""
-    model, rtol, controller = judge.model, record.rtol, motion.changes.get("controller")
+    model, rtol, controller = judge.model, record.rtol, motion.overrides.get("controller")
     conservative = model.conservative and controller is None
     order = [run.coordinates.index(label) for label in model.labels]
     q, v = run.q_tree[:, order], run.v_tree[:, order]
@@ -155,7 +156,7 @@ def _pieces(record: Record, run: Run, motion: Motion, judge: Judge) -> str:
         record.jump = float(np.abs(np.diff(total)).max() / scale)
     rows, acting = np.arange(len(run.t)), None
     if controller is not None:
-        rows, acting = joint_forces(controller, model, run, motion.changes["solver.output_dt"])
+        rows, acting = joint_forces(controller, model, run, motion.overrides["solver.output_dt"])
     q, v, t = q[rows], v[rows], run.t[rows]
     chosen = _choose(np.random.default_rng([motion.seed, 4]), total if conservative else None, v)
     acting = None if acting is None else acting[chosen]

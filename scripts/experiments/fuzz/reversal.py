@@ -23,7 +23,7 @@ def reversal(run: Run, motion: Motion, judge: Judge, order: Sequence[int], doubt
     A way that magnifies errors much itself is left out, as pieces are: where it is off by more than `doubtful` rtol
     the judge goes it too. So is one that stops.
     """
-    rtol = motion.changes["solver.rtol"]
+    rtol = motion.overrides["solver.rtol"]
     then = max(0, len(run.t) - 1 - INSTANTS)
     span = float(run.t[-1] - run.t[then])
     if span <= 0:
@@ -34,9 +34,9 @@ def reversal(run: Run, motion: Motion, judge: Judge, order: Sequence[int], doubt
         "q": {name: float(run.q_tree[-1, k]) for name, k in at.items()},
         "q_dot": {name: -float(run.v_tree[-1, at[name]]) for name in run.independent},
     }
-    changes = {**motion.changes, "initial": initial, "t_end": span, "event": [], "solver.output_dt": span}
+    overrides = {**motion.overrides, "initial": initial, "t_end": span, "event": [], "solver.output_dt": span}
     try:
-        back = ckc_pin.simulate(motion.scene, changes)
+        back = ckc_pin.simulate(motion.scene, overrides)
     except CkcError:
         return np.nan
     if back.status != "done":

@@ -25,9 +25,9 @@ def shrink(motion: Motion) -> Motion:
     again = record.verdict != "done" or record.gross
     while again and trials < MOST_TRIALS:
         again = False
-        for changes in _smaller(motion.changes, record, run):
+        for overrides in _smaller(motion.overrides, record, run):
             trials += 1
-            smaller = replace(motion, changes=changes)
+            smaller = replace(motion, overrides=overrides)
             found, its_run = run_motion(smaller, thorough=True)
             if _kind(found) == wanted:
                 motion, record, run, again = smaller, found, its_run, True
@@ -41,35 +41,35 @@ def _kind(record: Record) -> tuple[str, bool, str]:
     return record.verdict, record.off, re.sub(r"-?\d[\d.e+-]*", "#", said)[:40]
 
 
-def _smaller(changes: Mapping[str, Any], record: Record, run: Run | None) -> Iterator[dict[str, Any]]:
-    """Smaller changes, the boldest first."""
-    for key in changes:
+def _smaller(overrides: Mapping[str, Any], record: Record, run: Run | None) -> Iterator[dict[str, Any]]:
+    """Simpler overrides, the boldest first."""
+    for key in overrides:
         if key not in NEEDED:
-            yield {k: x for k, x in changes.items() if k != key}
-    if changes.get("controller") is not None:
-        yield {**changes, "controller": None}
-    if len(changes.get("event", [])) > 1:
-        for k in range(len(changes["event"])):
-            yield {**changes, "event": [changes["event"][k]]}
+            yield {k: x for k, x in overrides.items() if k != key}
+    if overrides.get("controller") is not None:
+        yield {**overrides, "controller": None}
+    if len(overrides.get("event", [])) > 1:
+        for k in range(len(overrides["event"])):
+            yield {**overrides, "event": [overrides["event"][k]]}
     if run is not None and record.worst_t == record.worst_t:
-        end = record.worst_t + 2 * changes["solver.output_dt"]
-        if end < 0.95 * changes["t_end"]:
-            yield {**changes, "t_end": end}
+        end = record.worst_t + 2 * overrides["solver.output_dt"]
+        if end < 0.95 * overrides["t_end"]:
+            yield {**overrides, "t_end": end}
         for part in (0.98, 0.9, 0.7, 0.5, 0.3):
             k = run.at(part * record.worst_t)
-            if run.t[k] > 0.1 * changes["t_end"]:
-                yield {**changes, "initial": _state(run, k), "t_end": changes["t_end"] - float(run.t[k])}
-    if changes["t_end"] != (short := float(f"{changes['t_end']:.2g}")):
-        yield {**changes, "t_end": short}
-    if changes["solver.rtol"] != (round_ := float(f"{changes['solver.rtol']:.0e}")):
-        yield {**changes, "solver.rtol": round_}
+            if run.t[k] > 0.1 * overrides["t_end"]:
+                yield {**overrides, "initial": _state(run, k), "t_end": overrides["t_end"] - float(run.t[k])}
+    if overrides["t_end"] != (short := float(f"{overrides['t_end']:.2g}")):
+        yield {**overrides, "t_end": short}
+    if overrides["solver.rtol"] != (round_ := float(f"{overrides['solver.rtol']:.0e}")):
+        yield {**overrides, "solver.rtol": round_}
     for digits in (2, 3, 4, 6):
         for table in ("q", "q_dot"):
-            initial = deepcopy(dict(changes["initial"]))
+            initial = deepcopy(dict(overrides["initial"]))
             if table in initial:
                 initial[table] = {name: float(f"{x:.{digits}g}") for name, x in initial[table].items()}
-                if initial != changes["initial"]:
-                    yield {**changes, "initial": initial}
+                if initial != overrides["initial"]:
+                    yield {**overrides, "initial": initial}
 
 
 def _state(run: Run, k: int) -> dict[str, Any]:

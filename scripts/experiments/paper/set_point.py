@@ -51,7 +51,7 @@ ROWS: dict[str, dict[str, Any]] = {
 def claims(figures: Path) -> list[Claim]:
     """Run the experiments on eqs. 14 and 15, write their figures into a folder, return the claims."""
     runs = {name: along_run({**DENSE, **how}) for name, how in FORMULATIONS.items()}
-    cases = {name: load_case(changes) for name, changes in ROWS.items()}
+    cases = {name: load_case(overrides) for name, overrides in ROWS.items()}
     certificates = {name: (case, case.certificate(DIVISIONS)) for name, case in cases.items()}
     case, own = next(iter(certificates.values()))
     first_run = next(iter(runs.values()))[0]

@@ -70,7 +70,7 @@ class Case:
         return certify(self.mechanism, self.controller, self.start, divisions)
 
 
-def load_case(changes: Mapping[str, Any] | None = None, scene: str | Path = SCENE) -> Case:
+def load_case(overrides: Mapping[str, Any] | None = None, scene: str | Path = SCENE) -> Case:
     """Load a set-point scene, with values replaced by dotted key.
 
     Raises
@@ -78,7 +78,7 @@ def load_case(changes: Mapping[str, Any] | None = None, scene: str | Path = SCEN
     InputError
         The scene has no set-point controller.
     """
-    loaded = load_scene(scene, changes)
+    loaded = load_scene(scene, overrides)
     mechanism = scene_mechanism(loaded)
     controller = scene_controller(loaded, mechanism)
     if not isinstance(controller, SetPoint):
@@ -86,10 +86,10 @@ def load_case(changes: Mapping[str, Any] | None = None, scene: str | Path = SCEN
     return Case(mechanism, controller, find_start(mechanism, loaded))
 
 
-def along_run(changes: Mapping[str, Any], scene: str | Path = SCENE) -> tuple[Run, Record]:
+def along_run(overrides: Mapping[str, Any], scene: str | Path = SCENE) -> tuple[Run, Record]:
     """Run a scene and compare V_L's rate with -q_dot^T K_V q_dot."""
-    case = load_case(changes, scene)
-    run = simulate(scene, changes)
+    case = load_case(overrides, scene)
+    run = simulate(scene, overrides)
     q_dot = run.v_tree[:, [run.column(name) for name in run.independent]]
     return run, record(run, lambda k: -float(q_dot[k] @ case.controller.K_V @ q_dot[k]))
 

@@ -47,14 +47,14 @@ WHOLE = {"solver.method": "Radau", "solver.rtol": 1e-9, "solver.output_dt": 0.01
 PERIODS = 4
 
 
-def lyapunov_along(changes: Mapping[str, Any], since: float = 0.0, scene: str = SCENE) -> Record:
+def lyapunov_along(overrides: Mapping[str, Any], since: float = 0.0, scene: str = SCENE) -> Record:
     """Run a tracking scene and compare eq. 18's function with the rate that eq. 19's last line gives it.
 
     With d_1 = d_2 = 1, M = I and errors' rates where eq. 19 prints rates.
 
     Parameters
     ----------
-    changes : mapping
+    overrides : mapping
         Values of the scene by dotted key.
     since : float
         Where the record begins, s.
@@ -67,7 +67,7 @@ def lyapunov_along(changes: Mapping[str, Any], since: float = 0.0, scene: str = 
     NumericalError
         The run does not get to its end.
     """
-    loaded = load_scene(scene, changes)
+    loaded = load_scene(scene, overrides)
     controller = _tracking(loaded)
     run = simulate(loaded)
     if run.status != "done":

@@ -16,7 +16,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.scene.scene import make_scene, with_changes
+from ckc_pin.scene.scene import apply_overrides, make_scene
 from scripts.experiments.stability.planar import Planar
 from scripts.experiments.stability.reference import Reference
 
@@ -39,7 +39,7 @@ class How:
     printed: bool = False
 
     @property
-    def changes(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """As a scene's keys."""
         return {
             "formulation": self.formulation,
@@ -63,7 +63,7 @@ class Case:
     group, name : str
     mechanism : Planar, str or table
         Written into a folder for the run, shipped, or made by rule.
-    changes : mapping
+    overrides : mapping
         The rest of the scene, by dotted key.
     reference : Reference
     how : tuple of How
@@ -74,7 +74,7 @@ class Case:
     group: str
     name: str
     mechanism: Planar | str | Mapping[str, Any]
-    changes: Mapping[str, Any]
+    overrides: Mapping[str, Any]
     reference: Reference
     how: tuple[How, ...]
     conserves: bool = True
@@ -127,8 +127,8 @@ def run_case(case: Case) -> list[Cell]:
         if isinstance(mechanism, Planar):
             mechanism.write(Path(folder))
             mechanism = "mechanism.toml"
-        data = with_changes({"mechanism": mechanism}, {**BUDGET, **case.changes})
-        return [_run_cell(case, how, with_changes(data, how.changes), Path(folder)) for how in case.how]
+        data = apply_overrides({"mechanism": mechanism}, {**BUDGET, **case.overrides})
+        return [_run_cell(case, how, apply_overrides(data, how.overrides), Path(folder)) for how in case.how]
 
 
 def _run_cell(case: Case, how: How, data: dict[str, Any], folder: Path) -> Cell:

@@ -17,7 +17,7 @@ __all__ = ["LONG", "LongRun", "long_run"]
 RTOL = 1e-10
 T_END = 1000.0
 OUTPUT_DT = 0.1
-# name, formulation, changes of five_bar/swing
+# name, formulation, overrides of five_bar/swing
 LONG: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("swing", "reduced", {}),
     ("swing", "spf", {}),
@@ -53,10 +53,10 @@ class LongRun:
     outcome: str
 
 
-def long_run(name: str, formulation: str, changes: dict[str, Any], t_end: float = T_END) -> LongRun:
+def long_run(name: str, formulation: str, overrides: dict[str, Any], t_end: float = T_END) -> LongRun:
     """Run one of `LONG`, or a shorter part of it."""
     every = {"t_end": t_end, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT, "formulation": formulation}
-    run = simulate("five_bar/swing", {**every, **changes})
+    run = simulate("five_bar/swing", {**every, **overrides})
     kinetic = kinetic_energies(run)
     drift = np.abs(run.energy - run.energy[0]).max() / (kinetic.max() - kinetic.min())
     return LongRun(

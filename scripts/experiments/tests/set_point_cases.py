@@ -30,9 +30,9 @@ class Given(NamedTuple):
     start: Start
 
 
-def given(changes: Mapping[str, Any] | None = None) -> Given:
+def given(overrides: Mapping[str, Any] | None = None) -> Given:
     """The five-bar's set-point scene with values replaced by dotted key."""
-    loaded = load_scene("five_bar/set_point", changes)
+    loaded = load_scene("five_bar/set_point", overrides)
     mechanism = scene_mechanism(loaded)
     controller = scene_controller(loaded, mechanism)
     assert isinstance(controller, SetPoint)

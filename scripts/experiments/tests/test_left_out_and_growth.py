@@ -112,9 +112,9 @@ def test_a_case_is_counted_and_timed() -> None:
         assert row.rhs > 50
 
 
-@pytest.mark.parametrize(("changes", "timed"), [({"solver.max_rhs": 20}, True), ({"formulation": "none"}, False)])
-def test_a_case_that_fails_says_why(changes: dict[str, object], timed: bool) -> None:
-    row = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", changes)
+@pytest.mark.parametrize(("overrides", "timed"), [({"solver.max_rhs": 20}, True), ({"formulation": "none"}, False)])
+def test_a_case_that_fails_says_why(overrides: dict[str, object], timed: bool) -> None:
+    row = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", overrides)
     assert row.rhs is None
     assert (row.rhs_s is not None) == timed
     assert row.reason

@@ -149,9 +149,9 @@ def test_every_formulation_is_measured_by_every_method() -> None:
     assert len(quick) == 4 * len(ours.QUICK_TOLERANCES)
     assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.FEW))
     assert {setting.method for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
-    assert {setting.changes(scene).get("spf_coordinates") for setting in full} == {None, "w", "z"}
+    assert {setting.overrides(scene).get("spf_coordinates") for setting in full} == {None, "w", "z"}
     for setting in full:
-        assert changed(scene, setting.changes(scene))
+        assert changed(scene, setting.overrides(scene))
 
 
 def test_a_setting_is_read_back_from_its_name() -> None:
@@ -272,7 +272,7 @@ def test_terms_written_out_are_paid_for_by_motion() -> None:
     assert None not in (found.compile_s, found.written_s, found.general_s, found.pays_s)
     assert found.written_s < found.general_s
     assert found.pays_s * (found.general_s - found.written_s) == pytest.approx(found.compile_s * SHORT.t_end)
-    large = written_out(replace(EVERY["n_four_bar_40"], changes={"mechanism.N": 80}), 1.5)
+    large = written_out(replace(EVERY["n_four_bar_40"], overrides={"mechanism.N": 80}), 1.5)
     assert "terms are written out for trees of up to 130" in large.refused
     assert large.compile_s is None
 

@@ -119,12 +119,12 @@ def test_the_files_that_are_written_are_the_shipped_five_bar(tmp_path: Path) -> 
 SHORT = {"initial.q": {"theta_1": SWING[0], "theta_3": SWING[1]}, "t_end": 0.2, "solver.output_dt": 0.1}
 
 
-def judge(reference: ByHand, how: How = EVERY[2], **changes: object) -> Cell:
+def judge(reference: ByHand, how: How = EVERY[2], **overrides: object) -> Cell:
     case = Case(
         "method",
         "short",
         "five_bar",
-        {**SHORT, **{k.replace("__", "."): v for k, v in changes.items()}},
+        {**SHORT, **{k.replace("__", "."): v for k, v in overrides.items()}},
         reference,
         (how,),
     )
@@ -255,17 +255,17 @@ def test_a_start_that_is_singular_to_rounding_is_refused() -> None:
 
 def test_a_bad_q_is_left_before_the_first_step() -> None:
     case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-04 away")
-    assert run_case(replace(case, changes={**case.changes, "solver.max_rhs": 1}, how=EVERY[:1]))[0].switches == 1
+    assert run_case(replace(case, overrides={**case.overrides, "solver.max_rhs": 1}, how=EVERY[:1]))[0].switches == 1
 
 
 # --- long runs -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "formulation", "changes"), LONG[2:], ids=["swing", "across type 2"])
-def test_part_of_a_long_run(name: str, formulation: str, changes: dict[str, object]) -> None:
+@pytest.mark.parametrize(("name", "formulation", "overrides"), LONG[2:], ids=["swing", "across type 2"])
+def test_part_of_a_long_run(name: str, formulation: str, overrides: dict[str, object]) -> None:
     """A tenth of the time, a tenth of the drift."""
-    run = long_run(name, formulation, changes, 100.0)
+    run = long_run(name, formulation, overrides, 100.0)
     assert run.outcome == "done"
     assert run.drift <= 1e-9
     assert run.max_phi <= 1e-12
-    assert (run.crossings > 5) == bool(changes)
+    assert (run.crossings > 5) == bool(overrides)
