@@ -13,7 +13,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
-from ckc_pin.base.validation import require_flag, require_kind, require_table
+from ckc_pin.base.validation import require_flag, require_table, require_type
 from ckc_pin.codegen.library import find
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
@@ -27,7 +27,7 @@ from ckc_pin.linear.linear_report import stability_text, stability_warning
 from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import acting_joints, findings, moving_mass
+from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints, find_model_warnings
 from ckc_pin.run.runnable import require_runnable
 from ckc_pin.run.warnings import check_desired, desired_warnings, limit_warnings
 from ckc_pin.scene.initial import Start
@@ -127,7 +127,7 @@ def check(
     InputError, MechanismError
         It cannot exist as described. Findings about one that can are not errors.
     """
-    require_kind(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
+    require_type(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
     require_flag(branches, "check: branches")
     if overrides is not None:
         require_table(overrides, "check: overrides", OVERRIDES)
@@ -201,7 +201,7 @@ def _mechanism_check(
         terms = "generated" if find(mechanism) else "pinocchio"
     at = mechanism.assembled
     values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
-    mass, inertia = moving_mass(mechanism)
+    mass, inertia = compute_moving_mass(mechanism)
     square = at.phi_z.shape[0] == at.phi_z.shape[1]
     return Check(
         name=name,
@@ -221,8 +221,8 @@ def _mechanism_check(
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
         mass=mass,
         inertia=inertia,
-        joints=acting_joints(mechanism),
-        warnings=(*mechanism.warnings, *findings(mechanism), *warnings),
+        joints=describe_joints(mechanism),
+        warnings=(*mechanism.warnings, *find_model_warnings(mechanism), *warnings),
         terms=terms,
         desired=desired,
     )

@@ -137,7 +137,7 @@ def _walk(system: SingularSystem, first: _Place, step: float, max_points: int) -
 def _advance(system: SingularSystem, place: _Place, length: float) -> _Place | None:
     """Predict along the tangent and correct; None where that is no local step."""
     n = system.mechanism.n
-    guess = place.at.moved(length * place.tangent[:n])
+    guess = place.at.integrate(length * place.tangent[:n])
     at, null, residual = system.solve(guess, place.null + length * place.tangent[n:], iterations=6)
     if residual > max(EXACT, system.mechanism.tolerance):
         return None

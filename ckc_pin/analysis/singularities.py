@@ -22,12 +22,12 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.kinematics.assembly import assemble
+from ckc_pin.kinematics.assembly import close_loops
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose, Rate
-from ckc_pin.mechanism.rank import RANK_TOLERANCE, choose_dependent, rank_of, scaled
+from ckc_pin.mechanism.rank import RANK_TOLERANCE, choose_dependent, compute_rank, scale_jacobian
 from ckc_pin.mechanism.spec import LoopSpec
 
 __all__ = ["Kind", "SingularPoint", "SingularSystem", "classify", "find_singular", "search_singular"]
@@ -139,9 +139,9 @@ class SingularSystem:
             if np.abs(residual).max() <= tolerance:
                 break
             step = -np.linalg.lstsq(self.jacobian(at, v), residual, rcond=1e-10)[0]
-            scale = min(1.0, MAX_STEP / np.abs(step / np.tile(at.tree.reach, 2)).max())
+            scale = min(1.0, MAX_STEP / np.abs(step / np.tile(at.tree.step_scale, 2)).max())
             while scale > 1e-6:
-                trial, v_trial = at.moved(scale * step[: self.mechanism.n]), v + scale * step[self.mechanism.n :]
+                trial, v_trial = at.integrate(scale * step[: self.mechanism.n]), v + scale * step[self.mechanism.n :]
                 left = self.residual(trial, v_trial)
                 if np.linalg.norm(left) < np.linalg.norm(residual):
                     at, v, residual = trial, v_trial, left
@@ -201,7 +201,7 @@ def search_singular(mechanism: Mechanism, count: int, seed: int = 0, point: str 
     found = []
     for _ in range(count):
         guess = mechanism.tree.integrate(mechanism.q_tree, random.uniform(-np.pi, np.pi, mechanism.n))
-        closed = assemble(mechanism.tree, mechanism.closure, guess, np.ones(mechanism.n), mechanism.tolerance)
+        closed = close_loops(mechanism.tree, mechanism.closure, guess, np.ones(mechanism.n), mechanism.tolerance)
         try:
             found.append(find_singular(mechanism, closed.q_tree, point))
         except NumericalError:
@@ -212,8 +212,8 @@ def search_singular(mechanism: Mechanism, count: int, seed: int = 0, point: str 
 def classify(system: SingularSystem, at: Kinematics, v: Array) -> SingularPoint:
     """Say what kind of singular configuration a solution is, and what is lost and what is left there."""
     mechanism = system.mechanism
-    J = scaled(at.J, mechanism.tree, mechanism.closure)
-    rank = rank_of(J).rank
+    J = scale_jacobian(at.J, mechanism.tree, mechanism.closure)
+    rank = compute_rank(J).rank
     allowed = np.linalg.svd(J)[2][rank:]
     q_part = np.linalg.svd(allowed[:, at.partition.q], compute_uv=False)
     fold, kind = float("nan"), "serial" if system.point is not None else _kind(at, v, mechanism.tolerance)
@@ -238,7 +238,7 @@ def classify(system: SingularSystem, at: Kinematics, v: Array) -> SingularPoint:
 
 def _best_chart(mechanism: Mechanism, at: Kinematics, J: Array, rank: int) -> tuple[tuple[str, ...], float]:
     """Return the coordinates that determine the mechanism best there, and sigma_min of their phi_z."""
-    blocks = [np.arange(v, v + 6) for _, v in mechanism.tree.free]
+    blocks = [np.arange(v, v + 6) for _, v in mechanism.tree.free_roots]
     z = choose_dependent(J, rank, blocks)
     if z is None:
         return (), 0.0
@@ -251,13 +251,13 @@ def _kind(at: Kinematics, v: Array, tolerance: float) -> Literal["locked", "fold
 
     Where two branches only meet, the way back to the meeting point is all that closes.
     """
-    z, moved = at.partition.z, at.moved(PROBE * v)
+    z, moved = at.partition.z, at.integrate(PROBE * v)
     for _ in range(60):
         if np.abs(moved.phi).max() <= tolerance:
             break
         step = np.zeros(at.tree.n)
         step[z] = -np.linalg.lstsq(moved.phi_z, moved.phi, rcond=1e-8)[0]
-        moved = moved.moved(step)
+        moved = moved.integrate(step)
     went = at.tree.difference(at.q_tree, moved.q_tree)
     closed = np.abs(moved.phi).max() <= tolerance
     singular = moved.margin() <= 1e-6

@@ -18,14 +18,14 @@ from uuid import uuid4
 
 from ckc_pin.errors import InputError
 
-__all__ = ["alone_in", "temporary_folder", "write_whole", "written_whole"]
+__all__ = ["lock_folder", "open_atomic", "temporary_folder", "write_atomic"]
 
 UNFINISHED = ".unfinished"
 PATIENCE = 10.0  # s
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[BinaryIO]:
+def open_atomic(path: Path) -> Iterator[BinaryIO]:
     """Give a file to write to; it takes its place when all is written, and on a failure what was there stays.
 
     Raises
@@ -48,9 +48,9 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_atomic(path: Path, text: str) -> None:
     """Write a text as UTF-8 (InputError where that cannot be)."""
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         file.write(text.encode())
 
 
@@ -72,7 +72,7 @@ def temporary_folder(place: Path | None = None) -> Iterator[Path]:
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Let one process at a time write the files of a result to a folder, so that they belong together.
 
     After `PATIENCE` it goes on beside the other one.

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from os.path import isdir, lexists
 from pathlib import Path
 
-from ckc_pin.base.atomic_files import write_whole
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError, MechanismError
 
@@ -96,7 +96,7 @@ def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
     for file, text in texts.items():
-        write_whole(folder / file, text)
+        write_atomic(folder / file, text)
     return [folder / file for file in texts]
 
 

@@ -14,7 +14,7 @@ import msgspec
 from ckc_pin.base.faults import Fault, faults, numbers
 from ckc_pin.errors import InputError
 
-__all__ = ["FileStruct", "by_coordinate", "convert", "read_text", "read_toml"]
+__all__ = ["FileStruct", "convert", "join_dotted_keys", "read_text", "read_toml"]
 
 T = TypeVar("T")
 
@@ -121,7 +121,7 @@ def _all_of(sentences: list[str]) -> str:
     return said + (f" and {len(sentences) - MOST_SAID} more" if len(sentences) > MOST_SAID else "")
 
 
-def by_coordinate(data: dict[str, Any], *path: str) -> None:
+def join_dotted_keys(data: dict[str, Any], *path: str) -> None:
     """Join the tables inside a table into dotted keys, in place: TOML reads ``root.z = 1`` as {root: {z: 1}}.
 
     Parameters

@@ -12,22 +12,22 @@ import numpy as np
 from ckc_pin.errors import InputError
 
 __all__ = [
-    "a_kind",
+    "accepts_arguments",
+    "describe_value",
     "is_number",
-    "require_arguments",
     "require_callable",
+    "require_controller_signature",
     "require_flag",
-    "require_kind",
     "require_path",
     "require_table",
-    "takes_arguments",
+    "require_type",
 ]
 
 PLAIN = (int, float, complex, str, bytes, type(None), np.generic)  # shown as they are; of the rest their kind
 MOST = 80  # characters of a value that is shown
 
 
-def a_kind(given: Any) -> str:
+def describe_value(given: Any) -> str:
     """Say what was given: a plain value as it is written, of anything else what it is."""
     if isinstance(given, type):
         return f"the class {given.__name__}"
@@ -37,7 +37,7 @@ def a_kind(given: Any) -> str:
     return f"{'an' if kind[0] in 'AEIOUaeiou' else 'a'} {kind}"
 
 
-def require_kind(given: Any, kinds: type | tuple[type, ...], what: str, takes: str) -> None:
+def require_type(given: Any, kinds: type | tuple[type, ...], what: str, takes: str) -> None:
     """Refuse an argument that is of none of some kinds.
 
     Parameters
@@ -56,28 +56,28 @@ def require_kind(given: Any, kinds: type | tuple[type, ...], what: str, takes: s
         ``what``, what was given, what it takes.
     """
     if not isinstance(given, kinds):
-        raise InputError(f"{what}: {a_kind(given)} was given; it takes {takes}")
+        raise InputError(f"{what}: {describe_value(given)} was given; it takes {takes}")
 
 
 def require_path(given: Any, what: str, takes: str = "a path, as a string or a Path") -> None:
-    """Refuse what is no path, or has characters that no path can have; errors are those of `require_kind`."""
-    require_kind(given, (str, PathLike), what, takes)
+    """Refuse what is no path, or has characters that no path can have; errors are those of `require_type`."""
+    require_type(given, (str, PathLike), what, takes)
     try:
         possible = isinstance(fspath(given), str) and b"\0" not in fsencode(given)
     except UnicodeEncodeError:
         possible = False
     if not possible:
-        raise InputError(f"{what}: {a_kind(fspath(given))} is not a valid path; it takes {takes}")
+        raise InputError(f"{what}: {describe_value(fspath(given))} is not a valid path; it takes {takes}")
 
 
 def require_table(given: Any, what: str, takes: str) -> None:
-    """Refuse what is no table, and one with keys that are no names; errors are those of `require_kind`."""
-    require_kind(given, Mapping, what, takes)
+    """Refuse what is no table, and one with keys that are no names; errors are those of `require_type`."""
+    require_type(given, Mapping, what, takes)
     for key in given:
-        require_kind(key, str, f"{what}, a key", takes)
+        require_type(key, str, f"{what}, a key", takes)
 
 
-def takes_arguments(function: Callable[..., Any], count: int) -> bool:
+def accepts_arguments(function: Callable[..., Any], count: int) -> bool:
     """Whether a function can be called with so many arguments."""
     try:
         signature(function).bind(*[None] * count)
@@ -88,7 +88,7 @@ def takes_arguments(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def require_arguments(function: Callable[..., Any], called: str, what: str) -> None:
+def require_controller_signature(function: Callable[..., Any], called: str, what: str) -> None:
     """Refuse a function that cannot be called with (t, terms).
 
     Raises
@@ -96,7 +96,7 @@ def require_arguments(function: Callable[..., Any], called: str, what: str) -> N
     InputError
         What it takes.
     """
-    if not takes_arguments(function, 2):
+    if not accepts_arguments(function, 2):
         raise InputError(
             f"{what}: {called}({', '.join(signature(function).parameters)}) was given; it must take (t, terms)"
         )
@@ -111,14 +111,14 @@ def require_callable(given: Any, what: str, takes: str, count: int = 2) -> None:
         What it takes.
     """
     if given is not None and not callable(given):
-        raise InputError(f"{what}: {a_kind(given)} was given; it takes {takes}")
-    if given is not None and not takes_arguments(given, count):
+        raise InputError(f"{what}: {describe_value(given)} was given; it takes {takes}")
+    if given is not None and not accepts_arguments(given, count):
         raise InputError(f"{what}: a function of other arguments was given; it takes {takes}")
 
 
 def require_flag(given: Any, what: str) -> None:
-    """Refuse what is neither True nor False; errors are those of `require_kind`."""
-    require_kind(given, (bool, np.bool_), what, "True or False")
+    """Refuse what is neither True nor False; errors are those of `require_type`."""
+    require_type(given, (bool, np.bool_), what, "True or False")
 
 
 def is_number(given: Any) -> bool:

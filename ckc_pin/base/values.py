@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 
-__all__ = ["Shared", "lazy"]
+__all__ = ["Immutable", "lazy"]
 
 T = TypeVar("T")
 
@@ -34,7 +34,7 @@ class lazy(Generic[T]):
         return value
 
 
-class Shared:
+class Immutable:
     """A frozen dataclass whose arrays are read-only: a copy of it is itself."""
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import ckc_pin
-from ckc_pin.base.atomic_files import alone_in
+from ckc_pin.base.atomic_files import lock_folder
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides, read_table
 from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
@@ -106,7 +106,7 @@ def _at(given: str) -> At:
 
 def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
     with interrupts.deferred(), ExitStack() as stack:
-        stack.enter_context(alone_in(out))
+        stack.enter_context(lock_folder(out))
         save_floquet(found, out / "floquet.npz")
         found.run.save(out / "run.npz")
 
@@ -121,7 +121,7 @@ def _write(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...], ou
     runs = sways(model)
     with ExitStack() as stack:
         with interrupts.deferred():
-            stack.enter_context(alone_in(out))
+            stack.enter_context(lock_folder(out))
             for path in out.iterdir():
                 if OF_MODEL.fullmatch(path.name) and path.is_file():
                     path.unlink()

@@ -9,7 +9,7 @@ from shlex import quote
 
 import click
 
-from ckc_pin.base.atomic_files import write_whole
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.cli import options
 from ckc_pin.cli.output import make_folder, print_json
 from ckc_pin.cli.signals import interrupts
@@ -37,7 +37,7 @@ def new(folder: Path, as_json: bool) -> None:
     with interrupts.deferred():  # all files or none
         make_folder(folder, "")
         for path, template in zip(paths, templates, strict=True):
-            write_whole(path, template.read_text(encoding="utf-8").replace("NAME", name))
+            write_atomic(path, template.read_text(encoding="utf-8").replace("NAME", name))
     if as_json:
         print_json({"status": "done", "written": [str(path) for path in paths]})
         return

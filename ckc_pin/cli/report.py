@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 import ckc_pin
-from ckc_pin.base.atomic_files import alone_in, write_whole
+from ckc_pin.base.atomic_files import lock_folder, write_atomic
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
@@ -123,7 +123,7 @@ def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], o
     written, figures = list[Path](), dict[int, str]()
     with ExitStack() as stack:
         with interrupts.deferred():
-            stack.enter_context(alone_in(out))
+            stack.enter_context(lock_folder(out))
             _write_texts(every, figures, out)
         for k, (found, data) in enumerate(zip(every, plain, strict=True)):
             if found.reference is None:
@@ -144,7 +144,7 @@ def _write_texts(every: Sequence[WorkPrecision], figures: dict[int, str], out: P
 
     texts = {"rows.csv": precision_csv(every), "report.md": precision_markdown(every, figures)}
     for name, text in texts.items():
-        write_whole(out / name, text)
+        write_atomic(out / name, text)
     return [out / name for name in texts]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 import ckc_pin
-from ckc_pin.base.atomic_files import alone_in, write_whole
+from ckc_pin.base.atomic_files import lock_folder, write_atomic
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides
@@ -121,9 +121,9 @@ def _write(finished: ckc_pin.Run, out: Path, figures: bool) -> KeyboardInterrupt
     try:
         with ExitStack() as stack:
             with interrupts.deferred():
-                stack.enter_context(alone_in(out))
+                stack.enter_context(lock_folder(out))
                 finished.save(out / "run.npz")
-                write_whole(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")
+                write_atomic(out / "scene.json", json.dumps(finished.scene, indent=2) + "\n")
             if figures:
                 with Working("drawing"):
                     _draw(finished, out)

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 import ckc_pin
-from ckc_pin.base.atomic_files import alone_in
+from ckc_pin.base.atomic_files import lock_folder
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
@@ -66,7 +66,7 @@ def _write(found: ckc_pin.Sensitivities, out: Path, figures: bool) -> None:
     """Save them and the run, whatever signals come, then draw them if that is asked for."""
     with ExitStack() as stack:
         with interrupts.deferred():
-            stack.enter_context(alone_in(out))
+            stack.enter_context(lock_folder(out))
             found.save(out / "sensitivities.npz")
             found.run.save(out / "run.npz")
         if not figures:

@@ -100,7 +100,7 @@ def _print(found: SweepResult, out: Path, as_json: bool) -> None:
 
 def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures: bool) -> None:
     """Write which variable matters, a row an output and variable, and draw it."""
-    from ckc_pin.base.atomic_files import write_whole
+    from ckc_pin.base.atomic_files import write_atomic
     from ckc_pin.ensembles.importance import importance
     from ckc_pin.ensembles.store_layout import array_name
 
@@ -118,7 +118,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
                 draw_importance(of, out / f"indices_{array_name(str(name))}.png")
             except InputError as error:
                 errors().print(f"no figures: {error}")
-    write_whole(out / "indices.csv", "\n".join(rows) + "\n")
+    write_atomic(out / "indices.csv", "\n".join(rows) + "\n")
 
 
 def _afterwards(found: SweepResult, out: Path, worst: tuple[str, ...], figures: bool) -> None:

@@ -88,7 +88,7 @@ def require_equal(mechanism: Mechanism, library: Library) -> None:
     code, random = Calls(library), np.random.default_rng(0)
     compared, order = 0, elimination_order(mechanism, kept_rows(mechanism))
     for at, closed in _configurations(mechanism, random):
-        v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.reach
+        v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.step_scale
         if closed and mechanism.closure.rows:
             v = v - np.linalg.pinv(at.J, rcond=1e-9) @ (at.J @ v)
         terms = Terms(mechanism, at, v)
@@ -184,7 +184,7 @@ def _cancels(terms: Terms, u: Array, acceleration: Array) -> bool:
     """Whether light bodies carry loads that would accelerate them far more without the loops."""
     D, _ = _kept(terms)
     alone = np.linalg.solve(D, u - terms.bias_tree + terms.damping_force)
-    reach = terms.mechanism.tree.reach
+    reach = terms.mechanism.tree.step_scale
     return bool(np.abs(alone / reach).max() > CANCELS * np.abs(acceleration / reach).max())
 
 
@@ -202,7 +202,7 @@ def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, 
     by_u = flat_by_u.reshape(tree.n, -1, order="F")
     size = float(np.abs(by_state).max())
     for k in range(tree.n):
-        h = DIFFERENCE * tree.reach[k]
+        h = DIFFERENCE * tree.step_scale[k]
         along = np.eye(tree.n)[k]
         for name, found, at in (
             ("q'", by_state[:, : tree.nq] @ tree.configuration_rate(q, along), lambda x: (tree.integrate(q, x), v, u)),
@@ -216,8 +216,8 @@ def _compare_derivatives(mechanism: Mechanism, code: Calls, q: Array, v: Array, 
 def _compare_change(terms: Terms, code: Calls, own: Array, random: np.random.Generator) -> None:
     """Along directions of everything at once."""
     mechanism, tree, q, v = terms.mechanism, terms.mechanism.tree, terms.q_tree, terms.v_tree
-    none, u = np.zeros(mechanism.closure.rows), random.uniform(-1, 1, tree.n) * tree.reach
-    steps, faster, more = random.uniform(-1, 1, (3, TOGETHER, tree.n)) * tree.reach
+    none, u = np.zeros(mechanism.closure.rows), random.uniform(-1, 1, tree.n) * tree.step_scale
+    steps, faster, more = random.uniform(-1, 1, (3, TOGETHER, tree.n)) * tree.step_scale
     varied = random.uniform(-1, 1, (TOGETHER, len(own))) * np.where(own == 0.0, FROM_ZERO, own)
     state, acceleration, _ = code.call("state", q, v, u)
     _compare(mechanism, "acceleration with its change", acceleration, code.call("acceleration", q, v, u, none)[0])
@@ -243,9 +243,9 @@ def _configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterat
     tree = mechanism.tree
     yield mechanism.assembled, True
     here = mechanism.independent_part(mechanism.q_tree)
-    reach = tree.reach[mechanism.partition.q]
+    reach = tree.step_scale[mechanism.partition.q]
     for k in range(STATES):
-        step = SPREAD * random.uniform(-1, 1, tree.n) * tree.reach
+        step = SPREAD * random.uniform(-1, 1, tree.n) * tree.step_scale
         yield mechanism.kinematics(tree.integrate(mechanism.q_tree, step)), False
         if not mechanism.splits_root:
             found = sigma(mechanism, here + SPREAD * random.uniform(-1, 1, mechanism.d) * reach * 0.9 ** (k % 10))

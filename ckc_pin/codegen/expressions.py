@@ -96,14 +96,14 @@ def expressions(
     D_tree, bias, potential = _inertia(mechanism, found, gravity, arguments)
     needed = _inertia(mechanism, driven, gravity, arguments)[1] + times(cs.diag(_armature(tree.n, arguments)), v_dot)
     elastic, damping, stored = _springs(mechanism, found, q, v, arguments)
-    rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.place.tolist(), arguments)
+    rows = row_terms(mechanism.closure, found, angles, v, q_dot, tree.q_index.tolist(), arguments)
     kept = kept_rows(mechanism)
     return Expressions(
         angles=angles,
         v=v,
         arguments=arguments,
         turns=turns,
-        quaternions=tuple(at_q + 3 for at_q, _ in tree.free),
+        quaternions=tuple(at_q + 3 for at_q, _ in tree.free_roots),
         q_dot=q_dot,
         D_tree=D_tree,
         bias_tree=bias - elastic,
@@ -212,7 +212,7 @@ def _springs(
     springs, n = mechanism.springs, mechanism.n
     elastic, damping, stored = cs.SX(n, 1), cs.SX(n, 1), cs.SX(1, 1)
     for k in range(n):
-        x = q[int(mechanism.tree.place[k])]
+        x = q[int(mechanism.tree.q_index[k])]
         pull = arguments.number("constant", k)
         stiffness = arguments.number("joint_stiffness", k)
         stretched = x - arguments.number("joint_rest", k)
@@ -244,8 +244,8 @@ def _configuration_rate(mechanism: Mechanism, q: Any, v: Any) -> Any:
     tree = mechanism.tree
     rate = cs.SX(tree.nq, 1)
     for k in range(tree.n):
-        rate[int(tree.place[k])] = v[k]
-    for at_q, at_v in tree.free:
+        rate[int(tree.q_index[k])] = v[k]
+    for at_q, at_v in tree.free_roots:
         u, w, spin = q[at_q + 3 : at_q + 6], q[at_q + 6], v[at_v + 3 : at_v + 6]
         slide = v[at_v : at_v + 3]
         rate[at_q : at_q + 3] = slide + 2 * cs.cross(u, cs.cross(u, slide) + w * slide)

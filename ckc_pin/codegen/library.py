@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
-from ckc_pin.base.atomic_files import temporary_folder, written_whole
+from ckc_pin.base.atomic_files import open_atomic, temporary_folder
 from ckc_pin.base.sources import Sources
 from ckc_pin.codegen.arguments import numbers, present, values
 from ckc_pin.errors import InputError, MechanismError
@@ -329,7 +329,7 @@ def _put(name: str, content: bytes) -> Path:
 
 
 def _written(path: Path, content: bytes) -> Path:
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         file.write(content)
     return path
 

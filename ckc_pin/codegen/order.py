@@ -79,7 +79,7 @@ def _matrices(mechanism: Mechanism, kept: Sequence[int]) -> Iterator[tuple[Array
     """
     tree, random, n = mechanism.tree, np.random.default_rng(0), mechanism.n
     for k in range(STATES + 1):
-        step = SPREAD * random.uniform(-1, 1, n) * tree.reach * (k > 0)
+        step = SPREAD * random.uniform(-1, 1, n) * tree.step_scale * (k > 0)
         at = mechanism.kinematics(tree.integrate(mechanism.q_tree, step))
         D = np.triu(Terms(mechanism, at, np.zeros(n)).D_tree)
         D, J = D + np.triu(D, 1).T, at.J[list(kept)]

@@ -50,7 +50,7 @@ class Varied:
         self._own = numbers(mechanism)
         self._present = values_of(mechanism.spec, mechanism.urdf)
         self.which = present(self._own)
-        self.possible = mechanism.tree.flat and all(_is_taken(name) for name in self.names)
+        self.possible = mechanism.tree.is_euclidean and all(_is_taken(name) for name in self.names)
         if self.possible and self.names:
             self.possible = self._reproduces()
         if self.possible and self.names:

@@ -95,7 +95,7 @@ class Actuation:
     ) -> None:
         self.mechanism, self.motors = mechanism, mechanism.motors
         motors, count = self.motors, len(self.motors.names)
-        self.direct = mechanism.driven_directly
+        self.direct = mechanism.has_direct_drives
         given = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
         self.given_limit = motors.vector(given, "controller.torque_limit", np.inf)
         self.limit = np.minimum(self.given_limit, motors.torque_limit)
@@ -114,7 +114,7 @@ class Actuation:
         """Name freedoms that no motor drives, as many as there are."""
         if self.direct:
             return []
-        transmission = self.motors.turns @ at.rho
+        transmission = self.motors.transmission @ at.rho
         sizes = np.linalg.norm(transmission, axis=1, keepdims=True)
         _, values, directions = np.linalg.svd(transmission / np.where(sizes > 0, sizes, 1.0), full_matrices=True)
         rank = int(np.sum(values > 1e-6 * max(values.max(initial=0.0), 1e-150)))
@@ -158,7 +158,7 @@ class Actuation:
         (motors,) array
             Where they cannot do it, as nearly as they can.
         """
-        return least((self.motors.turns @ tangent).T, force, self.weights)
+        return least((self.motors.transmission @ tangent).T, force, self.weights)
 
     def apply(self, terms: Terms, u: Array) -> Effort:
         """Map u to tau within limits; of redundant motors, as `allocate` does.
@@ -176,7 +176,7 @@ class Actuation:
         if self.direct:
             tau = np.clip(u, -self.limit, self.limit)
             return Effort(tau, self.motors.force(tau), tau)
-        transmission = (self.motors.turns @ terms.rho).T  # u = transmission tau
+        transmission = (self.motors.transmission @ terms.rho).T  # u = transmission tau
         tau = allocate(transmission, u, self.limit, self.weights, self.preload)
         return Effort(tau, self.motors.force(tau), transmission @ tau)
 

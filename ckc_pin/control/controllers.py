@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import a_kind, require_arguments, require_callable, require_kind
+from ckc_pin.base.validation import describe_value, require_callable, require_controller_signature, require_type
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.gains import gain_matrix, require_positive_definite
 from ckc_pin.control.spec import Gain
@@ -76,13 +76,15 @@ def as_controller(given: Any) -> Controller | TorqueController:
         raise InputError(f"controller: the class {name} was given; give an object of it, as {name}() makes one")
     own = [name for name in ("u", "tau") if callable(getattr(given, name, None))]
     if not own and not callable(given):
-        raise InputError(f"controller: {a_kind(given)} was given; it takes {TAKES}")
+        raise InputError(f"controller: {describe_value(given)} was given; it takes {TAKES}")
     for name in own or [""]:
         law = getattr(given, name) if name else given
         called = name or getattr(given, "__name__", type(given).__name__)
         if isinstance(law, type):
-            raise InputError(f"controller: {called}: {a_kind(law)} was given; it takes a function of (t, terms)")
-        require_arguments(law, called, "controller")
+            raise InputError(
+                f"controller: {called}: {describe_value(law)} was given; it takes a function of (t, terms)"
+            )
+        require_controller_signature(law, called, "controller")
     if own:
         _require_lyapunov(getattr(given, "lyapunov", None))
     if type(given) is SetPoint or type(given) is Tracking:  # a subclass may have attributes of its own
@@ -96,7 +98,7 @@ def _require_lyapunov(function: Any) -> None:
     """Refuse an attribute `lyapunov` that a run could not evaluate (InputError)."""
     takes = "a function of (t, terms, w) that returns a number, or None"
     if isinstance(function, type):
-        raise InputError(f"controller: lyapunov: {a_kind(function)} was given; it takes {takes}")
+        raise InputError(f"controller: lyapunov: {describe_value(function)} was given; it takes {takes}")
     require_callable(function, "controller: lyapunov", takes, 3)
 
 
@@ -178,13 +180,13 @@ class SetPoint:
         q_d: Array | Mapping[str, float],
         near: Kinematics | None = None,
     ) -> None:
-        require_kind(mechanism, Mechanism, "SetPoint: mechanism", "a Mechanism, as load returns it")
+        require_type(mechanism, Mechanism, "SetPoint: mechanism", "a Mechanism, as load returns it")
         names = mechanism.independent
         self.K_P, self.K_V = gain_matrix(K_P, names, "K_P"), gain_matrix(K_V, names, "K_V")
         require_positive_definite(self.K_P, "K_P")
         require_positive_definite(self.K_V, "K_V", semi=True)
         if not isinstance(q_d, Mapping):
-            require_kind(q_d, (np.ndarray, list, tuple), "SetPoint: q_d", "a number for each independent coordinate")
+            require_type(q_d, (np.ndarray, list, tuple), "SetPoint: q_d", "a number for each independent coordinate")
             if len(q_d) != len(names):
                 raise InputError(f"SetPoint: q_d has {len(q_d)} numbers; {len(names)} are needed: {', '.join(names)}")
             q_d = dict(zip(names, q_d, strict=True))
@@ -201,7 +203,7 @@ class SetPoint:
 
     def require_attributes(self) -> None:
         """Refuse attributes that were replaced by values that the law cannot use (InputError)."""
-        require_kind(self.target, Terms, "SetPoint: target", "Terms, those at the target")
+        require_type(self.target, Terms, "SetPoint: target", "Terms, those at the target")
         d = self.target.mechanism.d
         for name, shape in (("K_P", (d, d)), ("K_V", (d, d)), ("q_d", (d,))):
             _require_array(getattr(self, name), shape, f"SetPoint: {name}")
@@ -238,7 +240,7 @@ class Tracking:
     def __init__(self, Lambda: float | Array, K_D: float | Array, desired: Desired, model: Model | None = None) -> None:
         of_each = [f"coordinate {k + 1}" for k in range(_dimension(desired))]
         if model is not None:
-            require_kind(model, Model, "Tracking: model", "a Model")
+            require_type(model, Model, "Tracking: model", "a Model")
         Lambda, K_D = gain_matrix(Lambda, of_each, "Lambda"), gain_matrix(K_D, of_each, "K_D")
         require_positive_definite(K_D, "K_D")
         try:
@@ -263,7 +265,7 @@ class Tracking:
         for name in ("Lambda", "K_D"):
             _require_array(getattr(self, name), (d, d), f"Tracking: {name}")
         if self.model is not None:
-            require_kind(self.model, Model, "Tracking: model", "a Model")
+            require_type(self.model, Model, "Tracking: model", "a Model")
 
     def u_rate_gradient(self, t: float, terms: Terms) -> Array:
         """d u / d q_dot, shape (d, d); C is linear in its velocity and C(x) y = C(y) x."""
@@ -288,14 +290,16 @@ def _require_array(given: Any, shape: tuple[int, ...], what: str) -> None:
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{what}: {a_kind(given)} was given; it takes an array of shape {shape} of finite numbers")
+        raise InputError(
+            f"{what}: {describe_value(given)} was given; it takes an array of shape {shape} of finite numbers"
+        )
 
 
 def _dimension(desired: Any) -> int:
     """Return how many coordinates a trajectory is of; refuse what is none."""
     takes = "a function of t that returns q_d, its rate and its acceleration, each of shape (d,)"
     if desired is None or isinstance(desired, type):
-        raise InputError(f"Tracking: desired: {a_kind(desired)} was given; it takes {takes}")
+        raise InputError(f"Tracking: desired: {describe_value(desired)} was given; it takes {takes}")
     require_callable(desired, "Tracking: desired", takes, 1)
     at_start = desired(0.0)
     shapes = [np.shape(part) for part in at_start] if isinstance(at_start, tuple | list | np.ndarray) else []

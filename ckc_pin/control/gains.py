@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import a_kind, is_number
+from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.spec import Gain
 from ckc_pin.errors import InputError
 
@@ -50,7 +50,7 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
 def _numbers(gain: Any, what: str, shape: str) -> Array:
     if not isinstance(gain, list | tuple | np.ndarray):
         takes = "a number, a table by joint or a matrix"
-        raise InputError(f"controller.{what}: {a_kind(gain)} was given; it takes {takes}")
+        raise InputError(f"controller.{what}: {describe_value(gain)} was given; it takes {takes}")
     try:
         return np.array(gain, dtype=float)
     except (TypeError, ValueError):  # rows of several lengths, words among the numbers

@@ -19,7 +19,7 @@ from ckc_pin.base.toml import convert
 from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
-from ckc_pin.mechanism.batch import difference, integrate
+from ckc_pin.mechanism.batch import difference_many, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.spec_frames import Vector3
@@ -224,8 +224,8 @@ class PointPath:
         for k, at in enumerate(coarse[:-1]):
             first = int(np.clip(k - NODES // 2 + 1, 0, len(coarse) - NODES))
             around = np.array([other.q_tree for other in coarse[first : first + NODES]])
-            steps = difference(tree, np.tile(at.q_tree, (NODES, 1)), around)
-            near.append(integrate(tree, np.tile(at.q_tree, (STRIDE, 1)), weights[k - first] @ steps))
+            steps = difference_many(tree, np.tile(at.q_tree, (NODES, 1)), around)
+            near.append(integrate_many(tree, np.tile(at.q_tree, (STRIDE, 1)), weights[k - first] @ steps))
         return self.point.meet(np.concatenate(near), self.place(self.times)[0], self.start)
 
     def _one_by_one(self) -> Array:

@@ -92,9 +92,9 @@ class Sampled:
             raise InputError(
                 'controller.sensor.q_dot_noise: with rate = "difference" no rate is measured; q_noise makes it noisy'
             )
-        if mechanism.rooted:
+        if root := mechanism.independent_root_coordinates:
             raise InputError(
-                f"controller.sensor: {mechanism.rooted[0]} is independent and belongs to a free root, which has no "
+                f"controller.sensor: the independent coordinate {root[0]!r} belongs to a free root, which has no "
                 "encoder; choose other independent coordinates"
             )
 

@@ -135,7 +135,7 @@ def _other_coordinates(mechanism: Mechanism, terms: Terms, factor: float) -> Ter
 
     Of a free root that is held in part those are tangent coordinates of it, some of them dependent.
     """
-    best = mechanism.best_partition(terms.at, whole=not mechanism.splits_root)
+    best = mechanism.choose_partition(terms.at, keep_roots_together=not mechanism.splits_root)
     if best is None:
         return None
     other = Kinematics(terms.at.tree, terms.at.closure, best, terms.at.q_tree)

@@ -171,7 +171,7 @@ def refuse_massless(terms: Terms, tangent: Array, among: IntArray) -> None:
         if values[0] > 1e-13:
             return
         motion = directions[:, 0] / scale
-    most = among[int(np.argmax(np.abs(tangent @ motion / terms.mechanism.tree.reach)[among]))]
+    most = among[int(np.argmax(np.abs(tangent @ motion / terms.mechanism.tree.step_scale)[among]))]
     raise InputError(
         f"{terms.mechanism.name}: the motion along {terms.mechanism.coordinates[most]} moves no mass, so no force can "
         "tell its acceleration; give the links it moves a mass and an inertia, or make the joint fixed"

@@ -27,7 +27,7 @@ def friction_force(mechanism: Mechanism, v_tree: Array) -> Array:
 
     Zero where a joint rests: what friction does there no velocity tells, anything up to its largest force.
     """
-    speed = np.abs(v_tree / mechanism.tree.reach)
+    speed = np.abs(v_tree / mechanism.tree.step_scale)
     slides = speed > AT_REST * speed.max(initial=0.0)
     return np.where(slides, -mechanism.joints.friction * np.sign(v_tree), 0.0)
 

@@ -112,7 +112,7 @@ class Terms(HasSummary):
     @lazy
     def q(self) -> Array:
         """Independent coordinates q, shape (d,)."""
-        return self.q_tree[self.mechanism.tree.place[self.at.partition.q]]
+        return self.q_tree[self.mechanism.tree.q_index[self.at.partition.q]]
 
     @lazy
     def q_dot(self) -> Array:

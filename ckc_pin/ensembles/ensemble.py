@@ -15,7 +15,7 @@ import msgspec
 
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.validation import a_kind, require_flag, require_kind, require_path, require_table
+from ckc_pin.base.validation import describe_value, require_flag, require_path, require_table, require_type
 from ckc_pin.ensembles.members import Chunk, Members
 from ckc_pin.ensembles.outputs import Function
 from ckc_pin.ensembles.progress import Advance, bar
@@ -151,7 +151,7 @@ def ensemble(
 
 def _require_tables(scene: Any, variables: Any, outputs: Any, overrides: Any) -> None:
     """Refuse what says what to run, where it is of the wrong kind (InputError); what is in it is checked later."""
-    require_kind(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
+    require_type(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
     require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
     require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
     if overrides is not None:
@@ -163,11 +163,13 @@ def _require_means(out: Any, threads: Any, workers: Any, scheduler: Any, chunk: 
     if out is not None:
         require_path(out, "ensemble: out")
     if scheduler is not None:
-        require_kind(scheduler, str, "ensemble: scheduler", 'an address, as "tcp://10.0.0.1:8786"')
+        require_type(scheduler, str, "ensemble: scheduler", 'an address, as "tcp://10.0.0.1:8786"')
     require_flag(progress, "ensemble: progress")
     for name, count in (("threads", threads), ("workers", workers), ("chunk", chunk)):
         if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-            raise InputError(f"ensemble: {name}: {a_kind(count)} was given; it takes a whole number of at least 1")
+            raise InputError(
+                f"ensemble: {name}: {describe_value(count)} was given; it takes a whole number of at least 1"
+            )
     if scheduler and workers:
         raise InputError("ensemble: workers and scheduler: give one of them")
 

@@ -319,7 +319,7 @@ class Members:
         known = all(name.rpartition("initial.q.")[2] in mechanism.independent for name in positions) and all(
             name.startswith(("initial.q.", "initial.q_dot.")) for name in starts
         )
-        if not known or not self._varied.possible or self.outputs.functions or not mechanism.tree.flat:
+        if not known or not self._varied.possible or self.outputs.functions or not mechanism.tree.is_euclidean:
             return False
         if spec.initial.w is not None or spec.solver.max_wall_s is not None or mechanism.splits_root:
             return False

@@ -208,7 +208,7 @@ class Outputs:
     def _settled(self, name: str, tolerance: float) -> Callable[[Recorded], Array]:
         """Whether at the end everything rests, and q is q_d where there is a set point."""
         law, mechanism = _law(self._ready), self._ready.mechanism
-        reach = mechanism.tree.reach
+        reach = mechanism.tree.step_scale
         q, v = self._places["q_tree"], self._places["v_tree"]
 
         def compute(recorded: Recorded) -> Array:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.toml import by_coordinate, convert, read_text, read_toml
+from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import is_path
 
@@ -186,7 +186,7 @@ def read_sweep(path: str | Path) -> tuple[SweepSpec, Sources]:
     """
     path = Path(path)
     data = read_toml(read_text(path, "sweep"), str(path))
-    by_coordinate(data, "overrides")
+    join_dotted_keys(data, "overrides")
     return sweep_of(data, Sources(str(path), path.parent)), Sources(str(path), path.parent)
 
 

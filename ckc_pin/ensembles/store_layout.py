@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ckc_pin.base.atomic_files import temporary_folder, written_whole
+from ckc_pin.base.atomic_files import open_atomic, temporary_folder
 from ckc_pin.base.interrupt import uninterrupted_thread
 from ckc_pin.ensembles.checksums import CHECKSUMS, ChunkChecksums, checksum, checksum_file, describe_damage
 from ckc_pin.ensembles.members import PENDING, STATUS, Members
@@ -208,7 +208,7 @@ def convert_files(path: Path, create: Callable[[int], Callable[[Path], None]]) -
         _copy(folder, path, [*files, f"{CHECKSUMS}/{DOCUMENT}"])
 
     def finish() -> None:
-        with written_whole(path / DOCUMENT) as file:
+        with open_atomic(path / DOCUMENT) as file:
             file.write(document)
 
     return finish
@@ -216,7 +216,7 @@ def convert_files(path: Path, create: Callable[[int], Callable[[Path], None]]) -
 
 def _copy(source: Path, to: Path, keys: Iterable[str]) -> None:
     for key in keys:
-        with written_whole(to / key) as file:
+        with open_atomic(to / key) as file:
             file.write((source / key).read_bytes())
 
 

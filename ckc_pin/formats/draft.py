@@ -15,7 +15,7 @@ import pinocchio as pin
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.orientation import to_rpy
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.spec import LoopSpec, MechanismSpec, PointSpec
@@ -122,7 +122,7 @@ class Draft:
         MechanismError
             Loops that do not close, `independent` that cannot serve.
         """
-        return assembled(self.spec(), Sources(self.name, None, {self.urdf_file: self.urdf()}))
+        return assemble_mechanism(self.spec(), Sources(self.name, None, {self.urdf_file: self.urdf()}))
 
 
 def frame(link: str, pose: pin.SE3) -> Frame:

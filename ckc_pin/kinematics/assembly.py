@@ -20,7 +20,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["Assembly", "assemble", "assembled"]
+__all__ = ["Assembly", "assemble_mechanism", "close_loops"]
 
 RESTARTS = 20
 EXACT = 1e-10  # |phi| in units of the mechanism's size that a closed mechanism of exact data reaches
@@ -35,10 +35,10 @@ class Assembly:
 
     q_tree: Array
     residual: float
-    misses: dict[str, float]
+    largest_residuals: dict[str, float]
 
 
-def assemble(
+def close_loops(
     tree: Tree,
     closure: Closure,
     q_tree: Array,
@@ -88,7 +88,7 @@ def assemble(
         q = _gauss_newton(tree, start, at, tolerance)
         phi, _ = at(q)
         open_, beyond = (float(np.abs(part).max(initial=0.0)) for part in np.split(phi, [closure.rows]))
-        found = Assembly(q, max(open_, beyond), closure.misses(phi[: closure.rows]))
+        found = Assembly(q, max(open_, beyond), closure.largest_residuals(phi[: closure.rows]))
         return found, open_ <= max(tolerance, rounded) and beyond <= tolerance
 
     random = np.random.default_rng(0)  # the same answer every time
@@ -97,7 +97,9 @@ def assemble(
         if closed:
             break
         spread = 0.1 * 1.4**attempt
-        trial, closed = outcome(tree.integrate(q_tree, free * tree.reach * random.uniform(-spread, spread, tree.n)))
+        trial, closed = outcome(
+            tree.integrate(q_tree, free * tree.step_scale * random.uniform(-spread, spread, tree.n))
+        )
         if closed or trial.residual < best.residual:
             best = trial
     return best
@@ -111,8 +113,8 @@ def _gauss_newton(
     for _ in range(100):
         if np.abs(phi).max(initial=0.0) <= 1e-3 * tolerance:
             break
-        part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.reach, phi, rcond=1e-6)[0], dtype=float)
-        longest, step = float(np.abs(part).max(initial=0.0)), part * tree.reach
+        part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.step_scale, phi, rcond=1e-6)[0], dtype=float)
+        longest, step = float(np.abs(part).max(initial=0.0)), part * tree.step_scale
         scale = min(1.0, 0.5 / longest) if longest > 0 else 0.0
         while scale > 1e-6:
             trial = tree.integrate(q, scale * step)
@@ -126,7 +128,7 @@ def _gauss_newton(
     return q
 
 
-def assembled(spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
+def assemble_mechanism(spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
     """Assemble a mechanism from what its files say, with numbers changed by name.
 
     Raises
@@ -157,8 +159,8 @@ def _nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept:
     found = []
     for _ in range(PERTURBATIONS if len(tangent) else 0):
         step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
-        step *= PERTURBATION / np.abs(step).max() * tree.reach
-        closed = assemble(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
+        step *= PERTURBATION / np.abs(step).max() * tree.step_scale
+        closed = close_loops(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
         if closed.residual <= 10 * accept:
             found.append(closed.q_tree)
     return found
@@ -192,9 +194,9 @@ def _nearest(linkage: Linkage, start: Array, within: tuple[Array, Array] | None 
     if linkage.spec.independent is not None:
         free = np.ones(tree.n)
         free[tree.indices(tuple(linkage.spec.independent), "independent")] = 0.0
-        closed = assemble(tree, linkage.closure, start, free, exact, within=within, rounded=rounded)
+        closed = close_loops(tree, linkage.closure, start, free, exact, within=within, rounded=rounded)
     if closed is None or closed.residual > rounded:
-        closed = assemble(tree, linkage.closure, start, np.ones(tree.n), exact, within=within, rounded=rounded)
+        closed = close_loops(tree, linkage.closure, start, np.ones(tree.n), exact, within=within, rounded=rounded)
     return closed
 
 
@@ -202,7 +204,7 @@ def _within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
     """Go from a configuration beyond stops, where no run can start, to one within them near it, if there is one."""
     tree, joints = linkage.tree, linkage.joints
     numbers = tree.to_coordinates(closed.q_tree)
-    beyond = np.abs(numbers - np.clip(numbers, joints.lower, joints.upper)) > EXACT * tree.reach
+    beyond = np.abs(numbers - np.clip(numbers, joints.lower, joints.upper)) > EXACT * tree.step_scale
     if not np.any(beyond):
         return closed
     inside = _nearest(linkage, closed.q_tree, (joints.lower, joints.upper))
@@ -217,19 +219,19 @@ def _within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
 
 def _why_not_closed(linkage: Linkage, best: Assembly, start: Array) -> str:
     """Name the loop with the largest miss, loops that cannot close even alone, and what to do."""
-    loop, miss = max(best.misses.items(), key=lambda item: item[1])
+    loop, miss = max(best.largest_residuals.items(), key=lambda item: item[1])
     message = f"not closed: nearest miss {miss:.3g} m at loop {loop}"
     if miss > 1000 * linkage.size:
         return f"{message}, {miss / linkage.size:.0f} times the mechanism's size of {linkage.size:.3g} m: units?"
     alone = []
     for name in dict.fromkeys(name for name, _ in linkage.closure.names):
         single = linkage.closure.only(name)
-        closed = assemble(linkage.tree, single, start, np.ones(linkage.tree.n), EXACT * linkage.size)
+        closed = close_loops(linkage.tree, single, start, np.ones(linkage.tree.n), EXACT * linkage.size)
         if closed.residual > ROUNDED * linkage.size:
             alone.append(f"{name} (miss {closed.residual:.3g})")
     if alone:
         message += f"; cannot close even alone: {', '.join(alone)}"
-    elif len(best.misses) > 1:
-        others = ", ".join(f"{k} {x:.3g}" for k, x in best.misses.items() if x > ROUNDED * linkage.size)
+    elif len(best.largest_residuals) > 1:
+        others = ", ".join(f"{k} {x:.3g}" for k, x in best.largest_residuals.items() if x > ROUNDED * linkage.size)
         message += f"; each loop closes alone, together they contradict each other ({others})"
     return f"{message}. Check the loops' frames and types, or give a [q_guess] nearer to a closed configuration"

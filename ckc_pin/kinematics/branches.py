@@ -26,7 +26,7 @@ def assembly_branches(mechanism: Mechanism) -> list[Kinematics]:
     """
     at = mechanism.assembled
     z = mechanism.partition.z
-    if len(z) > LARGEST or not mechanism.tree.flat:
+    if len(z) > LARGEST or not mechanism.tree.is_euclidean:
         raise InputError(
             f"{mechanism.name}: branches are listed for mechanisms with at most {LARGEST} dependent joints; "
             f"this one has {len(z)}"
@@ -37,7 +37,7 @@ def assembly_branches(mechanism: Mechanism) -> list[Kinematics]:
     for _ in range(STARTS if len(z) else 0):
         step = np.zeros(mechanism.n)
         step[z] = random.uniform(-1.0, 1.0, len(z)) * reach
-        closed = _settle(at.moved(step), mechanism.tolerance)
+        closed = _settle(at.integrate(step), mechanism.tolerance)
         if closed is not None and all(_apart(mechanism, closed, other) for other in found):
             found.append(closed)
     return found
@@ -55,7 +55,7 @@ def _settle(start: Kinematics, tolerance: float) -> Kinematics | None:
         longest = np.abs(step).max()
         if not np.isfinite(longest) or longest == 0.0:
             return None
-        at = at.moved(step * min(1.0, 0.3 / longest))
+        at = at.integrate(step * min(1.0, 0.3 / longest))
     return None
 
 

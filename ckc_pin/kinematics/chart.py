@@ -35,11 +35,11 @@ class Chart:
     def __init__(self, tree: Tree, independent: IntArray, q_tree: Array) -> None:
         self._tree = tree
         self._independent = independent
-        self._place = tree.place[independent]
+        self._place = tree.q_index[independent]
         inside = set(independent.tolist())
         self._roots = [
             (q_at, [int(np.flatnonzero(independent == v_at + k)[0]) for k in range(6)], _rotation(q_tree, q_at))
-            for q_at, v_at in tree.free
+            for q_at, v_at in tree.free_roots
             if v_at in inside
         ]
         self.plain = not self._roots

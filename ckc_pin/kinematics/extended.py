@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.batch import evaluate, joined
+from ckc_pin.mechanism.batch import evaluate_closure, join_closures
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -26,7 +26,7 @@ from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import LoopSpec
 from ckc_pin.mechanism.spec_frames import FrameSpec
 
-__all__ = ["Extended", "Task", "extend", "find_point"]
+__all__ = ["Extended", "Task", "extend_closure", "find_point"]
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -93,7 +93,7 @@ class Task:
 
     def evaluate(self, q_tree: Array) -> tuple[Array, Array]:
         """All rows and their Jacobians at configurations (count, nq)."""
-        return evaluate(self.extended.mechanism.tree, self.extended.closure, q_tree)
+        return evaluate_closure(self.extended.mechanism.tree, self.extended.closure, q_tree)
 
 
 def find_point(mechanism: Mechanism, name: str | None = None) -> str:
@@ -113,7 +113,7 @@ def find_point(mechanism: Mechanism, name: str | None = None) -> str:
     return name or next(iter(mechanism.points))
 
 
-def extend(mechanism: Mechanism, point: str | None = None) -> Extended:
+def extend_closure(mechanism: Mechanism, point: str | None = None) -> Extended:
     """Add the rows of the independent coordinates, and those of a point where one is named.
 
     Raises
@@ -122,12 +122,12 @@ def extend(mechanism: Mechanism, point: str | None = None) -> Extended:
         No such point, or one that does not tell the configuration.
     """
     single = [k for k in mechanism.partition.q if mechanism.coordinates[k] not in mechanism.tree.free_coordinates]
-    closure = joined(mechanism.closure, _joint_rows(mechanism, single))
+    closure = join_closures(mechanism.closure, _joint_rows(mechanism, single))
     rows, with_joints = mechanism.closure.rows, closure.rows
     chosen = np.zeros(0, np.intp)
     if point is not None:
         chosen = _fixing(mechanism, point)
-        closure = joined(closure, _point_rows(mechanism, point, "weld" if np.any(chosen >= 3) else "point"))
+        closure = join_closures(closure, _point_rows(mechanism, point, "weld" if np.any(chosen >= 3) else "point"))
     names = [".".join(name) for name in mechanism.closure.names]
     return Extended(
         mechanism=mechanism,
@@ -167,7 +167,7 @@ def _fixing(mechanism: Mechanism, point: str) -> IntArray:
     """Choose d of the six rows of a place, each the one that adds most; turns only when positions add nothing."""
     at = mechanism.assembled
     frame = Kinematics(mechanism.tree, _point_rows(mechanism, point, "weld"), at.partition, mechanism.q_tree)
-    moves = frame.J @ at.rho * mechanism.tree.reach[at.partition.q]
+    moves = frame.J @ at.rho * mechanism.tree.step_scale[at.partition.q]
     moves[:3] /= mechanism.size
     least = RANK_TOLERANCE * max(1.0, float(np.abs(moves).max(initial=0.0)))
     chosen: list[int] = []

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.toml import by_coordinate, convert, read_toml
-from ckc_pin.base.validation import is_number, require_kind, require_table
+from ckc_pin.base.toml import convert, join_dotted_keys, read_toml
+from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.library import MECHANISM_FILE, texts_of
+from ckc_pin.mechanism.library import MECHANISM_FILE, read_mechanism_texts
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec
@@ -47,8 +47,8 @@ def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -
     MechanismError
         A mechanism that cannot exist as described.
     """
-    require_kind(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*texts_of(name), None if overrides is None else _as_read(overrides))
+    require_type(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
+    return build(*read_mechanism_texts(name), None if overrides is None else _as_read(overrides))
 
 
 def _as_read(overrides: Any) -> Overrides:
@@ -77,7 +77,7 @@ def as_mechanism(given: Any, who: str) -> Mechanism:
         No mechanism; what `load` raises.
     """
     takes = "a mechanism: itself, its shipped name or its path"
-    require_kind(given, (Mechanism, str, Path, GeneratorSpec), f"{who}: mechanism", takes)
+    require_type(given, (Mechanism, str, Path, GeneratorSpec), f"{who}: mechanism", takes)
     return given if isinstance(given, Mechanism) else load(given)
 
 
@@ -102,7 +102,7 @@ def build(text: str, sources: Sources, overrides: Overrides | None = None) -> Me
 
 def _build(text: str, sources: Sources, overrides: Overrides | None) -> Mechanism:
     data = read_toml(text, sources.name)
-    by_coordinate(data, "q_guess")
+    join_dotted_keys(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
     with sources.naming():
-        return assembled(spec, sources, overrides)
+        return assemble_mechanism(spec, sources, overrides)

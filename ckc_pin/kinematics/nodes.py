@@ -9,10 +9,10 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.continuation import follow_many
 from ckc_pin.kinematics.extended import Task
-from ckc_pin.mechanism.batch import ManyPoses, integrate
+from ckc_pin.mechanism.batch import ManyPoses, integrate_many
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["SHORTEST", "Nodes", "follow", "nodes_at", "shapes", "solutions", "solve"]
+__all__ = ["SHORTEST", "Nodes", "find_solutions", "follow", "nodes_at", "shape_points", "solve"]
 
 MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
 ITERATIONS = 8
@@ -91,11 +91,11 @@ def solve(task: Task, start: Array, given: Array, iterations: int = ITERATIONS) 
         going = ~done & (size <= 0.5 * left[active]) & np.isfinite(size)
         left[active] = size
         step = -_solve(jacobian[going][:, every], residual[going])
-        local = np.abs(step / mechanism.tree.reach).max(axis=1, initial=0.0) <= MAX_STEP
+        local = np.abs(step / mechanism.tree.step_scale).max(axis=1, initial=0.0) <= MAX_STEP
         active = active[going][local]
         if not len(active):
             break
-        found.q_tree[active] = integrate(mechanism.tree, found.q_tree[active], step[local])
+        found.q_tree[active] = integrate_many(mechanism.tree, found.q_tree[active], step[local])
     return found, solved
 
 
@@ -135,8 +135,8 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
         here = at[active]
         right = np.hstack([np.zeros((len(active), free)), part[:, None] * change[active]])
         step = _solve(here.J[:, task.every], right)
-        near = np.abs(step / tree.reach).max(axis=1) <= MAX_STEP
-        guess = integrate(tree, here.q_tree, np.where(near[:, None], step, 0.0))
+        near = np.abs(step / tree.step_scale).max(axis=1) <= MAX_STEP
+        guess = integrate_many(tree, here.q_tree, np.where(near[:, None], step, 0.0))
         trial, solved = solve(task, guess, start.given[active] + (done + part)[:, None] * change[active])
         good = solved & near & (trial.det * here.det > 0)
         at.put(active[good], trial[good])
@@ -145,7 +145,7 @@ def follow(task: Task, start: Nodes, change: Array, shortest: float = SHORTEST) 
     return at, follow_many(len(change), advance, shortest) == 1.0
 
 
-def solutions(task: Task, given: Array, most: int) -> Array:
+def find_solutions(task: Task, given: Array, most: int) -> Array:
     """List configurations with these given values, as different shapes, the assembled one's branch first.
 
     They are found from random starts, so that some may be missed.
@@ -166,10 +166,10 @@ def solutions(task: Task, given: Array, most: int) -> Array:
     reach = np.where(mechanism.tree.in_metres, mechanism.size, np.pi)
     steps = random.uniform(-1.0, 1.0, (STARTS, mechanism.n)) * reach
     steps[0] = 0.0
-    starts = integrate(mechanism.tree, np.tile(mechanism.q_tree, (STARTS, 1)), steps)
+    starts = integrate_many(mechanism.tree, np.tile(mechanism.q_tree, (STARTS, 1)), steps)
     closed = _settle(task, starts, np.tile(given, (STARTS, 1)))
     found: list[int] = []
-    look = shapes(mechanism, closed)
+    look = shape_points(mechanism, closed)
     for k in range(len(closed)):
         if all(np.abs(look[k] - look[other]).max() > SAME * mechanism.size for other in found):
             found.append(k)
@@ -190,12 +190,12 @@ def _settle(task: Task, start: Array, given: Array) -> Array:
         longest = np.abs(step).max(axis=1, keepdims=True, initial=1e-300)
         if np.all(longest < 1e-12):
             break
-        q_tree = integrate(mechanism.tree, q_tree, step * np.minimum(1.0, WALK / longest))
+        q_tree = integrate_many(mechanism.tree, q_tree, step * np.minimum(1.0, WALK / longest))
     nodes, solved = solve(task, q_tree, given)
     return nodes.q_tree[solved]
 
 
-def shapes(mechanism: Mechanism, q_tree: Array) -> Array:
+def shape_points(mechanism: Mechanism, q_tree: Array) -> Array:
     """What a mechanism looks like at configurations (count, nq): centres of mass and ends of loops, (count, k).
 
     Whole turns of a joint do not show, nor do joints of a massless link that only say how it is held.

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import require_kind
+from ckc_pin.base.validation import require_type
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.continuation import follow, same_branch
-from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
-from ckc_pin.kinematics.nodes import solutions
+from ckc_pin.kinematics.extended import Extended, Task, extend_closure, find_point
+from ckc_pin.kinematics.nodes import find_solutions
 from ckc_pin.kinematics.sigma import newton, sigma
-from ckc_pin.mechanism.batch import difference, evaluate, integrate
+from ckc_pin.mechanism.batch import difference_many, evaluate_closure, integrate_many
 from ckc_pin.mechanism.closure import Closure, Selected
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -66,10 +66,10 @@ class Point:
     """
 
     def __init__(self, mechanism: Mechanism, name: str | None = None) -> None:
-        require_kind(mechanism, Mechanism, "Point: mechanism", "a Mechanism, as load returns it")
+        require_type(mechanism, Mechanism, "Point: mechanism", "a Mechanism, as load returns it")
         self.mechanism = mechanism
         self.name = find_point(mechanism, name)
-        self.extended: Extended = extend(mechanism, self.name)
+        self.extended: Extended = extend_closure(mechanism, self.name)
         chosen = np.concatenate([self.extended.loops, self.extended.fixing])
         closure = self.extended.closure
         rows = Selected(closure.groups, closure.rows, chosen)
@@ -180,9 +180,9 @@ class Point:
 
         def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
             step = at.phi_z_factor.solve(part * change)
-            if not np.abs(step / at.tree.reach).max() <= LONGEST_STEP:
+            if not np.abs(step / at.tree.step_scale).max() <= LONGEST_STEP:
                 return None
-            trial = newton(at.moved(step), level - (1.0 - done - part) * change, self.mechanism.tolerance)
+            trial = newton(at.integrate(step), level - (1.0 - done - part) * change, self.mechanism.tolerance)
             return trial.at if trial.converged else None
 
         at, done = follow(begin, advance, SMALLEST_PIECE)
@@ -209,11 +209,11 @@ class Point:
         levels = self._level(wanted, begin)
         if levels.shape[1] != self.mechanism.n:
             return None
-        room = np.abs(difference(tree, near[:-1], near[1:])).max()
+        room = np.abs(difference_many(tree, near[:-1], near[1:])).max()
         q_tree, moved, place = near.copy(), np.zeros(len(near)), np.empty((len(near), 3))
         left, side = np.arange(len(near)), np.zeros((2, len(near)))
         for _ in range(MOST_CORRECTIONS):
-            rows, J_rows = evaluate(tree, self.extended.closure, q_tree[left])
+            rows, J_rows = evaluate_closure(tree, self.extended.closure, q_tree[left])
             phi, J = rows[:, self._chosen], J_rows[:, self._chosen]
             place[left], side[:, left] = rows[:, self.extended.place[:3]], (np.sign(np.linalg.det(J)), self.side(J))
             if not side.all() or np.any(side != side[:, :1]):
@@ -227,7 +227,7 @@ class Point:
             moved[left] += np.abs(step).max(axis=1)
             if not np.all(moved <= room):
                 return None
-            q_tree[left] = integrate(tree, q_tree[left], step)
+            q_tree[left] = integrate_many(tree, q_tree[left], step)
         else:
             return None
         place += self.position(q_tree[0]) - place[0]
@@ -282,7 +282,7 @@ class Point:
     def _solutions(self, wanted: Array, begin: Kinematics) -> list[Array]:
         task = Task(self.extended, self.extended.fixing)
         given = self._level(wanted, begin)[len(self.extended.loops) :]
-        return [q for q in solutions(task, given, MOST) if self._met(self.kinematics(q), wanted)]
+        return [q for q in find_solutions(task, given, MOST) if self._met(self.kinematics(q), wanted)]
 
     def _anywhere(self, begin: Kinematics, wanted: Array) -> Kinematics | None:
         """Return a solution on the same side of Psi's singular configurations, the one that is nearest."""

@@ -19,7 +19,17 @@ from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
-__all__ = ["Newton", "Sigma", "Verdict", "move", "nearest", "newton", "predict", "shortest", "sigma"]
+__all__ = [
+    "Newton",
+    "Sigma",
+    "Verdict",
+    "follow_sigma",
+    "minimum_norm_step",
+    "newton",
+    "predict",
+    "project_onto_closure",
+    "sigma",
+]
 
 Verdict = Literal["converged", "out of reach", "singular"]
 
@@ -102,13 +112,13 @@ def sigma(
     if mechanism.splits_root:
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     start = start or mechanism.assembled
-    if mechanism.tree.flat:
-        step = q - start.q_tree[mechanism.tree.place[mechanism.partition.q]]
+    if mechanism.tree.is_euclidean:
+        step = q - start.q_tree[mechanism.tree.q_index[mechanism.partition.q]]
     else:
         numbers = mechanism.tree.to_coordinates(start.q_tree)
         numbers[mechanism.partition.q] = q
         step = mechanism.tree.difference(start.q_tree, mechanism.tree.from_coordinates(numbers))[mechanism.partition.q]
-    return move(start, step, w, mechanism.tolerance, anywhere=anywhere)
+    return follow_sigma(start, step, w, mechanism.tolerance, anywhere=anywhere)
 
 
 def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
@@ -131,7 +141,7 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
         Not converged when a step is not local, does not contract, or phi_z is singular.
     """
     at, loose = start, tolerance > LOOSE * start.tree.size
-    tolerance *= start.tree.coarseness(start.q_tree)
+    tolerance *= start.tree.tolerance_factor(start.q_tree)
     residual = at.phi - w
     size = _unclosed(at, residual)
     redundant = len(residual) > len(at.partition.z)
@@ -144,9 +154,9 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
             return Newton(at, iteration, closed)
         step = np.zeros(at.tree.n)
         step[at.partition.z] = -at.phi_z_factor.solve(residual)
-        if not np.abs(step / at.tree.reach).max() <= MAX_STEP:
+        if not np.abs(step / at.tree.step_scale).max() <= MAX_STEP:
             return Newton(at, iteration, False)
-        at = at.moved(step)
+        at = at.integrate(step)
         residual = at.phi - w
         previous, size = size, _unclosed(at, residual)
         if not size <= max(0.5 * previous, tolerance):
@@ -155,7 +165,7 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
     return Newton(at, MAX_ITERATIONS, size <= tolerance)
 
 
-def nearest(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) -> Kinematics:
+def project_onto_closure(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) -> Kinematics:
     """Close the loops by the shortest steps, q and z alike, as far as these lead.
 
     Parameters
@@ -170,8 +180,8 @@ def nearest(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) 
     at, rows = start, np.eye(start.tree.n)[list(still)]
     size, none = float(np.abs(at.phi).max(initial=0.0)), np.zeros(len(rows))
     for _ in range(MAX_ITERATIONS if size > 0.0 else 0):
-        step = shortest(np.vstack([at.J, rows]), rank, np.concatenate([at.phi, none]), at.tree.reach)
-        trial = at.moved(step)
+        step = minimum_norm_step(np.vstack([at.J, rows]), rank, np.concatenate([at.phi, none]), at.tree.step_scale)
+        trial = at.integrate(step)
         previous, size = size, float(np.abs(trial.phi).max())
         if not size < previous:
             break
@@ -179,7 +189,7 @@ def nearest(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) 
     return at
 
 
-def shortest(rows: Array, rank: int, residual: Array, reach: Array) -> Array:
+def minimum_norm_step(rows: Array, rank: int, residual: Array, reach: Array) -> Array:
     """Return the least x with rows x = -residual, radians and the mechanism's size being alike."""
     u, values, v = np.linalg.svd(rows * reach, full_matrices=False)
     along = (u[:, :rank].T @ residual) / np.maximum(values[:rank], 1e-300)
@@ -202,10 +212,10 @@ def predict(at: Kinematics, dq: Array, dw: Array | None = None) -> Kinematics:
     step = at.rho @ dq
     if dw is not None:
         step[at.partition.z] += at.phi_z_factor.solve(dw)
-    return at.moved(step)
+    return at.integrate(step)
 
 
-def move(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
+def follow_sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
     """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq, and from its level to w.
 
     Each piece is predicted along rho and corrected by Newton. Where the line ends early, q is looked for from other
@@ -249,14 +259,14 @@ def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done
     """
     target = np.zeros(at.tree.n)
     target[at.partition.q] = dq
-    tolerance *= at.tree.coarseness(at.moved(target).q_tree)
-    start, random = at.moved(target), np.random.default_rng(0)
+    tolerance *= at.tree.tolerance_factor(at.integrate(target).q_tree)
+    start, random = at.integrate(target), np.random.default_rng(0)
     least, singular, other = np.inf, False, False
     for attempt in range(STARTS):
         spread = np.zeros(at.tree.n)
         spread[at.partition.z] = random.uniform(-np.pi, np.pi, len(at.partition.z)) if attempt else 0.0
-        spread *= at.tree.reach
-        nearest = _least_squares(start.moved(spread), w, tolerance)
+        spread *= at.tree.step_scale
+        nearest = _least_squares(start.integrate(spread), w, tolerance)
         miss = float(np.abs(nearest.phi - w).max(initial=0.0))
         least = min(least, miss)
         flat = nearest.margin() <= 1e-6
@@ -284,7 +294,7 @@ def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinema
         gram, gradient = at.phi_z.T @ at.phi_z, at.phi_z.T @ residual
         step = np.zeros(at.tree.n)
         step[z] = -np.linalg.solve(gram + damping * np.eye(len(z)) * max(1e-30, np.trace(gram)), gradient)
-        trial = at.moved(step)
+        trial = at.integrate(step)
         if np.linalg.norm(trial.phi - w) < np.linalg.norm(residual):
             at, damping = trial, max(damping / 5, 1e-12)
             if np.abs(step).max() < 1e-12:

@@ -14,7 +14,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.linear.closed_loop import ClosedLoop, Feedback
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import beyond_stops
+from ckc_pin.mechanism.warnings import describe_stop_violation
 
 __all__ = ["LoopWithinLimits"]
 
@@ -56,7 +56,7 @@ class LoopWithinLimits:
         NumericalError
             A joint is beyond its stops, the motors do not give what is wanted, or it is not linearized there.
         """
-        if beyond := beyond_stops(self.mechanism, state.q_tree):
+        if beyond := describe_stop_violation(self.mechanism, state.q_tree):
             raise NumericalError(f"{where} {beyond}")
         actuation = self.actuation
         if actuation is not None and np.isfinite(actuation.limit).any():

@@ -91,12 +91,12 @@ class LinearModel:
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
         """Of A, in rising order of |eigenvalue|: of a motion, those of the instant."""
-        return modes_of(self.A, self.motions, self._units, self.mechanism.tree.reach)
+        return modes_of(self.A, self.motions, self._units, self.mechanism.tree.step_scale)
 
     @cached_property
     def _units(self) -> Array:
         tree = self.mechanism.tree
-        return tree.reach[[tree.index[name] for name in self.states[: len(self.states) // 2]]]
+        return tree.step_scale[[tree.index[name] for name in self.states[: len(self.states) // 2]]]
 
     def sway(self, number: int) -> Run | None:
         """Return a mode, counted from 1, as a run to play; see `ckc_pin.linear.mode_animation.sway`."""
@@ -225,12 +225,12 @@ def linear_model(
     if names:
         notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
     if not terms.v_tree.any() and unbalanced(terms, u_tree, found.T):
-        a = found.acceleration / mechanism.tree.reach
+        a = found.acceleration / mechanism.tree.step_scale
         k = int(np.argmax(np.abs(a)))
         rate = f"{found.acceleration[k]:.4g} {mechanism.tree.units('/s^2')[k]}"
         notes = (*notes, f"at rest, but nothing keeps it there: {mechanism.coordinates[k]} accelerates with {rate}")
     points = mechanism.point_jacobians(terms.q_tree)
-    turns, zero = mechanism.motors.turns.T, np.zeros((mechanism.n + 3 * len(points), len(found.at)))
+    turns, zero = mechanism.motors.transmission.T, np.zeros((mechanism.n + 3 * len(points), len(found.at)))
     places = np.vstack([found.T, *(x @ found.T for x in points.values())])
     forces_q = found.multipliers_q @ found.T + found.multipliers_v @ found.V
     return LinearModel(
@@ -260,6 +260,6 @@ def linear_model(
 
 def _refuse_massless(terms: Terms, locked: IntArray) -> None:
     tangent = motions(terms)
-    tangent = tangent @ kernel(tangent[locked] / terms.mechanism.tree.reach[locked, None])
+    tangent = tangent @ kernel(tangent[locked] / terms.mechanism.tree.step_scale[locked, None])
     if tangent.shape[1]:
         refuse_massless(terms, tangent, np.arange(terms.mechanism.n))

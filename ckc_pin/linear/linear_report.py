@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import format_eigenvalues, to_pairs
 from ckc_pin.linear.linear_model import LinearModel, eigenvalues_of
 from ckc_pin.linear.stability_result import Stability
@@ -91,7 +91,7 @@ def save_linear(model: LinearModel, path: Path) -> Path:
     about = {"name": model.name, "at": model.at, "t": model.t, "locked": model.locked, "notes": model.notes}
     if model.closed_loop is not None:
         arrays["closed_loop"] = model.closed_loop
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         np.savez_compressed(file, **arrays, meta=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8))
     return path
 

@@ -13,7 +13,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import is_number, require_kind, require_table
+from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
@@ -23,12 +23,12 @@ from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import load
-from ckc_pin.kinematics.sigma import nearest, shortest, sigma
+from ckc_pin.kinematics.sigma import minimum_norm_step, project_onto_closure, sigma
 from ckc_pin.linear.closed_loop import ClosedLoop
 from ckc_pin.linear.linear_model import LinearModel, linear_model
 from ckc_pin.linear.resting import hold
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import beyond_stops
+from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native.plant import NONE
 from ckc_pin.run.compiled_terms import library_of
 from ckc_pin.run.recorded_joints import RecordedJoints
@@ -109,7 +109,7 @@ def linearize(
     ((4, 4), ('theta_1', 'theta_3'))
     """
     takes = "a mechanism or a scene: itself, its name or path"
-    require_kind(what, (Mechanism, Scene, str, Path), "linearize: what", takes)
+    require_type(what, (Mechanism, Scene, str, Path), "linearize: what", takes)
     if overrides is not None:
         require_table(overrides, "linearize: overrides", OVERRIDES)
     with one_blas_thread():
@@ -165,7 +165,7 @@ def _at_equilibrium(subject: _Subject) -> LinearModel:
         motors = "as assembled, or at coordinates, where its motors hold it, or " if mechanism.actuated else ""
         says = f"{error}; or linearize it {motors}at an instant of a scene's run"
         raise NumericalError(says, q_tree=error.q_tree) from None
-    if says := beyond_stops(mechanism, at.q_tree):
+    if says := describe_stop_violation(mechanism, at.q_tree):
         raise InputError(f"{mechanism.name}: at its equilibrium {says}; give coordinates within them")
     return _at_rest(
         subject,
@@ -186,7 +186,7 @@ def _at_target(subject: _Subject) -> LinearModel:
     found = sigma(mechanism, law.q_d, find_start(mechanism, scene).at)  # on the branch that a run is on
     if found.verdict != "converged":
         raise InputError(f'at = "target": {mechanism.name} cannot be there: {found.reason}')
-    if says := beyond_stops(mechanism, found.at.q_tree):
+    if says := describe_stop_violation(mechanism, found.at.q_tree):
         raise InputError(f'{mechanism.name}: at = "target": {says}; give another controller.q_d')
     state, actuation = Terms(mechanism, found.at, np.zeros(mechanism.n)), subject.actuation
     actuation.require_transmission(state.at)
@@ -217,7 +217,7 @@ def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
 def _operating(subject: _Subject, state: Terms) -> LinearModel:
     """Hold a configuration by stops, the least torques and, where these fail, friction; refuse what nothing holds."""
     mechanism = subject.mechanism
-    if says := beyond_stops(mechanism, state.q_tree):
+    if says := describe_stop_violation(mechanism, state.q_tree):
         raise InputError(f"{mechanism.name}: at: {says}; give coordinates within them")
     rest = hold(state, subject.actuation, rubs=subject.smoothing is None)
     notes = []
@@ -304,9 +304,9 @@ def _with_controller(
 def _closed(state: Terms) -> Terms:
     """Close loops that are slightly open, and make J v' zero."""
     mechanism = state.mechanism
-    at, v = nearest(state.at, mechanism.rank), state.v_tree
+    at, v = project_onto_closure(state.at, mechanism.rank), state.v_tree
     if v.any():
-        v = v + shortest(at.J, mechanism.rank, at.J @ v, mechanism.tree.reach)
+        v = v + minimum_norm_step(at.J, mechanism.rank, at.J @ v, mechanism.tree.step_scale)
     return Terms(mechanism, at, v)
 
 
@@ -328,7 +328,7 @@ def _run_to(scene: Scene, t: float) -> Run:
 def _notes(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
     """Say what stands between this model and the run that goes on from there."""
     notes = []
-    if np.any(np.abs(run.v_tree[k]) > 1e-6 * run.mechanism.tree.reach):
+    if np.any(np.abs(run.v_tree[k]) > 1e-6 * run.mechanism.tree.step_scale):
         notes.append("about a motion, not a state of rest: A and B are those of the instant")
     limits = scene_actuation(scene, run.mechanism).limit
     full = [name for name, x, most in zip(run.actuated, run.tau[k], limits, strict=True) if abs(x) >= most * (1 - 1e-9)]

@@ -13,7 +13,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues
-from ckc_pin.base.validation import require_kind
+from ckc_pin.base.validation import require_type
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
@@ -93,7 +93,7 @@ def gain_locus(
     """
     import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
 
-    require_kind(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
+    require_type(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
     if not isinstance(what, Scene):
         if not names_a_scene(str(what)):
             return None

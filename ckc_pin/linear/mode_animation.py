@@ -10,7 +10,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import is_number
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.sigma import nearest, shortest
+from ckc_pin.kinematics.sigma import minimum_norm_step, project_onto_closure
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.modes import ComplexArray, Mode, telling
 from ckc_pin.mechanism.library import MECHANISM_FILE
@@ -71,18 +71,18 @@ def _swing(model: LinearModel, shape: ComplexArray, swing: ComplexArray, rate: c
     """States of the motion, the shortest way off the shape that the loops ask for."""
     mechanism, tree = model.mechanism, model.mechanism.tree
     start, still = tree.from_coordinates(model.q_tree), [tree.index[name] for name in model.locked]
-    rank, tolerance = mechanism.n - len(model.states) // 2, mechanism.tolerance * tree.coarseness(start)
+    rank, tolerance = mechanism.n - len(model.states) // 2, mechanism.tolerance * tree.tolerance_factor(start)
     rest = np.eye(mechanism.n)[still]
     states: list[Terms] = []
     for factor in swing:
         part = (shape * factor).real
         moved = mechanism.kinematics(tree.integrate(start, part))
-        at = nearest(moved, rank, still)
-        off = np.abs(tree.difference(moved.q_tree, at.q_tree) / tree.reach).max()
-        if np.abs(at.phi).max(initial=0.0) > tolerance or off > max(float(np.abs(part / tree.reach).max()), LEAST):
+        at = project_onto_closure(moved, rank, still)
+        off = np.abs(tree.difference(moved.q_tree, at.q_tree) / tree.step_scale).max()
+        if np.abs(at.phi).max(initial=0.0) > tolerance or off > max(float(np.abs(part / tree.step_scale).max()), LEAST):
             return None
         rows, v = np.vstack([at.J, rest]), (rate * shape * factor).real
-        states.append(Terms(mechanism, at, v + shortest(rows, rank, rows @ v, tree.reach)))
+        states.append(Terms(mechanism, at, v + minimum_norm_step(rows, rank, rows @ v, tree.step_scale)))
     return states
 
 

@@ -72,7 +72,7 @@ def hold(state: Terms, actuation: Actuation, *, rubs: bool) -> Rest:
     at_stop, refused = np.flatnonzero(side), None
     sets = chain.from_iterable(combinations(at_stop, count) for count in range(len(at_stop), -1, -1))
     for touching in (np.array(some, np.intp) for some in islice(sets, MOST_WAYS)):
-        tangent = every @ kernel(every[touching] / mechanism.tree.reach[touching, None])
+        tangent = every @ kernel(every[touching] / mechanism.tree.step_scale[touching, None])
         try:
             tau, friction = _share(state, tangent, actuation, rubs=rubs)
         except InputError as error:
@@ -96,7 +96,7 @@ def motions(state: Terms) -> Array:
 
 def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
     """Whether more than rounding is left of what acts at rest, along a basis of motions."""
-    reach, springs = state.mechanism.tree.reach, state.mechanism.springs
+    reach, springs = state.mechanism.tree.step_scale, state.mechanism.springs
     sizes = np.abs(state.h_tree) + np.abs(u_tree) + springs.sizes(state.q_tree)
     enough = LEFT_OVER * (np.abs(tangent.T) @ sizes)
     scale = weight(state.mechanism) + float((reach * sizes).max())
@@ -108,7 +108,7 @@ def unbalanced(state: Terms, u_tree: Array, tangent: Array) -> bool:
 def _side(mechanism: Mechanism, q_tree: Array) -> Array:
     """Return -1 at a joint's lower stop, 1 at its upper one, else 0, by coordinate."""
     joints, numbers = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
-    near = AT_STOP * mechanism.tree.reach
+    near = AT_STOP * mechanism.tree.step_scale
     return np.where(numbers - joints.lower <= near, -1.0, np.where(joints.upper - numbers <= near, 1.0, 0.0))
 
 
@@ -123,7 +123,7 @@ def kernel(rows: Array) -> Array:
 def _share(state: Terms, tangent: Array, actuation: Actuation, *, rubs: bool) -> tuple[Array, Array]:
     """Torques of motors, and where these do not do it alone forces of friction, (n,), that hold along a basis."""
     mechanism, none = state.mechanism, np.zeros(state.mechanism.n)
-    turns, friction = mechanism.motors.turns, mechanism.joints.friction
+    turns, friction = mechanism.motors.transmission, mechanism.joints.friction
     tau = _least(state, tangent, turns, actuation.limit, actuation.weights, actuation.preload)
     if not unbalanced(state, turns.T @ tau, tangent):
         return tau, none
@@ -176,8 +176,8 @@ def _why_not(state: Terms, tangent: Array, actuation: Actuation) -> str:
 
 def _loose(mechanism: Mechanism, tangent: Array) -> str:
     """Name freedoms that no motor drives, by the coordinates that tell them best."""
-    ways, _ = np.linalg.qr(tangent / mechanism.tree.reach[:, None])
-    loose = ways @ kernel(mechanism.motors.turns @ (mechanism.tree.reach[:, None] * ways))
+    ways, _ = np.linalg.qr(tangent / mechanism.tree.step_scale[:, None])
+    loose = ways @ kernel(mechanism.motors.transmission @ (mechanism.tree.step_scale[:, None] * ways))
     own = mechanism.partition.q
     rank = np.linalg.matrix_rank(loose, tol=1e-6)
     first = own if np.linalg.matrix_rank(loose[own], tol=1e-6) == rank else np.arange(mechanism.n)

@@ -9,7 +9,7 @@ from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.continuation import follow
-from ckc_pin.kinematics.sigma import move, sigma
+from ckc_pin.kinematics.sigma import follow_sigma, sigma
 from ckc_pin.linear.limited_closed_loop import LoopWithinLimits
 from ckc_pin.linear.linear_model import eigenvalues_of
 from ckc_pin.linear.sampled_loop import sampled_loop
@@ -59,7 +59,7 @@ def set_point_stability(
     if sampling is not None:
         multiplier = float(np.abs(np.linalg.eigvals(sampled_loop(loop, *sampling))).max())
         stable, slowest = multiplier < 1.0 - SURE, time_constant(float(np.log(max(multiplier, 1e-300))) / sampling[0])
-    reach = mechanism.tree.reach[mechanism.partition.q]
+    reach = mechanism.tree.step_scale[mechanism.partition.q]
     K_P, hessian = (x / 2 + x.T / 2 for x in (law.K_P, h_gradient(mechanism, rest.at)))
     half, offset = np.linalg.inv(np.linalg.cholesky(K_P)), rest.q - law.q_d
     factor = max(0.0, -float(np.linalg.eigvalsh(half @ hessian @ half.T)[0]))
@@ -96,7 +96,7 @@ def _rest(mechanism: Mechanism, law: SetPoint, target: Kinematics) -> Kinematics
             if np.abs(missing).max() <= BALANCED * scale:
                 return at
             step = np.asarray(np.linalg.solve(stiffness, missing), dtype=float)
-            found = move(at, step, 0.0, mechanism.tolerance, anywhere=False)
+            found = follow_sigma(at, step, 0.0, mechanism.tolerance, anywhere=False)
             if found.verdict != "converged":
                 return None
             at = found.at

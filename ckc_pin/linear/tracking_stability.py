@@ -63,7 +63,7 @@ def tracking_stability(
             break
         steps *= 2
     offset = _offset(driven, t_end, sampling)
-    far = float((offset / loop.mechanism.tree.reach[loop.mechanism.partition.q]).max())
+    far = float((offset / loop.mechanism.tree.step_scale[loop.mechanism.partition.q]).max())
     with np.errstate(over="ignore"):
         growth, largest_growth = (float(np.exp(x)) for x in (end, grown.max()))
     reason = None

@@ -19,14 +19,14 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["ManyPoses", "difference", "evaluate", "integrate", "joined"]
+__all__ = ["ManyPoses", "difference_many", "evaluate_closure", "integrate_many", "join_closures"]
 
 Renumber = Callable[[IntArray], IntArray]
 
 CHUNK = 2048  # configurations evaluated together: their arrays stay in the processor's cache
 
 
-def evaluate(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array, Array]:
+def evaluate_closure(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array, Array]:
     """Return phi and J of a closure at many configurations.
 
     Parameters
@@ -52,7 +52,7 @@ def evaluate(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array, Array]
 
 def _evaluate(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Array]:
     if isinstance(group, Affine):
-        phi = pose.configurations[:, pose.tree.place] @ group.matrix.T - group.offset
+        phi = pose.configurations[:, pose.tree.q_index] @ group.matrix.T - group.offset
         return phi, np.broadcast_to(group.matrix, (pose.count, *group.matrix.shape))
     copies = _copies(group, closure, pose)
     shape = (pose.count, len(group.out))
@@ -97,7 +97,7 @@ def renumbered(group: Rows, rows: Renumber, pairs: Renumber, directions: Renumbe
     raise TypeError(f"rows of an unknown kind: {type(group).__name__}")
 
 
-def joined(a: Closure, b: Closure) -> Closure:
+def join_closures(a: Closure, b: Closure) -> Closure:
     """Return one closure with the rows of two, those of the first one first."""
     pairs, directions = len(a.anchors.point_joint) // 2, len(a.anchors.direction_joint)
     more = tuple(
@@ -114,18 +114,18 @@ def joined(a: Closure, b: Closure) -> Closure:
     return Closure(anchors, a.groups + more, a.names + b.names, a.aligned + aligned, a.turned_by + b.turned_by)
 
 
-def integrate(tree: Tree, q_tree: Array, step: Array) -> Array:
+def integrate_many(tree: Tree, q_tree: Array, step: Array) -> Array:
     """Move configurations (count, nq) by tangent steps (count, n)."""
-    if tree.flat:
+    if tree.is_euclidean:
         return q_tree + step
     return np.array([pin.integrate(tree.model, q, dq) for q, dq in zip(q_tree, step, strict=True)]).reshape(
         q_tree.shape
     )
 
 
-def difference(tree: Tree, start: Array, end: Array) -> Array:
+def difference_many(tree: Tree, start: Array, end: Array) -> Array:
     """Return the tangent steps (count, n) from configurations to others, (count, nq) each."""
-    if tree.flat:
+    if tree.is_euclidean:
         return end - start
     return np.array([pin.difference(tree.model, a, b) for a, b in zip(start, end, strict=True)]).reshape(-1, tree.n)
 

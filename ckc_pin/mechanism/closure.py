@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import Shared
+from ckc_pin.base.values import Immutable
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
@@ -23,7 +23,7 @@ _XYZ = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Closure(Shared):
+class Closure(Immutable):
     """All rows of all loops and couplings.
 
     Attributes
@@ -96,7 +96,7 @@ class Closure(Shared):
         rows = Selected(self.groups, len(self.names), keep)
         return Closure(self.anchors, (rows,), tuple(self.names[k] for k in keep), ())
 
-    def misses(self, phi: Array) -> dict[str, float]:
+    def largest_residuals(self, phi: Array) -> dict[str, float]:
         """Largest |phi| of each loop."""
         worst: dict[str, float] = {}
         for (loop, _), value in zip(self.names, np.abs(phi), strict=True):
@@ -109,7 +109,7 @@ class Closure(Shared):
 
 
 @dataclass(frozen=True)
-class Selected(Shared):
+class Selected(Immutable):
     """Some rows of a closure, as a group of its own."""
 
     groups: tuple[Rows, ...]
@@ -216,7 +216,7 @@ class ClosureBuilder:
         """Add the row joint - ratio * other - offset = 0."""
         name = f"{coupling.joint}~{coupling.other}"
         where = f"coupling {name!r}"
-        joint, other = (self.tree.one_freedom(x, where) for x in (coupling.joint, coupling.other))
+        joint, other = (self.tree.joint_index(x, where) for x in (coupling.joint, coupling.other))
         if joint == other:
             raise MechanismError(f"{where}: a joint cannot be coupled to itself")
         coefficients = np.zeros(self.tree.n)

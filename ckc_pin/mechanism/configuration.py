@@ -8,17 +8,17 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import Factorization
-from ckc_pin.base.values import Shared, lazy
+from ckc_pin.base.values import Immutable, lazy
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose, Rate
-from ckc_pin.mechanism.rank import scaled
+from ckc_pin.mechanism.rank import scale_jacobian
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Kinematics", "Partition", "Psi"]
 
 
 @dataclass(frozen=True)
-class Partition(Shared):
+class Partition(Immutable):
     """The split q' = [q; z] of eq. 2: where the independent and the dependent coordinates stand."""
 
     q: IntArray
@@ -95,13 +95,13 @@ class Kinematics:
         """
         if not len(self.partition.z):
             return float("inf")
-        J = scaled(self.J, self.tree, self.closure)
+        J = scale_jacobian(self.J, self.tree, self.closure)
         if not np.all(np.isfinite(J)):
             return float("nan")
         least = np.linalg.svd(J[:, self.partition.z], compute_uv=False)[len(self.partition.z) - 1]
         return float(least / max(np.linalg.norm(J), 1e-300))
 
-    def moved(self, step: Array) -> Kinematics:
+    def integrate(self, step: Array) -> Kinematics:
         """Return the kinematics at the configuration a tangent step away."""
         return Kinematics(self.tree, self.closure, self.partition, self.tree.integrate(self.q_tree, step))
 
@@ -123,7 +123,7 @@ class Psi:
 
     def value(self, q: Array) -> Array:
         """Psi(q', q), shape (rows + d,)."""
-        return np.concatenate([self.at.phi, self.at.q_tree[self.at.tree.place[self.at.partition.q]] - q])
+        return np.concatenate([self.at.phi, self.at.q_tree[self.at.tree.q_index[self.at.partition.q]] - q])
 
     @property
     def jacobian(self) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.values import Shared
+from ckc_pin.base.values import Immutable
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.spec_frames import FrameSpec
 
@@ -17,7 +17,7 @@ __all__ = ["Frame", "Frames"]
 
 
 @dataclass(frozen=True)
-class Frame(Shared):
+class Frame(Immutable):
     """A frame fixed in a joint of the tree (joint 0: the world): rotation (3, 3), translation (3,)."""
 
     joint: int

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
-from ckc_pin.base.values import Shared
+from ckc_pin.base.values import Immutable
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rank import RankReport, choose_dependent, rank_of, redundant_rows, scaled
+from ckc_pin.mechanism.rank import RankReport, choose_dependent, compute_rank, redundant_rows, scale_jacobian
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Freedoms", "count_freedoms", "idle_coordinates"]
@@ -20,7 +20,7 @@ IMMOBILE = 1e-9  # of a motion of size one: what a coordinate that cannot move t
 
 
 @dataclass(frozen=True)
-class Freedoms(Shared):
+class Freedoms(Immutable):
     """What the rank of J says.
 
     Attributes
@@ -66,11 +66,11 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
         Given a basis of J's null space there, (k, n), closed configurations a small step along it.
     """
     jacobian = _scaled_at(tree, closure, q_tree)
-    here = there = rank_of(jacobian)
+    here = there = compute_rank(jacobian)
     jacobians = [(here.rank, jacobian)]
     for other in nearby(_directions(jacobian)[here.rank :]):
         candidate = _scaled_at(tree, closure, other)
-        report = rank_of(candidate)
+        report = compute_rank(candidate)
         jacobians.append((report.rank, candidate))
         if report.rank > there.rank:
             there, jacobian = report, candidate
@@ -89,7 +89,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
             f"the rank is not certain: relative singular values {there.above:.1e} | {there.below:.1e} around the cut "
             f"at {there.rank}; numbers rounded in the files, or nearly singular"
         )
-    blocks = [np.arange(v, v + 6) for _, v in tree.free]
+    blocks = [np.arange(v, v + 6) for _, v in tree.free_roots]
     return Freedoms(
         d=tree.n - there.rank,
         rank=there,
@@ -115,7 +115,7 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequenc
         What motors, and springs on joints, turn with each joint.
     """
     ends = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
-    moves = np.vstack([tree.centre_jacobians(q_tree), *ends, turns]) @ tangent
+    moves = np.vstack([tree.centre_of_mass_jacobians(q_tree), *ends, turns]) @ tangent
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)
@@ -133,4 +133,4 @@ def _directions(jacobian: Array) -> Array:
 
 
 def _scaled_at(tree: Tree, closure: Closure, q_tree: Array) -> Array:
-    return scaled(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure)
+    return scale_jacobian(closure.jacobian(Pose(tree, closure.anchors, q_tree)), tree, closure)

@@ -52,7 +52,7 @@ class Joints:
         armature, damping = np.array(model.armature), np.array(model.damping)
         seen = set[str]()
         for spec in specs:
-            at = tree.one_freedom(spec.name, "joint")
+            at = tree.joint_index(spec.name, "joint")
             if spec.name in seen:
                 raise MechanismError(f"joint: {spec.name!r} is given twice")
             seen.add(spec.name)

@@ -13,7 +13,15 @@ from ckc_pin.base.toml import convert, read_text
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.generators import GENERATORS, GeneratorSpec, generate
 
-__all__ = ["about", "first_comment", "is_path", "library", "mechanism_file", "shipped", "texts_of"]
+__all__ = [
+    "describe_mechanism",
+    "first_comment",
+    "is_path",
+    "library",
+    "mechanism_file",
+    "read_mechanism_texts",
+    "shipped",
+]
 
 MECHANISM_FILE = "mechanism.toml"
 
@@ -57,9 +65,9 @@ def mechanism_file(name: str | Path) -> Path:
     return path
 
 
-def about(name: str) -> str:
+def describe_mechanism(name: str) -> str:
     """What a shipped mechanism is, in a sentence: the first comment of its file, so that the two cannot drift apart."""
-    return first_comment(texts_of(name)[0])
+    return first_comment(read_mechanism_texts(name)[0])
 
 
 def first_comment(text: str) -> str:
@@ -71,7 +79,7 @@ def first_comment(text: str) -> str:
     return re.split(r"(?<=\.) +(?=[A-Z])", whole, maxsplit=1)[0]
 
 
-def texts_of(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
+def read_mechanism_texts(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
     """Return the text of a mechanism's file, and where the texts that it names come from.
 
     Raises

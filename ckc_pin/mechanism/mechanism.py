@@ -14,7 +14,7 @@ from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rank import choose_dependent, rank_of, scaled
+from ckc_pin.mechanism.rank import choose_dependent, compute_rank, scale_jacobian
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
@@ -115,26 +115,28 @@ class Mechanism(HasSummary):
         return self.kinematics(self.q_tree)
 
     @property
-    def rooted(self) -> tuple[str, ...]:
+    def independent_root_coordinates(self) -> tuple[str, ...]:
         """Independent coordinates that belong to free roots."""
         return tuple(name for name in self.independent if name in self.tree.free_coordinates)
 
     @property
-    def driven_directly(self) -> bool:
+    def has_direct_drives(self) -> bool:
         """Whether the motors turn the independent joints themselves, so that tau is u of eq. 6."""
-        return np.array_equal(self.motors.turns, np.eye(self.n)[self.partition.q])
+        return np.array_equal(self.motors.transmission, np.eye(self.n)[self.partition.q])
 
     def independent_part(self, q_tree: Array) -> Array:
         """Return q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]
 
-    def best_partition(self, at: Kinematics, *, whole: bool = True) -> Partition | None:
+    def choose_partition(self, at: Kinematics, *, keep_roots_together: bool = True) -> Partition | None:
         """Return the split whose phi_z is furthest from singular at a configuration, by a pivoted QR.
 
-        None where it would split the coordinates of a free root, if these are to stay `whole`.
+        None if it would split the coordinates of a free root and these are to be kept together.
         """
-        jacobian = scaled(at.J, self.tree, self.closure)
-        z = choose_dependent(jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free] if whole else [])
+        jacobian = scale_jacobian(at.J, self.tree, self.closure)
+        z = choose_dependent(
+            jacobian, self.rank, [np.arange(v, v + 6) for _, v in self.tree.free_roots] if keep_roots_together else []
+        )
         return None if z is None else Partition(np.setdiff1d(np.arange(self.n), z), z)
 
     def point_positions(self, q_tree: Array) -> dict[str, Array]:
@@ -195,12 +197,12 @@ class Mechanism(HasSummary):
                 f"d = {self.d} freedoms{remedy}"
             )
         z = np.array(sorted(every - set(at.tolist())), dtype=np.intp)
-        if rank_of(self.freedoms.jacobian[:, z]).rank < len(z):
+        if compute_rank(self.freedoms.jacobian[:, z]).rank < len(z):
             raise MechanismError(
                 f"independent: {', '.join(names)} cannot parametrise the mechanism where it is assembled "
                 f"(phi_z is singular there){remedy}"
             )
-        self.splits_root = any(0 < sum(v_at <= k < v_at + 6 for k in at) < 6 for _, v_at in self.tree.free)
+        self.splits_root = any(0 < sum(v_at <= k < v_at + 6 for k in at) < 6 for _, v_at in self.tree.free_roots)
         if self.splits_root and chosen is not None:
             raise MechanismError(
                 f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
@@ -215,9 +217,11 @@ class Mechanism(HasSummary):
         """Return coordinates that can serve as q: those with motors as far as phi_z stays sound, then others."""
         if motors is None or not motors.names or self.freedoms.dependent is None:
             return best
-        driven = np.flatnonzero(motors.turns.any(axis=0))
-        driven = driven[np.argsort(np.argmax(motors.turns[:, driven] != 0, axis=0), kind="stable")]  # in tau's order
-        blocks = [np.arange(v, v + 6) for _, v in self.tree.free]
+        driven = np.flatnonzero(motors.transmission.any(axis=0))
+        driven = driven[
+            np.argsort(np.argmax(motors.transmission[:, driven] != 0, axis=0), kind="stable")
+        ]  # in tau's order
+        blocks = [np.arange(v, v + 6) for _, v in self.tree.free_roots]
         z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, driven)
         if z is None:
             return best
@@ -229,7 +233,7 @@ class Mechanism(HasSummary):
         self.motors = Motors.on_joints(self.tree, joints) if motors is None else motors
         self.actuated = self.motors.names
         anchors = [self.closure.anchors, self.springs.anchors]
-        turns = np.vstack([self.motors.turns, np.diag(self.springs.joint_stiffness)])
+        turns = np.vstack([self.motors.transmission, np.diag(self.springs.joint_stiffness)])
         idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, anchors, turns)
         if idle:
             self.warnings.append(

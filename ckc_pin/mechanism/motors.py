@@ -1,4 +1,4 @@
-"""Motors: which joints each of them turns, through which gear, and what it can do."""
+"""Motors: which joints each of them transmission, through which gear, and what it can do."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["Motors", "motors_of"]
 
 
 class Motors:
-    """The motors of a mechanism: with theta the angles of their shafts, theta_dot = turns v'.
+    """The motors of a mechanism: with theta the angles of their shafts, theta_dot = transmission v'.
 
-    Power is the same on both sides of a gear, so a motor's own torque tau acts on the tree as u' = turns^T tau.
+    Power is the same on both sides of a gear, so a motor's own torque tau acts on the tree as u' = transmission^T tau.
 
     Parameters
     ----------
     names : sequence of str
-    turns : (m, n) array
+    transmission : (m, n) array
         A motor's rate by the joints' rates: its gear.
     torque_limit, speed_limit : (m,) array
         Of the motor itself, N m or N, rad/s or m/s; infinite where there is none.
@@ -39,9 +39,9 @@ class Motors:
     """
 
     def __init__(
-        self, names: Sequence[str], turns: Array, torque_limit: Array, speed_limit: Array, key: str = "motor"
+        self, names: Sequence[str], transmission: Array, torque_limit: Array, speed_limit: Array, key: str = "motor"
     ) -> None:
-        self.names, self.turns, self.key = tuple(names), turns, key
+        self.names, self.transmission, self.key = tuple(names), transmission, key
         self.torque_limit, self.speed_limit = torque_limit, speed_limit
         twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
         if twice is not None:
@@ -69,7 +69,7 @@ class Motors:
 
     def force(self, tau: Array) -> Array:
         """Return what torques do to the tree, u' of shape (n,)."""
-        return self.turns.T @ tau
+        return self.transmission.T @ tau
 
     def vector(self, values: Mapping[str, Any], what: str, fill: float | None = None) -> Array:
         """Turn a table by motor into a vector, shape (m,).
@@ -107,23 +107,23 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
         return Motors.on_joints(tree, spec.actuated)
     if not spec.motor:
         return None
-    turns, armature = np.zeros((len(spec.motor), tree.n)), np.array(tree.model.armature)
+    transmission, armature = np.zeros((len(spec.motor), tree.n)), np.array(tree.model.armature)
     names = []
     for k, motor in enumerate(spec.motor):
         names.append(_name(motor, k))
         where = f"motor {names[k]!r}"
         for joint, share in _joints(motor, where).items():
-            turns[k, tree.one_freedom(joint, where)] = motor.ratio * share
-        if not turns[k].any():
-            raise MechanismError(f"{where}: its gear turns no joint: a ratio other than 0 is needed")
-        if motor.rotor_inertia and np.count_nonzero(turns[k]) > 1:
+            transmission[k, tree.joint_index(joint, where)] = motor.ratio * share
+        if not transmission[k].any():
+            raise MechanismError(f"{where}: its gear transmission no joint: a ratio other than 0 is needed")
+        if motor.rotor_inertia and np.count_nonzero(transmission[k]) > 1:
             raise MechanismError(
                 f"{where}: rotor_inertia goes with a motor on one joint; on several it would couple their inertias. "
                 "Leave it out, or give the joints an armature"
             )
         if motor.rotor_inertia:
             with np.errstate(over="ignore"):
-                armature += turns[k] ** 2 * motor.rotor_inertia
+                armature += transmission[k] ** 2 * motor.rotor_inertia
             if not np.all(np.isfinite(armature)):
                 raise MechanismError(
                     f"{where}: ratio = {motor.ratio:g} with rotor_inertia = {motor.rotor_inertia:g} is too large: what "
@@ -131,7 +131,7 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
                 )
     tree.model.armature = armature
     limits = np.array([(m.torque_limit or np.inf, m.speed_limit or np.inf) for m in spec.motor])
-    return Motors(names, turns, limits[:, 0], limits[:, 1])
+    return Motors(names, transmission, limits[:, 0], limits[:, 1])
 
 
 def _name(motor: MotorSpec, k: int) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import Shared, lazy
+from ckc_pin.base.values import Immutable, lazy
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
@@ -30,7 +30,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Anchors(Shared):
+class Anchors(Immutable):
     """What a closure's rows hold on to: pairs of points, and directions, each fixed in a joint (0: world).
 
     Attributes

@@ -12,7 +12,15 @@ from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["RANK_TOLERANCE", "RankReport", "choose_dependent", "rank_of", "redundant_rows", "scaled", "scales"]
+__all__ = [
+    "RANK_TOLERANCE",
+    "RankReport",
+    "choose_dependent",
+    "compute_rank",
+    "jacobian_scales",
+    "redundant_rows",
+    "scale_jacobian",
+]
 
 RANK_TOLERANCE = 1e-5  # relative; files are rounded to six digits
 SOUND = 0.03  # of the largest pivot: what a column must bring along to be in z in the place of one that shall be in q
@@ -40,18 +48,18 @@ class RankReport:
         return self.below < SURE
 
 
-def scaled(jacobian: Array, tree: Tree, closure: Closure) -> Array:
+def scale_jacobian(jacobian: Array, tree: Tree, closure: Closure) -> Array:
     """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
-    rows, columns = scales(tree, closure)
+    rows, columns = jacobian_scales(tree, closure)
     return rows[:, None] * jacobian * columns
 
 
-def scales(tree: Tree, closure: Closure) -> tuple[Array, Array]:
+def jacobian_scales(tree: Tree, closure: Closure) -> tuple[Array, Array]:
     """Return what J's rows, shape (rows,), and its columns, shape (n,), are multiplied with for that."""
-    return np.where(closure.in_metres(tree), 1.0 / tree.size, 1.0), tree.reach
+    return np.where(closure.in_metres(tree), 1.0 / tree.size, 1.0), tree.step_scale
 
 
-def rank_of(scaled_jacobian: Array) -> RankReport:
+def compute_rank(scaled_jacobian: Array) -> RankReport:
     """Count singular values above the tolerance times the largest."""
     if min(scaled_jacobian.shape) == 0:
         return RankReport(0, 0.0, 0.0)
@@ -102,7 +110,7 @@ def choose_dependent(
             q, _ = np.linalg.qr(scaled_jacobian[:, inside])
             left = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
             return np.sort(np.concatenate([inside, _pivots(left, rank - len(inside), rest, wanted)]))
-        if rank_of(scaled_jacobian[:, rest]).rank < rank:
+        if compute_rank(scaled_jacobian[:, rest]).rank < rank:
             return None
     return np.sort(_pivots(scaled_jacobian[:, rest], rank, rest, wanted))
 

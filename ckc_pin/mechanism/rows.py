@@ -23,7 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import Shared
+from ckc_pin.base.values import Immutable
 from ckc_pin.mechanism.pose import Pose, Rate, cross
 from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_dot, skew
 from ckc_pin.mechanism.tree import Tree
@@ -57,7 +57,7 @@ def _along(e: Array, jacobian: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Component(Shared):
+class Component(Immutable):
     """e . r, the component of a point difference along a direction; `turning` unless e is the world's."""
 
     out: IntArray
@@ -90,7 +90,7 @@ class Component(Shared):
 
 
 @dataclass(frozen=True)
-class Dot(Shared):
+class Dot(Immutable):
     """a . b of two directions: zero when they are perpendicular."""
 
     out: IntArray
@@ -117,7 +117,7 @@ class Dot(Shared):
 
 
 @dataclass(frozen=True)
-class Distance(Shared):
+class Distance(Immutable):
     """(r . r - L^2) / (2 L): to first order the error of the distance itself, in metres."""
 
     out: IntArray
@@ -142,7 +142,7 @@ class Distance(Shared):
 
 
 @dataclass(frozen=True)
-class Affine(Shared):
+class Affine(Immutable):
     """A q' - c in the coordinates of one-freedom joints, whose places in q the tree knows."""
 
     out: IntArray
@@ -153,7 +153,7 @@ class Affine(Shared):
         return np.any((self.matrix != 0) & tree.in_metres, axis=1)
 
     def phi(self, pose: Pose) -> Array:
-        return self.matrix @ pose.q_tree[pose.tree.place] - self.offset
+        return self.matrix @ pose.q_tree[pose.tree.q_index] - self.offset
 
     def jacobian(self, pose: Pose) -> Array:
         return self.matrix
@@ -163,7 +163,7 @@ class Affine(Shared):
 
 
 @dataclass(frozen=True)
-class RelativeLog(Shared):
+class RelativeLog(Immutable):
     """log(R_A^T R_B): three rows for each pair of frames, zero when they are parallel."""
 
     out: IntArray  # (3 pairs,)

@@ -44,7 +44,7 @@ class Springs:
             where = f"spring {k + 1}"
             if spec.joint is not None:
                 _forbid(where, "a spring on a joint", spec, ("frame_a", "frame_b", "rest_length"))
-                self._add_joint(tree.one_freedom(spec.joint, where), spec)
+                self._add_joint(tree.joint_index(spec.joint, where), spec)
             elif spec.frame_a is not None and spec.frame_b is not None:
                 _forbid(where, "a spring between frames", spec, ("rest",))
                 ends_a.append(frames.find(spec.frame_a, f"{where}, frame_a"))
@@ -55,7 +55,7 @@ class Springs:
                 raise InputError(f"{where}: give either joint, or frame_a and frame_b")
         self.constant = np.zeros(tree.n)
         for k, force in enumerate(forces):
-            self.constant[tree.one_freedom(force.joint, f"force {k + 1}")] += force.value
+            self.constant[tree.joint_index(force.joint, f"force {k + 1}")] += force.value
         ends = [*ends_a, *ends_b]
         empty = np.zeros(0, np.intp)
         self.anchors = Anchors(
@@ -79,7 +79,7 @@ class Springs:
 
     def elastic_force(self, q_tree: Array) -> Array:
         """Generalized force of springs and constant forces, shape (n,): minus the gradient of `energy`."""
-        force = self.constant - self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest)
+        force = self.constant - self.joint_stiffness * (q_tree[self.tree.q_index] - self.joint_rest)
         if self.between_frames:
             length, length_jacobian = self._lengths(q_tree)
             force -= (self.stiffness * (length - self.rest_length)) @ length_jacobian
@@ -87,7 +87,7 @@ class Springs:
 
     def sizes(self, q_tree: Array) -> Array:
         """What `elastic_force` would be if nothing in it acted against anything else, shape (n,): never negative."""
-        sizes = np.abs(self.constant) + np.abs(self.joint_stiffness * (q_tree[self.tree.place] - self.joint_rest))
+        sizes = np.abs(self.constant) + np.abs(self.joint_stiffness * (q_tree[self.tree.q_index] - self.joint_rest))
         if self.between_frames:
             length, length_jacobian = self._lengths(q_tree)
             sizes += np.abs(self.stiffness * (length - self.rest_length)) @ np.abs(length_jacobian)
@@ -148,7 +148,7 @@ class Springs:
 
     def energy(self, q_tree: Array) -> float:
         """Energy stored, joules; what a constant force has left to give counts, zero at coordinate zero."""
-        coordinates = q_tree[self.tree.place]
+        coordinates = q_tree[self.tree.q_index]
         energy = 0.5 * float(self.joint_stiffness @ (coordinates - self.joint_rest) ** 2)
         energy -= float(self.constant @ coordinates)
         if self.between_frames:

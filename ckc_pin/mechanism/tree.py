@@ -62,32 +62,32 @@ class Tree:
         self._work_on(model)
         self.n: int = model.nv
         self.nq: int = model.nq
-        self.flat = self.n == self.nq
+        self.is_euclidean = self.n == self.nq
         self.coordinates = tuple(_labels(model))
         self.index = {label: k for k, label in enumerate(self.coordinates)}
         # where the coordinate of a one-freedom joint stands in q (a free root's: its position, then nothing)
-        self.place = np.array(_places(model), dtype=np.intp)
-        self.free = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
-        self.free_coordinates = {self.coordinates[v + k] for _, v in self.free for k in range(6)}
+        self.q_index = np.array(_places(model), dtype=np.intp)
+        self.free_roots = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
+        self.free_coordinates = {self.coordinates[v + k] for _, v in self.free_roots for k in range(6)}
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
         self.measure(1.0)
         # support[joint, 0, k] is 1 where coordinate k moves the joint
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
-        self.carrier = np.zeros(self.n, dtype=np.intp)  # by coordinate: the joint whose body its own is fixed to
+        self.parent_joint = np.zeros(self.n, dtype=np.intp)  # by coordinate: the joint whose body its own is fixed to
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
-            self.carrier[joint.idx_v : joint.idx_v + joint.nv] = parents[k]
+            self.parent_joint[joint.idx_v : joint.idx_v + joint.nv] = parents[k]
 
     def measure(self, size: float) -> None:
         """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
         self.size = size
-        self.reach = np.where(self.in_metres, size, 1.0)
+        self.step_scale = np.where(self.in_metres, size, 1.0)
         self._units = np.ones(self.nq)
-        self._units[self.place] = self.reach
+        self._units[self.q_index] = self.step_scale
 
-    def coarseness(self, q_tree: Array) -> float:
+    def tolerance_factor(self, q_tree: Array) -> float:
         """Return how much coarser loops close there than near zero, at least 1.
 
         Coordinates are rounded as they are large: a crank's after many turns, all of what is far from the origin. What
@@ -163,12 +163,15 @@ class Tree:
         lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         for k, label in enumerate(self.coordinates):
             if label not in self.free_coordinates:
-                low, high = self.model.lowerPositionLimit[self.place[k]], self.model.upperPositionLimit[self.place[k]]
+                low, high = (
+                    self.model.lowerPositionLimit[self.q_index[k]],
+                    self.model.upperPositionLimit[self.q_index[k]],
+                )
                 lower[k] = low if low > -1e300 else -np.inf
                 upper[k] = high if high < 1e300 else np.inf
         return lower, upper
 
-    def centre_jacobians(self, q_tree: Array) -> Array:
+    def centre_of_mass_jacobians(self, q_tree: Array) -> Array:
         """Jacobians of the centres of mass of all moving bodies that have mass, stacked: (3 bodies, n)."""
         placement, jacobian = self.kinematics(q_tree)
         rows = [np.zeros((0, self.n))]
@@ -182,19 +185,19 @@ class Tree:
 
     def integrate(self, q_tree: Array, step: Array) -> Array:
         """Move a configuration by a tangent step."""
-        return q_tree + step if self.flat else np.asarray(pin.integrate(self.model, q_tree, step))
+        return q_tree + step if self.is_euclidean else np.asarray(pin.integrate(self.model, q_tree, step))
 
     def difference(self, start: Array, end: Array) -> Array:
         """Return the tangent step from one configuration to another."""
-        return end - start if self.flat else np.asarray(pin.difference(self.model, start, end))
+        return end - start if self.is_euclidean else np.asarray(pin.difference(self.model, start, end))
 
     def configuration_rate(self, q_tree: Array, v_tree: Array) -> Array:
         """Time derivative of Pinocchio's q at a tangent velocity, shape (nq,)."""
-        if self.flat:
+        if self.is_euclidean:
             return v_tree
         rate = np.empty(self.nq)
-        rate[self.place] = v_tree
-        for q_at, v_at in self.free:
+        rate[self.q_index] = v_tree
+        for q_at, v_at in self.free_roots:
             x, y, z, w = q_tree[q_at + 3 : q_at + 7]
             p, q, r = v_tree[v_at + 3 : v_at + 6]  # angular velocity in the body's axes
             rotation = pin.Quaternion(np.array([x, y, z, w])).matrix()
@@ -210,7 +213,7 @@ class Tree:
         A tangent step x beside a motion v' changes at its own rate less [v', x].
         """
         matrix = np.zeros((self.n, self.n))
-        for _, at in self.free:
+        for _, at in self.free_roots:
             matrix[at : at + 6, at : at + 6] = pin.Motion(v_tree[at : at + 6]).action
         return matrix
 
@@ -229,10 +232,10 @@ class Tree:
 
     def to_coordinates(self, q_tree: Array) -> Array:
         """Return the n numbers that files and JSON carry (a free root: position, rotation vector)."""
-        if self.flat:
+        if self.is_euclidean:
             return np.array(q_tree)
-        numbers = np.array(q_tree[self.place])
-        for q_at, v_at in self.free:
+        numbers = np.array(q_tree[self.q_index])
+        for q_at, v_at in self.free_roots:
             rotation = pin.Quaternion(np.ascontiguousarray(q_tree[q_at + 3 : q_at + 7])).normalized()
             numbers[v_at : v_at + 3] = q_tree[q_at : q_at + 3]
             numbers[v_at + 3 : v_at + 6] = pin.log3(rotation.matrix())
@@ -240,11 +243,11 @@ class Tree:
 
     def from_coordinates(self, numbers: Array) -> Array:
         """Inverse of `to_coordinates`."""
-        if self.flat:
+        if self.is_euclidean:
             return np.array(numbers, dtype=float)
         q_tree = self.neutral()
-        q_tree[self.place] = numbers
-        for q_at, v_at in self.free:
+        q_tree[self.q_index] = numbers
+        for q_at, v_at in self.free_roots:
             q_tree[q_at : q_at + 3] = numbers[v_at : v_at + 3]
             q_tree[q_at + 3 : q_at + 7] = pin.Quaternion(pin.exp3(numbers[v_at + 3 : v_at + 6])).coeffs()
         return q_tree
@@ -287,7 +290,7 @@ class Tree:
         """Return the unit of each coordinate, rad or m, ``per="/s"`` of its rate."""
         return [f"{'m' if length else 'rad'}{per}" for length in self.in_metres]
 
-    def one_freedom(self, joint: str, where: str) -> int:
+    def joint_index(self, joint: str, where: str) -> int:
         """Return where a joint of one freedom stands; MechanismError names those there are."""
         if joint not in self.index or joint in self.free_coordinates:
             single = ", ".join(c for c in self.coordinates if c not in self.free_coordinates)

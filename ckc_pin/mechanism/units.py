@@ -75,5 +75,5 @@ def _of_coordinate(mechanism: Mechanism, root: str, carrier: str, key: str) -> s
 
 def _shafts(mechanism: Mechanism) -> list[str]:
     """Return the unit of each motor's own angle, or way."""
-    lengths, turns = mechanism.tree.in_metres, mechanism.motors.turns != 0
+    lengths, turns = mechanism.tree.in_metres, mechanism.motors.transmission != 0
     return ["m" if np.all(lengths[row]) else "rad" for row in turns]

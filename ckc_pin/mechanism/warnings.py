@@ -7,7 +7,13 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["acting_joints", "beyond_stops", "findings", "moving_mass", "outside_limits"]
+__all__ = [
+    "compute_moving_mass",
+    "describe_joints",
+    "describe_stop_violation",
+    "find_model_warnings",
+    "list_limit_violations",
+]
 
 FAR = 0.5  # rad, or sizes of the mechanism: further from q_guess than that is another pose than the one described
 ROUNDING = 1e-9  # rad, or sizes: at a limit, not beyond it
@@ -15,7 +21,7 @@ AT_STOP = 1e-11  # rad, or sizes: so far beyond a stop is at it
 LENGTH = 1e-12  # sizes: less is no length
 
 
-def findings(mechanism: Mechanism) -> list[str]:
+def find_model_warnings(mechanism: Mechanism) -> list[str]:
     """Name links without mass, springs that do nothing, and coordinates that assembly took far from their guess."""
     says = []
     if weightless := _weightless(mechanism):
@@ -35,19 +41,19 @@ def findings(mechanism: Mechanism) -> list[str]:
     return says
 
 
-def outside_limits(mechanism: Mechanism, q_tree: Array) -> list[str]:
+def list_limit_violations(mechanism: Mechanism, q_tree: Array) -> list[str]:
     """Return the coordinates of a configuration that are outside their joints' limits, with both."""
     lower, upper = mechanism.tree.limits()
-    numbers, slack = mechanism.tree.to_coordinates(q_tree), ROUNDING * mechanism.tree.reach
+    numbers, slack = mechanism.tree.to_coordinates(q_tree), ROUNDING * mechanism.tree.step_scale
     outside = np.flatnonzero((numbers < lower - slack) | (numbers > upper + slack))
     names = mechanism.coordinates
     return [f"{names[k]} = {numbers[k]:.6g} (limits {lower[k]:.6g} to {upper[k]:.6g})" for k in outside]
 
 
-def beyond_stops(mechanism: Mechanism, q_tree: Array) -> str:
+def describe_stop_violation(mechanism: Mechanism, q_tree: Array) -> str:
     """Say which coordinate of a configuration is furthest beyond its stops, with both; empty where none is."""
     joints, numbers = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
-    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.reach
+    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.step_scale
     worst = int(np.argmax(off))
     if off[worst] <= AT_STOP:
         return ""
@@ -57,7 +63,7 @@ def beyond_stops(mechanism: Mechanism, q_tree: Array) -> str:
     )
 
 
-def moving_mass(mechanism: Mechanism) -> tuple[float, Array]:
+def compute_moving_mass(mechanism: Mechanism) -> tuple[float, Array]:
     """Mass of all bodies that move, kg, and their inertia as assembled, kg m^2.
 
     The inertia, (3, 3), is about their common centre of mass and in the world's axes. Armature has no part in either.
@@ -78,7 +84,7 @@ def moving_mass(mechanism: Mechanism) -> tuple[float, Array]:
     return total, inertia
 
 
-def acting_joints(mechanism: Mechanism) -> dict[str, dict[str, float]]:
+def describe_joints(mechanism: Mechanism) -> dict[str, dict[str, float]]:
     """Return armature, damping, friction, stops and restitution of the joints that have one of them but damping.
 
     `lower` and `upper` are where the stops are, infinite where there is none.
@@ -120,6 +126,6 @@ def _far_from_guess(mechanism: Mechanism) -> list[str]:
     found = []
     for name, value in guess.items():
         at = tree.index[name]
-        if abs(numbers[at] - value) > FAR * tree.reach[at]:
+        if abs(numbers[at] - value) > FAR * tree.step_scale[at]:
             found.append(f"{name} = {numbers[at]:.4g} (guess {value:.4g})")
     return found

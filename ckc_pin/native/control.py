@@ -69,7 +69,7 @@ def control_table(
 def actuation_table(actuation: Actuation) -> dict[str, Any]:
     """Describe how motors turn u to their torques."""
     return {
-        "turns": np.asfortranarray(actuation.motors.turns),
+        "turns": np.asfortranarray(actuation.motors.transmission),
         "direct": actuation.direct,
         "limit": actuation.limit,
         "weights": actuation.weights,
@@ -174,7 +174,7 @@ def _point(path: PointPath) -> dict[str, Any] | None:
     return {
         "kind": "point",
         "model": packed(mechanism.tree.model),
-        "place": mechanism.tree.place.tolist(),
+        "place": mechanism.tree.q_index.tolist(),
         "closure": closure_table(extended.closure, mechanism.n),
         "psi": psi.tolist(),
         "axis": axis.tolist(),

@@ -89,7 +89,7 @@ class Plant:
 
     def __init__(self, mechanism: Mechanism, smoothing: float | None = None, library: Library | None = None) -> None:
         self.mechanism = mechanism
-        self._native = _core.Plant(core_table(mechanism, library, smoothing), mechanism.motors.turns)
+        self._native = _core.Plant(core_table(mechanism, library, smoothing), mechanism.motors.transmission)
 
     def at(self, terms: Terms, u_tree: Array, locked: IntArray = NONE) -> AccelerationDerivatives:
         """Solve eq. 1 and differentiate it.

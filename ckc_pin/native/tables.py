@@ -11,7 +11,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.library import Library
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.rank import RANK_TOLERANCE, scales
+from ckc_pin.mechanism.rank import RANK_TOLERANCE, jacobian_scales
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.springs import Springs
 
@@ -30,12 +30,12 @@ def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: 
         Of a core that moves: the rate over which dry friction grows, rad/s or m/s; zero where joints stick. Absent,
         joints neither rub nor stop.
     """
-    rows, columns = scales(mechanism.tree, mechanism.closure)
+    rows, columns = jacobian_scales(mechanism.tree, mechanism.closure)
     written = {} if library is None else {"written": (library.path, library.parameters)}
     return {
         **written,
         "model": packed(mechanism.tree.model),
-        "place": mechanism.tree.place.tolist(),
+        "place": mechanism.tree.q_index.tolist(),
         "closure": closure_table(mechanism.closure, mechanism.n),
         "springs": _springs(mechanism.springs),
         "joints": _joints(mechanism, smoothing),
@@ -101,7 +101,7 @@ def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
         "lower": joints.lower if acts else np.full(n, -np.inf),
         "upper": joints.upper if acts else np.full(n, np.inf),
         "restitution": joints.restitution,
-        "reach": mechanism.tree.reach,
+        "reach": mechanism.tree.step_scale,
         "size": mechanism.size,
         "smoothing": smoothing or 0.0,
     }

@@ -273,7 +273,7 @@ def variation_table(
 
     return {
         "model": packed(model),
-        "place": Tree(model).place.tolist(),
+        "place": Tree(model).q_index.tolist(),
         "real_q": real_q.tolist(),
         "real_v": real_v.tolist(),
         "closure": closure,
@@ -281,7 +281,7 @@ def variation_table(
         "own": mechanism.partition.q.tolist(),
         "at_equilibrium": at_equilibrium,
         "target": target,
-        "turns": np.asfortranarray(mechanism.motors.turns),
+        "turns": np.asfortranarray(mechanism.motors.transmission),
         "parameters": [
             ([crossing(effect) for effect in x.effects], np.zeros(tree.n) if x.q is None else x.q,
              np.zeros(mechanism.d) if x.q_dot is None else x.q_dot, x.assembled_at)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.validation import require_arguments, require_kind
+from ckc_pin.base.validation import require_controller_signature, require_type
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -56,7 +56,9 @@ class Event:
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise InputError(f"Event: {self.function!r:.80} is no function of (t, terms)")
-        require_arguments(self.function, getattr(self.function, "__name__", type(self.function).__name__), "Event")
+        require_controller_signature(
+            self.function, getattr(self.function, "__name__", type(self.function).__name__), "Event"
+        )
         if self.direction not in (-1, 0, 1) or isinstance(self.direction, bool):
             raise InputError(f"Event: direction = {self.direction!r:.80}; valid: -1, 0, 1")
         if not isinstance(self.stop, bool):
@@ -98,7 +100,7 @@ def event_functions(specs: Sequence[EventSpec], own: Sequence[Event], mechanism:
     InputError
         An unknown coordinate, one without limits, a margin that this mechanism does not have, no `Event`.
     """
-    require_kind(own, (list, tuple), "events", "a list of Event")
+    require_type(own, (list, tuple), "events", "a list of Event")
     found: list[EventFunction] = []
     for k, spec in enumerate(specs):
         found += _of_scene(spec, mechanism, f"event[{k}]")

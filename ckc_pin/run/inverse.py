@@ -181,9 +181,9 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
 
 def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t: float) -> None:
     """Refuse a configuration where some freedom is held by no actuator, as at a rocker's dead centre."""
-    motions = tangent / mechanism.tree.reach[:, None]
+    motions = tangent / mechanism.tree.step_scale[:, None]
     motions, _ = np.linalg.qr(motions)  # of one size, in radians or the mechanism's size
-    grip = mechanism.motors.turns @ motions
+    grip = mechanism.motors.transmission @ motions
     values, directions = np.linalg.eigh(grip.T @ grip)
     if values[0] <= DEAD**2:
         loose = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]

@@ -24,7 +24,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import a_kind, is_number
+from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
 from ckc_pin.control.spec import FeedbackSpec
@@ -38,7 +38,7 @@ from ckc_pin.dynamics.formulations import (
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.chart import Chart
-from ckc_pin.kinematics.sigma import move
+from ckc_pin.kinematics.sigma import follow_sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import find_start
@@ -173,12 +173,12 @@ class LevelSet:
     def close(self, t: float, numbers: Array) -> Kinematics:
         """Return the configuration at q on the level set phi(q, z) = w(t)."""
         step = self._chart.step(self._last.q_tree, numbers)
-        found = move(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
+        found = follow_sigma(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
         self.counts["newton"] += found.iterations
         if found.verdict != "converged":
             tree = self.mechanism.tree
             where = tree.named(tree.to_coordinates(found.at.q_tree))
-            raise NumericalError(f"move(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
+            raise NumericalError(f"follow_sigma(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
         self._last = found.at
         return found.at
 
@@ -220,7 +220,7 @@ class PrintedSpf:
     counts: dict[str, int] = field(default_factory=lambda: {"newton": 0})
 
     def __post_init__(self) -> None:
-        self._d, partition, place = self.mechanism.d, self.mechanism.partition, self.mechanism.tree.place
+        self._d, partition, place = self.mechanism.d, self.mechanism.partition, self.mechanism.tree.q_index
         self._q, self._z = place[partition.q], place[partition.z]
         self.y0 = np.concatenate([self.initial.q_tree[self._q], self.q_dot, self.initial.q_tree[self._z]])
 
@@ -265,7 +265,7 @@ class Dae:
 
     def terms(self, t: float, y: Array) -> Terms:
         y, tree = _state(t, y, self.y0), self.mechanism.tree
-        q_tree = y[: tree.nq] if tree.flat else pin.normalize(tree.model, y[: tree.nq])
+        q_tree = y[: tree.nq] if tree.is_euclidean else pin.normalize(tree.model, y[: tree.nq])
         return Terms(self.mechanism, self.mechanism.kinematics(q_tree), y[tree.nq :])
 
     def velocity(self, t: float, y: Array) -> Array:
@@ -286,11 +286,11 @@ class Dae:
 def _state(t: Any, y: Any, y0: Array) -> Array:
     """Return a state as numbers (InputError where it, or t, is none)."""
     if not is_number(t):
-        raise InputError(f"as_ivp: t: {a_kind(t)} was given; it takes a number, s")
+        raise InputError(f"as_ivp: t: {describe_value(t)} was given; it takes a number, s")
     try:
         found = np.asarray(y, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"as_ivp: y: {a_kind(y)} was given; it takes {len(y0)} numbers, as y0 has") from None
+        raise InputError(f"as_ivp: y: {describe_value(y)} was given; it takes {len(y0)} numbers, as y0 has") from None
     if found.shape != y0.shape:
         raise InputError(f"as_ivp: y: shape {found.shape} was given; it takes {len(y0)} numbers, as y0 has")
     return found

@@ -43,7 +43,7 @@ def formulation_table(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarra
     }
     sticks = mechanism.joints.has_events(spec.friction_smoothing)
     if spec.formulation == "spf" and spec.spf_coordinates == "z":
-        if mechanism.tree.free:
+        if mechanism.tree.free_roots:
             raise InputError(
                 'spf_coordinates = "z": eq. 8 as printed integrates q and z as numbers, and the rotation of a free '
                 'root is none; take "w"'

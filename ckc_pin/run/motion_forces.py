@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Status
@@ -109,7 +109,7 @@ class MotionForces(HasSummary):
             "joint_forces": _stacked(self.joint_forces, len(self.t)),
             "meta": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
         }
-        with written_whole(path) as file:
+        with open_atomic(path) as file:
             np.savez_compressed(file, **arrays)
         return path
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import write_whole
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Summary
-from ckc_pin.base.validation import a_kind, is_number, require_path
+from ckc_pin.base.validation import describe_value, is_number, require_path
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
@@ -148,7 +148,7 @@ class Run(HasSummary):
         if name not in others:
             own = ", ".join(self.coordinates)
             raise InputError(
-                f"run[{a_kind(name)}]: there are the coordinates {own}, and the arrays {', '.join(others)}"
+                f"run[{describe_value(name)}]: there are the coordinates {own}, and the arrays {', '.join(others)}"
             )
         return np.asarray(getattr(self, name))
 
@@ -181,7 +181,7 @@ class Run(HasSummary):
         if isinstance(t, slice):
             return part_of(self, first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
         if not is_number(t):
-            raise InputError(f"Run.sel: t: {a_kind(t)} was given; it takes a time, s, or slice(start, stop)")
+            raise InputError(f"Run.sel: t: {describe_value(t)} was given; it takes a time, s, or slice(start, stop)")
         if not first <= t <= last:
             raise InputError(f"Run.sel: t = {t:g} s; the run is from {first:g} to {last:g} s")
         return state_of(self, self.at(t))
@@ -195,7 +195,7 @@ class Run(HasSummary):
     def at(self, t: float) -> int:
         """Return the row of the output instant nearest to t, s."""
         if not is_number(t):
-            raise InputError(f"Run.at: {a_kind(t)} was given; it takes a time, s")
+            raise InputError(f"Run.at: {describe_value(t)} was given; it takes a time, s")
         return int(np.argmin(np.abs(self.t - t)))
 
     @cached_property
@@ -211,7 +211,7 @@ class Run(HasSummary):
     @cached_property
     def motor_rates(self) -> Array:
         """Rates of the motors themselves, before their gears, along the run, shape (m, motors), rad/s or m/s."""
-        return self.v_tree @ self.mechanism.motors.turns.T
+        return self.v_tree @ self.mechanism.motors.transmission.T
 
     def too_fast(self) -> dict[str, float]:
         """Return the largest rate of each motor that is above its speed limit at some output instant."""
@@ -298,7 +298,7 @@ class Run(HasSummary):
             It cannot be written; a joint is called as another column is.
         """
         require_path(path, "Run.to_csv: path")
-        write_whole(Path(path), as_csv(self))
+        write_atomic(Path(path), as_csv(self))
         return Path(path)
 
     # --- files -----------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import Vector3
@@ -100,7 +100,7 @@ def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array]
         "coordinates": np.array(coordinates),
         "meta": np.frombuffer(msgspec.json.encode(meta), dtype=np.uint8),
     }
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         np.savez_compressed(file, allow_pickle=False, **content)
 
 

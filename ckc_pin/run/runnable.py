@@ -11,7 +11,7 @@ from ckc_pin.dynamics.formulations import refuse_massless
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
-from ckc_pin.mechanism.warnings import beyond_stops
+from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.scene.initial import Start, find_start, require_chart
 from ckc_pin.scene.scene import Scene
 
@@ -43,7 +43,7 @@ def require_runnable(
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     start = find_start(mechanism, scene)
     with scene.sources.naming():
-        if beyond := beyond_stops(mechanism, start.at.q_tree):
+        if beyond := describe_stop_violation(mechanism, start.at.q_tree):
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within them")
     refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = controller.controller if isinstance(controller, Sampled) else controller

@@ -134,7 +134,7 @@ def _fastest(loop: Any, mechanism: Mechanism) -> str:
     if at is None:
         return "steps are very short"
     v = at[1][tree.nq : tree.nq + tree.n]
-    k = int(np.argmax(np.abs(v) / tree.reach))
+    k = int(np.argmax(np.abs(v) / tree.step_scale))
     return f"steps are very short ({mechanism.coordinates[k]} moves at {v[k]:.2g} {tree.units('/s')[k]})"
 
 

@@ -57,14 +57,14 @@ def _of_controller(mechanism: Mechanism, key: str, of: str) -> str:
     if key == "desired":
         of, _, key = of.rpartition(".")
     viscous = [VISCOUS[unit] for unit in q]
-    by_coordinate = {
+    join_dotted_keys = {
         "K_P": [STIFF[unit] for unit in q], "K_V": viscous, "K_D": viscous, "Lambda": ["1/s"] * len(q), "q_d": q,
         "offset": q, "resolution": q, "q_noise": q, "q_dot_noise": [f"{unit}/s" for unit in q],
     }  # fmt: skip
     by_motor = {"torque_limit": tau, "preload": tau, "torque_resolution": tau,
                 "torque_rate": [f"{unit}/s" for unit in tau]}  # fmt: skip
-    if key in by_coordinate:
-        return _along(mechanism.independent, by_coordinate[key], of)
+    if key in join_dotted_keys:
+        return _along(mechanism.independent, join_dotted_keys[key], of)
     return _along(mechanism.actuated, by_motor[key], of) if key in by_motor else ""
 
 

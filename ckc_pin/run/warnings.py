@@ -9,7 +9,7 @@ from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import CkcError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import outside_limits
+from ckc_pin.mechanism.warnings import list_limit_violations
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
 from ckc_pin.scene.scene import Scene
@@ -49,7 +49,7 @@ def check_desired(
 
 def limit_warnings(mechanism: Mechanism, q_tree: Array, what: str) -> list[str]:
     """Name the joints that a configuration has outside their limits."""
-    outside = outside_limits(mechanism, q_tree)
+    outside = list_limit_violations(mechanism, q_tree)
     return [f"{what} is outside joint limits: {', '.join(outside)}"] if outside else []
 
 

@@ -93,14 +93,14 @@ def _off_chart(mechanism: Mechanism, given: dict[str, float]) -> Kinematics | No
         return None
     numbers = mechanism.vector(given, mechanism.coordinates, "initial.q")
     at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-    best = None if is_chart(at) else mechanism.best_partition(at)
+    best = None if is_chart(at) else mechanism.choose_partition(at)
     if best is None:
         return None
     at = Kinematics(at.tree, at.closure, best, at.q_tree)
     if not is_chart(at):
         return None
     closed = newton(at, 0.0, mechanism.tolerance)
-    moved = mechanism.tree.difference(at.q_tree, closed.at.q_tree) / mechanism.tree.reach
+    moved = mechanism.tree.difference(at.q_tree, closed.at.q_tree) / mechanism.tree.step_scale
     return closed.at if closed.converged and np.abs(moved).max() <= ROUNDED else None
 
 
@@ -161,7 +161,7 @@ def _singular(mechanism: Mechanism, where: str, at: Kinematics) -> NumericalErro
 
 def _what_would_help(mechanism: Mechanism, at: Kinematics) -> str:
     """Say what is singular; other independent coordinates help where J keeps its rank."""
-    best = mechanism.best_partition(at)
+    best = mechanism.choose_partition(at)
     if best is not None and is_chart(Kinematics(at.tree, at.closure, best, at.q_tree)):
         names = ", ".join(mechanism.coordinates[k] for k in best.q)
         return (

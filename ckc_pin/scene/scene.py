@@ -15,11 +15,11 @@ import numpy as np
 
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Summary
-from ckc_pin.base.toml import by_coordinate, convert, read_text, read_toml
-from ckc_pin.base.validation import require_kind, require_table
+from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
+from ckc_pin.base.validation import require_table, require_type
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.library import MECHANISM_FILE, about, first_comment, is_path, library, shipped
+from ckc_pin.mechanism.library import MECHANISM_FILE, describe_mechanism, first_comment, is_path, library, shipped
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
@@ -126,7 +126,7 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     InputError
         A missing file, malformed TOML, an unknown key, a wrong type or value.
     """
-    require_kind(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
+    require_type(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
     if overrides is not None:
         require_table(overrides, "load_scene: overrides", OVERRIDES)
     path = scene_file(name)
@@ -169,7 +169,7 @@ def as_scene(given: Any, overrides: Mapping[str, Any] | None, who: str) -> Scene
             f"{who}: a Mechanism was given, which does not say from where and how long it moves; it takes {TAKES}"
             + (f"; those of {given.name}: {names}" if names else "")
         )
-    require_kind(given, (Scene, str, Path), f"{who}: scene", TAKES)
+    require_type(given, (Scene, str, Path), f"{who}: scene", TAKES)
     if overrides is not None:
         require_table(overrides, f"{who}: overrides", OVERRIDES)
     if not isinstance(given, Scene):
@@ -182,7 +182,7 @@ def as_scene(given: Any, overrides: Mapping[str, Any] | None, who: str) -> Scene
 def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     """Check parsed data; where msgspec's checks end, ours begin."""
     for table in BY_NAME:
-        by_coordinate(data, *table)
+        join_dotted_keys(data, *table)
     spec = convert(data, SceneSpec, sources.name)
     if spec.initial.at is not None and spec.initial.q:
         raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
@@ -230,7 +230,7 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[
     """
     changed = deepcopy(data)
     for path in BY_NAME:
-        by_coordinate(changed, *path)
+        join_dotted_keys(changed, *path)
     for key, value in overrides.items():
         *tables, last = _place_of(f"parameters.{key}" if is_parameter(key) else key)
         at = changed
@@ -275,7 +275,11 @@ def catalogue() -> list[tuple[str, str, dict[str, str]]]:
     What a file is about is its first comment, so that the list cannot drift from the files.
     """
     return [
-        (name, about(name), {scene: first_comment(_scene_text(name, scene)) for scene in scene_names(name)})
+        (
+            name,
+            describe_mechanism(name),
+            {scene: first_comment(_scene_text(name, scene)) for scene in scene_names(name)},
+        )
         for name in shipped()
     ]
 

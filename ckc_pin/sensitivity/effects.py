@@ -291,7 +291,7 @@ def _of_motor(mechanism: Mechanism, actuation: Actuation, name: str, key: str) -
     """By its rotor; by its gear where its torque is what is given; by its limit while that is reached."""
     motors = mechanism.motors
     number = motors.names.index(name)
-    motor, turns = mechanism.spec.motor[number], motors.turns[number]
+    motor, turns = mechanism.spec.motor[number], motors.transmission[number]
     joint = int(np.flatnonzero(turns)[0])  # the only one where there is a rotor
     if key == "rotor_inertia":
         if np.count_nonzero(turns) > 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import format_eigenvalues
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.summary import HasSummary, Summary
-from ckc_pin.base.validation import a_kind, is_number
+from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.spec import FeedbackSpec
@@ -126,7 +126,7 @@ def floquet(
         It does not get to its end.
     """
     if not is_number(period):
-        raise InputError(f"floquet: period: {a_kind(period)} was given; it takes a number of seconds")
+        raise InputError(f"floquet: period: {describe_value(period)} was given; it takes a number of seconds")
     if not np.isfinite(period) or period <= 0:
         raise InputError(f"period = {period:g}: a positive number of seconds is needed")
     if period < LEAST:
@@ -134,10 +134,10 @@ def floquet(
     given = as_scene(scene, overrides, "floquet")
     loaded = make_scene(apply_overrides(given.to_dict(), {"t_end": float(period)}), given.name, given.sources)
     mechanism = scene_mechanism(loaded)
-    if mechanism.rooted:
+    if root := mechanism.independent_root_coordinates:
         raise InputError(
-            f"{mechanism.name}: {mechanism.rooted[0]}: a free root among the independent coordinates: of its "
-            "rotation there is no one matrix over a period; take other independent coordinates, or fix the root"
+            f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, whose rotation has no "
+            "monodromy matrix; choose other independent coordinates, or fix the root"
         )
     if isinstance(loaded.spec.controller, FeedbackSpec) and loaded.spec.controller.sample_time is not None:
         _require_whole_samples(loaded.spec.controller, loaded.spec.controller.sample_time, float(period), loaded.name)
@@ -159,7 +159,7 @@ def floquet(
     order = np.argsort(-np.abs(multipliers), kind="stable")
     states = (*names, *(f"{name}_dot" for name in names))
     uncertainty = _miss(run, period) + loaded.spec.solver.rtol
-    reach = mechanism.tree.reach[q]
+    reach = mechanism.tree.step_scale[q]
     scale = np.concatenate([reach, 2 * np.pi / period * reach])
     stable = _verdict(monodromy / scale[:, None] * scale, multipliers, uncertainty)
     return Floquet(states, monodromy, multipliers[order], stable, uncertainty, float(period), run)
@@ -276,7 +276,7 @@ def _miss(run: Run, period: float) -> float:
                 f"period = {run.t[-1]:.9g} s is none: after it {run.coordinates[worst]}{what} is off by "
                 f"{miss[worst]:.6g} from its {values[0, worst]:.6g} at the start"
             )
-        largest = max(largest, float(np.abs(miss / (unit * tree.reach)).max()))
+        largest = max(largest, float(np.abs(miss / (unit * tree.step_scale)).max()))
     return largest
 
 
@@ -321,6 +321,6 @@ def save_floquet(found: Floquet, path: Path) -> Path:
     """
     arrays: dict[str, Any] = {"monodromy": found.monodromy, "multipliers": found.multipliers}
     arrays |= {"states": np.array(found.states, dtype=str), "period": found.period, "name": found.run.scene_name}
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         np.savez_compressed(file, **arrays)
     return path

@@ -211,7 +211,7 @@ def at_assembled_stop(
     stop = next((effect for effect in x.effects if effect.kind in ("lower", "upper")), None)
     if stop is None:
         return x
-    k, reach = stop.index, mechanism.tree.reach
+    k, reach = stop.index, mechanism.tree.step_scale
     value = float(getattr(mechanism.joints, stop.kind)[k])
     if not np.isfinite(value):  # the stop of a joint that cannot move
         return x
@@ -302,10 +302,10 @@ def _of_controller(mechanism: Mechanism, scene: Scene, controller: object) -> It
 
 def _of_start(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[SensitivityParameter]:
     tree, moved = mechanism.tree, np.eye(mechanism.tree.n)
-    for q, v in tree.free:  # numbers in the world's axes, tangent in the body's
+    for q, v in tree.free_roots:  # numbers in the world's axes, tangent in the body's
         moved[v : v + 3, v : v + 3] = pin.Quaternion(q_tree[q + 3 : q + 7]).matrix().T
         moved[v + 3 : v + 6, v + 3 : v + 6] = pin.Jexp3(tree.to_coordinates(q_tree)[v + 3 : v + 6])
-    roots = (mechanism.coordinates[v : v + 6] for _, v in tree.free)
+    roots = (mechanism.coordinates[v : v + 6] for _, v in tree.free_roots)
     parted = {name for root in roots if not set(root) <= set(mechanism.independent) for name in root}
     for k, name in enumerate(mechanism.independent):
         if name not in parted and scene.spec.initial.at is None:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
-from ckc_pin.base.validation import require_callable, require_kind, require_path
+from ckc_pin.base.validation import require_callable, require_path, require_type
 from ckc_pin.base.values import lazy
 from ckc_pin.control.controllers import Controller, Law
 from ckc_pin.control.sampled import Sampled
@@ -146,7 +146,7 @@ class Sensitivities(HasSummary):
             "end_time": np.full(len(self.parameters), np.nan) if self.end_time is None else self.end_time,
             "meta": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
         }
-        with written_whole(path) as file:
+        with open_atomic(path) as file:
             np.savez_compressed(file, **arrays)
         return path
 
@@ -205,9 +205,9 @@ def sensitivities(
     scene = as_scene(scene, overrides, "sensitivities")
     require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
     parameters = [parameters] if isinstance(parameters, str | bytes) else parameters
-    require_kind(parameters, Sequence, "sensitivities: parameters", NAMES)
+    require_type(parameters, Sequence, "sensitivities: parameters", NAMES)
     for name in parameters:
-        require_kind(name, str, "sensitivities: parameters", NAMES)
+        require_type(name, str, "sensitivities: parameters", NAMES)
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, controller, events, derivatives=derivatives_of(tuple(parameters)))

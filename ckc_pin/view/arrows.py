@@ -61,10 +61,10 @@ def arrows(run: Run, rows: IntArray, moved: Placements) -> list[Arrow]:
             frame = mechanism.frames.find(spec.frame_a, spec.name)
             where = moved.of(frame.joint, frame.translation)
             found.append(Arrow(f"loop:{spec.name}", LOOPS, False, where, carried[spec.name]))
-    model, efforts = mechanism.tree.model, run.tau[rows] @ mechanism.motors.turns
+    model, efforts = mechanism.tree.model, run.tau[rows] @ mechanism.motors.transmission
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
-        if model.joints[joint].nv == 1 and np.any(mechanism.motors.turns[:, column]):
+        if model.joints[joint].nv == 1 and np.any(mechanism.motors.transmission[:, column]):
             axis, turns = mechanism.tree.axis(joint)
             vector = (moved.rotation[:, joint] @ axis) * np.nan_to_num(efforts[:, column, None])
             found.append(Arrow(f"motor:{model.names[joint]}", MOTORS, turns, moved.translation[:, joint], vector))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.view import style
 
@@ -50,7 +50,7 @@ def write(figure: Figure, folder: Path, stem: str, formats: Sequence[str]) -> li
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # the same figure gives the same file
     paths = [folder / f"{stem}.{kind}" for kind in formats]
     for kind, path in zip(formats, paths, strict=True):
-        with look(), written_whole(path) as file:
+        with look(), open_atomic(path) as file:
             figure.savefig(file, dpi=style.DPI, format=kind, metadata=dates.get(kind))
     return paths
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import written_whole
+from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
@@ -60,7 +60,7 @@ def save_gif(runs: Run | Sequence[Run], path: str | Path, *, speed: float = 1.0)
     with look():
         frames = _Frames(shown, times, speed).images()
     durations = [1000 // RATE] * (count - 1) + [LAST]
-    with written_whole(file) as written:
+    with open_atomic(file) as written:
         frames[0].save(written, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
     return file
 

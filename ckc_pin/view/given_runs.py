@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ckc_pin.base.validation import require_kind
+from ckc_pin.base.validation import require_type
 from ckc_pin.errors import InputError
 from ckc_pin.run.run import Run
 
@@ -23,5 +23,5 @@ def given_runs(given: Any, who: str) -> list[Run]:
     if not runs:
         raise InputError(f"{who}: no run given; give at least one")
     for run in runs:
-        require_kind(run, Run, f"{who}: runs", "runs, as simulate and Run.load return them")
+        require_type(run, Run, f"{who}: runs", "runs, as simulate and Run.load return them")
     return runs

@@ -86,7 +86,7 @@ class Group:
         """How far a coordinate goes, in radians or in the mechanism's size, or how hard a motor pushes."""
         run = self.runs[0]
         if name in run.coordinates:
-            unit = float(self.mechanism.tree.reach[run.column(name)])
+            unit = float(self.mechanism.tree.step_scale[run.column(name)])
             return float(max(np.ptp(run.q_tree[:, run.column(name)]) for run in self.runs)) / unit
         return float(max(np.abs(run.tau[:, run.actuated.index(name)]).max() for run in self.runs))
 

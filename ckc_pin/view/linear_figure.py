@@ -108,12 +108,12 @@ def _moving(model: LinearModel, modes: list[Mode]) -> list[int]:
     """Coordinates that move in some mode; all where they are few."""
     if len(model.coordinates) <= LONG:
         return list(range(len(model.coordinates)))
-    most = np.max([np.abs(mode.shape / model.mechanism.tree.reach) for mode in modes], axis=0)
+    most = np.max([np.abs(mode.shape / model.mechanism.tree.step_scale) for mode in modes], axis=0)
     return [int(k) for k in np.flatnonzero(most >= LEAST)]
 
 
 def _shape(ax: Any, model: LinearModel, mode: Mode, names: list[int], number: int) -> None:
-    shape = (mode.shape / model.mechanism.tree.reach)[names]
+    shape = (mode.shape / model.mechanism.tree.step_scale)[names]
     ax.barh(range(len(names)), shape.real, color=style.COLOURS[0], height=0.6, label="at one instant")
     if np.abs(shape.imag).max(initial=0.0) > LEAST:  # Re(shape exp(i pi / 2))
         ax.barh(

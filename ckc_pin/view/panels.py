@@ -100,7 +100,7 @@ def efforts(slot: Slot, group: Group, names: Sequence[str], note: str = "") -> N
 
 def effort_symbol(group: Group) -> str:
     """Return u where the motors turn the independent joints themselves, as in the paper, else tau."""
-    return "u" if group.mechanism.driven_directly else r"\tau"
+    return "u" if group.mechanism.has_direct_drives else r"\tau"
 
 
 def loop_forces(slot: Slot, group: Group) -> None:

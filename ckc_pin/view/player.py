@@ -10,9 +10,9 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from ckc_pin.base.atomic_files import write_whole
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.interrupt import acknowledge
-from ckc_pin.base.validation import is_number, require_flag, require_kind, require_path
+from ckc_pin.base.validation import is_number, require_flag, require_path, require_type
 from ckc_pin.errors import InputError
 from ckc_pin.run.run import Run
 from ckc_pin.view.bodies import missing_meshes
@@ -76,7 +76,7 @@ def play(
     require_flag(open_browser, "play: open_browser")
     require_flag(block, "play: block")
     require_flag(forces, "play: forces")
-    require_kind(port, int, "play: port", "a port from 1 to 65535, or 0 for any free one")
+    require_type(port, int, "play: port", "a port from 1 to 65535, or 0 for any free one")
     ordered, drawing = _drawing(runs, speed, gap, meshes, forces)
     try:
         from ckc_pin.view.server import ViewServer
@@ -121,7 +121,7 @@ def save_html(
 def write_page(text: str, path: str | Path) -> Path:
     """Write a page as `save_html` does."""
     path = file_in_folder(path, "save_html: path")
-    write_whole(path, text)
+    write_atomic(path, text)
     return path
 
 

@@ -187,7 +187,7 @@ def _axis_name(direction: Array, otherwise: str) -> str:
 def _normal(mechanism: Mechanism) -> Array | None:
     """Common normal of a planar mechanism: all hinges along it, all slides across it; None when there is none."""
     tree = mechanism.tree
-    if tree.free:
+    if tree.free_roots:
         return None
     _, jacobian = tree.kinematics(mechanism.q_tree)
     hinges = [axis for axis in jacobian[3:].T if np.any(axis)]

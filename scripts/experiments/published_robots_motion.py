@@ -58,7 +58,7 @@ def given_back(draft: Draft) -> float:
         It has no motion, or not to the end.
     """
     drawn = draft.mechanism()
-    numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.reach * drawn.freedoms.singular
+    numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.step_scale * drawn.freedoms.singular
     draft = replace(
         draft,
         joints=[(msgspec.structs.replace(spec, stops=False), comment) for spec, comment in draft.joints],
@@ -72,8 +72,10 @@ def given_back(draft: Draft) -> float:
         scene = Path(folder) / "default.scene.toml"
         scene.write_text(SCENE, encoding="utf-8")
         mechanism = ckc_pin.load(Path(folder))
-        overrides = {} if mechanism.rooted else _swing(mechanism)
-        pushed = ckc_pin.simulate(scene, controller=_push(mechanism)) if mechanism.rooted else None
+        overrides = {} if mechanism.independent_root_coordinates else _swing(mechanism)
+        pushed = (
+            ckc_pin.simulate(scene, controller=_push(mechanism)) if mechanism.independent_root_coordinates else None
+        )
         motion = ckc_pin.inverse_dynamics(pushed or scene, None if pushed else overrides)
         run = ckc_pin.simulate(scene, overrides, controller=_Torques(Table(motion.t, motion.tau)))
     for part in (motion, run):
@@ -86,7 +88,7 @@ def given_back(draft: Draft) -> float:
 def _swing(mechanism: Mechanism) -> dict[str, Any]:
     """Overrides of the scene: what the independent coordinates shall do, and how they start."""
     tree, names = mechanism.tree, mechanism.independent
-    offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.reach)
+    offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.step_scale)
     desired = {name: {"offset": offset[name], "harmonics": [[amplitude[name], RATE, 0.0]]} for name in names}
     return {
         "controller": {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": desired},
@@ -98,7 +100,7 @@ def _push(mechanism: Mechanism) -> _Torques:
     """What would make each motor swing alone, all else free to move."""
     at = mechanism.assembled
     inertia = at.rho.T @ Terms(mechanism, at, np.zeros(mechanism.n)).D_tree @ at.rho
-    moved = mechanism.motors.turns @ at.rho
+    moved = mechanism.motors.transmission @ at.rho
     force = SIZE * RATE**2 / np.diag(moved @ np.linalg.solve(inertia, moved.T))
     t = np.linspace(0.0, T_END, STEPS + 1)
     return _Torques(Table(t, np.outer(np.cos(RATE * t), force)))

@@ -53,7 +53,7 @@ def friction() -> Any:
         taken = []
         for row in np.flatnonzero(here):
             terms = run.sel(t=float(run.t[row])).terms
-            torques = run.mechanism.motors.turns.T @ run.tau[row]
+            torques = run.mechanism.motors.transmission.T @ run.tau[row]
             taken.append(joints(int(row), terms, torques)[k] / most)
         label = "events" if smooth is None else f"smoothed over {smooth:g} rad/s"
         rate.plot(run.t[here], run.v_tree[here, k], color=colour, linestyle=dashes, label=label)

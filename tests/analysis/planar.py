@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ckc_pin.base.sources import Sources
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, PointSpec
 
@@ -50,4 +50,4 @@ def linkage(
         ],
         point=[PointSpec(name="tip", frame="a_tip")],
     )
-    return assembled(spec, Sources("linkage", None, {"linkage.urdf": urdf}))
+    return assemble_mechanism(spec, Sources("linkage", None, {"linkage.urdf": urdf}))

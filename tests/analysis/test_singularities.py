@@ -146,7 +146,9 @@ def test_residual_is_differentiated_right(pair: Pair) -> None:
         at, v = mechanism.kinematics(random.uniform(-1, 1, 4)), random.uniform(-1, 1, 4)
         h, columns = 1e-6, []
         for step in h * np.eye(8):
-            ahead, behind = (system.residual(at.moved(sign * step[:4]), v + sign * step[4:]) for sign in (1.0, -1.0))
+            ahead, behind = (
+                system.residual(at.integrate(sign * step[:4]), v + sign * step[4:]) for sign in (1.0, -1.0)
+            )
             columns.append((ahead - behind) / (2 * h))
         assert_close(system.jacobian(at, v), np.array(columns).T, 1e-8)
 

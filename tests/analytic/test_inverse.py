@@ -300,7 +300,7 @@ def test_preload_of_a_recorded_run_stays() -> None:
     recorded = ckc_pin.simulate("two_ur5/lift", {"t_end": 0.05, "solver.output_dt": 0.01})
     mechanism = recorded.mechanism
     at = mechanism.kinematics(mechanism.tree.from_coordinates(recorded.q_tree[0]))
-    transmission = (mechanism.motors.turns @ at.rho).T
+    transmission = (mechanism.motors.transmission @ at.rho).T
     strain = np.linalg.svd(transmission)[2][-1]
     assert_close(transmission @ strain, 0, 1e-12)
     strained = replace(recorded, tau=recorded.tau + 5.0 * strain)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ckc_pin.kinematics.sigma import move, newton, sigma
+from ckc_pin.kinematics.sigma import follow_sigma, newton, sigma
 from ckc_pin.mechanism import Psi
 from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
 from tests.conftest import Pair, assert_close
@@ -83,10 +83,10 @@ def test_sigma_follows_from_level_to_level(pair: Pair) -> None:
     moved = replace(reference, base=reference.base - away)
     for dq in ([0.0, 0.0], [-0.05, 0.02]):
         start = sigma(mechanism, q).at
-        there = move(start, np.array(dq), w, mechanism.tolerance, anywhere=False)
+        there = follow_sigma(start, np.array(dq), w, mechanism.tolerance, anywhere=False)
         assert there.verdict == "converged"
         assert_close(turned(there.at.q_tree - moved.sigma(q + dq)), 0, 1e-11)
-        back = move(there.at, -np.array(dq), 0.0, mechanism.tolerance, anywhere=False)
+        back = follow_sigma(there.at, -np.array(dq), 0.0, mechanism.tolerance, anywhere=False)
         assert back.verdict == "converged"
         assert_close(turned(back.at.q_tree - reference.sigma(q)), 0, 1e-11)
 

@@ -67,7 +67,7 @@ def test_pivots_of_a_mechanism_are_not_small(name: str) -> None:
     order = elimination_order(mechanism, kept)
     assert sorted(order) == list(range(n + len(kept)))
     here = mechanism.independent_part(mechanism.q_tree)
-    reach = mechanism.tree.reach[mechanism.partition.q]
+    reach = mechanism.tree.step_scale[mechanism.partition.q]
     for _ in range(10):
         at = sigma(mechanism, here + 0.3 * random.uniform(-1, 1, mechanism.d) * reach).at
         D, J = np.triu(Terms(mechanism, at, np.zeros(n)).D_tree), at.J[kept]

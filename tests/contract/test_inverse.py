@@ -125,7 +125,7 @@ def test_a_point_s_path() -> None:
     terms = [
         ckc_pin.Terms(mechanism, mechanism.kinematics(q), v) for q, v in zip(found.q_tree, found.v_tree, strict=True)
     ]
-    power = np.sum(found.tau * (found.v_tree @ mechanism.motors.turns.T), axis=1)
+    power = np.sum(found.tau * (found.v_tree @ mechanism.motors.transmission.T), axis=1)
     work = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(found.t))])
     energy = np.array([at.energy for at in terms])
     assert_close(energy - energy[0], work, 1e-6)

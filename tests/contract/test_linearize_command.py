@@ -242,7 +242,7 @@ def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_pe
         frames = [np.argmin(np.abs(run.t - part / model.modes[number - 1].frequency)) for part in (0.0, 0.25)]
         parts = np.array([[bar.get_width() for bar in drawn] for drawn in bars])
         moved = [tree.difference(rest, tree.from_coordinates(run.q_tree[k])) for k in frames]
-        seen = np.array(moved) / tree.reach
+        seen = np.array(moved) / tree.step_scale
         most = np.argmax(np.abs(seen))
         seen /= seen.flat[most] / parts.flat[most]  # as large as it is shown
         assert np.abs(seen - parts).max() < 0.05

@@ -20,8 +20,8 @@ def mine(folder: Path, name: str = "five_bar") -> Path:
 
 
 def test_it_is_built_once(tmp_path: Path, monkeypatch) -> None:
-    built, assembled = [], loading.assembled
-    monkeypatch.setattr(loading, "assembled", lambda *given: built.append(1) or assembled(*given))
+    built, assemble_mechanism = [], loading.assemble_mechanism
+    monkeypatch.setattr(loading, "assemble_mechanism", lambda *given: built.append(1) or assemble_mechanism(*given))
     path = mine(tmp_path)
     first, again = load(path), load(path)
     assert len(built) == 1
@@ -87,8 +87,8 @@ def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
     paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.MOST_KEPT + 3)]
     for path in paths:
         load(path)
-    built, assembled = [], loading.assembled
-    monkeypatch.setattr(loading, "assembled", lambda *given: built.append(1) or assembled(*given))
+    built, assemble_mechanism = [], loading.assemble_mechanism
+    monkeypatch.setattr(loading, "assemble_mechanism", lambda *given: built.append(1) or assemble_mechanism(*given))
     load(paths[-1]), load(paths[3])
     assert not built
     load(paths[0])

@@ -17,9 +17,9 @@ import pytest
 from ckc_pin import CkcError, Run, check, load, simulate
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import to_json
-from ckc_pin.base.toml import by_coordinate, convert
+from ckc_pin.base.toml import convert, join_dotted_keys
 from ckc_pin.cli.tables import profile_table
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.run.run_file import RunMeta, hashes_of
@@ -99,8 +99,8 @@ def test_mechanisms(name: str) -> None:
 
 
 def _check(data: Any, name: str, folder: Path) -> None:
-    by_coordinate(data, "q_guess")
-    check(assembled(convert(data, MechanismSpec, name), Sources(name, folder)))
+    join_dotted_keys(data, "q_guess")
+    check(assemble_mechanism(convert(data, MechanismSpec, name), Sources(name, folder)))
 
 
 @pytest.mark.parametrize("file", ["five_bar.urdf", "mechanism.toml", "swing.scene.toml"])

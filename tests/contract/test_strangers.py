@@ -17,7 +17,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import CkcError, Event, InputError, MechanismError, Run, Simulator, load, simulate, terms
-from ckc_pin.base.atomic_files import UNFINISHED, written_whole
+from ckc_pin.base.atomic_files import UNFINISHED, open_atomic
 from ckc_pin.kinematics.sigma import sigma
 
 # --- numbers -----------------------------------------------------------------------------------------
@@ -262,10 +262,10 @@ def test_what_a_killed_process_left_is_cleared_and_what_another_writes_is_not(tm
     path = tmp_path / "run.npz"
     for content in (b"", b"half"):
         (tmp_path / f".run.npz.{len(content)}{UNFINISHED}").write_bytes(content)
-    with written_whole(path) as file:
+    with open_atomic(path) as file:
         file.write(b"first")
         file.flush()
-        with written_whole(path) as other:
+        with open_atomic(path) as other:
             other.write(b"second")
         assert path.read_bytes() == b"second"
     assert path.read_bytes() == b"first"

@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 
-from ckc_pin.base.toml import by_coordinate
+from ckc_pin.base.toml import join_dotted_keys
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.scene.spec import SceneSpec
 from tests.contract.helpers.command import ckc
@@ -118,7 +118,7 @@ def check_part(text: str) -> None:
     """Validate keys as part of a scene, a mechanism or a controller."""
     data = tomllib.loads(text)
     for table in (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("q_guess",)):
-        by_coordinate(data, *table)
+        join_dotted_keys(data, *table)
     scene = {"mechanism": "mechanism.toml", "formulation": "dae", "t_end": 1.0}
     controller = {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": {}}
     if "controller" in data and "type" not in data["controller"]:

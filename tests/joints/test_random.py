@@ -23,7 +23,7 @@ def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
     random = np.random.default_rng([seed, 77])
     random_mechanism(seed).write(folder)
     mechanism = load(folder)
-    tree, reach = mechanism.tree, mechanism.tree.reach
+    tree, reach = mechanism.tree, mechanism.tree.step_scale
     numbers = tree.to_coordinates(mechanism.q_tree)
     size = np.abs(Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)).h_tree)
     size = np.where(size > 1e-9 * size.max(), size, size.max()) if size.any() else np.ones(mechanism.n)
@@ -52,7 +52,7 @@ def test_random_mechanisms_rub_and_stop(seed: int, tmp_path: Path) -> None:
     for run in runs:
         assert run.status == "done", run.message
         assert run.max_phi < 1e-9 * max(1.0, run.mechanism.size)
-        joints, reach = run.mechanism.joints, run.mechanism.tree.reach
+        joints, reach = run.mechanism.joints, run.mechanism.tree.step_scale
         assert np.all((run.q_tree - joints.lower) / reach > -1e-8)
         assert np.all((joints.upper - run.q_tree) / reach > -1e-8)
         assert run.dissipated is not None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import simulate
-from ckc_pin.mechanism.rank import scales
+from ckc_pin.mechanism.rank import jacobian_scales
 from tests.native.loops import started
 from tests.regression.test_reference_cases import first_top_pin
 
@@ -73,7 +73,7 @@ def test_the_least_singular_value_that_is_monitored_is_that_of_j(N):
     """Of chains whose J is decomposed whole and of longer ones, against NumPy's and differences of NumPy's."""
     ready = started("n_four_bar", {"mechanism.N": N})
     mechanism = ready.mechanism
-    rows, columns = scales(mechanism.tree, mechanism.closure)
+    rows, columns = jacobian_scales(mechanism.tree, mechanism.closure)
 
     def singular_values(t):
         J = mechanism.kinematics(start + t * v_tree).J

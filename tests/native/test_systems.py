@@ -61,7 +61,7 @@ def test_a_free_roots_rates_whatever_its_quaternion_has_become(name):
     tree, random = ivp.mechanism.tree, np.random.default_rng(1)
     for _ in range(50):
         q_tree = tree.integrate(ready.start.at.q_tree, 0.3 * random.standard_normal(tree.n))
-        for q_at, _v_at in tree.free:
+        for q_at, _v_at in tree.free_roots:
             q_tree[q_at + 3 : q_at + 7] *= -1.0 if random.random() < 0.5 else 1.001  # both are read as unit ones
         y = np.concatenate([q_tree, random.standard_normal(tree.n)])
         wanted, found = ivp.f(0.0, y), ready.loop.rhs(0.0, y)
@@ -132,7 +132,7 @@ def _closed(mechanism, y, metric):
 
     at = mechanism.kinematics(q_tree)
     for _ in range(20):
-        at = at.moved(shortest(at, at.phi))
+        at = at.integrate(shortest(at, at.phi))
     return at, v + shortest(at, at.J @ v)
 
 

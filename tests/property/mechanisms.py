@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics import Terms
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, TreeSpec
@@ -104,7 +104,7 @@ def closed_mechanism(
         joint=ROTORS,
     )
     texts = {prefix: world.urdf(prefix) for prefix in world.stands}
-    return Closed(assembled(spec, Sources("a random world", None, texts)), world, q)
+    return Closed(assemble_mechanism(spec, Sources("a random world", None, texts)), world, q)
 
 
 def _closing_loop(kind: LoopType, world: World, q: Numbers) -> LoopSpec:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from ckc_pin.dynamics import Terms, dae_acceleration, multipliers
-from ckc_pin.kinematics.sigma import nearest, shortest
+from ckc_pin.kinematics.sigma import minimum_norm_step, project_onto_closure
 from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.native.plant import Plant
 from tests.analytic.five_bar import Array
@@ -36,9 +36,9 @@ def test_it_is_the_flow_and_the_forces_of_eq_1_to_first_order(closed: Closed) ->
 
     def beside(h: float) -> Array:
         """A state on the closure whose deviation is h x to first order."""
-        at = nearest(mechanism.kinematics(tree.integrate(state.q_tree, h * step)), rank)
+        at = project_onto_closure(mechanism.kinematics(tree.integrate(state.q_tree, h * step)), rank)
         v = state.v_tree + h * dv
-        return np.concatenate([at.q_tree, v + shortest(at.J, rank, at.J @ v, tree.reach)])
+        return np.concatenate([at.q_tree, v + minimum_norm_step(at.J, rank, at.J @ v, tree.step_scale)])
 
     def here(y: Array) -> Terms:
         return Terms(mechanism, mechanism.kinematics(y[: tree.nq]), y[tree.nq :])

@@ -32,7 +32,7 @@ ROUNDED = 1e-9  # of the largest row of J: a row of zeros
 def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, Any]:
     """Overrides of a scene: every independent coordinate swings about where the mechanism is assembled."""
     numbers = mechanism.tree.named(mechanism.tree.to_coordinates(mechanism.q_tree))
-    reach = mechanism.tree.named(mechanism.tree.reach)
+    reach = mechanism.tree.named(mechanism.tree.step_scale)
     desired, rates = {}, {}
     for k, name in enumerate(mechanism.independent):
         amplitude = size * reach[name] * (1.0 + 0.1 * k)
@@ -119,7 +119,7 @@ def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> No
     scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
     mechanism = scene_mechanism(ckc_pin.load_scene(scene))
     overrides = waves(mechanism, 0.1)
-    if mechanism.splits_root or mechanism.rooted:
+    if mechanism.splits_root or mechanism.independent_root_coordinates:
         says = "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+.* is held by none"
         with pytest.raises(InputError, match=says):
             inverse_dynamics(scene, overrides)

@@ -252,7 +252,7 @@ def test_redundant_rows_are_off_together_or_not_at_all() -> None:
         simulate("bricard", {**overrides, "initial.w": [1e-3] * 5})
     bricard, moves = mechanism("bricard"), np.array([1e-3, 0.0, 2e-3, 1e-3, 0.0])
     moves[bricard.partition.q] = 0.0  # the start's own
-    off = bricard.assembled.moved(moves)
+    off = bricard.assembled.integrate(moves)
     assert np.abs(off.phi).max() > 1e-4
     run = simulate("bricard", {**overrides, "initial.w": off.phi.tolist()})
     assert run.status == "done"

@@ -17,9 +17,9 @@ from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.mapped import Approach, Locus, Path
-from ckc_pin.kinematics.nodes import shapes
+from ckc_pin.kinematics.nodes import shape_points
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.batch import evaluate
+from ckc_pin.mechanism.batch import evaluate_closure
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
@@ -112,7 +112,7 @@ def _way(follower: _Follower, desired: Desired, t: Array, grids: Sequence[Grid])
     way = np.array([follower(desired(float(x))[0]) for x in t])
     if not follower.cartesian:  # q_d, reached or not, is compared with the assembled branch
         return way, np.repeat(np.arange(len(grids))[:, None] == 0, len(t), axis=1)
-    return way, seen(way, shapes(follower.mechanism, np.array(follower.passed)), grids)
+    return way, seen(way, shape_points(follower.mechanism, np.array(follower.passed)), grids)
 
 
 class _Follower:
@@ -131,7 +131,7 @@ class _Follower:
             return q[self.domain.over]
         self.at = sigma(self.mechanism, q, self.at).at
         self.passed.append(self.at.q_tree)
-        given, _ = evaluate(self.mechanism.tree, self.domain.task.extended.closure, self.at.q_tree[None])
+        given, _ = evaluate_closure(self.mechanism.tree, self.domain.task.extended.closure, self.at.q_tree[None])
         return np.asarray(given[0, rows])
 
 

@@ -16,12 +16,12 @@ from ckc_pin.analysis.map.progress import Progress, Steps
 from ckc_pin.analysis.map.value import located, map_value, name_of
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import require_callable, require_kind
+from ckc_pin.base.validation import require_callable, require_type
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.extended import Extended, Task, extend, find_point
+from ckc_pin.kinematics.extended import Extended, Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
-from ckc_pin.kinematics.nodes import nodes_at, solutions
+from ckc_pin.kinematics.nodes import find_solutions, nodes_at
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.scene import TAKES, Scene, load_scene
 
@@ -72,8 +72,8 @@ def singularity_map(
     """
     found = as_mechanism(mechanism, "singularity_map")
     if scene is not None:
-        require_kind(scene, (Scene, str, FilePath), "singularity_map: scene", TAKES)
-    require_kind(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
+        require_type(scene, (Scene, str, FilePath), "singularity_map: scene", TAKES)
+    require_type(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
         raise InputError(f"singularity_map: over: {over!r} was given; it takes one or two names, as [{over!r}]")
     require_callable(progress, "singularity_map: progress", "a function of the part that is done", 1)
@@ -125,9 +125,9 @@ def singularity_map(
 def _branches(task: Task) -> tuple[Array, bool]:
     """Return a configuration of each branch to be mapped, and whether there are or may be more."""
     mechanism = task.extended.mechanism
-    if not mechanism.tree.flat or len(mechanism.dependent) > LARGEST:
+    if not mechanism.tree.is_euclidean or len(mechanism.dependent) > LARGEST:
         return mechanism.q_tree[None], True
-    found = solutions(task, nodes_at(task, mechanism.q_tree[None]).given[0], MOST + 1)
+    found = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).given[0], MOST + 1)
     return found[:MOST], len(found) > MOST
 
 
@@ -140,20 +140,20 @@ def _scene(mechanism: str | FilePath, scene: str | FilePath) -> Scene:
 def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tuple[Extended, tuple[str, ...]]:
     """Add the point's rows; where it is not needed a point that will not do is a note."""
     try:
-        return extend(mechanism, find_point(mechanism, point)), ()
+        return extend_closure(mechanism, find_point(mechanism, point)), ()
     except InputError as error:
         if needed:
             raise
-        return extend(mechanism), (f"no serial singularities: {error}",)
+        return extend_closure(mechanism), (f"no serial singularities: {error}",)
 
 
 def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
     """Choose the given rows and which of them are the axes."""
     mechanism = extended.mechanism
-    if mechanism.rooted and not cartesian:
+    if (root := mechanism.independent_root_coordinates) and not cartesian:
         raise InputError(
-            f"{mechanism.name}: {mechanism.rooted[0]} belongs to a free root, which has no chart to draw a map over; "
-            "choose joints as independent coordinates"
+            f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, and a map needs joint "
+            "coordinates; choose joints as independent coordinates"
         )
     if cartesian:
         task = Task(extended, extended.fixing)
@@ -161,7 +161,7 @@ def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tu
         if not valid:
             raise InputError(f"{mechanism.name}: the point {extended.point!r} stands still as assembled; name another")
     else:
-        task = Task(extend(mechanism), extended.joints)
+        task = Task(extend_closure(mechanism), extended.joints)
         valid = list(mechanism.independent)
     names = valid[:2] if over is None else list(over)
     unknown = [name for name in names if name not in valid]

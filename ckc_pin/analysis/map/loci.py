@@ -20,10 +20,10 @@ from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.extended import Extended
 from ckc_pin.kinematics.mapped import Kind, Locus
-from ckc_pin.kinematics.nodes import shapes
-from ckc_pin.mechanism.batch import evaluate
+from ckc_pin.kinematics.nodes import shape_points
+from ckc_pin.mechanism.batch import evaluate_closure
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.rank import rank_of, scaled
+from ckc_pin.mechanism.rank import compute_rank, scale_jacobian
 
 __all__ = ["LocusSystem", "find_loci", "seen"]
 
@@ -85,7 +85,7 @@ class LocusSystem(SingularSystem):
 def _bracket(at: Kinematics, v: Array) -> Array:
     """Return the matrix (n, n) of e -> [v, e], zero but for free roots."""
     matrix = np.zeros((len(v), len(v)))
-    for _, k in at.tree.free:
+    for _, k in at.tree.free_roots:
         linear, angular = (-np.cross(np.eye(3), part) for part in (v[k : k + 3], v[k + 3 : k + 6]))
         matrix[k : k + 6, k : k + 6] = np.block([[angular, linear], [np.zeros((3, 3)), angular]])
     return matrix
@@ -190,7 +190,7 @@ def _starts(system: LocusSystem, grid: Grid, edges: bool) -> tuple[IntArray, Arr
     numbers = rows[:, None] * domain.shape[1] + columns
     size = np.full(numbers.shape, np.nan)
     inside = grid.reached[numbers]
-    _, jacobian = evaluate(task.extended.mechanism.tree, system.extended.closure, grid.q_tree[numbers[inside]])
+    _, jacobian = evaluate_closure(task.extended.mechanism.tree, system.extended.closure, grid.q_tree[numbers[inside]])
     size[inside] = np.linalg.svd(jacobian[:, system._still], compute_uv=False)[:, -1]
     chosen = np.zeros(size.shape, bool)
     for k, axis in enumerate(domain.axes):
@@ -209,7 +209,7 @@ def _starts(system: LocusSystem, grid: Grid, edges: bool) -> tuple[IntArray, Arr
 
 def _known(system: LocusSystem, at: Kinematics, serial: bool, found: list[_Found]) -> bool:
     """Whether a solution lies on a curve that has been traced, as far as its points can tell."""
-    look = shapes(system.mechanism, at.q_tree[None])
+    look = shape_points(system.mechanism, at.q_tree[None])
     for locus in found:
         if locus.serial == serial:
             stride = np.abs(np.diff(locus.look, axis=0)).max(initial=1e-6 * system.mechanism.size)
@@ -228,8 +228,8 @@ def _follow(
         curve = trace(system, at, null, STEP, LONGEST)
     else:
         curve = SingularCurve(at.q_tree[None], null[None], False, float(np.abs(system.residual(at, null)).max()))
-    look = shapes(mechanism, curve.q_tree)
-    given, _ = evaluate(mechanism.tree, domain.task.extended.closure, curve.q_tree)
+    look = shape_points(mechanism, curve.q_tree)
+    given, _ = evaluate_closure(mechanism.tree, domain.task.extended.closure, curve.q_tree)
     place = given[:, domain.task.rows[domain.over]]
     return _Found(serial, kind, curve, look, place, seen(place, look, grids, edges))
 
@@ -239,7 +239,7 @@ def _kind(system: LocusSystem, serial: bool, at: Kinematics, null: Array) -> Kin
     own = mechanism.kinematics(at.q_tree)
     if not serial:
         return classify(SingularSystem(mechanism), own, null).kind
-    rank = rank_of(scaled(own.J, mechanism.tree, mechanism.closure)).rank
+    rank = compute_rank(scale_jacobian(own.J, mechanism.tree, mechanism.closure)).rank
     return "serial" if rank == mechanism.rank else "rank loss"
 
 
@@ -255,7 +255,7 @@ def seen(place: Array, look: Array, grids: Sequence[Grid], ends: bool = False) -
     for aspect, grid in enumerate(grids):
         near = np.full((*block.shape, look.shape[1]), np.nan)
         there = grid.reached[block]
-        near[there] = shapes(mechanism, grid.q_tree[block[there]])
+        near[there] = shape_points(mechanism, grid.q_tree[block[there]])
         known = np.flatnonzero(np.any(there, axis=1))
         gap = np.nanmin(np.max(np.abs(near[known] - look[known][:, None]), axis=2), axis=1)
         spread = np.max(np.nanmax(near[known], axis=1) - np.nanmin(near[known], axis=1), axis=1)

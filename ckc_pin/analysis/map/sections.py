@@ -21,7 +21,7 @@ from ckc_pin.analysis.map.value import located, map_value
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.extended import Task, extend, find_point
+from ckc_pin.kinematics.extended import Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import SHORTEST, follow, nodes_at
@@ -98,7 +98,7 @@ class Stack:
     def __init__(
         self, mechanism: Mechanism, point: str | None, over: Sequence[str], steps: Steps | None = None
     ) -> None:
-        self.extended = extend(mechanism, find_point(mechanism, point))
+        self.extended = extend_closure(mechanism, find_point(mechanism, point))
         fixing = self.extended.fixing - self.extended.place[0]
         if mechanism.d != 3 or fixing.tolist() != [0, 1, 2]:
             raise InputError(

@@ -117,7 +117,7 @@ def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
     """Compare two motions of one mechanism; the second one's size is the scale."""
     m = min(len(motion.q_tree), len(other.q_tree))
     q, theirs = motion.q_tree[:m], other.q_tree[:m]
-    if tree.flat:
+    if tree.is_euclidean:
         difference = q - theirs
     else:  # a rotation vector jumps where it has turned by pi
         from_numbers = tree.from_coordinates

@@ -136,7 +136,7 @@ def _difference(mechanism: Mechanism, model: Any, state: tuple[Array, Array]) ->
     ours = tree.evaluate(pin.crba, q_tree)
     ours = np.triu(ours) + np.triu(ours, 1).T
     off = float(np.abs(to.T @ mass @ to - ours).max() / np.abs(ours).max())
-    if tree.flat:
+    if tree.is_euclidean:
         bias = tree.evaluate(pin.nonLinearEffects, q_tree, v_tree)
         off = max(off, float(np.abs(to.T @ data.qfrc_bias - bias).max() / max(float(np.abs(bias).max()), 1e-12)))
     return off

@@ -147,7 +147,7 @@ def _motors(mechanism: Mechanism, root: Element) -> None:
         return
     actuators = SubElement(root, "actuator")
     motors = mechanism.motors
-    for name, turns, limit in zip(motors.names, motors.turns, motors.torque_limit, strict=True):
+    for name, turns, limit in zip(motors.names, motors.transmission, motors.torque_limit, strict=True):
         joints = np.flatnonzero(turns)
         motor = SubElement(actuators, "motor", name=name)
         if len(joints) == 1:

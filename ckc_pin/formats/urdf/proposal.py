@@ -13,7 +13,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import Draft, vector
-from ckc_pin.kinematics.assembly import assemble
+from ckc_pin.kinematics.assembly import close_loops
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.pose import Pose
@@ -59,7 +59,7 @@ def propose(draft: Draft, pairs: Sequence[LoopSpec]) -> list[tuple[LoopSpec, str
         for coupling in [*draft.spec().coupling, *couplings]:
             builder.add_coupling(coupling)
         closure = builder.build()
-        closed = assemble(tree, closure, tree.neutral(), np.ones(tree.n), 1e-10)
+        closed = close_loops(tree, closure, tree.neutral(), np.ones(tree.n), 1e-10)
         pose = Pose(tree, closure.anchors, closed.q_tree)
         for pair in spatial:
             ends = [frames.find(f, pair.name) for f in (pair.frame_a, pair.frame_b)]

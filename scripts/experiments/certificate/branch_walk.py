@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.kinematics.sigma import move
+from ckc_pin.kinematics.sigma import follow_sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -45,7 +45,7 @@ def margin_gradient(at: Kinematics) -> Array:
 
 def follow(mechanism: Mechanism, at: Kinematics, dq: Array) -> tuple[Kinematics, float]:
     """Move q by dq along the branch; return where that led and how much of the way it was, 1 for all of it."""
-    moved = move(at, dq, 0.0, mechanism.tolerance, anywhere=False)
+    moved = follow_sigma(at, dq, 0.0, mechanism.tolerance, anywhere=False)
     return moved.at, moved.reached
 
 

@@ -180,7 +180,7 @@ def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: floa
     """Say why the argument does not even begin."""
     if controller.target.mechanism is not mechanism:
         return "the controller compensates the gravity of another model than the plant"
-    if not mechanism.tree.flat:
+    if not mechanism.tree.is_euclidean:
         return "an independent coordinate belongs to a free root, whose orientation is not a vector"
     if np.any(start.w):
         return "the start is off phi = 0: V_L is a Lyapunov function of the reduced model only"

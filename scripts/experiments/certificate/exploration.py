@@ -92,7 +92,7 @@ def explore(
     InputError
         A free root.
     """
-    if not mechanism.tree.flat:
+    if not mechanism.tree.is_euclidean:
         raise InputError(f"{mechanism.name}: a free root's orientation is not a vector; there is no lattice of it")
     if mechanism.d <= 2:
         return _flood(mechanism, centre, step, height, level, turn)

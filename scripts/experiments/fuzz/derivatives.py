@@ -98,7 +98,7 @@ def draw(seed: int, folder: Path) -> Draw:
     made = random_mechanism(seed)
     made.write(folder)
     plain = ckc_pin.load(folder)
-    tree, reach = plain.tree, plain.tree.reach
+    tree, reach = plain.tree, plain.tree.step_scale
     numbers = tree.to_coordinates(plain.q_tree)
     force = np.abs(Terms(plain, plain.assembled, np.zeros(plain.n)).h_tree)
     force = np.where(force > 1e-9 * force.max(), force, force.max()) if force.any() else np.ones(plain.n)
@@ -255,7 +255,7 @@ def _states(run: ckc_pin.Run, mechanism: Mechanism) -> Array:
 def _scale(mechanism: Mechanism) -> tuple[Array, Sequence[int]]:
     tree = mechanism.tree
     joints = [k for name, k in tree.index.items() if name not in tree.free_coordinates]
-    reach = tree.reach[joints]
+    reach = tree.step_scale[joints]
     return np.concatenate([reach, reach / np.sqrt(mechanism.size)]), joints
 
 

@@ -99,7 +99,7 @@ def _overrides(random: np.random.Generator, mechanism: Mechanism, about: _Shippe
             overrides["initial"]["w"] = (random.uniform(-1, 1, mechanism.closure.rows) * 1e-3 * mechanism.size).tolist()
     if random.random() < 1 / 3:
         overrides["event"] = _events(random, mechanism, q, q_dot)
-    if q is not None and not mechanism.rooted and random.random() < 0.12:
+    if q is not None and not mechanism.independent_root_coordinates and random.random() < 0.12:
         overrides["controller"] = _controller(random, mechanism, q)
         if "sample_time" in overrides["controller"]:  # every change of u is at an output instant
             overrides["solver.output_dt"] = overrides["controller"]["sample_time"] / PER_SAMPLE

@@ -48,7 +48,7 @@ class FromLast:
         """Return the configuration at q, shape (d,)."""
         step = np.zeros(self._mechanism.n)
         step[self._last.partition.q] = q - self._mechanism.independent_part(self._last.q_tree)
-        return newton(self._last.moved(step), 0.0, self._tolerance).at
+        return newton(self._last.integrate(step), 0.0, self._tolerance).at
 
     def keep(self, q: Array) -> Kinematics:
         """Return the configuration at the q of an accepted step: where the next ones start."""

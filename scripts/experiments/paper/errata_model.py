@@ -163,6 +163,6 @@ def _skew(terms: Terms, C_tree: Array) -> float:
     mechanism: Mechanism = terms.mechanism
     step = 1e-5
     ahead, behind = (
-        Terms(mechanism, terms.at.moved(sign * step * terms.v_tree), terms.v_tree).D_tree for sign in (1.0, -1.0)
+        Terms(mechanism, terms.at.integrate(sign * step * terms.v_tree), terms.v_tree).D_tree for sign in (1.0, -1.0)
     )
     return float(np.abs((ahead - behind) / (2 * step) - C_tree - C_tree.T).max())

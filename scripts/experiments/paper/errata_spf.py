@@ -53,7 +53,7 @@ def boundary_layer_sign() -> Erratum:
     mechanism, on, _ = _off_manifold()
     z, columns = mechanism.partition.z, []
     for step in STEP * np.eye(mechanism.n)[z]:
-        ahead, behind = (on.moved(sign * step) for sign in (1.0, -1.0))
+        ahead, behind = (on.integrate(sign * step) for sign in (1.0, -1.0))
         columns.append((ahead.phi_z_factor.solve(ahead.phi) - behind.phi_z_factor.solve(behind.phi)) / (2 * STEP))
     printed = np.linalg.eigvals(np.array(columns).T).real
     return Erratum(

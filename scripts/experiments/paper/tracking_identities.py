@@ -67,7 +67,7 @@ def skewness(mechanism: Mechanism, count: int, epsilon: float, off: float = 0.02
         at, _ = follow(mechanism, mechanism.assembled, random.uniform(-1, 1, mechanism.d))
         away = np.zeros(mechanism.n)
         away[at.partition.z] = random.uniform(-off, off, mechanism.n - mechanism.d)
-        moved = at.moved(away)
+        moved = at.integrate(away)
         if min(margin(at), margin(moved)) < least:
             continue
         states += 1
@@ -85,7 +85,7 @@ def defect(mechanism: Mechanism, at: Kinematics, along: Array, at_velocity: Arra
     speed = float(np.linalg.norm(along))
 
     def D(distance: float) -> Array:
-        return Terms(mechanism, at.moved(distance / speed * along), np.zeros(mechanism.n)).D
+        return Terms(mechanism, at.integrate(distance / speed * along), np.zeros(mechanism.n)).D
 
     D_dot = (8 * (D(STEP) - D(-STEP)) - (D(2 * STEP) - D(-2 * STEP))) / (12 * STEP / speed)
     S = D_dot - 2 * Terms(mechanism, at, at_velocity).C

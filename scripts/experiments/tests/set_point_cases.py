@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin import Mechanism
 from ckc_pin.base.sources import Sources
 from ckc_pin.control import SetPoint
-from ckc_pin.kinematics.assembly import assembled
+from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.scene.initial import Start, find_start
@@ -52,7 +52,7 @@ def pendulum(links: int) -> Mechanism:
         parent, x = f"rod{k}", 1.0
     spec = MechanismSpec(name="pendulum", urdf="p.urdf", gravity=(0.0, -G, 0.0))
     urdf = f'<robot name="p">{"".join(parts)}</robot>'
-    return assembled(spec, Sources("pendulum", None, {"p.urdf": urdf}))
+    return assemble_mechanism(spec, Sources("pendulum", None, {"p.urdf": urdf}))
 
 
 def at_rest(mechanism: Mechanism, q: list[float]) -> Start:

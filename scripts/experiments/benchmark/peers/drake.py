@@ -47,7 +47,7 @@ class Drake:
             return CONTROLLED
         if others:
             return f"it has no constraint for {', '.join(sorted(others))}"
-        if work.mechanism.tree.free:
+        if work.mechanism.tree.free_roots:
             return "free roots are not set up in it"
         try:
             _Plant(work.mechanism, 1e-3)

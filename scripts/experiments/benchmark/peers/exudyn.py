@@ -43,7 +43,7 @@ class Exudyn:
         others = {loop.type for loop in mechanism.spec.loop} - set(CLOSED)
         if work.controlled:
             return CONTROLLED
-        if others or mechanism.spec.coupling or mechanism.tree.free:
+        if others or mechanism.spec.coupling or mechanism.tree.free_roots:
             return f"not set up in it: {', '.join(sorted(others)) or 'couplings and free roots'}"
         if mechanism.springs.joint_stiffness.any() or mechanism.springs.joint_damping.any():
             return "springs and dampers on joints are not set up in it"

@@ -45,7 +45,7 @@ class Ida:
             metadata.version("scikit-sundae")
         except metadata.PackageNotFoundError:
             return "not installed: pip install 'ckc_pin[sundials]'"
-        return "it integrates numbers, a free root has none" if work.mechanism.tree.free else None
+        return "it integrates numbers, a free root has none" if work.mechanism.tree.free_roots else None
 
     def version(self) -> str:
         return f"scikit-sundae {metadata.version('scikit-sundae')}"

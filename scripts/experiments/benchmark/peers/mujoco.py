@@ -75,7 +75,7 @@ class Mujoco:
         ours = dae_acceleration(terms, np.zeros(tree.n))
         mass = np.abs(to.T @ M @ to - terms.D_tree).max() / np.abs(terms.D_tree).max()
         said = f"D' agrees to {mass:.0e}"
-        if tree.flat:
+        if tree.is_euclidean:
             bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
             off = np.abs(to.T @ data.qfrc_bias - bias).max() / max(float(np.abs(bias).max()), 1e-12)
             apart = np.abs(to.T @ data.qacc - ours).max() / max(float(np.abs(ours).max()), 1.0)

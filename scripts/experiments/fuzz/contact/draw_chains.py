@@ -52,10 +52,10 @@ def draw_jammed(seed: int, random: np.random.Generator) -> Case:
     for attempt in range(200):
         texts = _random_closed(seed * 1000 + attempt, random)
         mechanism = _loaded(texts)
-        if mechanism is None or mechanism.d != 1 or mechanism.rooted:
+        if mechanism is None or mechanism.d != 1 or mechanism.independent_root_coordinates:
             continue
         _, _, Vt = np.linalg.svd(mechanism.assembled.J)
-        rates = Vt[-1] / mechanism.tree.reach
+        rates = Vt[-1] / mechanism.tree.step_scale
         moving = np.flatnonzero(np.abs(rates) > 0.05 * np.abs(rates).max())
         moving = moving[[mechanism.coordinates[k] not in mechanism.tree.free_coordinates for k in moving]]
         if len(moving) < 2:
@@ -119,7 +119,7 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
     mechanism = _loaded(texts)
     if mechanism is None:
         return Case(seed, kind, texts, {}, {"t_end": 0.01, "solver.rtol": RTOL, "initial": {"at": "assembled"}})
-    tree, reach = mechanism.tree, mechanism.tree.reach
+    tree, reach = mechanism.tree, mechanism.tree.step_scale
     numbers = tree.to_coordinates(mechanism.q_tree)
     size = np.abs(ckc_pin.Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)).h_tree)
     size = np.where(size > 1e-9 * size.max(), size, size.max()) if size.any() else np.ones(mechanism.n)
@@ -145,7 +145,7 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
     }
     overrides = _overrides(mechanism, rates, duration)
     conservative = True
-    if not mechanism.rooted and not mechanism.splits_root and random.random() < 0.12:
+    if not mechanism.independent_root_coordinates and not mechanism.splits_root and random.random() < 0.12:
         texts = _with_motors(texts, mechanism, random, size)
         overrides["controller"] = _controller(mechanism, random, size)
         conservative = False

@@ -103,7 +103,7 @@ def energy_fault(run: Run, model: Model, case: Case) -> tuple[str, str]:
 
 def limits_fault(run: Run, case: Case) -> str:
     """Whether a joint is beyond a stop, or the loops are open."""
-    reach = run.mechanism.tree.reach
+    reach = run.mechanism.tree.step_scale
     for name, contact in case.contacts.items():
         k = run.column(name)
         beyond = max(contact.lower - run.q_tree[:, k].min(), run.q_tree[:, k].max() - contact.upper) / reach[k]
