@@ -21,8 +21,8 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.workspace import DesiredCheck
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.kinematics.branches import assembly_branches
 from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.sigma import assembly_branches
 from ckc_pin.linear.linear_report import stability_text, stability_warning
 from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability

@@ -1,10 +1,61 @@
 """Types of NumPy arrays."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar, overload
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Array", "BoolArray", "IntArray"]
+__all__ = [
+    "Array",
+    "BoolArray",
+    "Immutable",
+    "IntArray",
+    "lazy",
+]
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
+
+T = TypeVar("T")
+
+
+class lazy(Generic[T]):
+    """A property computed once per object.
+
+    Like `functools.cached_property` without its lock, which costs more than some of our values on Python 3.11.
+    """
+
+    def __init__(self, compute: Callable[[Any], T]) -> None:
+        self.compute = compute
+        self.name = compute.__name__
+        self.__doc__ = compute.__doc__
+
+    @overload
+    def __get__(self, owner: None, kind: type) -> lazy[T]: ...
+    @overload
+    def __get__(self, owner: object, kind: type) -> T: ...
+    def __get__(self, owner: Any, kind: type) -> Any:
+        if owner is None:
+            return self
+        value = owner.__dict__[self.name] = self.compute(owner)
+        return value
+
+
+class Immutable:
+    """A frozen dataclass whose arrays are read-only: a copy of it is itself."""
+
+    def __post_init__(self) -> None:
+        for value in self.__dict__.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.__post_init__()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return self

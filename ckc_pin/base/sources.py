@@ -7,12 +7,20 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os.path import isdir, lexists
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError, MechanismError
 
-__all__ = ["Sources", "resolve", "write_texts"]
+__all__ = [
+    "MAX_DEPTH",
+    "Sources",
+    "resolve",
+    "strict_xml",
+    "write_texts",
+]
 
 PACKAGE = "package://"
 
@@ -106,3 +114,40 @@ def _shares() -> list[Path]:
 
     wheel = Path(pinocchio.__file__).resolve().parents[4] / "share"
     return [wheel, Path(sys.prefix) / "share"]
+
+
+MAX_DEPTH = 300  # of nested elements; ElementTree writes by recursion
+
+
+def strict_xml(text: str, source: str) -> ElementTree.Element:
+    """Parse XML from a stranger: no recovery, no document type, hence no entities, no abyss of nested elements.
+
+    Raises
+    ------
+    InputError
+        With the line, where expat has one.
+    """
+    depth = 0
+
+    def refuse(name: str, *_: object) -> None:
+        raise InputError(f"{source}: a document type declaration ({name}) is not accepted")
+
+    def enter(*_: object) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > MAX_DEPTH:
+            raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
+
+    def leave(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    # The text is UTF-8, or it would not have been read, whatever its first line says.
+    checker = expat.ParserCreate("utf-8")
+    checker.StartDoctypeDeclHandler = refuse
+    checker.StartElementHandler, checker.EndElementHandler = enter, leave
+    try:
+        checker.Parse(text.encode(), True)
+        return ElementTree.fromstring(text.encode(), ElementTree.XMLParser(encoding="utf-8"))
+    except (expat.ExpatError, ElementTree.ParseError) as error:
+        raise InputError(f"{source}: malformed XML: {error}") from None

@@ -18,7 +18,7 @@ from ckc_pin.codegen.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, values_of
 from ckc_pin.mechanism.spec import FrameSpec
-from ckc_pin.mechanism.urdf_checks import INERTIA
+from ckc_pin.mechanism.urdf import INERTIA
 
 __all__ = ["Varied"]
 

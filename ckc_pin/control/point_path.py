@@ -22,7 +22,7 @@ from ckc_pin.kinematics.point import Point
 from ckc_pin.mechanism.batch import difference_many, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.spec_frames import Vector3
+from ckc_pin.mechanism.spec import Vector3
 
 __all__ = ["Circle", "Line", "Place", "PointPath", "make_desired"]
 

@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.linear_algebra import Factorization
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_table
-from ckc_pin.base.values import lazy
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma

@@ -18,9 +18,19 @@ from ckc_pin.formats.orientation import to_rpy
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.spec import LoopSpec, MechanismSpec, PointSpec
-from ckc_pin.mechanism.spec_frames import Frame, FrameSpec, Vector3
-from ckc_pin.mechanism.spec_parts import CouplingSpec, ForceSpec, JointSpec, MotorSpec, SpringSpec
+from ckc_pin.mechanism.spec import (
+    CouplingSpec,
+    ForceSpec,
+    Frame,
+    FrameSpec,
+    JointSpec,
+    LoopSpec,
+    MechanismSpec,
+    MotorSpec,
+    PointSpec,
+    SpringSpec,
+    Vector3,
+)
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, UrdfTree, merge
 

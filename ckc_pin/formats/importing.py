@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ckc_pin.base.sources import strict_xml
 from ckc_pin.base.toml import read_text
-from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft
 from ckc_pin.formats.mechanism_file import mechanism_text, write

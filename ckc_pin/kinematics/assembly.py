@@ -12,11 +12,11 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.freedoms import count_freedoms
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.rank import count_freedoms
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.tree import Tree
 

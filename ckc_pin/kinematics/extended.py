@@ -23,8 +23,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors
 from ckc_pin.mechanism.rank import RANK_TOLERANCE
 from ckc_pin.mechanism.rows import Affine
-from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
 __all__ = ["Extended", "Task", "extend_closure", "find_point"]
 

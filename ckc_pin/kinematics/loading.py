@@ -15,8 +15,7 @@ from ckc_pin.base.toml import convert, join_dotted_keys, read_toml
 from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.assembly import assemble_mechanism
-from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.library import MECHANISM_FILE, read_mechanism_texts
+from ckc_pin.mechanism.library import MECHANISM_FILE, GeneratorSpec, read_mechanism_texts
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec

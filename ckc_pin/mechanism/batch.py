@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import lazy
+from ckc_pin.base.arrays import Array, IntArray, lazy
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import Immutable
+from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
-from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Closure", "ClosureBuilder", "perpendicular"]

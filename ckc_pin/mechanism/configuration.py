@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
 from ckc_pin.base.linear_algebra import Factorization
-from ckc_pin.base.values import Immutable, lazy
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import scale_jacobian

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array
-from ckc_pin.base.values import Immutable
+from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.errors import MechanismError
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec
 
 __all__ = ["Frame", "Frames"]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.errors import MechanismError
-from ckc_pin.mechanism.spec_parts import JointSpec
+from ckc_pin.mechanism.spec import JointSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Joints"]

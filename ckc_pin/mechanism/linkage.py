@@ -14,8 +14,7 @@ from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.motors import motors_of
 from ckc_pin.mechanism.parameters import Overrides, changed
-from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, merge

@@ -10,11 +10,10 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
-from ckc_pin.mechanism.freedoms import Freedoms, idle_coordinates
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rank import choose_dependent, compute_rank, scale_jacobian
+from ckc_pin.mechanism.rank import Freedoms, choose_dependent, compute_rank, idle_coordinates, scale_jacobian
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 

@@ -10,8 +10,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import is_number
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.spec_parts import MotorSpec
+from ckc_pin.mechanism.spec import MechanismSpec, MotorSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Motors", "motors_of"]

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from ckc_pin.base.toml import convert
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.spec import MechanismSpec
-from ckc_pin.mechanism.urdf_checks import INERTIA, LIMITS, check_inertial, check_range, floats
+from ckc_pin.mechanism.urdf import INERTIA, LIMITS, check_inertial, check_range, floats
 
 __all__ = [
     "AXES",

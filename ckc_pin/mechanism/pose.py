@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.values import Immutable, lazy
+from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]

@@ -10,7 +10,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
-from ckc_pin.mechanism.spec_parts import ForceSpec, SpringSpec
+from ckc_pin.mechanism.spec import ForceSpec, SpringSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Springs"]

@@ -17,7 +17,7 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.arguments import numbers, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.native.tables import core_table, packed
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
-from ckc_pin.base.values import lazy
+from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
 from ckc_pin.dynamics.terms import Terms

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 
 from ckc_pin.control.spec import ControllerSpec
-from ckc_pin.mechanism.generators import GeneratorSpec
-from ckc_pin.mechanism.spec_frames import Vector3
+from ckc_pin.mechanism.library import GeneratorSpec
+from ckc_pin.mechanism.spec import Vector3
 
 __all__ = ["EventSpec", "InitialSpec", "Method", "SceneSpec", "SolverSpec", "TermsOf"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ckc_pin.base.summary import Row, Summary
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec, TrackingSpec
-from ckc_pin.mechanism.generators import GeneratorSpec
+from ckc_pin.mechanism.library import GeneratorSpec
 
 if TYPE_CHECKING:
     from ckc_pin.scene.scene import Scene

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_callable, require_path, require_type
-from ckc_pin.base.values import lazy
 from ckc_pin.control.controllers import Controller, Law
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError

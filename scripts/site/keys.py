@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
-from ckc_pin.base.faults import expected
+from ckc_pin.base.toml import expected
 from ckc_pin.control.point_path import PointPathSpec
 from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
 from ckc_pin.ensembles.spec import SweepSpec

@@ -12,7 +12,7 @@ from ckc_pin import Mechanism, load
 from ckc_pin.codegen.library import compiled
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.so3 import log_jacobian, log_jacobian_dot
+from ckc_pin.mechanism.rows import log_jacobian, log_jacobian_dot
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.native import _core
 from ckc_pin.native.plant import Plant

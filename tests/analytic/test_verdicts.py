@@ -12,8 +12,7 @@ import pytest
 from ckc_pin import Stability, check, load, load_scene, simulate
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.dynamics import Terms
-from ckc_pin.kinematics.branches import assembly_branches
-from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.kinematics.sigma import assembly_branches, sigma
 from ckc_pin.mechanism.library import library
 from ckc_pin.scene.parts import scene_controller
 from tests.analytic.five_bar import FIVE_BAR, Array

@@ -10,12 +10,10 @@ import msgspec
 import pytest
 
 from ckc_pin import InputError
-from ckc_pin.base.faults import faults
-from ckc_pin.base.toml import convert
+from ckc_pin.base.toml import convert, faults
 from ckc_pin.formats.urdf.robot_yaml import RobotYaml
 from ckc_pin.mechanism.library import library
-from ckc_pin.mechanism.spec import LoopType, MechanismSpec
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec, LoopType, MechanismSpec
 from ckc_pin.scene.spec import SceneSpec
 from tests.contract.test_mutations import mutated
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import MechanismError, Run, check, load, load_scene, simulate
-from ckc_pin.mechanism.generators import MAX_N, GeneratorSpec, generate
+from ckc_pin.mechanism.library import MAX_N, GeneratorSpec, generate
 from ckc_pin.mechanism.tree import MOST
 from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc

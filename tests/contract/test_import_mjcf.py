@@ -13,7 +13,7 @@ import pytest
 
 from ckc_pin import simulate
 from ckc_pin.formats.importing import Draft, read, write
-from ckc_pin.mechanism.spec_parts import JointSpec
+from ckc_pin.mechanism.spec import JointSpec
 from tests.conftest import assert_close
 from tests.contract.helpers.models import TWO_ARMS, model, said, write_workshop
 from tests.contract.helpers.mujoco_twin import Twin

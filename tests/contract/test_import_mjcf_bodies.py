@@ -13,7 +13,7 @@ import pytest
 from ckc_pin.errors import InputError
 from ckc_pin.formats.importing import read
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.spec_parts import JointSpec, MotorSpec
+from ckc_pin.mechanism.spec import JointSpec, MotorSpec
 from tests.conftest import assert_close
 from tests.contract.helpers.models import TWO_ARMS, model, said, tetrahedron
 from tests.contract.helpers.mujoco_twin import Twin

@@ -13,9 +13,16 @@ from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, TreeSpec
-from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.spec_parts import CouplingSpec, JointSpec, SpringSpec
+from ckc_pin.mechanism.spec import (
+    CouplingSpec,
+    FrameSpec,
+    JointSpec,
+    LoopSpec,
+    LoopType,
+    MechanismSpec,
+    SpringSpec,
+    TreeSpec,
+)
 from tests.analytic.five_bar import Array
 from tests.property.worlds import Numbers, World, random_world, rotation, slope
 

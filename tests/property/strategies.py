@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from ckc_pin.mechanism.spec import LoopSpec, LoopType
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec, LoopSpec, LoopType
 from tests.property.worlds import JOINTS
 
 TYPES: tuple[LoopType, ...] = (

@@ -14,9 +14,7 @@ from scipy.spatial.transform import Rotation
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.frames import Frames
-from ckc_pin.mechanism.spec import LoopSpec, LoopType
-from ckc_pin.mechanism.spec_frames import FrameSpec
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, FrameSpec, LoopSpec, LoopType
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, merge
 from tests.analytic.five_bar import Array

@@ -7,7 +7,7 @@ import math
 from ckc_pin.formats.draft import number, some
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tree import MjcfTree
-from ckc_pin.mechanism.spec_parts import ForceSpec, MotorSpec
+from ckc_pin.mechanism.spec import ForceSpec, MotorSpec
 
 __all__ = ["Actuators", "moved_joints"]
 

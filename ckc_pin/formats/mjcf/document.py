@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from ckc_pin.base.sources import strict_xml
 from ckc_pin.base.toml import read_text
-from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.files import Files, expand
 

@@ -15,9 +15,7 @@ from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tendons import Tendon, Tendons
 from ckc_pin.formats.mjcf.tree import MjcfTree, Placed
 from ckc_pin.formats.orientation import from_quaternion
-from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.spec_frames import Frame
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec
 
 __all__ = ["Equalities"]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from stat import S_ISREG
 from xml.etree.ElementTree import Element
 
+from ckc_pin.base.sources import MAX_DEPTH, strict_xml
 from ckc_pin.base.toml import read_text
-from ckc_pin.base.xml import MAX_DEPTH, strict_xml
 from ckc_pin.errors import InputError
 
 __all__ = ["Files", "expand"]

@@ -10,7 +10,7 @@ import pinocchio as pin
 from ckc_pin.formats.draft import frame, number
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tree import MjcfTree
-from ckc_pin.mechanism.spec_parts import SpringSpec
+from ckc_pin.mechanism.spec import SpringSpec
 
 __all__ = ["Tendon", "Tendons"]
 

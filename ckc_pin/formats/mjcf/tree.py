@@ -22,7 +22,7 @@ from ckc_pin.formats.mjcf.joints import Joint, is_free_root
 from ckc_pin.formats.mjcf.shapes import draw
 from ckc_pin.formats.orientation import from_quaternion, to_rpy
 from ckc_pin.formats.urdf.elements import UNLIMITED, Body, JointLimits, add_inertial, add_joint, add_link
-from ckc_pin.mechanism.spec_parts import JointSpec, SpringSpec
+from ckc_pin.mechanism.spec import JointSpec, SpringSpec
 
 __all__ = ["MjcfTree", "Placed"]
 

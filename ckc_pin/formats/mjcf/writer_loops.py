@@ -17,8 +17,7 @@ from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine
-from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.spec_frames import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
 __all__ = ["Sites", "add_loops", "add_springs", "in_one_plane", "numbers", "quaternion"]
 

@@ -17,8 +17,7 @@ from ckc_pin.kinematics.assembly import close_loops
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.mechanism.spec import LoopSpec
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["propose"]

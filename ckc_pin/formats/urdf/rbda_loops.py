@@ -16,8 +16,7 @@ import numpy as np
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.draft import Draft, checked_direction, frame, number, unique, vector
 from ckc_pin.formats.urdf.names import Names, origin_of, three
-from ckc_pin.mechanism.spec import LoopSpec, LoopType
-from ckc_pin.mechanism.spec_parts import CouplingSpec
+from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, LoopType
 
 __all__ = ["take_loops"]
 

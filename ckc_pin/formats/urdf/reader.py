@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+from ckc_pin.base.sources import strict_xml
 from ckc_pin.base.toml import read_text
-from ckc_pin.base.xml import strict_xml
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft, safe_name, some
 from ckc_pin.formats.urdf.closing_frames import take_closing_frames

@@ -17,7 +17,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import CkcError
-from ckc_pin.mechanism.generators import GeneratorSpec, generate
+from ckc_pin.mechanism.library import GeneratorSpec, generate
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.scene import load_scene

@@ -13,7 +13,7 @@ from ckc_pin.control.controllers import SetPoint
 from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.sigma import assembly_branches
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate

@@ -9,7 +9,7 @@ import pytest
 
 from ckc_pin import load
 from ckc_pin.control import SetPoint
-from ckc_pin.kinematics.branches import assembly_branches
+from ckc_pin.kinematics.sigma import assembly_branches
 from scripts.experiments.certificate.branch_walk import follow
 from scripts.experiments.certificate.certificate import certify, level_of, rest_height
 from scripts.experiments.tests.set_point_cases import (

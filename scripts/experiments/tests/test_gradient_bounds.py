@@ -9,8 +9,7 @@ from ckc_pin import Mechanism, load
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.branches import assembly_branches
-from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.kinematics.sigma import assembly_branches, sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from scripts.experiments.certificate.branch_walk import margin, margin_gradient
 from scripts.experiments.certificate.gradient_bounds import (
