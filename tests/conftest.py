@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from ckc_pin import Mechanism, Run, load, simulate
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
 settings.register_profile(
@@ -68,7 +68,7 @@ def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
         for name in ("five_bar", "four_bar", "n_four_bar", "slider_crank"):
-            compiled(load(name))
+            compile_terms(load(name))
     return folder
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_flag, require_table, require_type
-from ckc_pin.codegen.library import find
+from ckc_pin.codegen.library import find_compiled_terms
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
@@ -174,7 +174,7 @@ def _stability(
         return Stability(None, f"a run does not begin: {refused}")
     if desired is not None and desired.leaves_at is not None:
         return Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
-    library = None if spec.solver.terms == "pinocchio" else find(mechanism)
+    library = None if spec.solver.terms == "pinocchio" else find_compiled_terms(mechanism)
     clocked = in_samples(scene, controller)
     found = stability(
         mechanism,
@@ -198,7 +198,7 @@ def _mechanism_check(
     mechanism: Mechanism, desired: DesiredCheck | None, warnings: list[str], terms: TermsOf, name: str
 ) -> Check:
     if terms == "auto":
-        terms = "generated" if find(mechanism) else "pinocchio"
+        terms = "generated" if find_compiled_terms(mechanism) else "pinocchio"
     at = mechanism.assembled
     values = np.linalg.svd(at.phi_z, compute_uv=False) if mechanism.dependent else np.ones(1)
     mass, inertia = compute_moving_mass(mechanism)

@@ -92,12 +92,12 @@ def compile_(mechanism: str, as_json: bool) -> None:
     """Compile a mechanism's terms, which its runs then take."""
     from time import perf_counter
 
-    from ckc_pin.codegen.library import cache_folder, compiled, find
+    from ckc_pin.codegen.library import cache_folder, compile_terms, find_compiled_terms
 
     loaded, started = ckc_pin.load(mechanism), perf_counter()
-    there = find(loaded)
+    there = find_compiled_terms(loaded)
     with Working(f"compiling {mechanism}"):
-        library = there or compiled(loaded, on_written=_expected)
+        library = there or compile_terms(loaded, on_written=_expected)
     seconds = perf_counter() - started
     kept = Path(library.path).parent == cache_folder()
     if not kept:  # in a folder that goes with this process

@@ -1,4 +1,5 @@
-"""The terms written out for one mechanism: `compiled` makes and keeps them, `find` takes what was kept.
+"""Code generation: the terms of one mechanism as CasADi expressions and as a compiled C library.
 
-CasADi is imported only where terms are written out; what was compiled is loaded without it.
+`library.compile_terms` writes, compiles, checks and caches a library; `library.find_compiled_terms` only looks into the
+cache. CasADi is imported only to write code: a cached library is loaded without it.
 """

@@ -1,4 +1,4 @@
-"""A CasADi function as a graph of operations, and which of its operations alike branches do with other numbers."""
+"""A CasADi function as a graph of operations, and packs of operations that identical branches have in common."""
 
 from __future__ import annotations
 
@@ -10,209 +10,231 @@ from typing import Any
 
 __all__ = ["Graph", "Lane", "Node", "Packing"]
 
-Lane = tuple[int, int]  # a group of alike branches, and which of them
+Lane = tuple[int, int]  # a group of identical branches, and a branch of it
 
 
 @dataclass(frozen=True)
 class Node:
-    """An operation, of nodes by number; of an input which argument and place, of a constant its value."""
+    """An operation.
+
+    Attributes
+    ----------
+    operation : int
+        CasADi's code.
+    operands : tuple of int
+        Nodes.
+    source : (int, int)
+        Argument and place, of an input.
+    value : float
+        Of a constant.
+    """
 
     operation: int
-    of: tuple[int, ...] = ()
-    at: tuple[int, int] = (0, 0)
+    operands: tuple[int, ...] = ()
+    source: tuple[int, int] = (0, 0)
     value: float = 0.0
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Nodes after those that they are of, and what is a result: (result, place) and the node."""
+    """Operations of a function in an order of evaluation.
+
+    Attributes
+    ----------
+    nodes : list of Node
+    results : list of ((int, int), int)
+        Result and place in it, and the node that is written there.
+    """
 
     nodes: list[Node]
     results: list[tuple[tuple[int, int], int]]
 
     @classmethod
-    def of(cls, function: Any) -> Graph:
-        """Read a function's instructions."""
+    def from_function(cls, function: Any) -> Graph:
+        """Read the instructions of a casadi.Function."""
         import casadi as cs
 
         nodes: list[Node] = []
         results: list[tuple[tuple[int, int], int]] = []
-        at_work: dict[int, int] = {}  # by place in the function's own working memory
+        in_memory: dict[int, int] = {}  # node by place in the function's working memory
         for k in range(function.n_instructions()):
-            operation, to = function.instruction_id(k), function.instruction_output(k)
-            of = function.instruction_input(k)
+            operation, outputs = function.instruction_id(k), function.instruction_output(k)
+            inputs = function.instruction_input(k)
             if operation == cs.OP_OUTPUT:
-                results.append(((to[0], to[1]), at_work[of[0]]))
+                results.append(((outputs[0], outputs[1]), in_memory[inputs[0]]))
                 continue
             if operation == cs.OP_INPUT:
-                node = Node(operation, at=(of[0], of[1]))
+                node = Node(operation, source=(inputs[0], inputs[1]))
             elif operation == cs.OP_CONST:
                 node = Node(operation, value=function.instruction_constant(k))
             else:
-                node = Node(operation, tuple(at_work[x] for x in of))
-            at_work[to[0]] = len(nodes)
+                node = Node(operation, tuple(in_memory[x] for x in inputs))
+            in_memory[outputs[0]] = len(nodes)
             nodes.append(node)
         return cls(nodes, results)
 
-    def divided_once(self) -> Graph:
-        """With one division by what several are divided by, whose inverse costs as much as ten products.
+    def share_divisions(self) -> Graph:
+        """Return the graph with one division for all quotients by the same node.
 
-        CasADi makes a division of every product with an inverse.
+        CasADi turns every product with an inverse into a division, which costs as much as ten products.
         """
         import casadi as cs
 
-        often = Counter(node.of[-1] for node in self.nodes if node.operation in (cs.OP_DIV, cs.OP_INV))
+        uses = Counter(node.operands[-1] for node in self.nodes if node.operation in (cs.OP_DIV, cs.OP_INV))
         nodes: list[Node] = []
-        place: list[int] = []
+        new_index: list[int] = []
         inverse: dict[int, int] = {}
         for node in self.nodes:
-            of = tuple(place[x] for x in node.of)
-            if node.operation in (cs.OP_DIV, cs.OP_INV) and often[node.of[-1]] > 1:
-                if node.of[-1] not in inverse:
-                    inverse[node.of[-1]] = len(nodes)
-                    nodes.append(Node(cs.OP_INV, of[-1:]))
-                by = inverse[node.of[-1]]
+            operands = tuple(new_index[x] for x in node.operands)
+            if node.operation in (cs.OP_DIV, cs.OP_INV) and uses[node.operands[-1]] > 1:
+                if node.operands[-1] not in inverse:
+                    inverse[node.operands[-1]] = len(nodes)
+                    nodes.append(Node(cs.OP_INV, operands[-1:]))
+                factor = inverse[node.operands[-1]]
                 if node.operation == cs.OP_INV:
-                    place.append(by)
+                    new_index.append(factor)
                     continue
-                node, of = replace(node, operation=cs.OP_MUL), (of[0], by)
-            place.append(len(nodes))
-            nodes.append(replace(node, of=of))
-        return Graph(nodes, [(to, place[k]) for to, k in self.results])
+                node, operands = replace(node, operation=cs.OP_MUL), (operands[0], factor)
+            new_index.append(len(nodes))
+            nodes.append(replace(node, operands=operands))
+        return Graph(nodes, [(place, new_index[k]) for place, k in self.results])
 
 
 class Packing:
-    """Packs of nodes that do the same in alike branches, a node a branch.
+    """Packs of nodes that do the same operation in identical branches, one node of each branch.
 
-    Nodes are gone through by whose they are, level after level. A node that is of one branch and of what all share is
-    the branch's, unless other branches have none like it. What is of several branches is shared, a stage later: nodes
-    of one stage in different branches do not depend on each other, and of those in one branch the later is deeper.
+    Nodes are visited level by level. A node whose operands belong to one branch, or to one branch and the shared part,
+    belongs to that branch, unless the other branches have no node like it. A node with operands of several branches is
+    shared and begins a new stage. Nodes of one stage in different branches do not depend on each other, and of two
+    nodes of one branch the later one is deeper.
 
     Parameters
     ----------
     graph : Graph
-    places : mapping of (argument, place) to (lane, int)
-        Inputs that belong to a branch, and which of its numbers they are.
+    lanes : mapping of (argument, place) to (lane, int)
+        Inputs that belong to a branch, and the number that they share with the other branches' inputs.
     vectorized : set of int
-        Operations that may be done together.
+        Operations that can be done on vectors.
 
     Attributes
     ----------
     packs : list of lists of int
     pack : dict of int to (int, int)
-        The pack of a node, and its place in it.
+        By node: its pack, and its place in the pack.
     """
 
-    def __init__(self, graph: Graph, places: Mapping[tuple[int, int], tuple[Lane, int]], vectorized: Set[int]) -> None:
-        self.graph, self.places, self.vectorized = graph, places, vectorized
-        self.together = Counter(group for group, _ in {x for x, _ in places.values()})
+    def __init__(self, graph: Graph, lanes: Mapping[tuple[int, int], tuple[Lane, int]], vectorized: Set[int]) -> None:
+        self.graph, self.lanes, self.vectorized = graph, lanes, vectorized
+        self.group_sizes = Counter(group for group, _ in {lane for lane, _ in lanes.values()})
         size = len(graph.nodes)
         self.lane: list[Lane | None] = [None] * size
-        self.level = [(0, 0)] * size  # stage, and how deep in it
+        self.level = [(0, 0)] * size  # stage, and depth in it
         self.key = [0] * size
         self.keys: dict[object, int] = {}
         self.packs: list[list[int]] = []
         self.pack: dict[int, tuple[int, int]] = {}
         self._waiting: dict[tuple[int, int], list[int]] = {}
         self._levels: list[tuple[int, int]] = []
-        self._missing = [len(node.of) for node in graph.nodes]
+        self._unresolved = [len(node.operands) for node in graph.nodes]
         self._users: list[list[int]] = [[] for _ in graph.nodes]
         for k, node in enumerate(graph.nodes):
-            for x in node.of:
+            for x in node.operands:
                 self._users[x].append(k)
-        self._go_on([k for k in range(size) if not self._missing[k]])
+        self._resolve_all([k for k in range(size) if not self._unresolved[k]])
         while self._levels:
-            self._go_on(self._judge(self._waiting.pop(heappop(self._levels))))
+            self._resolve_all(self._pack_level(self._waiting.pop(heappop(self._levels))))
 
-    def whose(self, k: int) -> tuple[Lane, int] | None:
-        """Whose a node is that other branches have alike, and which of theirs."""
+    def lane_of(self, k: int) -> tuple[Lane, int] | None:
+        """Return the lane of a node that has partners in the other branches, and the number that they share."""
         lane = self.lane[k]
         if lane is None:
             return None
         if k in self.pack:
             return lane, self.pack[k][0]
         node = self.graph.nodes[k]
-        return (lane, -1 - self.key[k]) if not node.of and node.at in self.places else None
+        return (lane, -1 - self.key[k]) if not node.operands and node.source in self.lanes else None
 
-    def _go_on(self, ready: list[int]) -> None:
-        """Settle nodes and all that is only waiting for them."""
+    def _resolve_all(self, ready: list[int]) -> None:
+        """Resolve nodes, and then the nodes that waited for them only."""
         while ready:
             k = ready.pop()
-            if self._settle(k):
-                ready += self._freed(k)
+            if self._resolve(k):
+                ready += self._release_users(k)
 
-    def _freed(self, k: int) -> list[int]:
+    def _release_users(self, k: int) -> list[int]:
+        """Count down the unresolved operands of a node's users; return the users that have none left."""
         for user in self._users[k]:
-            self._missing[user] -= 1
-        return [x for x in dict.fromkeys(self._users[k]) if not self._missing[x]]
+            self._unresolved[user] -= 1
+        return [x for x in dict.fromkeys(self._users[k]) if not self._unresolved[x]]
 
-    def _settle(self, k: int) -> bool:
-        """Whose a node is, unless that is seen only next to others of its level."""
+    def _resolve(self, k: int) -> bool:
+        """Assign a node to a lane or to the shared part; return False if that depends on other nodes of its level."""
         import casadi as cs
 
         node = self.graph.nodes[k]
-        of = {self.lane[x] for x in node.of if self.lane[x] is not None}
-        stage = max([self.level[x][0] for x in node.of], default=0)
-        if node.operation == cs.OP_INPUT and node.at in self.places:
-            self.lane[k], number = self.places[node.at]
-            self._name(k, "input", node.at[0], number)
-        elif len(of) == 1:
-            depth = 1 + max(self.level[x][1] for x in node.of if self.level[x][0] == stage)
-            (self.lane[k],), self.level[k] = of, (stage, depth)
-            self._name(k, node.operation, *(self.key[x] for x in node.of))
+        operand_lanes = {self.lane[x] for x in node.operands if self.lane[x] is not None}
+        stage = max([self.level[x][0] for x in node.operands], default=0)
+        if node.operation == cs.OP_INPUT and node.source in self.lanes:
+            self.lane[k], number = self.lanes[node.source]
+            self._set_key(k, "input", node.source[0], number)
+        elif len(operand_lanes) == 1:
+            depth = 1 + max(self.level[x][1] for x in node.operands if self.level[x][0] == stage)
+            (self.lane[k],), self.level[k] = operand_lanes, (stage, depth)
+            self._set_key(k, node.operation, *(self.key[x] for x in node.operands))
             if node.operation in self.vectorized:
                 if (stage, depth) not in self._waiting:
                     heappush(self._levels, (stage, depth))
                 self._waiting.setdefault((stage, depth), []).append(k)
                 return False
         else:
-            self._share(k, stage + bool(of))
+            self._make_shared(k, stage + bool(operand_lanes))
         return True
 
-    def _judge(self, level: list[int]) -> list[int]:
-        """Pack what all branches do; what is done in some is shared. Returns what is ready then."""
-        alike: dict[int, dict[int, list[int]]] = defaultdict(lambda: defaultdict(list))
+    def _pack_level(self, level: list[int]) -> list[int]:
+        """Pack the nodes that all branches have, make the others shared, and return the nodes that are ready then."""
+        by_key: dict[int, dict[int, list[int]]] = defaultdict(lambda: defaultdict(list))
         for k in sorted(level):
             lane = self.lane[k]
             assert lane is not None
-            alike[self.key[k]][lane[1]].append(k)
-        for found in alike.values():
-            nodes = next(iter(found.values()))
+            by_key[self.key[k]][lane[1]].append(k)
+        for by_branch in by_key.values():
+            nodes = next(iter(by_branch.values()))
             lane = self.lane[nodes[0]]
             assert lane is not None
-            if len(found) == self.together[lane[0]] and {len(x) for x in found.values()} == {len(nodes)}:
-                for x in zip(*self._in_one_order([found[at] for at in sorted(found)]), strict=True):
-                    self.pack |= {node: (len(self.packs), at) for at, node in enumerate(x)}
+            is_in_all = len(by_branch) == self.group_sizes[lane[0]]
+            if is_in_all and {len(x) for x in by_branch.values()} == {len(nodes)}:
+                for x in zip(*self._align([by_branch[branch] for branch in sorted(by_branch)]), strict=True):
+                    self.pack |= {node: (len(self.packs), place) for place, node in enumerate(x)}
                     self.packs.append(list(x))
             else:
-                for k in (k for part in found.values() for k in part):
-                    self._share(k, self.level[k][0] + 1)
-        return [x for k in level for x in self._freed(k)]
+                for k in (k for part in by_branch.values() for k in part):
+                    self._make_shared(k, self.level[k][0] + 1)
+        return [x for k in level for x in self._release_users(k)]
 
-    def _in_one_order(self, branches: list[list[int]]) -> list[list[int]]:
-        """Nodes that do the same within a branch, in an order that is the same in each: by what they are of."""
+    def _align(self, branches: list[list[int]]) -> list[list[int]]:
+        """Sort each branch's nodes with the same key by their operands, so that partners stand at the same place."""
         if len(branches[0]) == 1:
             return branches
         nodes = self.graph.nodes
-        common = set.intersection(*({x for k in branch for x in nodes[k].of} for branch in branches))
+        common = set.intersection(*({x for k in branch for x in nodes[k].operands} for branch in branches))
 
-        def place(x: int) -> tuple[int, ...]:
+        def rank(x: int) -> tuple[int, ...]:
             if x in self.pack:
                 return 0, self.pack[x][0]
             if x in common:
                 return 1, x
-            return (3,) if nodes[x].of else (2, *nodes[x].at)  # what else a branch has of its own stands in its order
+            return (3,) if nodes[x].operands else (2, *nodes[x].source)  # other operands keep their branch's order
 
-        return [sorted(branch, key=lambda k: ([place(x) for x in nodes[k].of], k)) for branch in branches]
+        return [sorted(branch, key=lambda k: ([rank(x) for x in nodes[k].operands], k)) for branch in branches]
 
-    def _share(self, k: int, stage: int) -> None:
+    def _make_shared(self, k: int, stage: int) -> None:
         import casadi as cs
 
         node = self.graph.nodes[k]
         self.lane[k], self.level[k] = None, (stage, 0)
-        self._name(k, "shared", node.value if node.operation == cs.OP_CONST else None)
+        self._set_key(k, "shared", node.value if node.operation == cs.OP_CONST else None)
 
-    def _name(self, k: int, *what: object) -> None:
-        """The same number for the same thing, in whatever branch of a group."""
+    def _set_key(self, k: int, *description: object) -> None:
+        """Give nodes with the same description the same key, in whatever branch of a group they are."""
         lane = self.lane[k]
-        self.key[k] = self.keys.setdefault((lane and lane[0], what), len(self.keys))
+        self.key[k] = self.keys.setdefault((lane and lane[0], description), len(self.keys))

@@ -1,8 +1,8 @@
-"""Written-out terms as shared libraries: found in the user's cache, or compiled, checked and put there.
+"""Compiled terms as shared libraries: looked up in the user's cache, or compiled, checked and stored there.
 
-A file of the cache is called KEY-COMPILER-CONTENT.so: the hash of all that enters the code, of the compiler and its
-flags, and of the file itself. One whose content is another is not loaded but made again. Two processes that make the
-same file at once both succeed, the second one's replaces the first one's.
+A cached file is called KEY-COMPILER-CONTENT.so, three hashes: of everything that enters the code, of the compiler with
+its flags, and of the file itself. A file whose content has another hash is compiled anew instead of loaded. Two
+processes may write the same file at the same time: the later one replaces the earlier one.
 """
 
 from __future__ import annotations
@@ -15,42 +15,37 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.atomic_files import open_atomic, temporary_folder
 from ckc_pin.base.sources import Sources
 from ckc_pin.codegen.arguments import numbers, present, values
+from ckc_pin.codegen.compiler import Compiler, compile_c, find_compiler, hash_of
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import RelativeLog
 
-__all__ = ["Library", "cache_folder", "compiled", "find", "too_large"]
+__all__ = ["Library", "cache_folder", "compile_terms", "explain_too_large", "find_compiled_terms"]
 
-FLAGS = ("-O2", "-std=c99", "-fPIC", "-shared", "-w")
-# Products and sums are fused where the acceleration's changes are found too, so that the processor's cache of
-# instructions holds both. A plain run's last digits stay those of processors that cannot fuse.
-EXACT, FUSED = "-ffp-contract=off", "-ffp-contract=fast"
-PATIENCE = 600.0  # s, for the compiler
-PER_LETTER = 4e-5  # s of the compiler for a letter of the text, as docs/theory/generated.md has them
-# Of a tree that is written out, with two minutes of the compiler at the most: its coordinates, and the joints that each
-# of them moves, all added up, as many as 40 in one branch do.
-MOST_COORDINATES, MOST_MOVED = 130, 820
+COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, measured in docs/theory/generated.md
+# Limits of a tree whose terms are compiled, so that the compiler takes at most two minutes. The second one limits the
+# number of (coordinate, moved joint) pairs: a single branch reaches it with 40 joints.
+MAX_COORDINATES, MAX_MOVED_JOINTS = 130, 820
 
 
 @dataclass(frozen=True)
 class Library:
-    """Terms of one mechanism, compiled.
+    """Compiled terms of one mechanism.
 
     Attributes
     ----------
     path : str
         The shared library.
     parameters : (k,) array
-        The mechanism's numbers, which its code takes as arguments.
+        The mechanism's numbers that its functions take as arguments.
     """
 
     path: str
@@ -58,36 +53,36 @@ class Library:
 
 
 def cache_folder() -> Path:
-    """Return where compiled terms are kept: the user's cache, whose folder nobody else writes to."""
+    """Return the folder of compiled terms in the user's cache."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "ckc_pin" / "terms"
 
 
-def too_large(mechanism: Mechanism) -> str:
-    """Say why a tree is too large for its terms to be written out; an empty text where it is not."""
+def explain_too_large(mechanism: Mechanism) -> str:
+    """Return why a tree is too large for its terms to be compiled, or an empty text if it is not."""
     moved = int(mechanism.tree.support.sum())
-    if mechanism.n <= MOST_COORDINATES and moved <= MOST_MOVED:
+    if mechanism.n <= MAX_COORDINATES and moved <= MAX_MOVED_JOINTS:
         return ""
     return (
         f"{mechanism.name}: {mechanism.n} coordinates, which move {moved} joints, each its own and those behind it; "
-        f"terms are written out for trees of up to {MOST_COORDINATES} coordinates that move up to {MOST_MOVED}"
+        f"terms are compiled for trees of up to {MAX_COORDINATES} coordinates that move up to {MAX_MOVED_JOINTS}"
     )
 
 
-def find(
+def find_compiled_terms(
     mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
 ) -> Library | None:
-    """Return the mechanism's terms if they were compiled before; None if not, or if the file has changed since.
+    """Return a mechanism's compiled terms if the cache has them and the file is intact; otherwise None.
 
-    `which` and `changes` as of `compiled`.
+    `which` and `changes` as in `compile_terms`.
     """
     folder = cache_folder()
-    if too_large(mechanism) or not folder.is_dir():
+    if explain_too_large(mechanism) or not folder.is_dir():
         return None
-    return _look(_Subject.of(mechanism, which, changes), folder)
+    return _look_up(_Subject.of(mechanism, which, changes), folder)
 
 
-def compiled(
+def compile_terms(
     mechanism: Mechanism,
     which: Mapping[str, BoolArray] | None = None,
     on_written: Callable[[float], None] | None = None,
@@ -95,42 +90,42 @@ def compiled(
     changes: bool = False,
     limited: bool = True,
 ) -> Library:
-    """Return the mechanism's terms, from the cache or compiled now.
+    """Return a mechanism's compiled terms, from the cache or compiled now.
 
     Parameters
     ----------
     mechanism : Mechanism
     which : mapping, optional
-        Which numbers are arguments (`arguments.present`), where that is more than those that are not zero: what is
-        varied from zero.
+        Numbers that are arguments (`arguments.present`), if these are more than the numbers that are not zero: a
+        parameter may vary from zero.
     on_written : callable, optional
-        Called once before the compiler, with the seconds that it may take.
+        Called once before the compiler starts, with the seconds that it may take.
     changes : bool
-        With how the acceleration changes along any direction (`code.functions`), a longer text.
+        Whether to add directional derivatives of the acceleration, which takes longer to compile.
     limited : bool
-        Whether a tree that is `too_large` is refused; the compiler has no other limit than its patience.
+        Whether to refuse a tree that is too large. The compiler's only other limit is its timeout.
 
     Raises
     ------
     InputError
-        A tree that is too large, no CasADi, no C compiler or one that fails, no place to write, or code whose
-        results are not those of Pinocchio.
+        The tree is too large, CasADi or a C compiler is missing or fails, no folder can be written to, or the compiled
+        terms differ from Pinocchio's.
     """
-    if limited and (reason := too_large(mechanism)):
+    if limited and (reason := explain_too_large(mechanism)):
         raise InputError(reason)
     subject = _Subject.of(mechanism, which, changes)
-    found = _look(subject, cache_folder())
-    if found is not None:
-        return found
-    compiler = _compiler(subject.changes)
+    library = _look_up(subject, cache_folder())
+    if library is not None:
+        return library
+    compiler = find_compiler(subject.changes)
     if compiler is None:
-        raise InputError("no C compiler: terms are written out as C, which needs `cc` on PATH")
+        raise InputError("compiled terms need a C compiler: `cc` was not found on PATH")
     return _make(_with_numbers_of_files(mechanism, subject), subject, compiler, on_written)
 
 
 @dataclass(frozen=True)
 class _Subject:
-    """What a mechanism's library is found by, and what its code takes."""
+    """A mechanism's key in the cache, and the arguments of its code."""
 
     key: str
     parameters: Array
@@ -139,9 +134,9 @@ class _Subject:
 
     @classmethod
     def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, changes: bool) -> _Subject:
-        given = numbers(mechanism)
-        which = which or present(given)
-        return cls(_key(mechanism, which, changes), values(given, which), which, changes)
+        mechanism_numbers = numbers(mechanism)
+        which = which or present(mechanism_numbers)
+        return cls(_key(mechanism, which, changes), values(mechanism_numbers, which), which, changes)
 
 
 def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism:
@@ -154,48 +149,13 @@ def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism
         return mechanism
     try:
         unchanged = build(sources.texts[MECHANISM_FILE], Sources(sources.name, sources.folder, sources.texts))
-    except (InputError, MechanismError):  # numbers with which it cannot be assembled
+    except (InputError, MechanismError):  # the files' numbers may not assemble
         return mechanism
     return unchanged if _key(unchanged, subject.which, subject.changes) == subject.key else mechanism
 
 
-@dataclass(frozen=True)
-class _Compiler:
-    path: str
-    flags: tuple[str, ...]
-    key: str
-
-
-def _compiler(fuses: bool) -> _Compiler | None:
-    import shutil
-
-    path = shutil.which("cc")
-    if path is None:
-        return None
-    flags = (*FLAGS, FUSED if fuses else EXACT, *_machine_flags(fuses))
-    real = Path(path).resolve()
-    stat = real.stat()
-    return _Compiler(path, flags, _hash((str(real), stat.st_size, stat.st_mtime_ns, flags))[:16])
-
-
-@cache
-def _machine_flags(fuses: bool) -> tuple[str, ...]:
-    """Wider registers and, where it may fuse, fused operations, if the machine has them."""
-    if platform.machine() not in ("x86_64", "AMD64"):
-        return ()
-    try:
-        there = set(Path("/proc/cpuinfo").read_text(encoding="ascii").split())
-    except OSError:
-        return ()
-    return tuple(f"-m{x}" for x in ("avx2", "fma") if x in there and (fuses or x != "fma"))
-
-
-def _hash(what: object) -> str:
-    return sha256(msgspec.json.encode(what, order="deterministic")).hexdigest()
-
-
 def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], changes: bool) -> str:
-    """The hash of all that enters the code: our own text, the tree, the table of rows, and which numbers are zero."""
+    """Return the hash of everything that enters the code: this package, the tree, the rows, which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
     model = tree.model
     joints = [
@@ -220,33 +180,34 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], changes: bool) ->
     ]
     anchors = closure.anchors
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
-    there = {name: x.tolist() for name, x in which.items()}
+    arguments = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
     kind = (mechanism.redundant, changes, platform.machine())
-    return _hash((_own_text(), joints, groups, table, there, springs, *kind))[:32]
+    return hash_of((_package_hash(), joints, groups, table, arguments, springs, *kind))[:32]
 
 
 def _is_constant(group: object, name: str) -> bool:
+    """Return whether an attribute of a group of rows is written into the code as a constant."""
     return isinstance(group, RelativeLog) or name in ("out", "pair", "direction", "a", "b")
 
 
 @cache
-def _own_text() -> str:
+def _package_hash() -> str:
     folder = Path(__file__).parent
-    return _hash([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
+    return hash_of([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
 
 
-def _look(subject: _Subject, folder: Path) -> Library | None:
-    """A file of that key, of the compiler that there is or, where there is none, of any."""
+def _look_up(subject: _Subject, folder: Path) -> Library | None:
+    """Return the cached file of a key and of the present compiler, or of any compiler if there is none."""
     try:
-        there = sorted(folder.glob(f"{subject.key}-*-*.so"))
-        if not there or not _is_usable(folder):
+        paths = sorted(folder.glob(f"{subject.key}-*-*.so"))
+        if not paths or not _is_usable(folder):
             return None
-        compiler = _compiler(subject.changes)
-        for path in there:
-            _, of_compiler, content = path.stem.rsplit("-", 2)
-            fits = compiler is None or of_compiler == compiler.key
-            if fits and content == sha256(path.read_bytes()).hexdigest()[:32]:
+        compiler = find_compiler(subject.changes)
+        for path in paths:
+            _, compiler_key, content = path.stem.rsplit("-", 2)
+            is_of_compiler = compiler is None or compiler_key == compiler.key
+            if is_of_compiler and content == sha256(path.read_bytes()).hexdigest()[:32]:
                 return Library(str(path), subject.parameters)
     except OSError:
         return None
@@ -254,88 +215,74 @@ def _look(subject: _Subject, folder: Path) -> Library | None:
 
 
 def _is_usable(folder: Path) -> bool:
-    """Whether nobody else writes there, and programs are loaded from there."""
+    """Return whether only this user can write to a folder, and libraries can be loaded from it."""
     stat = folder.stat()
-    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022 and _executes(folder)
+    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022 and _allows_execution(folder)
 
 
-def _executes(folder: Path) -> bool:
-    """Whether the file system lets programs be loaded from there."""
-    return not os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)  # a flag of Linux's
+def _allows_execution(folder: Path) -> bool:
+    """Return whether the folder's file system is mounted without `noexec`."""
+    return not os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)  # Linux only
 
 
 def _make(
-    mechanism: Mechanism, subject: _Subject, compiler: _Compiler, on_written: Callable[[float], None] | None
+    mechanism: Mechanism, subject: _Subject, compiler: Compiler, on_written: Callable[[float], None] | None
 ) -> Library:
+    """Write, compile, check and store a mechanism's terms."""
     import tempfile
 
-    from ckc_pin.codegen.comparison import require_equal
+    from ckc_pin.codegen.comparison import require_equal_terms
 
-    places = (Path(tempfile.gettempdir()), cache_folder())
-    place = next((folder for folder in places if folder.is_dir() and _executes(folder)), None)
+    folders = (Path(tempfile.gettempdir()), cache_folder())
+    place = next((folder for folder in folders if folder.is_dir() and _allows_execution(folder)), None)
     if place is None:
-        raise InputError(f"compiled terms cannot be loaded: neither {places[0]} nor {places[1]} allows programs")
+        raise InputError(f"compiled terms cannot be loaded: neither {folders[0]} nor {folders[1]} allows programs")
     with temporary_folder(place) as folder:
-        library = folder / "terms.so"
-        _compile(mechanism, subject, compiler, folder / "terms.c", library, on_written)
-        require_equal(mechanism, Library(str(library), values(numbers(mechanism), subject.which)))
+        source, library = folder / "terms.c", folder / "terms.so"
+        text = _write_c_source(mechanism, subject)
+        if on_written is not None:
+            on_written(len(text) * COMPILE_S_PER_CHARACTER)
+        try:
+            source.write_text(text, encoding="ascii")
+            compile_c(compiler, source, library, mechanism.name)
+        except OSError as error:
+            raise InputError(f"{mechanism.name}: its terms cannot be compiled: {error.strerror}") from error
+        require_equal_terms(mechanism, Library(str(library), values(numbers(mechanism), subject.which)))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
-        return Library(str(_put(name, content)), subject.parameters)
+        return Library(str(_store(name, content)), subject.parameters)
 
 
-def _compile(
-    mechanism: Mechanism,
-    subject: _Subject,
-    compiler: _Compiler,
-    text: Path,
-    library: Path,
-    on_written: Callable[[float], None] | None,
-) -> None:
-    from ckc_pin.codegen.program import run_program
-
+def _write_c_source(mechanism: Mechanism, subject: _Subject) -> str:
     try:
-        from ckc_pin.codegen.code import Code
+        from ckc_pin.codegen.term_functions import TermFunctions
 
-        written = Code.of(mechanism, subject.which, changes=subject.changes).text()
+        return TermFunctions.of(mechanism, subject.which, changes=subject.changes).c_source()
     except ModuleNotFoundError as error:
-        says = "terms are written out by CasADi, which is not installed: pip install ckc_pin[symbolic]"
-        raise InputError(says) from error
-    if on_written is not None:
-        on_written(len(written) * PER_LETTER)
-    try:
-        text.write_text(written, encoding="ascii")
-        command = [compiler.path, *compiler.flags, "-o", str(library), str(text), "-lm"]
-        done = run_program(command, PATIENCE, temporary=text.parent)
-    except TimeoutError:
-        raise InputError(f"{mechanism.name}: the C compiler took more than {PATIENCE:g} s for its terms") from None
-    except OSError as error:
-        raise InputError(f"{mechanism.name}: its terms cannot be compiled: {error.strerror}") from error
-    if done.returncode != 0 or not library.exists():
-        says = next((line for line in done.stderr.splitlines() if line.strip()), f"exit code {done.returncode}")
-        raise InputError(f"{mechanism.name}: the C compiler fails: {says:.200}")
+        message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"
+        raise InputError(message) from error
 
 
-def _put(name: str, content: bytes) -> Path:
-    """Write a library to the cache, or where that cannot be to a folder that goes with the process."""
+def _store(name: str, content: bytes) -> Path:
+    """Write a library to the cache, or if that is impossible to a folder that is removed when the process ends."""
     try:
         folder = cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_usable(folder):
-            return _written(folder / name, content)
+            return _write_file(folder / name, content)
     except (OSError, InputError):
         pass
-    return _written(_own_folder() / name, content)
+    return _write_file(_process_folder() / name, content)
 
 
-def _written(path: Path, content: bytes) -> Path:
+def _write_file(path: Path, content: bytes) -> Path:
     with open_atomic(path) as file:
         file.write(content)
     return path
 
 
 @cache
-def _own_folder() -> Path:
+def _process_folder() -> Path:
     import atexit
     import shutil
     import tempfile

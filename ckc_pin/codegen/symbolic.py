@@ -1,4 +1,4 @@
-"""A mechanism's terms as CasADi functions, for a person's own optimal control, identification or code."""
+"""A mechanism's terms as CasADi functions, for optimal control, identification or code generation by the user."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.codegen.acceleration import ConstrainedInertia
 from ckc_pin.codegen.arguments import labels, numbers, present, values
-from ckc_pin.codegen.expressions import expressions
+from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["Symbolic", "symbolic"]
-
 
 FUNCTIONS = ("phi", "J", "J_dot_v", "D_tree", "potential", "bias_tree", "damping", "kinetic", "q_dot", "v_dot")
 
@@ -27,16 +26,20 @@ FUNCTIONS = ("phi", "J", "J_dot_v", "D_tree", "potential", "bias_tree", "damping
 class Symbolic(HasSummary):
     """CasADi functions of a mechanism; SI units, vectors in the order of `coordinates`.
 
-    q is Pinocchio's q' (nq numbers, a free root's rotation a quaternion x, y, z, w of unit length), v is v' (n numbers,
-    a free root's twist in its own axes), u is u' (n forces), p the numbers named by `parameters`.
+    Arguments of the functions:
+
+    - q: Pinocchio's q', nq numbers. A free root's rotation is a quaternion x, y, z, w of unit length.
+    - v: v', n numbers. A free root's are its twist in its own axes.
+    - u: u', n generalized forces.
+    - p: the numbers named by `parameters`.
 
     Attributes
     ----------
     coordinates, independent : tuple of str
     parameters : tuple of str
-        Masses, centres, inertias, offsets, lengths, stiffnesses, gravity: those that are not zero.
+        Names of the masses, centres, inertias, offsets, lengths, stiffnesses and gravity that are not zero.
     values : (k,) array
-        The mechanism's own.
+        The mechanism's values of the parameters.
     q_tree : (nq,) array
         The assembled configuration.
     phi, J : casadi.Function
@@ -44,13 +47,13 @@ class Symbolic(HasSummary):
     J_dot_v : casadi.Function
         Of (q, v, p): (rows).
     D_tree, potential : casadi.Function
-        Of (q, p): (n, n), and joules, of gravity, springs and constant forces.
+        Of (q, p): (n, n); and J, the potential energy of gravity, springs and constant forces.
     bias_tree, damping, kinetic : casadi.Function
-        Of (q, v, p): C' v' + h' less what springs do, (n); what dampers do, (n); joules.
+        Of (q, v, p): C' v' + h' less the forces of springs, (n); the forces of dampers, (n); J.
     q_dot : casadi.Function
         Of (q, v): the rate of q, (nq).
     v_dot : casadi.Function
-        Of (q, v, u, p): eq. 1's acceleration, (n), on the closure and off it, where J has its rank.
+        Of (q, v, u, p): eq. 1's acceleration, (n), on the closure and off it, where J has full rank.
     """
 
     coordinates: tuple[str, ...]
@@ -70,7 +73,7 @@ class Symbolic(HasSummary):
     v_dot: Any
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
+        """One-screen summary."""
         functions = [str(getattr(self, name)) for name in FUNCTIONS]
         rows: list[Row] = [
             ("coordinates", self.coordinates),
@@ -82,7 +85,7 @@ class Symbolic(HasSummary):
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
-    """Write a mechanism's terms out as CasADi functions.
+    """Return a mechanism's terms as CasADi functions.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     Raises
     ------
     InputError
-        CasADi is not installed; the mechanism is no such.
+        CasADi is not installed, or the mechanism is unknown.
 
     >>> five_bar = symbolic("five_bar")
     >>> five_bar.v_dot(five_bar.q_tree, np.zeros(4), np.zeros(4), five_bar.values).shape
@@ -103,19 +106,20 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
         import casadi as cs
     except ModuleNotFoundError as error:
         raise InputError("symbolic needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
-    terms, given = expressions(mechanism), numbers(mechanism)
-    q, v, p = terms.angles.q, terms.v, terms.arguments.vector
+    terms, mechanism_numbers = term_expressions(mechanism), numbers(mechanism)
+    q, v, p = terms.configuration.q, terms.v, terms.arguments.vector
     u = cs.SX.sym("u", mechanism.n)
     v_dot, _ = ConstrainedInertia(terms).acceleration(u, np.zeros(mechanism.closure.rows))
 
-    def function(name: str, result: Any, **of: Any) -> Any:
-        return cs.Function(name, list(of.values()), [cs.densify(terms.angles.in_q(result))], list(of), [name])
+    def function(name: str, result: Any, **arguments: Any) -> Any:
+        value = cs.densify(terms.configuration.as_function_of_q(result))
+        return cs.Function(name, list(arguments.values()), [value], list(arguments), [name])
 
     return Symbolic(
         coordinates=mechanism.coordinates,
         independent=mechanism.independent,
-        parameters=tuple(labels(mechanism, present(given))),
-        values=values(given, present(given)),
+        parameters=tuple(labels(mechanism, present(mechanism_numbers))),
+        values=values(mechanism_numbers, present(mechanism_numbers)),
         q_tree=np.array(mechanism.q_tree),
         phi=function("phi", terms.rows.phi, q=q, p=p),
         J=function("J", terms.rows.J, q=q, p=p),

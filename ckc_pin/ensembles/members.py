@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import interrupt_again
-from ckc_pin.codegen.library import Library, compiled, find, too_large
+from ckc_pin.codegen.library import Library, compile_terms, explain_too_large, find_compiled_terms
 from ckc_pin.codegen.varied import Varied
 from ckc_pin.ensembles.names import check_names
 from ckc_pin.ensembles.outputs import Function, Outputs, Recorded
@@ -290,14 +290,14 @@ class Members:
         if wanted == "pinocchio":
             return None
         if wanted == "generated":
-            return compiled(self.mechanism, which=which)
-        library = find(self.mechanism, which)
-        if library is not None or count < 2 or too_large(self.mechanism):
+            return compile_terms(self.mechanism, which=which)
+        library = find_compiled_terms(self.mechanism, which)
+        if library is not None or count < 2 or explain_too_large(self.mechanism):
             return library
         if count * self.work() < WORTH * self.mechanism.n:
             return None
         try:
-            return compiled(self.mechanism, which=which)
+            return compile_terms(self.mechanism, which=which)
         except InputError:  # no compiler, no CasADi: the general terms do
             return None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ckc_pin.base.arrays import BoolArray
-from ckc_pin.codegen.library import Library, compiled, find
+from ckc_pin.codegen.library import Library, compile_terms, find_compiled_terms
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.spec import TermsOf
 
@@ -16,7 +16,7 @@ def library_of(mechanism: Mechanism, terms: TermsOf) -> Library | None:
     """Return compiled terms where they are asked for; "auto" takes those that are there, and never makes a run wait."""
     if terms == "pinocchio":
         return None
-    return compiled(mechanism) if terms == "generated" else find(mechanism)
+    return compile_terms(mechanism) if terms == "generated" else find_compiled_terms(mechanism)
 
 
 def changing_library(mechanism: Mechanism, terms: TermsOf, which: Mapping[str, BoolArray] | None) -> Library | None:
@@ -26,4 +26,4 @@ def changing_library(mechanism: Mechanism, terms: TermsOf, which: Mapping[str, B
     """
     if which is None or terms == "pinocchio":
         return None
-    return (compiled if terms == "generated" else find)(mechanism, which, changes=True)
+    return (compile_terms if terms == "generated" else find_compiled_terms)(mechanism, which, changes=True)

@@ -13,7 +13,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.validation import require_callable, require_flag
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.control.controllers import Controller, Law, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
@@ -198,7 +198,7 @@ def _compile(ready: Prepared) -> None:
     """Give the loop terms that are written out, where they can be."""
     with suppress(InputError):  # too many coordinates, no CasADi, no compiler: it goes on as it is
         missing = ready.missing_arguments
-        library = compiled(ready.mechanism, missing, changes=missing is not None)
+        library = compile_terms(ready.mechanism, missing, changes=missing is not None)
         ready.loop.write((library.path, library.parameters))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import Row, Summary, format_quantities
-from ckc_pin.codegen.library import too_large
+from ckc_pin.codegen.library import explain_too_large
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined
@@ -76,7 +76,7 @@ def _would_pay(run: Run) -> str:
     if run.stats.get("terms", "pinocchio") != "pinocchio" or run.stats["wall_s"] < LONG:
         return ""
     mechanism = _mechanism(run)
-    if mechanism is None or too_large(mechanism):
+    if mechanism is None or explain_too_large(mechanism):
         return ""
     return "; compiled ones are several times faster: ckc compile"
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ckc_pin import Simulator, Terms, linearize, load
 from ckc_pin.base.arrays import Array
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.native.plant import Plant
 from ckc_pin.run.simulate import run_prepared
 from scripts.experiments.bench import least, ready
@@ -63,7 +63,7 @@ def plant() -> Measured:
     mechanism = load("five_bar")
     at = mechanism.assembled
     state, found = Terms(mechanism, at, at.rho @ np.array([1.0, -2.0])), []
-    for terms, library in zip(TERMS, (compiled(mechanism), None), strict=True):
+    for terms, library in zip(TERMS, (compile_terms(mechanism), None), strict=True):
         loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
         alone = loop.seconds(np.append(0.0, loop.y)[np.newaxis], 20000)
         found.append(Plant(mechanism, library=library).seconds(state, np.zeros(mechanism.n)) / alone)
@@ -74,7 +74,7 @@ def linearize_ms() -> Measured:
     """The whole call at coordinates, the mechanism being loaded: terms that are there, or none."""
     found, q = [], {"theta_1": -1.1, "theta_3": -1.8}
     mechanism = load("five_bar")
-    compiled(mechanism)
+    compile_terms(mechanism)
     for cached in (True, False):
         with TemporaryDirectory() as folder, nullcontext() if cached else empty_cache(Path(folder)):
             found.append(1e3 * least(lambda: linearize(mechanism, q), 30))
@@ -87,7 +87,7 @@ def compile_seconds(name: str) -> Measured:
     with TemporaryDirectory() as folder, empty_cache(Path(folder)):
         for _ in range(2):
             began = perf_counter()
-            compiled(mechanism)
+            compile_terms(mechanism)
             times.append(perf_counter() - began)
     return times[0], times[1]
 

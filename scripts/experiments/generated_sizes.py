@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.codegen.code import Code
-from ckc_pin.codegen.library import Library, compiled
+from ckc_pin.codegen.library import Library, compile_terms
+from ckc_pin.codegen.term_functions import TermFunctions
 from ckc_pin.errors import InputError
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.parts import scene_mechanism
@@ -96,12 +96,12 @@ def measure(name: str) -> Size:
         scene = _scene(name, Path(folder))
         mechanism = scene_mechanism(load_scene(scene))
         began = _spent()
-        found = Code.of(mechanism)
-        text = found.text()
+        found = TermFunctions.of(mechanism)
+        text = found.c_source()
         expressions_s, began = _spent() - began, _spent()
         reason, library = "", None
         try:
-            library = compiled(mechanism, limited=False)
+            library = compile_terms(mechanism, limited=False)
         except InputError as error:
             reason = str(error)
         about = (

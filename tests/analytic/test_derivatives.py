@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Mechanism, load
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.rows import log_jacobian, log_jacobian_dot
@@ -55,7 +55,7 @@ def test_the_five_bar(seed: int) -> None:
     at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.3, 0.3, 2)).at
     state = Terms(mechanism, at, at.rho @ random.uniform(-3, 3, 2))
     compare(state, random)
-    compare(state, random, Plant(mechanism, library=compiled(mechanism)))
+    compare(state, random, Plant(mechanism, library=compile_terms(mechanism)))
 
 
 @pytest.mark.parametrize("make", [coupled_four_bar, plate_on_springs])

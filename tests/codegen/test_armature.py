@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import Mechanism, as_ivp, load, simulate, symbolic, terms
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.dynamics import dae_acceleration, reduced_acceleration
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
@@ -78,7 +78,7 @@ def test_terms_have_the_rotors(mechanism: Mechanism) -> None:
 
 def test_accelerations_have_the_rotors(mechanism: Mechanism) -> None:
     """In NumPy, in C++ with Pinocchio's terms and with compiled ones, and of CasADi."""
-    cores = [_core.Core(core_table(mechanism)), _core.Core(core_table(mechanism, compiled(mechanism)))]
+    cores = [_core.Core(core_table(mechanism)), _core.Core(core_table(mechanism, compile_terms(mechanism)))]
     expressions = symbolic(mechanism)
     for q_tree, q_dot, u in states():
         v_tree = GEARED.rho(q_tree) @ q_dot

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import ensemble, load, sensitivities, simulate
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.mechanism.parameters import values_of
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.scene import load_scene
@@ -82,7 +82,7 @@ def test_a_library_does_not_depend_on_the_masses_it_was_first_asked_for_with(
     names = []
     for k, overrides in enumerate([{}, STOPPED]):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(k)))
-        names.append(Path(compiled(load("stewart", overrides)).path).name)
+        names.append(Path(compile_terms(load("stewart", overrides)).path).name)
     assert names[0] == names[1]
 
 

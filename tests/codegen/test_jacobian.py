@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load, simulate
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import FIVE_BAR
 from tests.codegen.test_compiled import COUPLED, FREE
@@ -85,7 +85,7 @@ def test_other_daes_jacobians_are_the_differences(name: str | int, tmp_path: Pat
     """Extrapolated central ones of the general core, along motions that keep quaternions' lengths."""
     folder = name if isinstance(name, str) else str(random_mechanism(name).write(tmp_path / "mechanism"))
     mechanism = load(folder)
-    compiled(mechanism)
+    compile_terms(mechanism)
     tree, random = mechanism.tree, np.random.default_rng(2)
     ours, theirs = (dae(folder, terms, tmp_path) for terms in ("generated", "pinocchio"))
     J = mechanism.assembled.J

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.ensembles.members import DONE, FAILED, STOPPED, Members
 from ckc_pin.ensembles.outputs import SHORT
 from ckc_pin.ensembles.spec import OutputSpec
@@ -295,7 +295,7 @@ def test_terms_of_a_tree_that_is_too_large_are_compiled_nowhere(tmp_path: Path) 
 
 def test_a_number_that_is_zero_varies_though_terms_without_it_are_in_the_cache() -> None:
     """What a plain run compiled leaves out what is zero in the file: a member by it would be the scene itself."""
-    compiled(ckc_pin.load("five_bar"))
+    compile_terms(ckc_pin.load("five_bar"))
     names = ("gravity.x", "link.link_2.com.y", "joint.theta_2.xyz.y")
     values = np.array([[2.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]])
     members = Members("five_bar/swing", {**SWING, "solver.terms": "auto"}, names, dict(OUTPUTS), 3, 1)

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from ckc_pin import Run, Simulator, load, simulate
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS
@@ -134,7 +134,7 @@ def test_at_every_tolerance_and_with_every_method(with_joints: Made, rtol: float
 def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float]) -> None:
     """It starts at rest, held by all four joints, and what is sampled lets it go at an instant of the clock."""
     scene = rubbing(with_joints) / "set_point.scene.toml"
-    compiled(load(scene.parent))
+    compile_terms(load(scene.parent))
     overrides = {f"controller.{key}": value for key, value in clock.items()}
     runs = [
         simulate(scene, {**overrides, "formulation": f, "solver.terms": terms, "t_end": 1.0, "solver.rtol": 1e-10})

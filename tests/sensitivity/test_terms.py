@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load, simulate
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 from tests.sensitivity.changed import TIGHT, written
 from tests.sensitivity.spatial import arms, tethered
@@ -96,7 +96,7 @@ def test_terms_that_are_compiled_on_the_way(there: bool, tmp_path: Path, monkeyp
     monkeypatch.setattr(sys.modules["ckc_pin.run.simulate"], "REPAYS", 300)
     scene, names = written(tmp_path), ["link.crank.mass", "joint.b.armature", "initial.q.a"]
     if there:
-        compiled(load(tmp_path / "bars.toml"))
+        compile_terms(load(tmp_path / "bars.toml"))
     found = sensitivities(scene, names, {**TIGHT, "solver.terms": "auto"})
     same(found, sensitivities(scene, names, {**TIGHT, "solver.terms": "pinocchio"}))
     counts = found.run.stats["changes_by_terms"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.parts import scene_mechanism
@@ -76,7 +76,7 @@ class Work:
     def terms(self) -> str:
         """What the mechanism is run with: terms written out, compiled here if need be, or Pinocchio's."""
         try:
-            compiled(self.mechanism)
+            compile_terms(self.mechanism)
         except InputError:
             return "pinocchio"
         return "generated"

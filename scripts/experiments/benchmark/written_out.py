@@ -9,7 +9,7 @@ from time import perf_counter
 
 from ckc_pin.analysis.precision.motion import move
 from ckc_pin.analysis.precision.settings import changed
-from ckc_pin.codegen.library import compiled
+from ckc_pin.codegen.library import compile_terms
 from ckc_pin.errors import InputError
 from scripts.experiments.benchmark.work import Work
 from scripts.experiments.generated_sizes import empty_cache
@@ -48,7 +48,7 @@ def written_out(work: Work, budget: float) -> WrittenOut:
     with TemporaryDirectory() as folder, empty_cache(Path(folder) / "cache"):
         began = perf_counter()
         try:
-            compiled(work.mechanism)
+            compile_terms(work.mechanism)
         except InputError as error:
             return WrittenOut(refused=str(error))
         found = WrittenOut(perf_counter() - began)

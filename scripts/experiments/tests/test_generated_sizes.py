@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load, load_scene
-from ckc_pin.codegen.code import Code
+from ckc_pin.codegen.term_functions import TermFunctions
 from scripts.experiments.generated_sizes import Size, measure, ring
 
 
@@ -20,9 +20,9 @@ def test_a_row_of_squares_is_measured_in_a_cache_of_its_own(tmp_path: Path, monk
     assert list(tmp_path.iterdir()) == []
     assert os.environ["XDG_CACHE_HOME"] == str(tmp_path)
     mechanism = load(load_scene("n_four_bar", {"mechanism.N": 1}).spec.mechanism)
-    code = Code.of(mechanism)
+    code = TermFunctions.of(mechanism)
     assert (found.name, found.n, found.reason) == ("1", 3, "")
-    assert (found.operations, found.bytes) == (code.functions["acceleration"].n_instructions(), len(code.text()))
+    assert (found.operations, found.bytes) == (code.functions["acceleration"].n_instructions(), len(code.c_source()))
     assert min(found.expressions_s, found.written_s, found.general_s) > 0
     assert found.compile_s > found.expressions_s
 

@@ -273,7 +273,7 @@ def test_terms_written_out_are_paid_for_by_motion() -> None:
     assert found.written_s < found.general_s
     assert found.pays_s * (found.general_s - found.written_s) == pytest.approx(found.compile_s * SHORT.t_end)
     large = written_out(replace(EVERY["n_four_bar_40"], overrides={"mechanism.N": 80}), 1.5)
-    assert "terms are written out for trees of up to 130" in large.refused
+    assert "terms are compiled for trees of up to 130" in large.refused
     assert large.compile_s is None
 
 

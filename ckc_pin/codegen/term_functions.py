@@ -1,0 +1,179 @@
+"""CasADi functions of a mechanism's terms, one C function each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ckc_pin.base.arrays import BoolArray
+from ckc_pin.codegen.acceleration import ConstrainedInertia
+from ckc_pin.codegen.branches import Lanes, assign_argument_lanes, find_identical_branches, group_roots
+from ckc_pin.codegen.c_source import LaneMap, split_column, trace_result_lanes, write_c_source
+from ckc_pin.codegen.derivatives import derivative_functions
+from ckc_pin.codegen.expressions import TermExpressions, term_expressions
+from ckc_pin.mechanism.mechanism import Mechanism
+
+__all__ = ["FUNCTIONS", "TermFunctions"]
+
+# By name of the C function: arguments and results. Matrices are dense, by columns. After q, each function takes the
+# cosines and sines of its entries; the last argument is the result of `numbers`.
+FUNCTIONS = {
+    "place": (("q",), ("phi", "J")),
+    "inertia": (("q",), ("D_tree",)),
+    "bias": (("q", "v"), ("bias_tree", "J_dot_v", "damping")),
+    "jacobian_rate": (("q", "v"), ("J_dot",)),
+    "rest": (("q",), ("h_tree",)),
+    "coriolis": (("q", "v", "x"), ("C_x",)),
+    "potential_energy": (("q",), ("potential",)),
+    "acceleration": (("q", "v", "u", "correction"), ("acceleration", "sound")),
+    "closing_step": (("q", "residual"), ("step", "sound")),
+    "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
+}
+# Limit of (operations of the acceleration) * n, about twice the operations of its derivatives. `jacobian` is left out
+# above it.
+MAX_JACOBIAN_OPERATIONS = 3e4
+
+
+@dataclass(frozen=True)
+class TermFunctions:
+    """CasADi functions of one mechanism's terms, from which its C library is written.
+
+    - `numbers` maps the mechanism's parameters to the last argument of the other functions.
+    - `FUNCTIONS` are the terms. `coriolis` is left out of a tree with a free root, whose twist has several C'.
+      `jacobian` is left out where it would take too long to compile.
+
+    With `changes`, there are also directional derivatives of the acceleration:
+
+    - `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it
+      is accurate.
+    - `change` takes the first of these and a direction: a step of q', changes of v' and `more`, the changes of u' and
+      of J v'_dot by the kept rows.
+    - `changes` does the same for `derivatives.DIRECTIONS` directions, the entries of the directions interleaved as in
+      its result. It is written only where it is worth its code.
+    - `varied_K` gives the part of `more` due to a change of the numbers of group K, and `groups` by how much the
+      numbers of each group change.
+
+    Attributes
+    ----------
+    functions : dict of str to casadi.Function
+    lanes : mapping
+        Lanes of the arguments that belong to identical branches.
+    """
+
+    functions: dict[str, Any]
+    lanes: LaneMap
+
+    @classmethod
+    def of(
+        cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
+    ) -> TermFunctions:
+        """Derive a mechanism's functions.
+
+        Parameters
+        ----------
+        mechanism : Mechanism
+        which : mapping, optional
+            Numbers that are arguments (`arguments.present`).
+        changes : bool
+            Whether to add directional derivatives.
+        """
+        import casadi as cs
+
+        lanes = dict(find_identical_branches(mechanism.tree))
+        terms = term_expressions(mechanism, which, group_roots(mechanism.tree, lanes))
+        symbols = {
+            "q": terms.configuration.q,
+            "trig": terms.configuration.trig,
+            "v": terms.v,
+            "u": cs.SX.sym("u", mechanism.n),
+            "correction": cs.SX.sym("correction", mechanism.closure.rows),
+            "residual": cs.SX.sym("residual", mechanism.closure.rows),
+            "x": cs.SX.sym("x", mechanism.n),
+        }
+        direction = {
+            "step": cs.SX.sym("step", mechanism.n),
+            "v": cs.SX.sym("v_change", mechanism.n),
+            "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
+            "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
+        }
+        results = _results(terms, symbols, direction if changes else None)
+        column, numbers, functions, lanes["numbers"] = _extract_numbers(mechanism, terms, results, lanes)
+        parts = dict(zip(results, split_column(column, [x.numel() for x in results.values()]), strict=True))
+        for name, (arguments, outputs) in FUNCTIONS.items():
+            if not parts.keys() >= {*outputs}:
+                continue
+            inputs = {x: symbols[x] for x in ("q", "trig", *arguments[1:])} | {"numbers": numbers}
+            outputs_column = cs.cse(cs.vertcat(*(parts[x] for x in outputs)))
+            values = split_column(outputs_column, [results[x].numel() for x in outputs])
+            functions[name] = cs.Function(name, [*inputs.values()], values, [*inputs], list(outputs))
+        if changes:
+            state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": numbers}
+            groups = terms.arguments.groups
+            derivatives, new_lanes = derivative_functions(parts, state, direction, groups, lanes)
+            functions, lanes = functions | derivatives, {**lanes, **new_lanes}
+        return cls(functions, lanes)
+
+    def c_source(self) -> str:
+        """Return the C source of all functions."""
+        return write_c_source([*self.functions.values()], self.lanes)
+
+
+def _extract_numbers(
+    mechanism: Mechanism, terms: TermExpressions, results: Mapping[str, Any], lanes: Mapping[str, Lanes]
+) -> tuple[Any, Any, dict[str, Any], Lanes]:
+    """Extract from the results what depends on the mechanism's numbers only, so that it is computed once.
+
+    Returns
+    -------
+    (column, numbers, functions, lanes)
+        The results that are left, their argument `numbers`, the function that computes it, and its lanes.
+    """
+    import casadi as cs
+
+    arguments, rotations = terms.arguments.vector, terms.rotations
+    own = cs.vertcat(arguments, *rotations.symbols)
+    column, extracted, definitions = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), own)
+    values = cs.vertcat(own, *definitions)
+    numbers = cs.Function("numbers", [own], [values], ["own"], ["numbers"])
+    argument_lanes = assign_argument_lanes(mechanism, terms.arguments, rotations, lanes)
+    number_lanes = trace_result_lanes(numbers, "numbers", {"own": argument_lanes})
+    values = cs.substitute(values, cs.vertcat(*rotations.symbols), cs.DM(rotations.values))
+    functions = {"numbers": cs.Function("numbers", [arguments], [values])}
+    return column, cs.vertcat(own, *extracted), functions, number_lanes
+
+
+def _results(terms: TermExpressions, symbols: dict[str, Any], direction: dict[str, Any] | None) -> dict[str, Any]:
+    import casadi as cs
+
+    rows = terms.rows
+    inertia = ConstrainedInertia(terms)
+    acceleration, _ = inertia.acceleration(symbols["u"], symbols["correction"])
+    J_dot = terms.configuration.directional_derivative(cs.vec(rows.J), terms.q_dot)
+    results = {
+        "phi": rows.phi,
+        "J": rows.J,
+        "D_tree": terms.D_tree,
+        "bias_tree": terms.bias_tree,
+        "J_dot_v": rows.J_dot_v,
+        "damping": terms.damping,
+        "J_dot": cs.reshape(J_dot, rows.J.shape),
+        "h_tree": cs.substitute(terms.bias_tree, terms.v, cs.DM.zeros(terms.v.numel())),
+        "potential": terms.potential,
+        "acceleration": acceleration,
+        "sound": inertia.accuracy(),
+        "step": inertia.closing_step(symbols["residual"]),
+    }
+    if not terms.quaternions:  # Christoffel symbols: the bias is quadratic in v'
+        results["C_x"] = cs.jtimes(terms.bias_tree, terms.v, symbols["x"]) / 2
+    if cs.n_nodes(acceleration) * terms.v.numel() < MAX_JACOBIAN_OPERATIONS:
+        results["by_state"], results["by_u"] = inertia.derivatives(symbols["u"])
+    if direction is None:
+        return {name: cs.densify(x) for name, x in results.items()}
+    uncorrected = cs.SX(rows.phi.numel(), 1)
+    results["acceleration_of_u"] = inertia.acceleration(symbols["u"], uncorrected)[0]
+    step, v, more, varied = direction.values()
+    q_change = cs.substitute(terms.q_dot, terms.v, step)
+    results["change"] = inertia.directional_derivative(symbols["u"], q_change, v, more)
+    results["by_arguments"] = inertia.argument_derivative(symbols["u"], varied)
+    return {name: cs.densify(x) for name, x in results.items()}
