@@ -23,7 +23,6 @@ from ckc_pin.control.workspace import DesiredCheck
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import assembly_branches
-from ckc_pin.linear.linear_report import stability_text, stability_warning
 from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -155,7 +154,7 @@ def check(
     if stable is None:
         warnings += [refused] if refused else []
     elif desired is None or desired.leaves_at is None:
-        warnings += stability_warning(stable, mechanism.independent)
+        warnings += stable.list_warnings(mechanism.independent)
     found = _mechanism_check(mechanism, desired, warnings, what.spec.solver.terms, what.name)
     found = replace(found, stability=stable)
     return replace(found, branches=_branches(mechanism)) if branches else found
@@ -180,11 +179,11 @@ def _stability(
         mechanism,
         controller,
         spec.t_end,
-        spec.friction_smoothing,
-        (clocked.sample_time, clocked.delay) if isinstance(clocked, Sampled) else None,
-        library,
-        start.at,
-        actuation,
+        smoothing=spec.friction_smoothing,
+        sampling=(clocked.sample_time, clocked.delay) if isinstance(clocked, Sampled) else None,
+        library=library,
+        start=start.at,
+        actuation=actuation,
     )
     return replace(found, leaves_out=_leaves_out(scene, actuation))
 
@@ -270,7 +269,7 @@ def check_summary(found: Check) -> Summary:
     elif found.desired is not None:
         rows.append(("desired", f"leaves the workspace at t = {found.desired.leaves_at:.5f} s"))
     if found.stability is not None:
-        rows.append(("closed loop", stability_text(found.stability)))
+        rows.append(("closed loop", found.stability.describe()))
     units = dict(zip(found.coordinates, found.units, strict=True))
     rows += [(f"joint {name}", _of_joint(joint, units[name])) for name, joint in found.joints.items()]
     rows += [("warning", warning) for warning in found.warnings]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,15 +12,10 @@ import ckc_pin
 from ckc_pin.base.atomic_files import lock_folder
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides, read_table
-from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_table
+from ckc_pin.cli.output import ProgressBar, Working, errors, make_folder, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.linear.linear_report import linear_plain, linear_text, save_linear
 from ckc_pin.linear.linearize import At
-from ckc_pin.sensitivity.floquet import floquet_text, save_floquet
-
-if TYPE_CHECKING:
-    from rich.text import Text
 
 __all__ = ["linearize"]
 
@@ -71,21 +65,21 @@ def linearize(
             found = ckc_pin.floquet(what, period, read_overrides("--set", overrides), progress)
         if out is not None:
             _write_floquet(found, out)
-        _print(found.to_dict() if as_json else floquet_text(found), out)
+        _print(found, out, as_json)
         return
     with Working(f"linearizing {what}"):
         model = ckc_pin.linearize(what, _at("equilibrium" if at is None else at), read_overrides("--set", overrides))
     runs, modes = 0 if out is None else _write(model, what, overrides, out), len(model.modes)
     barred = "rigid ones do not, nor any whose swing the loops do not follow, nor more than twelve"
     more = "" if runs == modes else f"; {runs} of {modes} modes can be played: {barred}"
-    _print(linear_plain(model) if as_json else linear_text(model), out, more)
+    _print(model, out, as_json, more)
 
 
-def _print(found: dict[str, Any] | Text, out: Path | None, more: str = "") -> None:
-    if isinstance(found, dict):
-        print_json(found)
+def _print(result: ckc_pin.LinearModel | ckc_pin.Floquet, out: Path | None, as_json: bool, more: str = "") -> None:
+    if as_json:
+        print_json(result.to_dict())
         return
-    print_table(found)
+    print_summary(result.summary())
     if out is not None:
         print(f"written to {out}{more}")
 
@@ -107,7 +101,7 @@ def _at(given: str) -> At:
 def _write_floquet(found: ckc_pin.Floquet, out: Path) -> None:
     with interrupts.deferred(), ExitStack() as stack:
         stack.enter_context(lock_folder(out))
-        save_floquet(found, out / "floquet.npz")
+        found.save(out / "floquet.npz")
         found.run.save(out / "run.npz")
 
 
@@ -116,16 +110,16 @@ def _write(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...], ou
 
     Returns how many modes are runs.
     """
-    from ckc_pin.linear.mode_animation import sways
+    from ckc_pin.linear.mode_animation import animate_modes
 
-    runs = sways(model)
+    runs = animate_modes(model)
     with ExitStack() as stack:
         with interrupts.deferred():
             stack.enter_context(lock_folder(out))
             for path in out.iterdir():
                 if OF_MODEL.fullmatch(path.name) and path.is_file():
                     path.unlink()
-            save_linear(model, out / "linear.npz")
+            model.save(out / "linear.npz")
             for number, run in runs.items():
                 run.save(out / f"mode_{number}.npz")
         locus = None

@@ -9,7 +9,6 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.linear.linear_report import stability_plain
 from ckc_pin.mechanism.units import motor_units
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ def check_plain(found: Check) -> dict[str, Any]:
     """Return a check as JSON-ready data."""
     branches = None if found.branches is None else found.branches.tolist()
     arrays = {"q_tree": found.q_tree.tolist(), "inertia": found.inertia.tolist(), "branches": branches,
-              "stability": stability_plain(found.stability)}  # fmt: skip
+              "stability": None if found.stability is None else found.stability.to_dict()}  # fmt: skip
     return asdict(found) | arrays
 
 

@@ -1,4 +1,4 @@
-"""Controllers in the loop, linearized exactly: what u depends on, and what that makes of the plant."""
+"""Exact linearization of mechanisms with feedback controllers."""
 
 from __future__ import annotations
 
@@ -11,29 +11,37 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.dynamics.formulations import tree_force
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native import _core
 from ckc_pin.native.control import actuation_table, law_table
 from ckc_pin.native.plant import NONE, Plant
 from ckc_pin.native.tables import core_table
 
-__all__ = ["ClosedLoop", "Feedback"]
+__all__ = ["ClosedLoop", "Feedback", "LimitedClosedLoop"]
 
-UNKNOWN = "q is no chart or has coordinates of a free root, or motors that share u are at their limits"
+NOT_DIFFERENTIABLE = (
+    "the independent coordinates do not parametrize the motion or belong to a free root, or motors that share a force "
+    "are at their limits"
+)
+U_TOLERANCE = 1e-9  # relative difference between the requested u and the u that the motors give
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """A controller about one state: x_dot = A x + B u, u = K x with x the deviations that the states of A are.
+    """A linearized plant and controller: ``x_dot = A x + B u`` and ``u = K x``.
 
     Attributes
     ----------
     A : (2 d, 2 d) array
+        Of deviations of the independent coordinates and of their rates.
     B : (2 d, m) array
     K : (m, 2 d) array
-        Of the independent coordinates, and where motors are at their limits of all joints that they turn.
+        One row for each independent coordinate. If motors are at their limits, also one row for each other joint that
+        they drive.
     """
 
     A: Array
@@ -41,24 +49,24 @@ class Feedback:
     K: Array
 
     @property
-    def closed(self) -> Array:
-        """A of the closed loop, (2 d, 2 d)."""
+    def A_closed(self) -> Array:
+        """State matrix of the closed loop, A + B K, (2 d, 2 d)."""
         return self.A + self.B @ self.K
 
 
 class ClosedLoop:
-    """A mechanism under eq. 14 or eq. 16, to be linearized at states of it.
+    """A mechanism with the controller of eq. 14 or eq. 16, which can be linearized about any state.
 
     Parameters
     ----------
     mechanism : Mechanism
     law : SetPoint or Tracking
     smoothing : float, optional
-        A scene's friction_smoothing.
+        The scene's friction_smoothing.
     library : Library, optional
-        The mechanism's terms, compiled.
+        Compiled terms of the mechanism.
     actuation : Actuation, optional
-        Motors with limits; absent, u acts as the controller asks for it.
+        Motors with limits. By default u acts without limits.
     """
 
     def __init__(
@@ -71,51 +79,115 @@ class ClosedLoop:
     ) -> None:
         self._plant = Plant(mechanism, smoothing, library)
         self._table = core_table(mechanism, library)
-        self._acts = _as_asked(mechanism) if actuation is None else actuation_table(actuation)
+        self._actuation = _ideal_actuation(mechanism) if actuation is None else actuation_table(actuation)
         self.law = law
 
     @property
     def law(self) -> SetPoint | Tracking:
-        """The controller, which may be changed for another one."""
+        """The controller. It can be replaced by another one of the same mechanism."""
         return self._law
 
     @law.setter
     def law(self, law: SetPoint | Tracking) -> None:
         self._law = law
-        self._native = _core.Feedback(self._table, self._acts | {"law": law_table(law)})
+        self._native = _core.Feedback(self._table, self._actuation | {"law": law_table(law)})
 
-    def at(self, t: float, terms: Terms, u_tree: Array | float = 0.0, locked: IntArray = NONE) -> Feedback:
-        """Linearize plant and controller.
+    def linearize(self, t: float, terms: Terms, u_tree: Array | float = 0.0, locked: IntArray = NONE) -> Feedback:
+        """Linearize plant and controller about a state.
 
         Parameters
         ----------
+        t : float
+            Time at which the controller is evaluated, s.
         terms : Terms
-            At v' = rho q_dot.
+            The state, with ``v_tree = rho q_dot``.
         u_tree : (n,) array, optional
-            Other forces that do not change with the state, as of joints that slide.
+            Other forces on the tree that do not depend on the state, such as friction of sliding joints.
         locked : int array, optional
-            Coordinates of joints that stick or touch.
+            Coordinates of joints that stick or are at a stop.
 
         Raises
         ------
         NumericalError
-            J has lost rank, the controller has no u there, or it is not known how motors at their limits share it.
+            J has lost rank, or the controller is not differentiable at this state.
         """
-        mechanism, found = self._plant.mechanism, self._native.at(t, terms.q_tree, terms.v_tree)
-        if not isinstance(found, tuple):
-            raise NumericalError(f"{mechanism.name}: the controller cannot be differentiated there: {found or UNKNOWN}")
-        force, by_q, by_v = found
+        mechanism, derivatives = self._plant.mechanism, self._native.at(t, terms.q_tree, terms.v_tree)
+        if not isinstance(derivatives, tuple):
+            reason = derivatives or NOT_DIFFERENTIABLE
+            raise NumericalError(f"{mechanism.name}: the controller cannot be differentiated there: {reason}")
+        force, force_by_q, force_by_v = derivatives
         plant = self._plant.at(terms, force + u_tree, locked)
         q = mechanism.partition.q
-        others = np.setdiff1d(np.flatnonzero(by_q.any(axis=1) | by_v.any(axis=1)), q)
-        acts = np.concatenate([q, others])
-        B = np.vstack([np.zeros((len(plant.at), len(acts))), plant.a_u[np.ix_(plant.at, acts)]])
-        K = np.hstack([by_q @ plant.T + by_v @ plant.V, by_v @ plant.T])[acts]
+        other_joints = np.setdiff1d(np.flatnonzero(force_by_q.any(axis=1) | force_by_v.any(axis=1)), q)
+        driven = np.concatenate([q, other_joints])
+        B = np.vstack([np.zeros((len(plant.at), len(driven))), plant.a_u[np.ix_(plant.at, driven)]])
+        K = np.hstack([force_by_q @ plant.T + force_by_v @ plant.V, force_by_v @ plant.T])[driven]
         return Feedback(plant.A, B, K)
 
 
-def _as_asked(mechanism: Mechanism) -> dict[str, Any]:
-    """Motors that turn the independent coordinates themselves, without limits."""
-    q, none = mechanism.partition.q, np.zeros(mechanism.d)
+def _ideal_actuation(mechanism: Mechanism) -> dict[str, Any]:
+    """Return the table of unlimited motors on the independent coordinates."""
+    q, zeros = mechanism.partition.q, np.zeros(mechanism.d)
     turns = np.asfortranarray(np.eye(mechanism.n)[q])
-    return {"turns": turns, "direct": True, "limit": none + np.inf, "weights": none + 1.0, "preload": none}
+    return {"turns": turns, "direct": True, "limit": zeros + np.inf, "weights": zeros + 1.0, "preload": zeros}
+
+
+@dataclass(frozen=True)
+class LimitedClosedLoop:
+    """A closed loop whose linearization is valid inside joint stops and torque limits only.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    law : SetPoint or Tracking
+    closed_loop : ClosedLoop
+        The same loop without limits.
+    smoothing : float or None
+        The scene's friction_smoothing.
+    actuation : Actuation or None
+        Motors with limits, if there are any.
+    """
+
+    mechanism: Mechanism
+    law: SetPoint | Tracking
+    closed_loop: ClosedLoop
+    smoothing: float | None
+    actuation: Actuation | None
+
+    def linearize(self, t: float, state: Terms, where: str) -> Feedback:
+        """Linearize plant and controller about a state inside all limits.
+
+        Parameters
+        ----------
+        where : str
+            Description of the state, the beginning of an error message.
+
+        Raises
+        ------
+        NumericalError
+            A joint is beyond its stops, the motors cannot give the controller's u, or the loop is not differentiable.
+        """
+        if violation := describe_stop_violation(self.mechanism, state.q_tree):
+            raise NumericalError(f"{where} {violation}")
+        actuation = self.actuation
+        if actuation is not None and np.isfinite(actuation.limit).any():
+            u = self.law.u(t, state)
+            limited = actuation.apply(state, u)
+            if np.abs(limited.u - u).max() > U_TOLERANCE * np.abs(u).max():
+                tau = actuation.distribute(state.rho, u)
+                k = int(np.argmax(np.abs(tau) / actuation.limit))
+                raise NumericalError(
+                    f"{where} {actuation.motors.names[k]} would need {abs(tau[k]):.4g}, its limit is "
+                    f"{actuation.limit[k]:.4g}"
+                )
+        return self.closed_loop.linearize(t, state)
+
+    def compute_required_u(self, state: Terms, q_ddot: Array) -> Array:
+        """Return the u that gives the mechanism an acceleration, (d,).
+
+        Dry friction is included only if it is smoothed.
+        """
+        force = tree_force(state, state.rho @ q_ddot + state.rho_dot_times(state.q_dot))
+        if self.smoothing is not None:
+            force += self.mechanism.joints.friction * np.tanh(state.v_tree / self.smoothing)
+        return state.rho.T @ force

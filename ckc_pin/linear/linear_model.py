@@ -1,62 +1,72 @@
-"""The linear model of a mechanism about one state: eq. 1 in minimal coordinates, differentiated exactly."""
+"""Linear model of a mechanism about one state: the exact derivatives of eq. 1 in minimal coordinates."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
+from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
 from ckc_pin.dynamics.formulations import refuse_massless
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.linear.modes import NO_DAMPING, ComplexArray, Mode, eigenvalues_of, modes_of
-from ckc_pin.linear.resting import kernel, motions, unbalanced
+from ckc_pin.linear.modes import MIN_DAMPING_RATIO, ComplexArray, Mode, compute_eigenvalues, compute_modes
+from ckc_pin.linear.statics import compute_velocity_basis, has_unbalanced_force, orthonormal_null_space
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.native.plant import NONE, Plant
+from ckc_pin.native.plant import NONE, AccelerationDerivatives, Plant
 
 if TYPE_CHECKING:
     from ckc_pin.run.run import Run
 
-__all__ = ["LinearModel", "Mode", "eigenvalues_of", "linear_model"]
+__all__ = ["LinearModel", "Mode", "linear_model"]
 
-COINCIDENT = 1e-9  # of the mechanism's size: ends of a spring so near to each other are at one place
-MOST_NAMES, MOST_ROWS = 14, 12  # names in a list, and modes, in what is printed
+COINCIDENCE_TOLERANCE = 1e-9  # relative to the mechanism's size, for the two ends of a spring
+MAX_NAMES = 14  # in a list of names
+MAX_MODES = 12  # in a summary
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
-    """dx/dt = A x + B tau, y = C x + D tau, of deviations from one state of a mechanism.
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(HasSummary):
+    """Linear state-space model of a mechanism: ``dx/dt = A x + B tau`` and ``y = C x + D tau``.
+
+    All variables are deviations from one state.
 
     Attributes
     ----------
     name : str
     mechanism : Mechanism
     at : str
-        What that state is, in words.
+        Description of the state.
     t : float or None
-        Of an instant of a run, s.
+        Time of a state of a run, s.
     states, inputs, outputs : tuple of str
-        d coordinates and then their rates, ``NAME_dot``; motors; coordinates of the tree, ``point:NAME.x`` and
-        ``loop:LOOP.ROW``, the multipliers of eq. 1. Those of a free root are tangent coordinates, in its own axes.
+        The states are d coordinates and then their rates, ``NAME_dot``. The inputs are the motors. The outputs are the
+        coordinates of the tree, ``point:NAME.x`` and ``loop:LOOP.ROW``, the multipliers of eq. 1. A free root has
+        tangent coordinates in its own axes.
     A, B, C, D : arrays
-        D is the feedthrough. SI units.
+        SI units. D is the feedthrough.
     q_tree, v_tree : (n,) arrays
-        The state itself, by coordinate.
+        The state, by coordinate.
     tau : (motors,) array
-        What the motors do there.
+        Motor torques at the state, N m or N.
     motions : (n, d) array
-        What each coordinate moves of the tree.
+        Velocity of the tree for a unit rate of each coordinate of the states.
     locked : tuple of str
-        Joints that stick or touch, and do not move.
+        Joints that stick or are at a stop. They do not move.
     closed_loop : (2 d, 2 d) array or None
-        A with the scene's controller, which then has no inputs.
+        State matrix with the scene's controller.
     notes : tuple of str
-        What to know before one takes it for the whole truth.
+        Limits of the model's validity.
     """
 
     name: str
@@ -80,39 +90,40 @@ class LinearModel:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Labels of `q_tree`, `v_tree` and of the shapes of modes."""
+        """Names of the entries of `q_tree`, `v_tree` and mode shapes."""
         return self.mechanism.coordinates
 
     @cached_property
     def eigenvalues(self) -> ComplexArray:
-        """Of A, 1/s, in falling order of their real parts."""
-        return eigenvalues_of(self.A, self._units)
+        """Eigenvalues of A, 1/s, by decreasing real part."""
+        return compute_eigenvalues(self.A, self._units)
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
-        """Of A, in rising order of |eigenvalue|: of a motion, those of the instant."""
-        return modes_of(self.A, self.motions, self._units, self.mechanism.tree.step_scale)
+        """Modes of A, by increasing |eigenvalue|. About a motion they are those of the instant."""
+        return compute_modes(self.A, self.motions, self._units, self.mechanism.tree.step_scale)
 
     @cached_property
     def _units(self) -> Array:
+        """Scale of each coordinate of the states: 1 rad, or the mechanism's size."""
         tree = self.mechanism.tree
         return tree.step_scale[[tree.index[name] for name in self.states[: len(self.states) // 2]]]
 
-    def sway(self, number: int) -> Run | None:
-        """Return a mode, counted from 1, as a run to play; see `ckc_pin.linear.mode_animation.sway`."""
-        from ckc_pin.linear.mode_animation import sway
+    def animate_mode(self, number: int) -> Run | None:
+        """Return a mode, counted from 1, as a run to play; see `ckc_pin.linear.mode_animation.animate_mode`."""
+        from ckc_pin.linear.mode_animation import animate_mode
 
-        return sway(self, number)
+        return animate_mode(self, number)
 
     def to_statespace(self) -> Any:
-        """Return the model for python-control, a `control.StateSpace` with the same names, dots as underscores.
+        """Convert to a `control.StateSpace` of python-control.
 
-        Of names that are the same then, the later ones get a number.
+        Names are the same, with dots replaced by underscores. Equal names get a number.
 
         Raises
         ------
         InputError
-            python-control is not installed, or there are no motors, and with them no inputs.
+            python-control is not installed, or the mechanism has no motors and so the model no inputs.
         """
         try:
             import control
@@ -121,45 +132,111 @@ class LinearModel:
                 "to_statespace needs python-control, which is not installed: pip install ckc_pin[control]"
             ) from error
         if not self.inputs:
-            raise InputError(f"{self.name}: no motors, so that there are no inputs, which python-control asks for")
-        states, inputs, outputs = (_distinct(x) for x in (self.states, self.inputs, self.outputs))
-        (name,) = _distinct((self.name,))
+            raise InputError(
+                f"{self.name}: to_statespace: python-control needs at least one input, but the mechanism has no motors"
+            )
+        states, inputs, outputs = (_make_distinct(x) for x in (self.states, self.inputs, self.outputs))
+        (name,) = _make_distinct((self.name,))
         return control.ss(self.A, self.B, self.C, self.D, states=states, inputs=inputs, outputs=outputs, name=name)
 
-    def __repr__(self) -> str:
-        head = f"LinearModel of {self.name} {self.at}: {len(self.states)} states, {len(self.inputs)} inputs"
-        shown = [f"  {says}" for says in (*_rows(self), *(f"note: {note}" for note in self.notes))]
-        return "\n".join([f"{head}, {len(self.outputs)} outputs", f"  states  {_some(self.states)}", *shown])
+    def to_dict(self) -> dict[str, Any]:
+        """Return the model as JSON-ready data (docs/reference/json.md)."""
+        closed_loop = None
+        if self.closed_loop is not None:
+            eigenvalues = to_pairs(compute_eigenvalues(self.closed_loop))
+            closed_loop = {"A": self.closed_loop.tolist(), "eigenvalues": eigenvalues}
+        return {
+            "name": self.name,
+            "states": self.states,
+            "inputs": self.inputs,
+            "outputs": self.outputs,
+            **{name: getattr(self, name).tolist() for name in "ABCD"},
+            "eigenvalues": to_pairs(self.eigenvalues),
+            "modes": [
+                {
+                    "eigenvalue": to_pairs([mode.eigenvalue])[0],
+                    "frequency": mode.frequency,
+                    "damping_ratio": mode.damping_ratio,
+                    "shape": dict(zip(self.coordinates, to_pairs(mode.shape), strict=True)),
+                }
+                for mode in self.modes
+            ],
+            "at": {
+                "state": self.at,
+                "t": self.t,
+                "coordinates": self.coordinates,
+                "q_tree": self.q_tree.tolist(),
+                "v_tree": self.v_tree.tolist(),
+                "tau": self.tau.tolist(),
+            },
+            "locked": self.locked,
+            "closed_loop": closed_loop,
+            "notes": self.notes,
+        }
+
+    def summary(self) -> Summary:
+        """Return states, inputs, modes and notes, as `repr` and a notebook show them."""
+        size = f"{len(self.states)} states, {len(self.inputs)} inputs, {len(self.outputs)} outputs"
+        rows: list[Row] = [("states", list(self.states)), ("inputs", list(self.inputs) or "none")]
+        rigid = sum(not mode.eigenvalue for mode in self.modes)
+        if rigid:
+            rows.append(("rigid modes", f"{rigid}, eigenvalue 0 1/s: nothing restores these motions"))
+        last = min(rigid + MAX_MODES, len(self.modes))
+        rows += [(f"mode {k + 1}", _describe_mode(self.modes[k])) for k in range(rigid, last)]
+        if last < len(self.modes):
+            rows.append(("more modes", f"{len(self.modes) - last}"))
+        if self.closed_loop is not None:
+            rows.append(("closed loop", f"{format_eigenvalues(compute_eigenvalues(self.closed_loop))} 1/s"))
+        rows += [("note", note) for note in self.notes]
+        return Summary(f"LinearModel of {self.name} {self.at}: {size}", rows)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model to a file, NumPy's npz without pickle (docs/reference/run_file.md).
+
+        The file is written completely or not at all.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written.
+        """
+        require_path(path, "LinearModel.save: path")
+        path = Path(path)
+        names = (*"ABCD", "q_tree", "v_tree", "tau", "motions", "eigenvalues")
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
+        labels = ("states", "inputs", "outputs", "coordinates")
+        arrays |= {name: np.array(getattr(self, name), dtype=str) for name in labels}
+        meta = {"name": self.name, "at": self.at, "t": self.t, "locked": self.locked, "notes": self.notes}
+        if self.closed_loop is not None:
+            arrays["closed_loop"] = self.closed_loop
+        with open_atomic(path) as file:
+            np.savez_compressed(file, **arrays, meta=np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8))
+        return path
 
 
-def _distinct(names: tuple[str, ...]) -> list[str]:
-    made: list[str] = []
+def _describe_mode(mode: Mode) -> str:
+    if not mode.frequency:
+        return mode.description
+    value = mode.eigenvalue
+    real = 0.0 if abs(mode.damping_ratio) < MIN_DAMPING_RATIO else value.real
+    return f"{mode.description}, eigenvalue {real:.6g} +- {value.imag:.6g}i 1/s"
+
+
+def _make_distinct(names: Sequence[str]) -> list[str]:
+    """Replace dots by underscores, and number the names that are equal then."""
+    distinct: list[str] = []
     for name in names:
-        plain = name.replace(".", "_")
-        again = (f"{plain}_{k}" for k in count(2))
-        made.append(plain if plain not in made else next(x for x in again if x not in made))
-    return made
+        base = name.replace(".", "_")
+        numbered = (f"{base}_{k}" for k in count(2))
+        distinct.append(base if base not in distinct else next(x for x in numbered if x not in distinct))
+    return distinct
 
 
-def _some(names: tuple[str, ...]) -> str:
-    """Names as far as people read them."""
-    return ", ".join(
-        names if len(names) <= MOST_NAMES else (*names[: MOST_NAMES - 1], f"{len(names) - MOST_NAMES + 1} more")
-    )
-
-
-def _rows(model: LinearModel) -> list[str]:
-    rows = [f"inputs  {_some(model.inputs) or 'none'}"]
-    rigid = sum(not mode.eigenvalue for mode in model.modes)
-    if rigid:
-        rows.append(f"eigenvalue 0 1/s{f' ({rigid} times)' if rigid > 1 else ''}: motions that nothing brings back")
-    for mode in model.modes[rigid : rigid + MOST_ROWS]:
-        value = mode.eigenvalue
-        still = bool(mode.frequency) and abs(mode.damping_ratio) < NO_DAMPING
-        pair = f"{0.0 if still else value.real:.6g} +- {value.imag:.6g}i 1/s: " if mode.frequency else ""
-        rows.append(f"eigenvalue {pair}{mode.says}")
-    more = len(model.modes) - rigid - MOST_ROWS
-    return rows + ([f"and {more} more"] if more > 0 else [])
+def _join_names(names: Sequence[str]) -> str:
+    """Join names, the last ones replaced by their number if there are many."""
+    if len(names) > MAX_NAMES:
+        names = (*names[: MAX_NAMES - 1], f"{len(names) - MAX_NAMES + 1} more")
+    return ", ".join(names)
 
 
 def linear_model(
@@ -179,60 +256,50 @@ def linear_model(
     Parameters
     ----------
     terms : Terms
-        On the closure.
+        A state on the constraint manifold.
     tau : (motors,) array
-        What the motors do there.
+        Motor torques at the state.
     at : str
-        What the state is, in words.
+        Description of the state.
     t : float, optional
-        Of an instant of a run, s.
+        Time of a state of a run, s.
     u_tree : (n,) array, optional
-        Other forces that do not change with the state, as of joints that slide.
+        Other forces on the tree that do not depend on the state, such as friction of sliding joints.
     locked : int array, optional
-        Coordinates of joints that stick or touch.
+        Coordinates of joints that stick or are at a stop.
     smoothing : float, optional
         Rate over which dry friction grows, as a scene's friction_smoothing.
     library : Library, optional
-        The mechanism's terms, compiled.
+        Compiled terms of the mechanism.
+    notes : tuple of str, optional
+        Notes about the state, which come before those about the model.
 
     Raises
     ------
     NumericalError
         J has lost rank.
     InputError
-        Nothing is free to move, a motion moves no mass, a damper or spring has no direction.
+        No freedom remains, a freedom moves no mass, or the ends of a spring coincide.
     """
     mechanism = terms.mechanism
     names = tuple(mechanism.coordinates[k] for k in locked)
-    if vague := mechanism.springs.without_direction(terms.q_tree, COINCIDENT * mechanism.size):
+    if coincident := mechanism.springs.without_direction(terms.q_tree, COINCIDENCE_TOLERANCE * mechanism.size):
         raise InputError(
-            f"{mechanism.name}: no linear model there: the ends of {_some(tuple(vague))} coincide, so that it has no "
-            "direction to act along, and its force no derivative; take another configuration"
+            f"{mechanism.name}: the linear model does not exist there: the ends of {_join_names(tuple(coincident))} "
+            "coincide, so the direction of its force is undefined; choose another configuration"
         )
-    _refuse_massless(terms, locked)
+    _require_mass(terms, locked)
     u_tree = mechanism.motors.force(tau) + u_tree
-    found = Plant(mechanism, smoothing, library).at(terms, u_tree, locked)
-    if not len(found.at):
-        smoothed = "; friction_smoothing lets them slide" if np.any(mechanism.joints.friction[locked]) else ""
-        why = f"its joints stick or touch ({', '.join(names)}){smoothed}" if names else "d = 0"
-        raise InputError(f"{mechanism.name}: no freedom is left to linearize in: {why}")
-    if not np.all(np.isfinite(found.A)):
-        raise NumericalError(f"{mechanism.name}: no linear model there, its derivatives are not finite")
-    chart = tuple(mechanism.coordinates[k] for k in found.at)
-    if chart != mechanism.independent and not names:
-        no, are = ("is no coordinate", "is") if len(chart) == 1 else ("are no coordinates", "are")
-        notes = (*notes, f"{', '.join(mechanism.independent)} {no} there; {', '.join(chart)} {are}")
-    if names:
-        notes = (*notes, f"locked by friction or a stop, so that they do not move: {_some(names)}")
-    if not terms.v_tree.any() and unbalanced(terms, u_tree, found.T):
-        a = found.acceleration / mechanism.tree.step_scale
-        k = int(np.argmax(np.abs(a)))
-        rate = f"{found.acceleration[k]:.4g} {mechanism.tree.units('/s^2')[k]}"
-        notes = (*notes, f"at rest, but nothing keeps it there: {mechanism.coordinates[k]} accelerates with {rate}")
+    plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked)
+    if not len(plant.at):
+        raise InputError(f"{mechanism.name}: no freedom remains to linearize: {_explain_locked(mechanism, locked)}")
+    if not np.all(np.isfinite(plant.A)):
+        raise NumericalError(f"{mechanism.name}: the linear model does not exist there: its derivatives are not finite")
+    chart = tuple(mechanism.coordinates[k] for k in plant.at)
     points = mechanism.point_jacobians(terms.q_tree)
-    turns, zero = mechanism.motors.transmission.T, np.zeros((mechanism.n + 3 * len(points), len(found.at)))
-    places = np.vstack([found.T, *(x @ found.T for x in points.values())])
-    forces_q = found.multipliers_q @ found.T + found.multipliers_v @ found.V
+    turns, zero = mechanism.motors.transmission.T, np.zeros((mechanism.n + 3 * len(points), len(plant.at)))
+    positions = np.vstack([plant.T, *(x @ plant.T for x in points.values())])
+    multipliers_by_q = plant.multipliers_q @ plant.T + plant.multipliers_v @ plant.V
     return LinearModel(
         name=mechanism.name,
         mechanism=mechanism,
@@ -245,21 +312,51 @@ def linear_model(
             *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
             *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
         ),
-        A=found.A,
-        B=found.B,
-        C=np.block([[places, zero], [forces_q, found.multipliers_v @ found.T]]),
-        D=np.vstack([np.zeros((len(zero), len(mechanism.actuated))), found.multipliers_u @ turns]),
+        A=plant.A,
+        B=plant.B,
+        C=np.block([[positions, zero], [multipliers_by_q, plant.multipliers_v @ plant.T]]),
+        D=np.vstack([np.zeros((len(zero), len(mechanism.actuated))), plant.multipliers_u @ turns]),
         q_tree=mechanism.tree.to_coordinates(terms.q_tree),
         v_tree=terms.v_tree,
         tau=tau,
-        motions=found.T,
+        motions=plant.T,
         locked=names,
-        notes=notes,
+        notes=(*notes, *_describe_validity(terms, u_tree, plant, names)),
     )
 
 
-def _refuse_massless(terms: Terms, locked: IntArray) -> None:
-    tangent = motions(terms)
-    tangent = tangent @ kernel(tangent[locked] / terms.mechanism.tree.step_scale[locked, None])
+def _require_mass(terms: Terms, locked: IntArray) -> None:
+    """Raise InputError if a freedom moves no mass."""
+    tangent = compute_velocity_basis(terms)
+    tangent = tangent @ orthonormal_null_space(tangent[locked] / terms.mechanism.tree.step_scale[locked, None])
     if tangent.shape[1]:
         refuse_massless(terms, tangent, np.arange(terms.mechanism.n))
+
+
+def _explain_locked(mechanism: Mechanism, locked: IntArray) -> str:
+    if not len(locked):
+        return "d = 0"
+    names = ", ".join(mechanism.coordinates[k] for k in locked)
+    remedy = "; friction_smoothing lets them slide" if np.any(mechanism.joints.friction[locked]) else ""
+    return f"its joints stick or are at stops ({names}){remedy}"
+
+
+def _describe_validity(
+    terms: Terms, u_tree: Array, plant: AccelerationDerivatives, locked: tuple[str, ...]
+) -> list[str]:
+    """Return notes on the choice of coordinates, on locked joints and on a state that does not remain at rest."""
+    mechanism, notes = terms.mechanism, []
+    chart = tuple(mechanism.coordinates[k] for k in plant.at)
+    if locked:
+        notes.append(f"locked by friction or a stop, so they do not move: {_join_names(locked)}")
+    elif chart != mechanism.independent:
+        verb = "does" if len(chart) == 1 else "do"
+        notes.append(
+            f"{', '.join(mechanism.independent)} {verb} not determine the configuration there; the states are those of "
+            f"{', '.join(chart)}"
+        )
+    if not terms.v_tree.any() and has_unbalanced_force(terms, u_tree, plant.T):
+        k = int(np.argmax(np.abs(plant.acceleration / mechanism.tree.step_scale)))
+        rate = f"{plant.acceleration[k]:.4g} {mechanism.tree.units('/s^2')[k]}"
+        notes.append(f"at rest but not in equilibrium: {mechanism.coordinates[k]} accelerates at {rate}")
+    return notes

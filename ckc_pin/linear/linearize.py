@@ -1,4 +1,4 @@
-"""Linear models: about an equilibrium, an operating point that motors hold, or an instant of a scene's run."""
+"""Linear models about an equilibrium, about an operating point held by motors, or at an instant of a scene's run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import minimum_norm_step, project_onto_closure, sigma
 from ckc_pin.linear.closed_loop import ClosedLoop
 from ckc_pin.linear.linear_model import LinearModel, linear_model
-from ckc_pin.linear.resting import hold
+from ckc_pin.linear.statics import balance_at_rest
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native.plant import NONE
@@ -42,13 +42,17 @@ __all__ = ["At", "linearize"]
 
 At = str | float | Mapping[str, float]
 
-NO_CHART = 1e-6  # margin of phi_z below which q is none
-OPEN = 1e-6  # of the mechanism's size: loops further open are not those of eq. 1
-MOMENT = 1e-9  # s: a run to its very start
+MIN_CHART_MARGIN = 1e-6  # margin of phi_z, below which q does not determine z to all digits
+CLOSURE_TOLERANCE = 1e-6  # |phi| relative to the mechanism's size
+MIN_DURATION_S = 1e-9  # of a run to its start
+SPEED_TOLERANCE = 1e-6  # rad/s or sizes/s; slower motions count as rest
+LIMIT_TOLERANCE = 1e-9  # relative to a torque limit
 
 
 @dataclass(frozen=True)
 class _Subject:
+    """What is linearized: a mechanism, and a scene if one is given."""
+
     mechanism: Mechanism
     scene: Scene | None
 
@@ -72,69 +76,73 @@ class _Subject:
 def linearize(
     what: Mechanism | Scene | str | Path, at: At = "equilibrium", overrides: Mapping[str, Any] | None = None
 ) -> LinearModel:
-    """Linearize a mechanism, exactly, in minimal coordinates.
+    """Linearize a mechanism in minimal coordinates, with exact derivatives.
 
     Parameters
     ----------
     what : Mechanism, Scene, str or Path
-        As `check` takes it. Of a mechanism's name with `overrides` or an instant, its default scene.
+        As in `check`. A mechanism's name with `overrides` or with a time stands for its default scene.
     at : "equilibrium", "assembled", "target", float or {coordinate: value}
-        The stable equilibrium reached from q_guess, motors at rest; an instant of the scene's run, s; or at rest the
-        configuration as assembled, or one as `terms` takes it, held by stops that joints rest on, by the least torques
-        of the motors, shared as in a run, and where these fail by friction; or the target of the scene's set point,
-        with the torques of that.
+        The state:
+
+        - "equilibrium": the stable equilibrium reached from q_guess, without motor torques.
+        - "assembled" or coordinates: at rest there. Loaded stops and minimum-norm motor torques hold the mechanism, and
+          dry friction if these are not sufficient. Motors share the torques as in a run.
+        - "target": the target of the scene's set point, with the controller's torques.
+        - a number: that time of the scene's run, s.
     overrides : mapping, optional
-        Values of the scene by dotted key, e.g. ``{"friction_smoothing": 0.01}``.
+        Overrides of the scene's keys, such as ``{"friction_smoothing": 0.01}``.
 
     Returns
     -------
     LinearModel
-        Of the plant, with the motors' torques as inputs; at an instant of a scene with a set point or tracking, and at
-        a set point's target, the closed loop's A besides.
+        Of the plant, with motor torques as inputs. It includes the closed loop at a set point's target, and at a time
+        of a scene with a set point or tracking.
 
     Raises
     ------
     InputError
-        An operating point that nothing holds, a joint beyond its stops, an instant outside the run, no freedom left.
+        Nothing holds the operating point, a joint is beyond its stops, the time is outside the run, or no freedom
+        remains.
     NumericalError
-        No equilibrium there, a singular configuration, a run that stopped before.
+        There is no equilibrium, the configuration is singular, or the run stopped earlier.
 
     Notes
     -----
-    Dry friction is smoothed as the scene's friction_smoothing says; else joints with friction that are at rest are
-    locked, and those that slide feel a constant force. Joints that rest on a stop are locked.
+    Dry friction is smoothed if the scene has friction_smoothing. Otherwise joints with friction are locked at rest and
+    feel a constant force while they slide. Joints that rest on a stop are locked.
 
     >>> model = linearize("five_bar")
     >>> model.A.shape, model.inputs
     ((4, 4), ('theta_1', 'theta_3'))
     """
-    takes = "a mechanism or a scene: itself, its name or path"
-    require_type(what, (Mechanism, Scene, str, Path), "linearize: what", takes)
+    expected = "a mechanism or a scene: itself, its name or path"
+    require_type(what, (Mechanism, Scene, str, Path), "linearize: what", expected)
     if overrides is not None:
         require_table(overrides, "linearize: overrides", OVERRIDES)
     with one_blas_thread():
-        subject = _subject(what, at, overrides)
+        subject = _find_subject(what, at, overrides)
         if subject.mechanism.d == 0:
-            raise InputError(f"{subject.mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
+            raise InputError(f"{subject.mechanism.name}: d = 0, the mechanism has no freedom to linearize")
         if isinstance(at, Mapping):
-            return _at_point(subject, at)
+            return _linearize_at_coordinates(subject, at)
         if not isinstance(at, str):
-            return _at_instant(subject, _instant(at))
+            return _linearize_at_time(subject, _require_time(at))
         match at:
             case "equilibrium":
-                return _at_equilibrium(subject)
+                return _linearize_at_equilibrium(subject)
             case "target":
-                return _at_target(subject)
+                return _linearize_at_target(subject)
             case "assembled":
                 mechanism = subject.mechanism
-                return _operating(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
-        raise _no_state(at)
+                return _linearize_balanced(subject, Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n)))
+        raise _unknown_state(at)
 
 
-def _subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
+def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
     if isinstance(what, str | Path):
-        timed = not isinstance(at, Mapping | str)
-        if not (names_a_scene(str(what)) or overrides or timed):
+        needs_run = not isinstance(at, Mapping | str)
+        if not (names_a_scene(str(what)) or overrides or needs_run):
             return _Subject(load(what), None)
         what = load_scene(what, overrides)
     elif overrides:
@@ -142,13 +150,13 @@ def _subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[st
     return _Subject(scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
 
 
-def _instant(at: Any) -> float:
+def _require_time(at: Any) -> float:
     if is_number(at) and abs(at) <= sys.float_info.max:
         return float(at)
-    raise _no_state(at)
+    raise _unknown_state(at)
 
 
-def _no_state(at: Any) -> InputError:
+def _unknown_state(at: Any) -> InputError:
     return InputError(
         f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or a table of coordinates'
     )
@@ -157,151 +165,149 @@ def _no_state(at: Any) -> InputError:
 # --- at rest -------------------------------------------------------------------------------------
 
 
-def _at_equilibrium(subject: _Subject) -> LinearModel:
+def _linearize_at_equilibrium(subject: _Subject) -> LinearModel:
     mechanism = subject.mechanism
     try:
         at = equilibrium(mechanism)
     except NumericalError as error:
-        motors = "as assembled, or at coordinates, where its motors hold it, or " if mechanism.actuated else ""
-        says = f"{error}; or linearize it {motors}at an instant of a scene's run"
-        raise NumericalError(says, q_tree=error.q_tree) from None
-    if says := describe_stop_violation(mechanism, at.q_tree):
-        raise InputError(f"{mechanism.name}: at its equilibrium {says}; give coordinates within them")
-    return _at_rest(
-        subject,
-        Terms(mechanism, at, np.zeros(mechanism.n)),
-        np.zeros(len(mechanism.actuated)),
-        NONE,
-        "at its equilibrium",
-    )
+        alternatives = "as assembled or at coordinates, where its motors hold it, or " if mechanism.actuated else ""
+        message = f"{error}; linearize it {alternatives}at a time of a scene's run instead"
+        raise NumericalError(message, q_tree=error.q_tree) from None
+    if violation := describe_stop_violation(mechanism, at.q_tree):
+        raise InputError(f"{mechanism.name}: at its equilibrium {violation}; give coordinates within the stops")
+    state = Terms(mechanism, at, np.zeros(mechanism.n))
+    return _linearize_at_rest(subject, state, np.zeros(len(mechanism.actuated)), NONE, "at its equilibrium")
 
 
-def _at_target(subject: _Subject) -> LinearModel:
+def _linearize_at_target(subject: _Subject) -> LinearModel:
     scene, mechanism = subject.scene, subject.mechanism
     law = None if scene is None else scene_controller(scene, mechanism)
     if scene is None or not isinstance(law, SetPoint):
         raise InputError(
             f'at = "target": {subject.name} has no set point; give a scene whose controller is of type "set_point"'
         )
-    found = sigma(mechanism, law.q_d, find_start(mechanism, scene).at)  # on the branch that a run is on
-    if found.verdict != "converged":
-        raise InputError(f'at = "target": {mechanism.name} cannot be there: {found.reason}')
-    if says := describe_stop_violation(mechanism, found.at.q_tree):
-        raise InputError(f'{mechanism.name}: at = "target": {says}; give another controller.q_d')
-    state, actuation = Terms(mechanism, found.at, np.zeros(mechanism.n)), subject.actuation
+    solution = sigma(mechanism, law.q_d, find_start(mechanism, scene).at)  # on the assembly branch of a run
+    if solution.verdict != "converged":
+        raise InputError(f'at = "target": {mechanism.name} cannot reach its target: {solution.reason}')
+    if violation := describe_stop_violation(mechanism, solution.at.q_tree):
+        raise InputError(f'{mechanism.name}: at = "target": {violation}; give another controller.q_d')
+    state, actuation = Terms(mechanism, solution.at, np.zeros(mechanism.n)), subject.actuation
     actuation.require_transmission(state.at)
     tau = actuation.apply(state, law.u(0.0, state)).tau
-    model = _at_rest(subject, state, tau, NONE, "at the target of its controller")
-    return _with_controller(subject, model, law, 0.0, state, 0.0)
+    model = _linearize_at_rest(subject, state, tau, NONE, "at the target of its controller")
+    return _add_closed_loop(subject, model, law, 0.0, state, 0.0)
 
 
-def _at_point(subject: _Subject, given: Mapping[str, float]) -> LinearModel:
+def _linearize_at_coordinates(subject: _Subject, coordinates: Mapping[str, float]) -> LinearModel:
     mechanism = subject.mechanism
-    whole = set(given) >= set(mechanism.coordinates)  # taken as it is: q may be no chart there
-    state = terms(mechanism, given, dict.fromkeys(mechanism.coordinates, 0.0) if whole else None)
-    miss = float(np.abs(state.phi).max(initial=0.0))
-    if miss > max(OPEN * mechanism.size, mechanism.tolerance):
+    # A complete configuration is used as it is, because the independent coordinates may not determine it.
+    is_complete = set(coordinates) >= set(mechanism.coordinates)
+    state = terms(mechanism, coordinates, dict.fromkeys(mechanism.coordinates, 0.0) if is_complete else None)
+    max_phi = float(np.abs(state.phi).max(initial=0.0))
+    if max_phi > max(CLOSURE_TOLERANCE * mechanism.size, mechanism.tolerance):
         raise InputError(
-            f"at: the loops do not close there (|phi| = {miss:.3g}); give {', '.join(mechanism.independent)} alone"
+            f"at: the loops are open there (|phi| = {max_phi:.3g}); give {', '.join(mechanism.independent)} only"
         )
-    if not whole and state.at.margin() <= NO_CHART:  # a fold, where Newton's method finds half of the digits
-        where = ", ".join(f"{name} = {x:.6g}" for name, x in given.items())
+    # Near a fold Newton's method finds only half of the digits.
+    if not is_complete and state.at.margin() <= MIN_CHART_MARGIN:
+        where = ", ".join(f"{name} = {x:.6g}" for name, x in coordinates.items())
         raise NumericalError(
-            f"at: {where} is singular: the other coordinates do not follow from that; take another configuration, or "
+            f"at: {where} is singular: it does not determine the other coordinates; choose another configuration, or "
             f"give {', '.join(mechanism.coordinates)}",
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(state.q_tree)),
         )
-    return _operating(subject, _closed(state))
+    return _linearize_balanced(subject, _project_onto_manifold(state))
 
 
-def _operating(subject: _Subject, state: Terms) -> LinearModel:
-    """Hold a configuration by stops, the least torques and, where these fail, friction; refuse what nothing holds."""
+def _linearize_balanced(subject: _Subject, state: Terms) -> LinearModel:
+    """Linearize about a configuration that stops, motors and dry friction hold at rest; InputError if they cannot."""
     mechanism = subject.mechanism
-    if says := describe_stop_violation(mechanism, state.q_tree):
-        raise InputError(f"{mechanism.name}: at: {says}; give coordinates within them")
-    rest = hold(state, subject.actuation, rubs=subject.smoothing is None)
+    if violation := describe_stop_violation(mechanism, state.q_tree):
+        raise InputError(f"{mechanism.name}: at: {violation}; give coordinates within the stops")
+    balance = balance_at_rest(state, subject.actuation, has_friction=subject.smoothing is None)
     notes = []
-    if rest.rubs:
-        notes.append("dry friction holds what the motors do not: other torques would do as well")
-    if len(rest.idle):
-        names = ", ".join(mechanism.coordinates[k] for k in rest.idle)
-        notes.append(f"at a stop that nothing pushes it into, and that the model leaves out: {names}")
-    says = "held by its motors" if mechanism.actuated else "at rest"
-    return _at_rest(subject, state, rest.tau, rest.touching, says, tuple(notes))
+    if balance.uses_friction:
+        notes.append("dry friction holds part of the load, so other motor torques are possible, too")
+    if len(balance.unloaded_stops):
+        names = ", ".join(mechanism.coordinates[k] for k in balance.unloaded_stops)
+        notes.append(f"at a stop without a force on it, which the model ignores: {names}")
+    at = "held by its motors" if mechanism.actuated else "at rest"
+    return _linearize_at_rest(subject, state, balance.tau, balance.loaded_stops, at, tuple(notes))
 
 
-def _at_rest(
-    subject: _Subject, state: Terms, tau: Array, touching: IntArray, says: str, notes: tuple[str, ...] = ()
+def _linearize_at_rest(
+    subject: _Subject, state: Terms, tau: Array, loaded_stops: IntArray, at: str, notes: tuple[str, ...] = ()
 ) -> LinearModel:
-    sticks = np.flatnonzero(subject.mechanism.joints.friction) if subject.smoothing is None else NONE
-    locked = np.union1d(sticks, touching)
+    sticking = np.flatnonzero(subject.mechanism.joints.friction) if subject.smoothing is None else NONE
+    locked = np.union1d(sticking, loaded_stops)
     return linear_model(
-        state, tau, at=says, locked=locked, smoothing=subject.smoothing, library=subject.library, notes=notes
+        state, tau, at=at, locked=locked, smoothing=subject.smoothing, library=subject.library, notes=notes
     )
 
 
 # --- along a run ---------------------------------------------------------------------------------
 
 
-def _at_instant(subject: _Subject, t: float) -> LinearModel:
+def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
     scene, mechanism = subject.scene, subject.mechanism
     if scene is None:
         raise InputError(f"at = {t:g}: a mechanism has no time; give one of its scenes")
-    run = _run_to(scene, t)
+    run = _run_until(scene, t)
     k = run.at(t)
-    miss = float(np.abs(run.phi[k]).max(initial=0.0))
-    if miss > max(OPEN * mechanism.size, 10 * mechanism.tolerance):
-        why = "as an SPF off its manifold has them; give a later instant"
+    max_phi = float(np.abs(run.phi[k]).max(initial=0.0))
+    if max_phi > max(CLOSURE_TOLERANCE * mechanism.size, 10 * mechanism.tolerance):
+        remedy = "because the SPF starts off its manifold; give a later time"
         if scene.spec.formulation == "dae":
-            why = "since nothing closes those of a DAE that drifts; set solver.projection = true"
-        raise InputError(f"at t = {t:.15g} s the loops of {scene.name} are open (|phi| = {miss:.3g}), {why}")
+            remedy = "because a DAE without projection drifts; set solver.projection = true"
+        raise InputError(f"at t = {t:.15g} s the loops of {scene.name} are open (|phi| = {max_phi:.3g}), {remedy}")
     at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
-    state = _closed(Terms(mechanism, at, run.v_tree[k]))
-    of_joints = RecordedJoints(run)
-    locked, smoothing = of_joints.locked[k], subject.smoothing
-    sliding = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * of_joints.sign[k]
+    state = _project_onto_manifold(Terms(mechanism, at, run.v_tree[k]))
+    joints = RecordedJoints(run)
+    locked, smoothing = joints.locked[k], subject.smoothing
+    friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sign[k]
     model = linear_model(
         state,
         run.tau[k],
         at=f"at t = {t:g} s",
         t=t,
-        u_tree=sliding,
+        u_tree=friction,
         locked=locked,
         smoothing=smoothing,
         library=subject.library,
-        notes=_notes(scene, run, k),
+        notes=_describe_instant(scene, run, k),
     )
     law = scene_controller(scene, mechanism)
-    return model if law is None else _with_controller(subject, model, law, t, state, sliding)
+    return model if law is None else _add_closed_loop(subject, model, law, t, state, friction)
 
 
-def _with_controller(
+def _add_closed_loop(
     subject: _Subject,
     model: LinearModel,
     law: SetPoint | Tracking | Torques,
     t: float,
     state: Terms,
-    sliding: Array | float,
+    friction: Array | float,
 ) -> LinearModel:
-    """Add the closed loop, or say why there is none."""
+    """Add the closed loop to a model, or a note why it has none."""
     if isinstance(law, Torques):
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
     locked = np.array([model.coordinates.index(name) for name in model.locked], np.intp)
     try:
         loop = ClosedLoop(subject.mechanism, law, subject.smoothing, subject.library, subject.actuation)
-        closed = loop.at(t, state, sliding, locked).closed
+        A_closed = loop.linearize(t, state, friction, locked).A_closed
     except NumericalError as error:
-        says = f"A and B are the plant's, without the scene's controller, since {error}"
-        return replace(model, notes=(*model.notes, says))
-    says = "A and B are the plant's; closed_loop is A with the scene's controller"
+        note = f"A and B are the plant's, without the scene's controller, because {error}"
+        return replace(model, notes=(*model.notes, note))
+    note = "A and B are the plant's; closed_loop is A with the scene's controller"
     spec = None if subject.scene is None else subject.scene.spec.controller
     if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-        more = {"delay": spec.delay > 0, "sensor": spec.sensor is not None, "drive": spec.drive is not None}
-        says += f", without its {', '.join(['sampling', *(name for name, there in more.items() if there)])}"
-    return replace(model, closed_loop=closed, notes=(*model.notes, says))
+        parts = {"delay": spec.delay > 0, "sensor": spec.sensor is not None, "drive": spec.drive is not None}
+        ignored = ["sampling", *(name for name, is_present in parts.items() if is_present)]
+        note += f", without its {', '.join(ignored)}"
+    return replace(model, closed_loop=A_closed, notes=(*model.notes, note))
 
 
-def _closed(state: Terms) -> Terms:
+def _project_onto_manifold(state: Terms) -> Terms:
     """Close loops that are slightly open, and make J v' zero."""
     mechanism = state.mechanism
     at, v = project_onto_closure(state.at, mechanism.rank), state.v_tree
@@ -310,28 +316,32 @@ def _closed(state: Terms) -> Terms:
     return Terms(mechanism, at, v)
 
 
-def _run_to(scene: Scene, t: float) -> Run:
-    """Run a scene up to an instant; its own output instants stay as they are."""
+def _run_until(scene: Scene, t: float) -> Run:
+    """Run a scene up to a time, with the scene's output instants."""
     t_end = scene.spec.t_end
     if not 0 <= t <= t_end:
         raise InputError(f"t = {t:.15g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:.15g} s")
-    overrides = {"t_end": max(t, min(MOMENT, t_end))}
+    overrides = {"t_end": max(t, min(MIN_DURATION_S, t_end))}
     run = simulate(make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources))
     if run.status == "interrupted":
         raise interrupt_again(run.message)
     if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):
         return run
-    says = f"t = {t:.15g} s is outside the run of {scene.name}, which ends at t = {run.t[-1]:.9g} s: {run.message}"
-    raise InputError(says) if run.status == "done" else NumericalError(says, t=float(run.t[-1]))
+    message = f"t = {t:.15g} s is outside the run of {scene.name}, which ends at t = {run.t[-1]:.9g} s: {run.message}"
+    raise InputError(message) if run.status == "done" else NumericalError(message, t=float(run.t[-1]))
 
 
-def _notes(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
-    """Say what stands between this model and the run that goes on from there."""
+def _describe_instant(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
+    """Return notes on a motion and on motors at their limits, at the output instant k of a run."""
     notes = []
-    if np.any(np.abs(run.v_tree[k]) > 1e-6 * run.mechanism.tree.step_scale):
+    if np.any(np.abs(run.v_tree[k]) > SPEED_TOLERANCE * run.mechanism.tree.step_scale):
         notes.append("about a motion, not a state of rest: A and B are those of the instant")
     limits = scene_actuation(scene, run.mechanism).limit
-    full = [name for name, x, most in zip(run.actuated, run.tau[k], limits, strict=True) if abs(x) >= most * (1 - 1e-9)]
-    if full:
-        notes.append(f"at the torque limit, so that no controller moves it further: {', '.join(full)}")
+    saturated = [
+        name
+        for name, tau, limit in zip(run.actuated, run.tau[k], limits, strict=True)
+        if abs(tau) >= limit * (1 - LIMIT_TOLERANCE)
+    ]
+    if saturated:
+        notes.append(f"at the torque limit, so the controller cannot increase the torque: {', '.join(saturated)}")
     return tuple(notes)

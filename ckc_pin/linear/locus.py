@@ -1,4 +1,4 @@
-"""Where a closed loop's eigenvalues go as a gain of its controller is turned up."""
+"""Root locus: eigenvalues of a closed loop as functions of a gain of its controller."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import require_type
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.linear.closed_loop import ClosedLoop
-from ckc_pin.linear.modes import ComplexArray, eigenvalues_of
+from ckc_pin.linear.modes import ComplexArray, compute_eigenvalues
 from ckc_pin.run.compiled_terms import library_of
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import scene_controller, scene_mechanism
@@ -33,19 +33,20 @@ GAINS = {SetPoint: ("K_P", "K_V"), Tracking: ("K_D", "Lambda")}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GainLocus(HasSummary):
-    """Eigenvalues of a scene's closed loop by a factor on one gain; `ckc_pin.plot` draws it.
+    """Eigenvalues of a scene's closed loop for multiples of one gain. `ckc_pin.plot` draws it.
 
     Attributes
     ----------
     name : str
-        The scene's.
-    gain : "K_P" or "K_V"; "K_D" or "Lambda"
-        Of a set point; of tracking.
+        The scene's name.
+    gain : "K_P", "K_V", "K_D" or "Lambda"
+        The first two are gains of a set point, the others of tracking.
     at : str
-        The state, in words.
+        Description of the state.
     factors : (m,) array
+        Multiples of the scene's gain.
     eigenvalues : (m, 2 d) complex array
-        1/s, at the target or at the start of the desired motion; those of one row in falling order of real parts.
+        1/s, at the target or at the start of the desired motion; in each row by decreasing real part.
     """
 
     name: str
@@ -55,44 +56,56 @@ class GainLocus(HasSummary):
     eigenvalues: ComplexArray
 
     @property
-    def own(self) -> int:
-        """Where the scene's own gain is among the factors."""
+    def scene_index(self) -> int:
+        """Index of the factor that is closest to 1, the scene's gain."""
         return int(np.argmin(np.abs(np.log(self.factors))))
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
-        return locus_summary(self)
+        """Return the eigenvalues at both ends of the locus and at the scene's gain."""
+        rows: list[Row] = [
+            (f"{self.gain} times {self.factors[k]:.4g}", f"{format_eigenvalues(self.eigenvalues[k])} 1/s")
+            for k in sorted({0, self.scene_index, len(self.factors) - 1})
+        ]
+        return Summary(f"GainLocus of {self.name}, {self.at}: {len(self.factors)} factors on {self.gain}", rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the locus as JSON-ready data, complex numbers as [re, im]."""
+        return {
+            "name": self.name,
+            "gain": self.gain,
+            "at": self.at,
+            "factors": self.factors.tolist(),
+            "eigenvalues": [to_pairs(row) for row in self.eigenvalues],
+        }
 
 
 def gain_locus(
     what: Scene | str | Path, gain: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> GainLocus | None:
-    """Return the locus of a scene's closed loop over a gain.
+    """Return the root locus of a scene's closed loop with respect to a gain.
 
     Parameters
     ----------
     what : Scene, str or Path
-        A scene, itself, its name or path.
+        A scene, or its name or path.
     gain : "K_P", "K_V", "K_D" or "Lambda", optional
-        One of its controller's; absent, K_P of a set point and K_D of tracking.
+        A gain of the scene's controller. Default: K_P of a set point and K_D of tracking.
     overrides : mapping, optional
-        Values of the scene by dotted key; with a name.
+        Overrides of the scene's keys, if `what` is a name or path.
 
     Returns
     -------
     GainLocus or None
-        None where it is no scene, has no set point and no tracking, or cannot be at its target or start. Sampling,
-        torque limits and dry friction are not in it.
+        None if `what` is not a scene, has neither a set point nor tracking, or cannot reach its target or start.
+        Sampling, torque limits and dry friction are ignored.
 
     Raises
     ------
     InputError
-        No such gain, a start out of reach, or what cannot be loaded.
+        The controller has no such gain, the start is out of reach, or the scene cannot be loaded.
     NumericalError
-        A start that is singular, J that has lost rank.
+        The start is singular, or J has lost rank.
     """
-    import scipy.linalg  # noqa: F401  (with its BLAS, before that is kept on one thread)
-
     require_type(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
     if not isinstance(what, Scene):
         if not names_a_scene(str(what)):
@@ -108,30 +121,20 @@ def gain_locus(
     if gain is not None and gain not in gains:
         raise InputError(f"gain_locus: gain = {gain!r:.80}: the controller of {what.name} has {' and '.join(gains)}")
     gain = gain or gains[0]
-    at_rest = isinstance(law, SetPoint)
     q, q_dot = (law.q_d, np.zeros(mechanism.d)) if isinstance(law, SetPoint) else law.desired(0.0)[:2]
-    found = sigma(mechanism, q, find_start(mechanism, what).at)  # on the branch that a run is on
-    if found.verdict != "converged":
+    solution = sigma(mechanism, q, find_start(mechanism, what).at)  # on the assembly branch of a run
+    if solution.verdict != "converged":
         return None
-    state = Terms(mechanism, found.at, found.at.rho @ q_dot)
+    state = Terms(mechanism, solution.at, solution.at.rho @ q_dot)
     values = []
-    with one_blas_thread():
+    with one_blas_thread(with_scipy=True):
         loop = ClosedLoop(mechanism, law, what.spec.friction_smoothing, library_of(mechanism, what.spec.solver.terms))
         for factor in FACTORS:
-            turned = copy.copy(law)
-            setattr(turned, gain, factor * getattr(law, gain))
-            loop.law = turned
-            values.append(eigenvalues_of(loop.at(0.0, state).closed))
-    at = "at its target" if at_rest else "at the start of the desired motion"
+            scaled = copy.copy(law)
+            setattr(scaled, gain, factor * getattr(law, gain))
+            loop.law = scaled
+            values.append(compute_eigenvalues(loop.linearize(0.0, state).A_closed))
+    at = "at its target" if isinstance(law, SetPoint) else "at the start of the desired motion"
     if mechanism.joints.friction.any() and what.spec.friction_smoothing is None:
         at += " without dry friction"
     return GainLocus(what.name, gain, at, FACTORS, np.array(values))
-
-
-def locus_summary(found: GainLocus) -> Summary:
-    """Return where the eigenvalues of a closed loop are at the ends of a locus, and as the scene has the gain."""
-    rows: list[Row] = [
-        (f"{found.gain} times {found.factors[k]:.4g}", f"{format_eigenvalues(found.eigenvalues[k])} 1/s")
-        for k in sorted({0, found.own, len(found.factors) - 1})
-    ]
-    return Summary(f"GainLocus of {found.name}, {found.at}: {len(found.factors)} factors on {found.gain}", rows)

@@ -1,4 +1,4 @@
-"""A linear closed loop that is sampled and held, exactly: from one sample to the next, and along a motion."""
+"""Exact discretization of linear closed loops with sampling and delay (zero-order hold)."""
 
 from __future__ import annotations
 
@@ -12,112 +12,112 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.linear.closed_loop import Feedback
 
-__all__ = ["MOST_DELAYED", "MOST_SAMPLES", "sampled_loop", "sampled_motion"]
+__all__ = ["MAX_DELAY_SAMPLES", "MAX_MOTION_SAMPLES", "build_sampled_loop", "propagate_sampled_loop"]
 
-MOST_DELAYED = 200  # samples that a delay may last for the matrix to be made
-MOST_SAMPLES = 50_000  # along a motion
-ONE = 1e-9  # of a sample time: instants nearer than that are one
+MAX_DELAY_SAMPLES = 200  # the size of the sampled loop's matrix grows with the delay
+MAX_MOTION_SAMPLES = 50_000  # along a motion
+TIME_TOLERANCE = 1e-9  # relative to the sample time; instants closer to each other are equal
 
 
-def sampled_loop(loop: Feedback, sample_time: float, delay: float) -> Array:
-    """Return the matrix from one sample to the next, of the state and of the u that are under way.
+def build_sampled_loop(loop: Feedback, sample_time: float, delay: float) -> Array:
+    """Return the matrix that maps the state at a sample to the state at the next sample.
 
-    u = K x(k T) acts from k T + delay on until the next one does. With delay = m T + r, 0 <= r < T, what acts after
-    k T is u of the sample k - m - 1, and after k T + r that of k - m.
+    ``u = K x(k T)`` acts from ``k T + delay`` until the next u does. With ``delay = m T + r`` and ``0 <= r < T``, the u
+    of sample k - m - 1 acts after ``k T``, and the u of sample k - m after ``k T + r``.
 
     Parameters
     ----------
+    loop : Feedback
     sample_time, delay : float
-        T > 0, s; at most `MOST_DELAYED` samples.
+        s. The delay is at most `MAX_DELAY_SAMPLES` samples.
 
     Returns
     -------
     (2 d + d (m + 1),) square array
-        Of x(k T), and of the u of the samples k - 1, k - 2, ..., k - m - 1. Stable where all eigenvalues are within the
-        unit circle.
+        It acts on x(k T) and on the u of samples k - 1, k - 2, ..., k - m - 1. The loop is stable if all eigenvalues
+        are inside the unit circle.
     """
     m, r = divmod(delay, sample_time)
-    if sample_time - r <= ONE * sample_time:  # a delay of whole samples, but for rounding
+    if sample_time - r <= TIME_TOLERANCE * sample_time:  # a whole number of samples up to rounding
         m, r = m + 1, 0.0
-    states, d, before = *loop.B.shape, int(m) + 1
-    late, soon = _constant_input(loop, r), _constant_input(loop, sample_time - r)
-    after = soon[0]
-    matrix = np.zeros((states + d * before, states + d * before))
-    matrix[:states, :states] = after @ late[0]
-    oldest = states + d * (before - 1)
-    matrix[:states, oldest:] = after @ late[1]
-    if m:  # u of the sample k - m
-        matrix[:states, oldest - d : oldest] += soon[1]
+    states, d, pending = *loop.B.shape, int(m) + 1
+    before, after = _integrate_constant_input(loop, r), _integrate_constant_input(loop, sample_time - r)
+    matrix = np.zeros((states + d * pending, states + d * pending))
+    matrix[:states, :states] = after[0] @ before[0]
+    oldest = states + d * (pending - 1)
+    matrix[:states, oldest:] = after[0] @ before[1]
+    if m:  # the u of sample k - m is part of the state
+        matrix[:states, oldest - d : oldest] += after[1]
     else:
-        matrix[:states, :states] += soon[1] @ loop.K
+        matrix[:states, :states] += after[1] @ loop.K
     matrix[states : states + d, :states] = loop.K
-    matrix[states + d :, states:oldest] = np.eye(d * (before - 1))
+    matrix[states + d :, states:oldest] = np.eye(d * (pending - 1))
     return matrix
 
 
-def sampled_motion(
+def propagate_sampled_loop(
     pieces: Sequence[Feedback], dt: float, start: Array, sample_time: float, delay: float
 ) -> list[tuple[Array, float]]:
-    """Return what states become along a motion whose loop is another one in each piece of time.
+    """Propagate states through a sampled loop whose linearization is piecewise constant in time.
 
     Parameters
     ----------
     pieces : sequence of Feedback
     dt : float
-        How long each lasts, s.
+        Duration of each piece, s.
     start : (2 d, k) array
-        States as columns; no u acts before that of the first sample does.
+        Initial states as columns. No u acts before that of the first sample.
     sample_time, delay : float
-        As of `sampled_loop`.
+        As in `build_sampled_loop`.
 
     Returns
     -------
     list of ((2 d, k) array, float)
-        At the start and at the end of each piece: the states divided by a factor that keeps them numbers, and its
-        logarithm.
+        At the start and at the end of each piece: the states divided by a positive factor, and the factor's logarithm.
+        The factor prevents overflow.
     """
-    near, end = ONE * sample_time, len(pieces) * dt
-    samples = sample_time * np.arange(int((end + near) / sample_time) + 1)
+    tolerance, end = TIME_TOLERANCE * sample_time, len(pieces) * dt
+    samples = sample_time * np.arange(int((end + tolerance) / sample_time) + 1)
     instants = np.sort(np.concatenate([samples, samples + delay, dt * np.arange(len(pieces) + 1)]))
-    instants = instants[np.concatenate([[True], np.diff(instants) > near]) & (instants <= end + near)]
+    instants = instants[np.concatenate([[True], np.diff(instants) > tolerance]) & (instants <= end + tolerance)]
 
     @cache
-    def constant_input(piece: int, spans: int) -> tuple[Array, Array]:
-        return _constant_input(pieces[piece], near * spans)
+    def integrate(piece: int, duration_in_tolerances: int) -> tuple[Array, Array]:
+        return _integrate_constant_input(pieces[piece], tolerance * duration_in_tolerances)
 
     x, u, number, log = start, np.zeros((pieces[0].B.shape[1], start.shape[1])), 0, 0.0
-    found = [(x, log)]
-    under_way: deque[tuple[float, Array]] = deque()
-    for t, then in pairwise(instants):
-        piece = min(int((t + near) / dt), len(pieces) - 1)
-        if number < len(samples) and samples[number] <= t + near:
-            under_way.append((samples[number] + delay, _gain(pieces, samples[number] / dt) @ x))
+    states = [(x, log)]
+    pending: deque[tuple[float, Array]] = deque()
+    for t, next_t in pairwise(instants):
+        piece = min(int((t + tolerance) / dt), len(pieces) - 1)
+        if number < len(samples) and samples[number] <= t + tolerance:
+            pending.append((samples[number] + delay, _interpolate_gain(pieces, samples[number] / dt) @ x))
             number += 1
-        while under_way and under_way[0][0] <= t + near:
-            u = under_way.popleft()[1]
-        state, force = constant_input(piece, round((then - t) / near))
-        x = state @ x + force @ u
-        if int((then + near) / dt) > piece:
-            size = max(1e-300, *(float(np.abs(y).max()) for y in (x, u, *(y for _, y in under_way))))
+        while pending and pending[0][0] <= t + tolerance:
+            u = pending.popleft()[1]
+        x_by_x, x_by_u = integrate(piece, round((next_t - t) / tolerance))
+        x = x_by_x @ x + x_by_u @ u
+        if int((next_t + tolerance) / dt) > piece:
+            size = max(1e-300, *(float(np.abs(y).max()) for y in (x, u, *(y for _, y in pending))))
             x, u, log = x / size, u / size, log + float(np.log(size))
-            under_way = deque((when, y / size) for when, y in under_way)
-            found.append((x, log))
-    return found
+            pending = deque((when, y / size) for when, y in pending)
+            states.append((x, log))
+    return states
 
 
-def _gain(pieces: Sequence[Feedback], t: float) -> Array:
-    """K at an instant, in pieces, on a line between those of two middles."""
-    k = min(max(int(t - 0.5), 0), max(len(pieces) - 2, 0))
-    one, two = pieces[k].K, pieces[min(k + 1, len(pieces) - 1)].K
-    return np.asarray(one + (t - 0.5 - k) * (two - one))
+def _interpolate_gain(pieces: Sequence[Feedback], position: float) -> Array:
+    """Interpolate K linearly between the middles of two pieces; `position` is a time divided by `dt`."""
+    k = min(max(int(position - 0.5), 0), max(len(pieces) - 2, 0))
+    first, second = pieces[k].K, pieces[min(k + 1, len(pieces) - 1)].K
+    return np.asarray(first + (position - 0.5 - k) * (second - first))
 
 
-def _constant_input(loop: Feedback, seconds: float) -> tuple[Array, Array]:
-    """exp(A s), and the integral of exp(A s) B."""
+def _integrate_constant_input(loop: Feedback, duration: float) -> tuple[Array, Array]:
+    """Return exp(A t), and the integral of exp(A t) B from 0 to t, for a duration t in s."""
     from scipy.linalg import expm
 
     states, d = loop.B.shape
-    both = np.zeros((states + d, states + d))
-    both[:states, :states], both[:states, states:] = loop.A, loop.B
-    whole = np.asarray(expm(both * seconds))
-    return whole[:states, :states], whole[:states, states:]
+    augmented = np.zeros((states + d, states + d))
+    augmented[:states, :states], augmented[:states, states:] = loop.A, loop.B
+    exponential = np.asarray(expm(augmented * duration))
+    return exponential[:states, :states], exponential[:states, states:]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
-from ckc_pin.linear.modes import Mode, eigenvalues_of, telling
+from ckc_pin.linear.modes import Mode, compute_eigenvalues, select_modes
 from ckc_pin.view import style
 from ckc_pin.view.canvas import look, write
 from ckc_pin.view.labels import plain, symbol
@@ -65,7 +65,7 @@ def _poles(model: LinearModel) -> Figure:
     figure = Figure(figsize=(6.2, 5.2), layout="constrained")
     ax = figure.subplots()
     figure.suptitle(f"{plain(model.name)}, {model.at}", x=0.01, ha="left", fontweight="bold")
-    closed = np.zeros(0) if model.closed_loop is None else eigenvalues_of(model.closed_loop)
+    closed = np.zeros(0) if model.closed_loop is None else compute_eigenvalues(model.closed_loop)
     values = np.concatenate([model.eigenvalues, closed])
     _plane(ax, values, values)
     ax.plot(model.eigenvalues.real, model.eigenvalues.imag, "x", color=style.COLOURS[0], label="plant", markersize=8)
@@ -82,7 +82,7 @@ def _modes(model: LinearModel) -> Figure:
     from matplotlib.figure import Figure
 
     rigid = sum(not mode.eigenvalue for mode in model.modes)
-    shown = [k for k in telling(model.modes, MOST) if model.modes[k].eigenvalue or rigid == len(model.modes)]
+    shown = [k for k in select_modes(model.modes, MOST) if model.modes[k].eigenvalue or rigid == len(model.modes)]
     names = _moving(model, [model.modes[k] for k in shown])
     wide = max(1.2 + 2.1 * len(shown), 4.6)
     figure = Figure(figsize=(wide, 1.5 + 0.24 * len(names)), layout="constrained")
@@ -120,7 +120,7 @@ def _shape(ax: Any, model: LinearModel, mode: Mode, names: list[int], number: in
             range(len(names)), -shape.imag, color=style.COLOURS[1], height=0.25, label="a quarter of a period later"
         )
     ax.axvline(0.0, color=style.GREY, linewidth=0.8)
-    ax.set(title=f"{number}: {mode.says}".replace(", ", "\n"), xlim=(-1.1, 1.1))
+    ax.set(title=f"{number}: {mode.description}".replace(", ", "\n"), xlim=(-1.1, 1.1))
 
 
 def _locus(locus: GainLocus) -> Figure:
@@ -132,7 +132,7 @@ def _locus(locus: GainLocus) -> Figure:
     gain = GAINS[locus.gain]
     figure.suptitle(f"{plain(locus.name)}, {locus.at}: root locus over {gain}", x=0.01, ha="left", fontweight="bold")
     values, factors = locus.eigenvalues, np.repeat(locus.factors, locus.eigenvalues.shape[1])
-    own = values[locus.own]
+    own = values[locus.scene_index]
     _plane(ax, values, own)
     dots = ax.scatter(values.real, values.imag, c=np.log10(factors), s=5, cmap="viridis")
     ax.plot(own.real, own.imag, "o", color=style.COLOURS[1], fillstyle="none")

@@ -1,4 +1,4 @@
-"""Linear models of states of rest: what holds them, what is locked there, what cannot be linearized."""
+"""Linear models at rest: balance by stops, motors and friction, locked joints, and states without a model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 from ckc_pin import InputError, Mechanism, NumericalError, linearize, load, load_scene, simulate, terms
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics import Terms, dae_acceleration
-from ckc_pin.linear.resting import hold
+from ckc_pin.linear.statics import balance_at_rest
 from ckc_pin.mechanism.library import mechanism_file
 from tests.analytic.small_models import plate_on_springs
 
@@ -45,8 +45,8 @@ def agree(ours: np.ndarray, theirs: np.ndarray, tolerance: float = 1e-10) -> Non
 # --- stops ---------------------------------------------------------------------------------------
 
 
-def test_a_joint_pushed_into_its_stop_rests_there(tmp_path: Path) -> None:
-    """Gravity pulls the cart down the slope to its lower stop: no torque of its motor is needed, and it stays there."""
+def test_a_joint_pushed_into_its_stop_is_locked(tmp_path: Path) -> None:
+    """Gravity pulls the cart to its lower stop, so its motor needs no force."""
     mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true"))
     model = linearize(mechanism, {"slide": -1.0, "swing": -0.6})
     assert model.locked == ("slide",)
@@ -55,26 +55,26 @@ def test_a_joint_pushed_into_its_stop_rests_there(tmp_path: Path) -> None:
     agree(model.B, np.array([[0.0, 0.0], [0.0, 1 / (m * L * L)]]))
 
 
-def test_a_joint_that_its_stop_would_have_to_pull_is_free(tmp_path: Path) -> None:
+def test_a_joint_pulled_off_its_stop_is_free(tmp_path: Path) -> None:
     mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true"))
     model = linearize(mechanism, {"slide": 0.5, "swing": -0.6})
     free = linearize(cart_and_pendulum(tmp_path, ""), {"slide": 0.5, "swing": -0.6})
     assert not model.locked
     agree(model.tau, free.tau)
     agree(model.A, free.A)
-    assert "at a stop that nothing pushes it into" in " ".join(model.notes)
+    assert "at a stop without a force on it" in " ".join(model.notes)
 
 
-def test_of_two_joints_at_stops_one_is_locked(tmp_path: Path) -> None:
-    """The cart rests on its stop, the pendulum's would have to pull: its motor holds it, with 0.4 rad to the side."""
+def test_only_the_loaded_one_of_two_joints_at_stops_is_locked(tmp_path: Path) -> None:
+    """The cart rests on its stop. The pendulum's stop would have to pull, so its motor holds it at 0.4 rad."""
     mechanism = cart_and_pendulum(tmp_path, joint("slide", "stops = true") + joint("swing", "stops = true"))
     model = linearize(mechanism, {"slide": -1.0, "swing": 0.4})
     assert model.locked == ("slide",)
     agree(model.tau, np.array([0.0, m * G * L * np.sin(0.4)]), 1e-12)
 
 
-def test_a_joint_of_a_loop_at_its_stop_moves_as_in_a_run(tmp_path: Path) -> None:
-    """The five-bar with its left elbow at an upper stop: it stays, and small torques beside do what the model says."""
+def test_a_loop_with_a_joint_at_its_stop_moves_as_in_a_run(tmp_path: Path) -> None:
+    """The five-bar's left elbow stays at its upper stop. The model predicts the motion that small torques cause."""
     q = {"theta_1": -1.1, "theta_3": -1.6}
     numbers = terms(load("five_bar"), q).q_tree.tolist()
     there = mechanism_file("five_bar").parent
@@ -90,19 +90,20 @@ def test_a_joint_of_a_loop_at_its_stop_moves_as_in_a_run(tmp_path: Path) -> None
     mechanism = load(str(tmp_path / "mechanism.toml"))
     model = linearize(mechanism, dict(zip(mechanism.coordinates, numbers, strict=True)))
     assert model.locked == ("theta_2",)
-    path, more = tmp_path / "it.scene.toml", np.array([1e-5, -5e-6])
+    path, extra = tmp_path / "it.scene.toml", np.array([1e-5, -5e-6])
     path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.3\nsolver.rtol = 1e-11\n')
     still, moved = (
-        simulate(load_scene(path, {"initial": {"q": q}}), controller=Constant(x)) for x in (model.tau, model.tau + more)
+        simulate(load_scene(path, {"initial": {"q": q}}), controller=ConstantTorques(x))
+        for x in (model.tau, model.tau + extra)
     )
     assert np.abs(still.q_tree - still.q_tree[0]).max() < 1e-12
-    step = np.block([[model.A, (model.B @ more)[:, None]], [np.zeros((1, 3))]])
+    step = np.block([[model.A, (model.B @ extra)[:, None]], [np.zeros((1, 3))]])
     k = model.coordinates.index(model.states[0])
     assert moved.q_tree[-1, k] - moved.q_tree[0, k] == pytest.approx(expm(0.3 * step)[0, 2], rel=1e-4)
 
 
-class Constant:
-    """Torques that do not change.
+class ConstantTorques:
+    """A controller that gives constant torques.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ class Constant:
         return self.torques
 
 
-def test_a_state_beyond_stops_is_refused(tmp_path: Path) -> None:
+def test_a_state_beyond_its_stops_is_rejected(tmp_path: Path) -> None:
     mechanism = cart_and_pendulum(tmp_path, joint("swing", "stops = true"))
     with pytest.raises(InputError, match=r"at: swing = 0\.5 is beyond its stops, -2 to 0\.4"):
         linearize(mechanism, {"slide": 0.0, "swing": 0.5})
@@ -131,13 +132,13 @@ SPRING = ('[[spring]]\njoint = "swing"\nstiffness = 90.0\nrest = 0.9\n'
 # --- motors and friction -------------------------------------------------------------------------
 
 
-def test_friction_holds_what_no_motor_does(tmp_path: Path) -> None:
-    """The slope asks for 0.6 (M + m) g."""
-    needed = 0.6 * (M + m) * G
-    for friction in (1.01 * needed, 0.99 * needed):
+def test_dry_friction_holds_a_joint_without_a_motor(tmp_path: Path) -> None:
+    """The force along the slope is 0.6 (M + m) g."""
+    load = 0.6 * (M + m) * G
+    for friction in (1.01 * load, 0.99 * load):
         rubs = joint("slide", f"friction = {friction}")
         mechanism = cart_and_pendulum(tmp_path, f'actuated = ["swing"]\n{rubs}')
-        if friction > needed:
+        if friction > load:
             model = linearize(mechanism, {"slide": 0.1, "swing": 0.0})
             assert model.locked == ("slide",)
             assert "dry friction holds" in " ".join(model.notes)
@@ -148,17 +149,17 @@ def test_friction_holds_what_no_motor_does(tmp_path: Path) -> None:
 
 
 def test_friction_helps_a_motor_at_its_limit(tmp_path: Path) -> None:
-    needed = 0.6 * (M + m) * G
-    rubs = joint("slide", f"friction = {0.7 * needed}")
-    motors = f'[[motor]]\njoint = "slide"\ntorque_limit = {0.4 * needed}\n[[motor]]\njoint = "swing"\n'
+    load = 0.6 * (M + m) * G
+    rubs = joint("slide", f"friction = {0.7 * load}")
+    motors = f'[[motor]]\njoint = "slide"\ntorque_limit = {0.4 * load}\n[[motor]]\njoint = "swing"\n'
     model = linearize(cart_and_pendulum(tmp_path, motors + rubs), {"slide": 0.1, "swing": 0.0})
-    assert 0.3 * needed <= model.tau[0] <= 0.4 * needed
-    with pytest.raises(InputError, match=rf"slide would need {needed:.4g}, its limit is {0.4 * needed:.4g}"):
+    assert 0.3 * load <= model.tau[0] <= 0.4 * load
+    with pytest.raises(InputError, match=rf"slide would need {load:.4g}, its limit is {0.4 * load:.4g}"):
         linearize(cart_and_pendulum(tmp_path, motors), {"slide": 0.1, "swing": 0.0})
 
 
 @pytest.mark.parametrize("limit", [None, {"theta_2": 0.05}])
-def test_redundant_motors_hold_it_as_a_run_does(tmp_path: Path, limit: dict[str, float] | None) -> None:
+def test_redundant_motors_share_the_load_as_in_a_run(tmp_path: Path, limit: dict[str, float] | None) -> None:
     for file in mechanism_file("five_bar").parent.iterdir():
         if file.is_file():
             text = file.read_text().replace(
@@ -181,9 +182,9 @@ def test_redundant_motors_hold_it_as_a_run_does(tmp_path: Path, limit: dict[str,
         assert (model.closed_loop is not None) == (at == "target")
 
 
-def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
-    """Sliders in gravity, at stops, with friction, with motors on several: a linear program knows what is possible."""
-    random, count, found = np.random.default_rng(0), 4, []
+def test_a_static_balance_is_found_if_one_exists(tmp_path: Path) -> None:
+    """A linear program decides whether random sliders at stops, with friction and motors, can be held."""
+    random, count, feasible = np.random.default_rng(0), 4, []
     inertial = '<inertial><mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     for _ in range(40):
         side, friction = random.integers(-1, 2, count), random.uniform(0.2, 1.5, count) * random.integers(0, 2, count)
@@ -209,39 +210,39 @@ def test_what_holds_is_found_wherever_there_is_any(tmp_path: Path) -> None:
         bounds = [(-x, x) for x in (*limit, *friction)] + stops
         forces = np.hstack([turns.T, np.eye(count), np.eye(count)])
         possible = linprog(np.zeros(forces.shape[1]), A_eq=forces, b_eq=state.h_tree, bounds=bounds).status == 0
-        found.append(possible)
+        feasible.append(possible)
         if possible:
-            rest = hold(state, Actuation(mechanism), rubs=True)
-            assert np.all(np.abs(rest.tau) <= limit * (1 + 1e-9))
-            assert set(rest.touching) <= set(np.flatnonzero(side))
+            balance = balance_at_rest(state, Actuation(mechanism), has_friction=True)
+            assert np.all(np.abs(balance.tau) <= limit * (1 + 1e-9))
+            assert set(balance.loaded_stops) <= set(np.flatnonzero(side))
         else:
             with pytest.raises(InputError, match="cannot hold"):
-                hold(state, Actuation(mechanism), rubs=True)
-    assert 10 < sum(found) < 30
+                balance_at_rest(state, Actuation(mechanism), has_friction=True)
+    assert 10 < sum(feasible) < 30
 
 
-# --- rest or none --------------------------------------------------------------------------------
+# --- equilibrium ---------------------------------------------------------------------------------
 
 
-def test_a_start_at_rest_that_does_not_last_is_noted() -> None:
+def test_a_note_reports_a_start_that_does_not_stay_at_rest() -> None:
     start = {"initial": {"q": {"theta_1": -1.0, "theta_3": -1.5}}}
     model = linearize(load_scene("five_bar/swing", start), 0.0)
     state = Terms(model.mechanism, model.mechanism.kinematics(model.q_tree), np.zeros(4))
     a = dae_acceleration(state, np.zeros(4))
     k = int(np.argmax(np.abs(a)))
-    wanted = f"nothing keeps it there: {model.coordinates[k]} accelerates with {a[k]:.4g} rad/s^2"
-    assert any(wanted in note for note in model.notes)
+    expected = f"not in equilibrium: {model.coordinates[k]} accelerates at {a[k]:.4g} rad/s^2"
+    assert any(expected in note for note in model.notes)
     assert not any("accelerates" in note for note in linearize("five_bar").notes)
 
 
 @pytest.mark.parametrize("name", ["flyball", "stewart", "delta", "talos", "bricard", "three_rrr"])
-def test_an_equilibrium_is_not_said_to_accelerate(name: str) -> None:
-    """Nor where springs carry the weight, so that what is left is rounding of both."""
+def test_an_equilibrium_has_no_note_of_acceleration(name: str) -> None:
+    """If springs carry the weight, the resultant force is the rounding of both."""
     assert not any("accelerates" in note for note in linearize(name).notes)
 
 
-def test_what_balances_needs_no_motor(tmp_path: Path) -> None:
-    """A slider between two springs that pull against each other, and a pendulum whose mass is on its axis."""
+def test_a_balanced_mechanism_needs_no_motor(tmp_path: Path) -> None:
+    """Two springs pull a slider in opposite directions, and gravity acts along the pendulum's axis."""
     text = 'actuated = []\n' + "".join(
         f'[[spring]]\nframe_a = {{link = "cart"}}\nframe_b = {{link = "base", xyz = [{0.8 * x}, 0, {0.6 * x}]}}\n'
         "stiffness = 900.0\n" for x in (1.3, -1.3)
@@ -249,11 +250,11 @@ def test_what_balances_needs_no_motor(tmp_path: Path) -> None:
     mechanism = cart_and_pendulum(tmp_path, text.replace("actuated", "gravity = [0, -9.81, 0]\nactuated"))
     model = linearize(mechanism, {"slide": 0.0, "swing": 0.7})
     assert not any("accelerates" in note for note in model.notes)
-    with pytest.raises(InputError, match="it has no motors"):
+    with pytest.raises(InputError, match="the mechanism has no motors"):
         linearize(mechanism, {"slide": 1e-6, "swing": 0.7})
 
 
-def test_a_root_constrained_in_part_has_an_equilibrium(tmp_path: Path) -> None:
+def test_a_partly_constrained_free_root_has_an_equilibrium(tmp_path: Path) -> None:
     mechanism = plate_on_springs(tmp_path)
     model = linearize(mechanism)
     state = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(model.q_tree)), np.zeros(mechanism.n))
@@ -261,8 +262,8 @@ def test_a_root_constrained_in_part_has_an_equilibrium(tmp_path: Path) -> None:
     assert model.eigenvalues.real.max() < 0, "with dampers, a minimum of the energy"
 
 
-def test_an_equilibrium_where_q_is_no_chart_has_other_coordinates(tmp_path: Path) -> None:
-    """A slider-crank that gravity pulls out to its dead centre: with q the slider's place nothing would be known."""
+def test_an_equilibrium_where_q_is_not_a_chart_has_other_coordinates(tmp_path: Path) -> None:
+    """Gravity pulls a slider-crank to its dead centre, where the slider's position is not a coordinate."""
     there, models = mechanism_file("slider_crank").parent, []
     for name in ("crank", "slider"):
         for file in there.iterdir():
@@ -270,7 +271,9 @@ def test_an_equilibrium_where_q_is_no_chart_has_other_coordinates(tmp_path: Path
             (tmp_path / file.name).write_text(text.replace("gravity = [0.0, -9.81, 0.0]", "gravity = [9.81, 0.0, 0.0]"))
         models.append(linearize(load(tmp_path / "mechanism.toml")))
     assert models[1].states[0] in ("crank", "rod")
-    assert models[1].notes[0] == f"slider is no coordinate there; {models[1].states[0]} is"
+    assert models[1].notes[0] == (
+        f"slider does not determine the configuration there; the states are those of {models[1].states[0]}"
+    )
     assert models[1].modes[0].frequency == pytest.approx(models[0].modes[0].frequency, rel=1e-9)
     assert not any("accelerates" in note for note in models[1].notes)
 
@@ -278,8 +281,8 @@ def test_an_equilibrium_where_q_is_no_chart_has_other_coordinates(tmp_path: Path
 # --- no linear model -----------------------------------------------------------------------------
 
 
-def test_a_spring_between_coincident_ends_is_refused_by_name(tmp_path: Path) -> None:
-    """At zero length a damper and a spring with a length at rest have no direction; one without a length has one."""
+def test_the_error_names_a_spring_with_coincident_ends(tmp_path: Path) -> None:
+    """At zero length only a spring without damping and with zero rest length has a derivative."""
     line = '[[spring]]\nframe_a = {link = "base"}\nframe_b = {link = "cart"}\nstiffness = 40.0\n'
     at = {"slide": 0.0, "swing": 0.0}
     for more in ("rest_length = 0.1\n", "damping = 2.0\n"):
@@ -291,7 +294,7 @@ def test_a_spring_between_coincident_ends_is_refused_by_name(tmp_path: Path) -> 
     agree(extra[:, :2], -mass @ np.diag([40.0, 0.0]))
 
 
-def test_a_motion_without_mass_is_refused_as_a_run_refuses_it(tmp_path: Path) -> None:
+def test_a_freedom_without_mass_is_rejected(tmp_path: Path) -> None:
     mechanism = cart_and_pendulum(tmp_path, "")
     text = (tmp_path / "it.urdf").read_text().replace(f'<mass value="{m}"/>', '<mass value="0"/>')
     (tmp_path / "it.urdf").write_text(text)
@@ -300,6 +303,6 @@ def test_a_motion_without_mass_is_refused_as_a_run_refuses_it(tmp_path: Path) ->
     assert mechanism.n == 2
 
 
-def test_an_instant_that_a_run_does_not_reach_is_for_the_numerics() -> None:
+def test_a_time_after_the_run_stops_is_a_numerical_error() -> None:
     with pytest.raises(NumericalError, match=r"ends at t = .* s: stopped at"):
         linearize(load_scene("five_bar/swing", {"solver.max_rhs": 20}), 1.5)

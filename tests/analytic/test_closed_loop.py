@@ -1,4 +1,4 @@
-"""Closed loops at instants of runs: differences of eq. 1 with the controller, its motors and the joints in it."""
+"""Closed-loop linear models against finite differences of eq. 1 with controller, motors and joint friction."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def five_bar_with(folder: Path, more: str, motors: bool = False) -> Mechanism:
         if file.is_file():
             (folder / file.name).write_bytes(file.read_bytes())
     path = folder / "mechanism.toml"
-    kept = [line for line in path.read_text().splitlines() if not (motors and line.startswith("actuated"))]
-    path.write_text("\n".join(kept) + more)
+    lines = [line for line in path.read_text().splitlines() if not (motors and line.startswith("actuated"))]
+    path.write_text("\n".join(lines) + more)
     return load(str(path))
 
 
@@ -80,19 +80,22 @@ def set_point(scene: Scene, mechanism: Mechanism) -> SetPoint:
 
 
 def closed_by_differences(
-    model: LinearModel, controller: Controller, actuation: Actuation, other: Callable[[Array], Array] | None = None
+    model: LinearModel,
+    controller: Controller,
+    actuation: Actuation,
+    extra_force: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """A of the five-bar's closed loop, from eq. 1 at states beside this one; `other`: what else acts, by v'."""
+    """State matrix of the five-bar's closed loop, by differences of eq. 1; `extra_force` is a function of v'."""
     mechanism, d, t = model.mechanism, model.mechanism.d, model.t or 0.0
     start = mechanism.kinematics(mechanism.tree.from_coordinates(model.q_tree))
-    own = mechanism.partition.q
-    x = np.concatenate([model.q_tree[own], model.v_tree[own]])
+    q = mechanism.partition.q
+    x = np.concatenate([model.q_tree[q], model.v_tree[q]])
 
     def acceleration(x: Array) -> Array:
         at = sigma(mechanism, x[:d], start).at
         state = Terms(mechanism, at, at.rho @ x[d:])
         force = actuation.apply(state, controller.u(t, state)).u_tree
-        return dae_acceleration(state, force + (0.0 if other is None else other(state.v_tree)))[own]
+        return dae_acceleration(state, force + (0.0 if extra_force is None else extra_force(state.v_tree)))[q]
 
     def slope(k: int, h: float) -> Array:
         step = h * np.eye(2 * d)[k]
@@ -107,7 +110,7 @@ def agree(ours: Array | None, theirs: Array) -> None:
     assert np.abs(ours - theirs).max() <= 1e-7 * np.abs(theirs).max()
 
 
-def test_friction_of_joints_that_slide_is_in_it(tmp_path: Path) -> None:
+def test_closed_loop_includes_friction_of_sliding_joints(tmp_path: Path) -> None:
     mechanism = five_bar_with(tmp_path, SLIDES)
     scene = scene_of(tmp_path, SET_POINT)
     model = linearize(scene, 0.13)
@@ -118,7 +121,7 @@ def test_friction_of_joints_that_slide_is_in_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("t", [0.0, 0.05])
-def test_a_motor_at_its_limit_does_not_answer(t: float) -> None:
+def test_a_motor_at_its_limit_does_not_respond(t: float) -> None:
     scene = load_scene("five_bar/set_point", {"controller.torque_limit": {"theta_1": 0.2}})
     mechanism = load("five_bar")
     model = linearize(scene, t)
@@ -127,42 +130,42 @@ def test_a_motor_at_its_limit_does_not_answer(t: float) -> None:
     agree(model.closed_loop, closed_by_differences(model, controller, actuation))
 
 
-def test_a_motor_on_several_joints_at_its_limit_does_not_answer(tmp_path: Path) -> None:
+def test_a_motor_on_several_joints_at_its_limit_does_not_respond(tmp_path: Path) -> None:
     mechanism = five_bar_with(tmp_path, GEARED, motors=True)
     scene = scene_of(tmp_path, SET_POINT)
     controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
-    full = []
+    is_saturated = []
     for t in (0.0, 0.1, 0.3, 0.6):
         model = linearize(scene, t)
-        full.append(abs(model.tau[0]) == 0.9)
+        is_saturated.append(abs(model.tau[0]) == 0.9)
         agree(model.closed_loop, closed_by_differences(model, controller, actuation))
-    assert set(full) == {True, False}
+    assert set(is_saturated) == {True, False}
 
 
-def test_a_joint_that_sticks_is_no_state_of_it(tmp_path: Path) -> None:
-    """Stopped by friction, theta_1 is held; theta_3 goes on under its motor."""
+def test_a_sticking_joint_is_not_a_state(tmp_path: Path) -> None:
+    """Friction stops theta_1, while theta_3 moves on under its motor."""
     mechanism = five_bar_with(tmp_path, '\n[[joint]]\nname = "theta_1"\nfriction = 30.0\n')
     scene = scene_of(tmp_path, SET_POINT)
     model = linearize(scene, 0.4)
     assert model.locked == ("theta_1",)
     assert model.states == ("theta_3", "theta_3_dot")
     controller, start = set_point(scene, mechanism), mechanism.kinematics(model.q_tree)
-    own = mechanism.partition.q
+    q = mechanism.partition.q
 
     def acceleration(x: Array) -> float:
         at = sigma(mechanism, np.array([model.q_tree[0], x[0]]), start).at
         state = Terms(mechanism, at, at.rho @ [0.0, x[1]])
         u = controller.u(0.4, state)
-        free = state.D[1, 1]  # with theta_1 at rest the second row of eq. 6 alone
-        return float((u - state.C_times(state.q_dot) - state.h)[1] / free)
+        inertia = state.D[1, 1]  # theta_1 is at rest, so only the second row of eq. 6 remains
+        return float((u - state.C_times(state.q_dot) - state.h)[1] / inertia)
 
-    x = np.array([model.q_tree[own[1]], model.v_tree[own[1]]])
+    x = np.array([model.q_tree[q[1]], model.v_tree[q[1]]])
     h = 1e-5
     slopes = [(acceleration(x + h * e) - acceleration(x - h * e)) / (2 * h) for e in np.eye(2)]
     agree(model.closed_loop, np.array([[0.0, 1.0], slopes]))
 
 
-def test_a_set_point_has_it_at_its_target() -> None:
+def test_a_set_point_has_a_closed_loop_at_its_target() -> None:
     scene = load_scene("five_bar/set_point")
     model, mechanism = linearize(scene, "target"), load("five_bar")
     assert np.abs(model.q_tree[mechanism.partition.q] - np.pi / 4).max() < 1e-12
@@ -171,42 +174,42 @@ def test_a_set_point_has_it_at_its_target() -> None:
         linearize("five_bar/tracking", "target")
 
 
-def test_at_a_target_that_motors_do_not_reach_it_says_so() -> None:
-    """Half of what the target asks of one motor: there the loop does not rest, and that motor does not answer."""
+def test_a_note_says_that_limited_motors_cannot_hold_the_target() -> None:
+    """One motor has half of the required torque, so the loop does not rest at its target."""
     needed = abs(linearize("five_bar/set_point", "target").tau[0])
     scene = load_scene("five_bar/set_point", {"controller.torque_limit": {"theta_1": needed / 2}})
     model, mechanism = linearize(scene, "target"), load("five_bar")
-    assert any("nothing keeps it there" in note for note in model.notes)
+    assert any("not in equilibrium" in note for note in model.notes)
     controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
     agree(model.closed_loop, closed_by_differences(model, controller, actuation))
 
 
-def test_loops_of_a_dae_that_drifts_are_said_to_be_open() -> None:
+def test_open_loops_of_a_drifting_dae_are_rejected() -> None:
     drifts = {"formulation": "dae", "solver": {"projection": False, "rtol": 1e-3}}
     with pytest.raises(InputError, match=r"are open .* set solver\.projection = true"):
         linearize(load_scene("five_bar/swing", drifts), 2.0)
 
 
-def test_target_and_locus_are_on_the_branch_that_a_run_is_on() -> None:
-    """The tip above the elbows; the five-bar is assembled with it below."""
+def test_target_and_locus_are_on_the_assembly_branch_of_the_run() -> None:
+    """The run starts with the tip above the elbows; the five-bar is assembled with the tip below."""
     start = terms(load("five_bar"), {"theta_1": -1.0, "theta_3": -1.5}).q_tree
-    mirrored = start.copy()  # elbows where they are, the distal links mirrored in the line between them
+    mirrored = start.copy()  # the distal links are mirrored in the line between the elbows
     first, second = (_elbow(load("five_bar"), start, name) for name in ("left", "right"))
     line = np.arctan2(*(second - first)[1::-1])
     mirrored[1] = 2 * line - 2 * start[0] - start[1]
     mirrored[3] = 2 * line - 2 * start[2] - start[3]
     q = dict(zip(load("five_bar").coordinates, mirrored.tolist(), strict=True))
     scene = load_scene("five_bar/set_point", {"controller.q_d": TARGET, "initial": {"q": q}})
-    model, found, locus = linearize(scene, "target"), check(scene).stability, gain_locus(scene)
-    plain = linearize(load_scene("five_bar/set_point", {"controller.q_d": TARGET}), "target")
-    assert abs(model.q_tree[1] - plain.q_tree[1]) > 0.1
-    assert found is not None
+    model, result, locus = linearize(scene, "target"), check(scene).stability, gain_locus(scene)
+    assembled = linearize(load_scene("five_bar/set_point", {"controller.q_d": TARGET}), "target")
+    assert abs(model.q_tree[1] - assembled.q_tree[1]) > 0.1
+    assert result is not None
     assert locus is not None
     assert model.closed_loop is not None
     ours = np.sort_complex(np.linalg.eigvals(model.closed_loop))
-    assert np.abs(ours - np.sort_complex(found.eigenvalues)).max() < 1e-8 * np.abs(ours).max()
-    own = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
-    assert np.abs(ours - np.sort_complex(own)).max() < 1e-8 * np.abs(ours).max()
+    assert np.abs(ours - np.sort_complex(result.eigenvalues)).max() < 1e-8 * np.abs(ours).max()
+    at_scene_gain = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
+    assert np.abs(ours - np.sort_complex(at_scene_gain)).max() < 1e-8 * np.abs(ours).max()
 
 
 def _elbow(mechanism: Mechanism, q_tree: Array, side: str) -> Array:

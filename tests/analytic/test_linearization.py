@@ -1,4 +1,4 @@
-"""Linear models: the appendix's five-bar by hand, differences of eq. 6, and small motions of the nonlinear run."""
+"""Linear models against the appendix, finite differences of eq. 6, and small motions of nonlinear runs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.analytic.small_models import coupled_four_bar
 ANGLES = ("theta_1", "theta_3")
 
 
-def by_hand(q_tree: Array, q_dot: Array, tau: Array) -> tuple[Array, Array, Array, Array]:
-    """A, B and what the multipliers depend on, from the appendix by complex steps along sigma."""
+def linearize_appendix(q_tree: Array, q_dot: Array, tau: Array) -> tuple[Array, Array, Array, Array]:
+    """A, B and the rows of C and D for the multipliers, from the appendix by complex steps along sigma."""
 
     def solution(x: Array) -> Array:
-        """q_ddot and lambda at (dq, q_dot, tau); the closure to first order, which is all there is."""
+        """q_ddot and lambda at (dq, q_dot, tau). A complex step needs sigma to first order only."""
         moved = q_tree + FIVE_BAR.rho(q_tree) @ x[:2]
         v_tree = FIVE_BAR.rho(moved) @ x[2:4]
         a, forces = FIVE_BAR.acceleration_and_multipliers(moved, v_tree, x[4:])
@@ -42,9 +42,9 @@ def agree(ours: Array, theirs: Array, tolerance: float = 1e-11) -> None:
 # --- the five-bar --------------------------------------------------------------------------------
 
 
-def test_the_equilibrium_is_that_of_the_appendix() -> None:
+def test_the_model_at_the_equilibrium_matches_the_appendix() -> None:
     model = linearize("five_bar")
-    A, B, C, D = by_hand(FIVE_BAR.equilibrium(), np.zeros(2), np.zeros(2))
+    A, B, C, D = linearize_appendix(FIVE_BAR.equilibrium(), np.zeros(2), np.zeros(2))
     agree(model.A, A)
     agree(model.B, B)
     agree(model.C[-2:], C, 1e-9)
@@ -56,12 +56,12 @@ def test_the_equilibrium_is_that_of_the_appendix() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_any_state_is_that_of_the_appendix(seed: int) -> None:
+def test_the_model_at_any_state_matches_the_appendix(seed: int) -> None:
     mechanism, random = load("five_bar"), np.random.default_rng(seed)
     q_dot, tau = random.uniform(-3, 3, 2), random.uniform(-1, 1, 2)
     at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.3, 0.3, 2)).at
     model = linear_model(Terms(mechanism, at, at.rho @ q_dot), tau, at="somewhere")
-    A, B, C, D = by_hand(at.q_tree, q_dot, tau)
+    A, B, C, D = linearize_appendix(at.q_tree, q_dot, tau)
     for ours, theirs in zip((model.A, model.B, model.C[-2:], model.D[-2:]), (A, B, C, D), strict=True):
         agree(ours, theirs, 1e-10)
     agree(model.C[:4, :2], FIVE_BAR.rho(at.q_tree))
@@ -69,7 +69,7 @@ def test_any_state_is_that_of_the_appendix(seed: int) -> None:
     assert names == (4, 7)
 
 
-def test_labels_say_what_is_what() -> None:
+def test_states_inputs_and_outputs_have_names() -> None:
     model = linearize("five_bar")
     assert model.states == ("theta_1", "theta_3", "theta_1_dot", "theta_3_dot")
     assert model.inputs == ANGLES
@@ -85,7 +85,7 @@ def test_labels_say_what_is_what() -> None:
 
 
 def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
-    """A joint called x_dot beside x, and two names that differ in a dot alone."""
+    """One joint is called x_dot and another x, and two names differ in a dot only."""
     folder = tmp_path / "it"
     coupled_four_bar(folder)
     urdf = (folder / "it.urdf").read_text()
@@ -100,7 +100,7 @@ def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
     assert plant.name == "it_is"
     assert plant.output_labels[:3] == ["x", "x_dot", "x_dot_2"]
     coupled_four_bar(tmp_path, actuated="actuated = []")
-    with pytest.raises(InputError, match=r"coupled: no motors"):
+    with pytest.raises(InputError, match=r"coupled: to_statespace: python-control needs .* has no motors"):
         linearize(load(str(tmp_path / "mechanism.toml"))).to_statespace()
 
 
@@ -108,8 +108,8 @@ def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_it_is_the_slope_of_the_reduced_model(name: str) -> None:
-    """Eq. 6 differenced along sigma, while what is linearized is eq. 1; the multipliers of least norm with it."""
+def test_the_model_matches_finite_differences_of_the_reduced_model(name: str) -> None:
+    """The model differentiates eq. 1; the reference is eq. 6 along sigma, with minimum-norm multipliers."""
     mechanism, random = load(name), np.random.default_rng(1)
     d, forces = mechanism.d, random.uniform(-1, 1, len(mechanism.actuated))
     start = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.03, 0.03, d)).at
@@ -126,18 +126,18 @@ def test_it_is_the_slope_of_the_reduced_model(name: str) -> None:
     slopes = [(rate(x + h * step) - rate(x - h * step)) / (2 * h) for h in (4e-4, 2e-4, 1e-4)]
     first, second = ((4 * fine - coarse) / 3 for coarse, fine in pairwise(slopes))
     assert model.states[:d] == mechanism.independent
-    wanted, rows = (16 * second - first) / 15, mechanism.closure.rows
-    agree(np.hstack([model.A, model.B])[d:] @ step, wanted[:d], 1e-6)
+    expected, rows = (16 * second - first) / 15, mechanism.closure.rows
+    agree(np.hstack([model.A, model.B])[d:] @ step, expected[:d], 1e-6)
     if rows:
-        agree(np.hstack([model.C, model.D])[-rows:] @ step, wanted[d:], 1e-6)
+        agree(np.hstack([model.C, model.D])[-rows:] @ step, expected[d:], 1e-6)
 
 
 @pytest.mark.parametrize("case", ["five_bar", "stewart", "springs"])
-def test_small_motions_converge_to_it_at_order_two(case: str, tmp_path: Path) -> None:
+def test_small_motions_converge_to_the_model_at_order_two(case: str, tmp_path: Path) -> None:
     scene, q = {
         "five_bar": ("five_bar/swing", None),
         "stewart": ("stewart/default", None),
-        "springs": (str(_scene(coupled_four_bar(tmp_path), tmp_path)), None),
+        "springs": (str(_write_scene(coupled_four_bar(tmp_path), tmp_path)), None),
     }[case]
     model = linearize(scene)
     d = len(model.states) // 2
@@ -148,28 +148,28 @@ def test_small_motions_converge_to_it_at_order_two(case: str, tmp_path: Path) ->
         q = {name: float(x + size * dx) for name, x, dx in zip(model.states[:d], rest, start, strict=True)}
         overrides = {"t_end": 0.4, "initial": {"q": q}, "formulation": "reduced", "solver.rtol": 1e-12}
         run = simulate(scene, overrides)
-        wanted = expm(0.4 * model.A) @ np.concatenate([size * start, np.zeros(d)])
+        expected = expm(0.4 * model.A) @ np.concatenate([size * start, np.zeros(d)])
         moved = run.q_tree[-1][[model.coordinates.index(name) for name in model.states[:d]]] - rest
-        misses.append(float(np.abs(moved - wanted[:d]).max()))
+        misses.append(float(np.abs(moved - expected[:d]).max()))
     orders = [np.log2(one / two) for one, two in pairwise(misses)]
     assert min(orders) > 1.9
     assert misses[-1] < 1e-5
 
 
-def _scene(mechanism: Mechanism, folder: Path) -> Path:
+def _write_scene(mechanism: Mechanism, folder: Path) -> Path:
     path = folder / "small.scene.toml"
     path.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 1.0\ninitial.at = "equilibrium"\n')
     assert mechanism.d == 1
     return path
 
 
-def test_rows_that_others_imply_stay_so_where_the_loops_are_slightly_open() -> None:
-    """Bricard's six rows of rank five: a step off the closure makes them independent, by rounding."""
+def test_redundant_rows_stay_redundant_if_the_loops_are_slightly_open() -> None:
+    """Bricard's six rows have rank five. A small step off the manifold makes them independent numerically."""
     mechanism, random = load("bricard"), np.random.default_rng(4)
     at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + 0.1).at
-    off = mechanism.kinematics(mechanism.tree.integrate(at.q_tree, 3e-9 * random.uniform(-1, 1, mechanism.n)))
+    perturbed = mechanism.kinematics(mechanism.tree.integrate(at.q_tree, 3e-9 * random.uniform(-1, 1, mechanism.n)))
     v = at.rho @ random.uniform(-1, 1, mechanism.d)
-    closed, opened = (linear_model(Terms(mechanism, x, v), np.zeros(1), at="somewhere") for x in (at, off))
+    closed, opened = (linear_model(Terms(mechanism, x, v), np.zeros(1), at="somewhere") for x in (at, perturbed))
     assert mechanism.redundant
     agree(opened.C, closed.C, 1e-7)
     agree(opened.D, closed.D, 1e-7)
@@ -178,30 +178,30 @@ def test_rows_that_others_imply_stay_so_where_the_loops_are_slightly_open() -> N
 # --- friction ------------------------------------------------------------------------------------
 
 
-RUBS = '\n[[joint]]\nname = "crank"\nfriction = 0.3\n'
+FRICTION = '\n[[joint]]\nname = "crank"\nfriction = 0.3\n'
 
 
-def _with_friction(folder: Path) -> str:
+def _write_scene_with_friction(folder: Path) -> str:
     coupled_four_bar(folder)
     path = folder / "mechanism.toml"
-    path.write_text(path.read_text() + RUBS)
-    return str(_scene(load(str(path)), folder))
+    path.write_text(path.read_text() + FRICTION)
+    return str(_write_scene(load(str(path)), folder))
 
 
-def test_friction_is_smoothed_or_locks(tmp_path: Path) -> None:
-    scene, smoothing = _with_friction(tmp_path), 0.05
-    with pytest.raises(InputError, match=r"no freedom is left.*crank.*friction_smoothing"):
+def test_dry_friction_is_smoothed_or_locks_its_joint(tmp_path: Path) -> None:
+    scene, smoothing = _write_scene_with_friction(tmp_path), 0.05
+    with pytest.raises(InputError, match=r"no freedom remains.*crank.*friction_smoothing"):
         linearize(scene)
-    free = linearize(str(_scene(coupled_four_bar(tmp_path / "smooth"), tmp_path / "smooth")))
+    free = linearize(str(_write_scene(coupled_four_bar(tmp_path / "smooth"), tmp_path / "smooth")))
     smooth = linearize(scene, overrides={"friction_smoothing": smoothing})
-    extra = -free.B[1, 0] * 0.3 / smoothing  # -F / s on the crank, which the motor turns too
+    extra = -free.B[1, 0] * 0.3 / smoothing  # -F / s acts on the crank, as the motor does
     assert smooth.inputs == ("crank",)
     agree(smooth.A - free.A, np.array([[0, 0], [0, extra]]), 1e-9)
     assert smooth.modes[0].frequency == 0.0, "overdamped"
 
 
-def test_a_locked_joint_leaves_the_others() -> None:
-    """The five-bar with theta_1 locked, by the appendix: the row of eq. 6 that is left."""
+def test_a_locked_joint_is_not_a_state() -> None:
+    """With theta_1 locked, the second row of eq. 6 from the appendix remains."""
     mechanism, q_dot = load("five_bar"), 0.7
     at = sigma(mechanism, mechanism.independent_part(mechanism.q_tree) + np.array([0.2, -0.1])).at
     state = Terms(mechanism, at, at.rho @ [0.0, q_dot])
@@ -210,7 +210,7 @@ def test_a_locked_joint_leaves_the_others() -> None:
     assert model.states == ("theta_3", "theta_3_dot")
 
     def acceleration(x: Array) -> Array:
-        """Of theta_3, at steps of theta_3, its rate and tau."""
+        """Acceleration of theta_3 after steps in theta_3, its rate and its torque."""
         moved = at.q_tree + FIVE_BAR.rho(at.q_tree)[:, 1] * x[0]
         rate = np.array([0.0, q_dot + x[1]])
         C = FIVE_BAR.C(moved, FIVE_BAR.rho(moved) @ rate)

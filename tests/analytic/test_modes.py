@@ -1,4 +1,4 @@
-"""Modes of linear models: zeros of free bodies, slow modes that are none, shapes of equal eigenvalues, what plays."""
+"""Modes of linear models: exact zeros, slow modes, shapes of equal eigenvalues, and animations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from ckc_pin import InputError, Mechanism, linearize, load
 from ckc_pin.dynamics import Terms
 from ckc_pin.linear.linear_model import linear_model
-from ckc_pin.linear.mode_animation import sway, sways
+from ckc_pin.linear.mode_animation import animate_mode, animate_modes
 
 BODY = ('<link name="{name}"><inertial><origin xyz="{x} 0.02 -0.03"/><mass value="{m}"/>'
         '<inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0.001" ixz="-0.002" iyz="0.0005"/></inertial>'
@@ -21,7 +21,7 @@ SLIDE = ('<joint name="{name}" type="prismatic"><parent link="{parent}"/><child 
          '<limit lower="-9" upper="9" effort="1" velocity="1"/></joint>')  # fmt: skip
 
 
-def made(folder: Path, body: str, text: str) -> Mechanism:
+def load_mechanism(folder: Path, body: str, text: str) -> Mechanism:
     (folder / "it.urdf").write_text(f'<robot name="it">{body}</robot>')
     (folder / "mechanism.toml").write_text(f'name = "it"\n{text}')
     return load(str(folder / "mechanism.toml"))
@@ -29,18 +29,18 @@ def made(folder: Path, body: str, text: str) -> Mechanism:
 
 def two_free_bodies(folder: Path, gravity: float = 0.0) -> Mechanism:
     bodies = BODY.format(name="a", x=0.1, m=1.3) + BODY.format(name="b", x=0.2, m=0.7) + HINGE
-    return made(folder, bodies, f'gravity = [0, 0, {-gravity}]\n[[tree]]\nfile = "it.urdf"\nroot = "free"\n'
+    return load_mechanism(folder, bodies, f'gravity = [0, 0, {-gravity}]\n[[tree]]\nfile = "it.urdf"\nroot = "free"\n'
                 '[[spring]]\njoint = "hinge"\nstiffness = 3.0\nrest = 0.4\n')  # fmt: skip
 
 
 def two_masses(folder: Path, weak: float, strong: float) -> Mechanism:
-    """A mass on a spring to the ground, and another one on a spring to that."""
+    """A mass on a spring to the ground, and a second mass on a spring to the first."""
     bodies = '<link name="ground"/>' + BODY.format(name="a", x=0, m=1.5) + BODY.format(name="b", x=0, m=0.5)
     bodies += SLIDE.format(name="x", parent="ground", child="a") + SLIDE.format(name="y", parent="a", child="b")
     springs = "".join(
         f'[[spring]]\njoint = "{k}"\nstiffness = {c}\nrest = 0.0\n' for k, c in (("x", weak), ("y", strong))
     )
-    return made(folder, bodies, f'urdf = "it.urdf"\n{springs}')
+    return load_mechanism(folder, bodies, f'urdf = "it.urdf"\n{springs}')
 
 
 def at_rest(mechanism: Mechanism, q_tree: np.ndarray) -> Terms:
@@ -49,8 +49,10 @@ def at_rest(mechanism: Mechanism, q_tree: np.ndarray) -> Terms:
 
 @pytest.mark.parametrize(("gravity", "motions"), [(0.0, 6), (9.81, 4)])
 @pytest.mark.parametrize("seed", range(3))
-def test_free_bodies_have_twelve_zeros(seed: int, gravity: float, motions: int, tmp_path: Path) -> None:
-    """Not the 1e-8 that rounding makes of double ones; in gravity turns out of its axis are no motions of a kind."""
+def test_free_bodies_have_twelve_eigenvalues_that_are_exactly_zero(
+    seed: int, gravity: float, motions: int, tmp_path: Path
+) -> None:
+    """Rounding would make 1e-8 of a double zero. With gravity, rotations out of its direction are not rigid."""
     mechanism, random = two_free_bodies(tmp_path, gravity), np.random.default_rng(seed)
     q_tree = mechanism.tree.integrate(mechanism.q_tree, random.uniform(-1, 1, mechanism.n))
     numbers = mechanism.tree.to_coordinates(q_tree)
@@ -58,29 +60,29 @@ def test_free_bodies_have_twelve_zeros(seed: int, gravity: float, motions: int, 
     state = at_rest(mechanism, mechanism.tree.from_coordinates(numbers))
     model = linear_model(state, np.zeros(1), at="anywhere")
     assert sum(mode.eigenvalue == 0 for mode in model.modes) == 12
-    answer = np.linalg.inv(state.D_tree)[-1, -1]  # of the hinge to a torque on it
-    assert abs(model.modes[-1].eigenvalue) == pytest.approx(np.sqrt(3.0 * answer), rel=1e-9)
+    compliance = np.linalg.inv(state.D_tree)[-1, -1]  # acceleration of the hinge for a unit torque on it
+    assert abs(model.modes[-1].eigenvalue) == pytest.approx(np.sqrt(3.0 * compliance), rel=1e-9)
     shapes = np.array([mode.shape for mode in model.modes[:12]])
     assert np.linalg.matrix_rank(shapes, tol=1e-6) == motions
     assert not shapes.imag.any()
-    assert "eigenvalue 0 1/s (12 times)" in repr(model)
+    assert "rigid modes  12, eigenvalue 0 1/s" in repr(model)
     assert np.sum(model.eigenvalues == 0) == 12
 
 
 @pytest.mark.parametrize(("weak", "strong"), [(1e-6, 5.0), (1e-10, 5.0), (1e-6, 1e6), (0.0, 1e9)])
-def test_a_slow_mode_is_none_of_rounding(weak: float, strong: float, tmp_path: Path) -> None:
-    """Even where another one is a hundred million times faster; where there is no spring it is zero exactly."""
+def test_a_slow_mode_is_not_taken_for_a_rigid_one(weak: float, strong: float, tmp_path: Path) -> None:
+    """Even if another mode is a hundred million times faster. Without a spring the eigenvalue is exactly zero."""
     mechanism = two_masses(tmp_path, weak, strong)
     model = linear_model(at_rest(mechanism, mechanism.q_tree), np.zeros(2), at="somewhere")
     mass = np.array([[2.0, 0.5], [0.5, 0.5]])
     squares = np.sort(np.linalg.eigvals(np.linalg.solve(mass, np.diag([weak, strong]))))
-    slow = np.sqrt(weak / 2.0) if weak else 0.0  # both masses together, to first order
+    slow = np.sqrt(weak / 2.0) if weak else 0.0  # to first order both masses move together
     assert abs(model.modes[0].eigenvalue) == pytest.approx(slow, rel=1e-5)
     assert abs(model.modes[-1].eigenvalue) == pytest.approx(np.sqrt(squares[1]), rel=1e-9)
 
 
-def test_modes_of_one_frequency_have_real_shapes_of_their_own() -> None:
-    """The Stewart platform's come in pairs; any mixture is one, and these are eigenvectors of A's lower left part."""
+def test_modes_of_equal_frequency_have_independent_real_shapes() -> None:
+    """Modes of the Stewart platform come in pairs. Any linear combination of a pair is an eigenvector of A."""
     model = linearize("stewart")
     at = [model.coordinates.index(name) for name in model.states[:6]]
     for one, two in ((0, 1), (4, 5)):
@@ -93,25 +95,25 @@ def test_modes_of_one_frequency_have_real_shapes_of_their_own() -> None:
             assert np.abs(model.A[6:, :6] @ shape + square * shape).max() < 1e-8 * square
 
 
-def test_modes_play_where_joints_are_locked() -> None:
+def test_animations_keep_locked_joints_in_place() -> None:
     model = linearize("talos")
-    runs = sways(model)
+    runs = animate_modes(model)
     assert len(model.locked) == 20
     assert list(runs) == [1, 2, 3, 4, 5, 6]
-    still = [model.coordinates.index(name) for name in model.locked]
+    locked = [model.coordinates.index(name) for name in model.locked]
     for run in runs.values():
-        assert np.abs(run.q_tree[:, still] - model.q_tree[still]).max() < 1e-12
+        assert np.abs(run.q_tree[:, locked] - model.q_tree[locked]).max() < 1e-12
         assert run.max_phi < 1e-9
         assert run.max_phi_dot < 1e-9
 
 
-def test_a_real_mode_decays_or_grows_as_its_eigenvalue_says(tmp_path: Path) -> None:
-    """An upright five-bar falls at the rate at which it would rise."""
+def test_animation_of_a_real_mode_has_its_time_constant(tmp_path: Path) -> None:
+    """The upright five-bar has a decay and a growth of equal rates."""
     model = linearize("five_bar", {"theta_1": 1.9, "theta_3": 1.2})
-    grows = next(k for k, mode in enumerate(model.modes, 1) if mode.eigenvalue.real > 1 and not mode.frequency)
-    falls = next(k for k, mode in enumerate(model.modes, 1) if mode.eigenvalue.real < -1 and not mode.frequency)
-    for number in (grows, falls):
-        run, rate = sway(model, number), model.modes[number - 1].eigenvalue.real
+    growth = next(k for k, mode in enumerate(model.modes, 1) if mode.eigenvalue.real > 1 and not mode.frequency)
+    decay = next(k for k, mode in enumerate(model.modes, 1) if mode.eigenvalue.real < -1 and not mode.frequency)
+    for number in (growth, decay):
+        run, rate = animate_mode(model, number), model.modes[number - 1].eigenvalue.real
         assert run is not None
         assert run.t[-1] == pytest.approx(3 / abs(rate))
         k = int(np.argmax(np.abs(model.modes[number - 1].shape)))
@@ -121,6 +123,8 @@ def test_a_real_mode_decays_or_grows_as_its_eigenvalue_says(tmp_path: Path) -> N
         assert ends[1] / ends[0] == pytest.approx(np.exp(-3), rel=0.2)
         assert run.max_phi < 1e-9
     with pytest.raises(InputError, match=r"mode 1 is rigid"):
-        sway(linear_model(at_rest(two_free_bodies(tmp_path), two_free_bodies(tmp_path).q_tree), np.zeros(1), at="x"), 1)
+        animate_mode(
+            linear_model(at_rest(two_free_bodies(tmp_path), two_free_bodies(tmp_path).q_tree), np.zeros(1), at="x"), 1
+        )
     with pytest.raises(InputError, match=r"mode 9: five_bar has modes 1 to 3"):
-        sway(model, 9)
+        animate_mode(model, 9)

@@ -1,4 +1,4 @@
-"""Closed loops: eigenvalues, the least K_P, growth along a motion; every shipped scene stable and long enough."""
+"""Stability of closed loops: eigenvalues, least K_P, growth of errors along a motion, and all shipped scenes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ CONTROLLED = [
     for scene in scene_names(mechanism)
     if load_scene(name := f"{mechanism}/{scene}").spec.controller is not None and name not in LEAVES
 ]
-LONG_ENOUGH = 4  # times the slowest decay: errors fall to a fiftieth
+MIN_TIME_CONSTANTS = 4  # duration of a shipped scene, in time constants of the slowest decay: errors fall to 2 %
 
 
-def controlled(name: str, overrides: dict[str, Any] | None = None) -> tuple[Mechanism, Any]:
+def load_controlled(name: str, overrides: dict[str, Any] | None = None) -> tuple[Mechanism, Any]:
     scene = load_scene(name, overrides)
     mechanism = scene_mechanism(scene)
     return mechanism, scene_controller(scene, mechanism)
@@ -48,8 +48,8 @@ def state_of(mechanism: Mechanism, law: Tracking, t: float, off: float) -> Terms
 
 
 @pytest.mark.parametrize("name", TRACKING)
-def test_a_controllers_gradient_is_the_difference(name: str) -> None:
-    mechanism, law = controlled(name)
+def test_controller_gain_matches_finite_differences(name: str) -> None:
+    mechanism, law = load_controlled(name)
     state, t = state_of(mechanism, law, 0.7, 0.02), 0.7
 
     def u(x: Array) -> Array:
@@ -58,22 +58,28 @@ def test_a_controllers_gradient_is_the_difference(name: str) -> None:
 
     step = np.random.default_rng(1).uniform(-1, 1, 2 * mechanism.d)
     one, two = ((u(h * step) - u(-h * step)) / (2 * h) for h in (2e-3, 1e-3))
-    wanted = (4 * two - one) / 3
-    assert np.abs(ClosedLoop(mechanism, law).at(t, state).K @ step - wanted).max() <= 1e-9 * np.abs(wanted).max()
+    expected = (4 * two - one) / 3
+    assert (
+        np.abs(ClosedLoop(mechanism, law).linearize(t, state).K @ step - expected).max()
+        <= 1e-9 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("name", TRACKING)
-def test_where_the_motion_is_as_desired_the_error_obeys_eq_16(name: str) -> None:
-    """D r_dot + (C + K_D) r = 0 with r = e_dot + Lambda e, the plant's own terms in the controller."""
-    mechanism, law = controlled(name)
+def test_errors_about_the_desired_motion_obey_eq_16(name: str) -> None:
+    """D r_dot + (C + K_D) r = 0 with r = e_dot + Lambda e, if the controller has the plant's terms."""
+    mechanism, law = load_controlled(name)
     state = state_of(mechanism, law, 0.7, 0.0)
     G = np.linalg.solve(state.D, state.C + law.K_D)
-    wanted = np.block([[np.zeros_like(G), np.eye(len(G))], [-G @ law.Lambda, -G - law.Lambda]])
-    assert np.abs(ClosedLoop(mechanism, law).at(0.7, state).closed - wanted).max() <= 1e-10 * np.abs(wanted).max()
+    expected = np.block([[np.zeros_like(G), np.eye(len(G))], [-G @ law.Lambda, -G - law.Lambda]])
+    assert (
+        np.abs(ClosedLoop(mechanism, law).linearize(0.7, state).A_closed - expected).max()
+        <= 1e-10 * np.abs(expected).max()
+    )
 
 
-def test_the_set_points_eigenvalues_are_those_of_the_appendix() -> None:
-    mechanism, law = controlled("five_bar/set_point")
+def test_set_point_eigenvalues_match_the_appendix() -> None:
+    mechanism, law = load_controlled("five_bar/set_point")
     target = FIVE_BAR.sigma(law.q_d)
     u = set_point(FIVE_BAR, law.q_d, law.K_P[0, 0], law.K_V[0, 0])
     h_d = FIVE_BAR.h(target)
@@ -84,44 +90,46 @@ def test_the_set_points_eigenvalues_are_those_of_the_appendix() -> None:
         return np.concatenate([x[2:], FIVE_BAR.acceleration(moved, x[2:], force)])
 
     assert np.abs(u(0.0, target, np.zeros(2)) - h_d).max() < 1e-12
-    wanted = np.linalg.eigvals(complex_step(rate, np.zeros(4)))
-    found = stability(mechanism, law, 1.0)
-    assert found.eigenvalues is not None
-    assert np.abs(np.sort_complex(found.eigenvalues) - np.sort_complex(wanted)).max() <= 1e-8 * np.abs(wanted).max()
-    assert found.slowest == pytest.approx(-1 / wanted.real.max())
+    expected = np.linalg.eigvals(complex_step(rate, np.zeros(4)))
+    result = stability(mechanism, law, 1.0)
+    assert result.eigenvalues is not None
+    assert (
+        np.abs(np.sort_complex(result.eigenvalues) - np.sort_complex(expected)).max() <= 1e-8 * np.abs(expected).max()
+    )
+    assert result.slowest == pytest.approx(-1 / expected.real.max())
 
 
 @pytest.mark.parametrize("name", ["five_bar/set_point", "talos/squat"])
-def test_the_least_gain_is_the_edge(name: str) -> None:
-    found = check(name).stability
-    assert found is not None
-    assert found.least_K_P is not None
-    least = float(found.least_K_P[0, 0])
+def test_the_least_gain_is_the_stability_boundary(name: str) -> None:
+    result = check(name).stability
+    assert result is not None
+    assert result.least_K_P is not None
+    least = float(result.least_K_P[0, 0])
     for factor, stable in ((1 + 1e-6, True), (1 - 1e-6, False)):
-        at_edge = stability(*_with_gain(name, factor * least), 1.0)
-        assert at_edge.eigenvalues is not None
-        assert at_edge.stable == stable
-        assert (at_edge.least_eigenvalue > 0) == stable  # type: ignore[operator]
-        assert (at_edge.eigenvalues.real.max() < 0) == stable
+        at_boundary = stability(*_with_gain(name, factor * least), 1.0)
+        assert at_boundary.eigenvalues is not None
+        assert at_boundary.stable == stable
+        assert (at_boundary.least_eigenvalue > 0) == stable  # type: ignore[operator]
+        assert (at_boundary.eigenvalues.real.max() < 0) == stable
 
 
 def _with_gain(name: str, gain: float) -> tuple[Mechanism, SetPoint]:
-    mechanism, law = controlled(name, {"controller.K_P": gain})
+    mechanism, law = load_controlled(name, {"controller.K_P": gain})
     return mechanism, law
 
 
 def waves(frequency: float, amplitude: float = 0.2) -> dict[str, Any]:
-    """A desired motion of the five-bar, hanging."""
-    of = {"theta_1": (-1.2, 0.3), "theta_3": (-1.9, 1.1)}
+    """Overrides that give the hanging five-bar a harmonic desired motion."""
+    offset_and_phase = {"theta_1": (-1.2, 0.3), "theta_3": (-1.9, 1.1)}
     return {
         f"controller.desired.{name}": {"offset": offset, "harmonics": [[amplitude, frequency, phase]]}
-        for name, (offset, phase) in of.items()
+        for name, (offset, phase) in offset_and_phase.items()
     }
 
 
 def growth_by_runs(overrides: dict[str, Any], t_end: float, off: float = 1e-6) -> float:
-    """Errors of the five-bar's tracking at the end by those at the start, each measured by the root of eq. 18."""
-    mechanism, law = controlled("five_bar/tracking", overrides)
+    """Growth of the five-bar's tracking error over a run, measured by the square root of eq. 18's function."""
+    mechanism, law = load_controlled("five_bar/tracking", overrides)
     start, names, ends = np.concatenate(law.desired(0.0)[:2]), mechanism.independent, []
     exact = {"formulation": "reduced", "solver.rtol": 1e-11, "solver.atol": 1e-14, "t_end": t_end}
     for step in np.vstack([np.zeros(4), off * np.eye(4)]):
@@ -143,93 +151,93 @@ def growth_by_runs(overrides: dict[str, Any], t_end: float, off: float = 1e-6) -
     ("overrides", "t_end"),
     [({}, 3.0), ({}, 2.2), (waves(2 * np.pi * 24), 2.0), (waves(37.0, 0.3) | {"controller.K_D": 2.0}, 1.7)],
 )
-def test_growth_is_what_runs_do(overrides: dict[str, Any], t_end: float) -> None:
-    """The nonlinear error of runs that start a little off; of a motion that comes round 48 times, too."""
-    found = stability(*controlled("five_bar/tracking", overrides), t_end)
-    assert found.growth == pytest.approx(growth_by_runs(overrides, t_end), rel=6e-3)
-    assert found.stable == (found.growth < 1)  # type: ignore[operator]
+def test_growth_matches_perturbed_runs(overrides: dict[str, Any], t_end: float) -> None:
+    """Runs start slightly off the desired motion. One motion has 48 cycles."""
+    result = stability(*load_controlled("five_bar/tracking", overrides), t_end)
+    assert result.growth == pytest.approx(growth_by_runs(overrides, t_end), rel=6e-3)
+    assert result.stable == (result.growth < 1)  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("t_end", [0.01, 0.31, 1.27])
-def test_growth_does_not_depend_on_when_the_motion_ends(t_end: float) -> None:
-    """Eq. 18's function falls along eq. 16's own closed loop, whatever the phase."""
-    found = stability(*controlled("five_bar/tracking", waves(9.0, 0.3) | {"controller.Lambda": 20.0}), t_end)
-    assert found.stable
-    assert found.largest_growth == pytest.approx(1.0, abs=1e-3)
+def test_largest_growth_does_not_depend_on_the_duration(t_end: float) -> None:
+    """Eq. 18's function decreases along eq. 16's closed loop, at any phase of the motion."""
+    result = stability(*load_controlled("five_bar/tracking", waves(9.0, 0.3) | {"controller.Lambda": 20.0}), t_end)
+    assert result.stable
+    assert result.largest_growth == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_long_motion_has_its_slowest_decay() -> None:
-    """Errors fall by more than numbers have room for; a mechanism that stands still has constant rates."""
+def test_a_long_motion_has_the_time_constant_of_its_slowest_decay() -> None:
+    """The growth underflows to zero. The mechanism stands still, so its rates of decay are constant."""
     overrides = waves(0.0) | {"controller.Lambda": 3.0, "controller.K_D": 5.0}
-    found = stability(*controlled("five_bar/tracking", overrides), 2000.0)
-    assert found.growth == 0.0
-    assert found.eigenvalues is not None
-    assert found.slowest == pytest.approx(-1 / found.eigenvalues.real.max(), rel=5e-3)
+    result = stability(*load_controlled("five_bar/tracking", overrides), 2000.0)
+    assert result.growth == 0.0
+    assert result.eigenvalues is not None
+    assert result.slowest == pytest.approx(-1 / result.eigenvalues.real.max(), rel=5e-3)
 
 
-def test_growth_beyond_all_numbers_is_said_to_be_so() -> None:
-    said = check(load_scene("five_bar/tracking", {"controller.sample_time": 0.02, "t_end": 90.0}))
-    assert said.stability is not None
-    assert said.stability.stable is False
-    assert any("may be more than 1e308 times as large at its end" in warning for warning in said.warnings)
+def test_a_warning_reports_growth_that_overflows() -> None:
+    result = check(load_scene("five_bar/tracking", {"controller.sample_time": 0.02, "t_end": 90.0}))
+    assert result.stability is not None
+    assert result.stability.stable is False
+    assert any("may be more than 1e308 times as large at its end" in warning for warning in result.warnings)
 
 
-def test_a_motion_too_quick_to_be_followed_has_no_verdict() -> None:
-    found = stability(*controlled("five_bar/tracking", waves(1e5)), 3.0)
-    assert found.stable is None
-    assert "too quick to be followed for longer than" in str(found.reason)
+def test_stability_of_a_motion_that_is_too_fast_is_unknown() -> None:
+    result = stability(*load_controlled("five_bar/tracking", waves(1e5)), 3.0)
+    assert result.stable is None
+    assert "too fast to be analyzed for longer than" in str(result.reason)
 
 
 # --- shipped scenes ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CONTROLLED)
-def test_shipped_controllers_are_stable_and_run_long_enough_to_show_it(name: str) -> None:
-    found, t_end = check(name), load_scene(name).spec.t_end
-    assert found.stability is not None
-    assert found.stability.stable
-    assert found.stability.slowest is not None
-    assert t_end >= LONG_ENOUGH * found.stability.slowest
-    assert not [warning for warning in found.warnings if "closed loop" in warning]
+def test_shipped_controllers_are_stable_and_their_scenes_long_enough(name: str) -> None:
+    result, t_end = check(name), load_scene(name).spec.t_end
+    assert result.stability is not None
+    assert result.stability.stable
+    assert result.stability.slowest is not None
+    assert t_end >= MIN_TIME_CONSTANTS * result.stability.slowest
+    assert not [warning for warning in result.warnings if "closed loop" in warning]
 
 
 @pytest.mark.parametrize("name", sorted(LEAVES))
-def test_a_motion_that_cannot_be_followed_has_no_verdict(name: str) -> None:
-    found = check(name)
-    assert found.stability is not None
-    assert found.stability.stable is None
-    assert "leaves the workspace at t = 4.39313 s" in str(found.stability.reason)
+def test_stability_of_a_motion_that_leaves_the_workspace_is_unknown(name: str) -> None:
+    result = check(name)
+    assert result.stability is not None
+    assert result.stability.stable is None
+    assert "leaves the workspace at t = 4.39313 s" in str(result.stability.reason)
 
 
-def test_the_squat_stays_where_it_was_sent() -> None:
-    """Up to what dry friction holds: 1e-3 rad."""
+def test_the_squat_stays_at_its_target() -> None:
+    """Up to the error that dry friction holds, 1e-3 rad."""
     run = simulate("talos/squat")
-    _, law = controlled("talos/squat")
+    _, law = load_controlled("talos/squat")
     error = np.abs(run.q_tree[:, run.mechanism.partition.q] - law.q_d).max(axis=1)
     assert error[run.at(3.0) :].max() < 1e-3
 
 
-def test_of_an_unstable_set_point_the_check_says_what_would_do() -> None:
-    """The squat's K_P of before: K_P + dh/dq has the eigenvalue -66."""
+def test_check_reports_the_least_gain_of_an_unstable_set_point() -> None:
+    """With K_P = 1000 of the squat, K_P + dh/dq has the eigenvalue -66."""
     scene = load_scene("talos/squat", {"controller.K_P": 1000.0})
-    found = check(scene)
-    assert found.stability is not None
-    assert not found.stability.stable
-    assert found.stability.least_eigenvalue == pytest.approx(-65.66, abs=0.01)
-    assert found.stability.slowest == np.inf
-    warning = next(x for x in found.warnings if "unstable" in x)
+    result = check(scene)
+    assert result.stability is not None
+    assert not result.stability.stable
+    assert result.stability.least_eigenvalue == pytest.approx(-65.66, abs=0.01)
+    assert result.stability.slowest == np.inf
+    warning = next(x for x in result.warnings if "unstable" in x)
     assert "1065.66" in warning
     assert stability(*_with_gain("talos/squat", 1065.7), 1.0).stable
 
 
-def test_a_set_point_of_another_model_rests_elsewhere(tmp_path: Any) -> None:
-    """Its gravity is not the plant's; about where the loop comes to rest, not about the target."""
+def test_a_set_point_with_another_model_is_stable_off_its_target(tmp_path: Any) -> None:
+    """The model's gravity is not the plant's. The loop is linearized about its position of rest, not its target."""
     scene = load_scene("five_bar/set_point", {"controller.model": "five_bar_as_printed"})
     mechanism = scene_mechanism(scene)
     law = scene_controller(scene, mechanism)
     assert isinstance(law, SetPoint)
-    found = stability(mechanism, law, 5.0)
-    assert found.stable
+    result = stability(mechanism, law, 5.0)
+    assert result.stable
     run = simulate("five_bar/set_point", {"controller.model": "five_bar_as_printed", "t_end": 5.0})
-    off = np.abs(run.q_tree[-1][[0, 2]] - law.q_d).max()
-    assert 1e-4 < off < 0.1
+    offset = np.abs(run.q_tree[-1][[0, 2]] - law.q_d).max()
+    assert 1e-4 < offset < 0.1

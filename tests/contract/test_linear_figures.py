@@ -87,4 +87,4 @@ def test_what_cannot_be_drawn_or_played_is_refused() -> None:
         gain_locus(scene, overrides={"controller.K_P": 1.0})
     for number in ("a", 0, 1.5, None, 3):
         with pytest.raises(InputError, match="five_bar has modes 1 to 2"):
-            model.sway(number)  # type: ignore[arg-type]
+            model.animate_mode(number)  # type: ignore[arg-type]

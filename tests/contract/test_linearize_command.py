@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Run, check, floquet, gain_locus, linearize, plot
-from ckc_pin.linear.mode_animation import sways
+from ckc_pin.linear.mode_animation import animate_modes
 from tests.analytic.small_models import plate_on_springs
 from tests.contract.helpers.command import ckc
 
@@ -82,7 +82,7 @@ def test_out_writes_model_figures_and_modes_to_play(tmp_path: Path) -> None:
     swing = run.q_tree - model.q_tree
     k = int(np.argmax(np.abs(shape)))
     assert np.ptp(swing[:, k]) == pytest.approx(2 * np.abs(swing[:, k]).max(), rel=0.2)
-    assert ckc("play", str(folder / "mode_1.npz"), "--html", str(tmp_path / "sway.html")).code == 0
+    assert ckc("play", str(folder / "mode_1.npz"), "--html", str(tmp_path / "mode.html")).code == 0
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_no_equilibrium_is_for_the_numerics(tmp_path: Path) -> None:
     answer = ckc("linearize", str(falling), "--json")
     assert answer.code == 3
     assert "no stable equilibrium is reached from q_guess: after 300 steps it still falls" in answer.json["message"]
-    assert "or linearize it as assembled" in answer.json["message"]
+    assert "linearize it as assembled" in answer.json["message"]
 
 
 PERIOD = "4.99171151369"  # of bricard/period, which swings to and fro and keeps its energy
@@ -128,7 +128,7 @@ def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Pat
     assert [complex(*x) for x in found["multipliers"]] == pytest.approx([1.0, 1.0], abs=1e-3)
     folder = tmp_path / "motion"
     answer = ckc("linearize", "bricard/period", "--period", PERIOD, "--out", str(folder))
-    assert "neither grow nor die out" in " ".join(answer.out.split())  # wherever its line is broken
+    assert "neither grow nor decay" in " ".join(answer.out.split())  # wherever its line is broken
     with np.load(folder / "floquet.npz") as file:
         assert np.array_equal(file["monodromy"], monodromy)
         assert file["states"].tolist() == found["states"]
@@ -138,8 +138,8 @@ def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Pat
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        (("bricard/period", "--period", "4"), "period = 4 s is none: after it"),
-        (("bricard/period", "--period", "-1"), "period = -1: a positive number of seconds is needed"),
+        (("bricard/period", "--period", "4"), "period = 4 s is not a period: after it"),
+        (("bricard/period", "--period", "-1"), "period = -1: expected a positive number of seconds"),
         (("bricard/period", "--period", "4", "--at", "2"), "--at and --period are both given"),
     ],
 )
@@ -225,9 +225,9 @@ def test_figures_show_poles_modes_and_the_locus() -> None:
 def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_period_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ckc_pin.linear.mode_animation.LARGEST", 0.01)
+    monkeypatch.setattr("ckc_pin.linear.mode_animation.MAX_AMPLITUDE", 0.01)
     model = linearize(plate_on_springs(tmp_path))  # with dampers, so that not all coordinates are in phase
-    figure, sways_in_time = plot(model)["modes"], sways(model)
+    figure, animations = plot(model)["modes"], animate_modes(model)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
         "at one instant",
         "a quarter of a period later",
@@ -238,7 +238,7 @@ def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_pe
     assert "root.x" in rows[0]
     for number in (1, 2, 3):
         bars = figure.axes[number - 1].containers
-        run = sways_in_time[number]
+        run = animations[number]
         frames = [np.argmin(np.abs(run.t - part / model.modes[number - 1].frequency)) for part in (0.0, 0.25)]
         parts = np.array([[bar.get_width() for bar in drawn] for drawn in bars])
         moved = [tree.difference(rest, tree.from_coordinates(run.q_tree[k])) for k in frames]
@@ -281,15 +281,15 @@ def test_a_run_that_stops_before_is_for_the_numerics() -> None:
 
 def test_an_undamped_mode_has_no_damping_ratio_of_rounding() -> None:
     model = linearize("stewart")
-    assert model.modes[0].says == "1.503 Hz, damping ratio 0"
-    run = model.sway(1)
+    assert model.modes[0].description == "1.503 Hz, damping ratio 0"
+    run = model.animate_mode(1)
     assert run is not None
     assert run.scene_name == "stewart: mode 1, 1.503 Hz", "a run of it has none"
 
 
 def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
     model = linearize("stewart")
-    runs = sways(model)
+    runs = animate_modes(model)
     assert list(runs) == [1, 2, 3, 4, 5, 6]
     for number, run in runs.items():
         mode = model.modes[number - 1]
