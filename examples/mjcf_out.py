@@ -16,7 +16,7 @@ from ckc_pin.view.canvas import look
 @look()
 def main():
     exported = export(ckc_pin.load("five_bar"), "mjcf")
-    print("Differences in MuJoCo:", *exported.differs, sep="\n  ")
+    print("Differences in MuJoCo:", *exported.differences, sep="\n  ")
     run = ckc_pin.simulate("five_bar/swing")
 
     model = mujoco.MjModel.from_xml_string(exported.text)

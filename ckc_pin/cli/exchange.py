@@ -70,8 +70,8 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
     written = [] if out is None else [exporting.write(found, out, overwrite)]
     if as_json:
         text = {} if written else {"text": found.text}
-        print_json({"status": "done", "written": [str(path) for path in written], **text, "differs": found.differs})
+        print_json({"status": "done", "written": [str(path) for path in written], **text, "differs": found.differences})
         return
     print("\n".join(f"written: {path}" for path in written) if written else found.text)
-    for difference in found.differs:
+    for difference in found.differences:
         (print if written else errors().print)(f"differs: {difference}")

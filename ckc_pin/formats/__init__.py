@@ -1,5 +1,6 @@
-"""Other people's files, in (`importing`) and out (`exporting`): a folder for each format.
+"""Import from and export to the file formats of other programs.
 
-`importing.read` makes a `Draft` of a file in `mjcf` or `urdf`: a URDF, what closes its loops, and what was guessed or
-left out; `importing.write` writes it down as a mechanism. `exporting.export` makes another program's file of one.
+`importing.read` reads a MuJoCo model (`mjcf`) or a URDF (`urdf`) into a `Draft`: a URDF tree, the loop closures beside
+it, and notes on what was assumed or left out. `importing.write` writes a draft as a mechanism. `exporting.export`
+converts a mechanism to another program's format.
 """

@@ -1,4 +1,7 @@
-"""What every reader makes of a file and the writer writes down: a URDF, the loops beside it, and notes."""
+"""An imported mechanism before it is written: a URDF tree, the loops beside it, and notes for the user.
+
+Every reader returns a `Draft`. The module also has what all readers share: names, rounding, rotations.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.orientation import to_rpy
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -34,49 +37,69 @@ from ckc_pin.mechanism.spec import (
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, UrdfTree, merge
 
-__all__ = ["Draft", "checked_direction", "frame", "number", "safe_name", "some", "unique", "vector"]
+__all__ = [
+    "Draft",
+    "choose_independent",
+    "choose_name",
+    "from_axis_angle",
+    "from_quaternion",
+    "from_rpy",
+    "list_names",
+    "make_frame",
+    "make_unique",
+    "require_direction",
+    "round_number",
+    "round_vector",
+    "to_rpy",
+]
 
 T = TypeVar("T")
-Noted = list[tuple[T, str]]  # with a comment for the file, or ""
+WithComment = list[tuple[T, str]]  # each table with its comment in the file; an empty comment is not written
 
-WORDS_WITHOUT_MEANING = ("robot", "model", "scene", "main", "urdf", "mjcf")
+GENERIC_NAMES = ("robot", "model", "scene", "main", "urdf", "mjcf")  # do not identify a mechanism
+MAX_NAME_CHARACTERS = 80
+MAX_LISTED_NAMES = 6  # in one message
+ZERO_TOLERANCE = 1e-15  # smaller lengths (m) and angles (rad) are rounding errors of a conversion
 
 
 @dataclass
 class Draft:
-    """A mechanism as a reader understood it.
+    """A mechanism as a reader understood it, to be written as ``mechanism.toml`` and a URDF.
 
     Attributes
     ----------
     name : str
-        Of the mechanism and of its files.
+        Name of the mechanism, and of its URDF.
     origin : str
-        What it was made from, for the head of the file.
+        The file that was imported and its format. The first line of ``mechanism.toml`` quotes it.
     robot : Element
         The tree as a URDF's <robot>.
     loops, couplings, springs, forces, joints, motors, points : list of (spec, comment)
-    independent, actuated : list of str, or None
-        None leaves it to the program; `actuated` names the joints of motors too.
+        Tables of ``mechanism.toml``.
+    independent, actuated : list of str or None
+        None: the program chooses them. `actuated` also lists the joints of `motors`.
     why_independent : str
         Comment on `independent`.
     gravity : (3,) tuple
+        m/s^2.
     q_guess : dict of str to float
+        Start of the assembly by coordinate, rad or m.
     guessed : list of str
         What the file does not say, and what was assumed.
     left_out : list of str
-        What the file says and the mechanism does not have.
+        Content of the file that the mechanism does not have.
     """
 
     name: str
     origin: str
     robot: ElementTree.Element
-    loops: Noted[LoopSpec] = field(default_factory=list)
-    couplings: Noted[CouplingSpec] = field(default_factory=list)
-    springs: Noted[SpringSpec] = field(default_factory=list)
-    forces: Noted[ForceSpec] = field(default_factory=list)
-    joints: Noted[JointSpec] = field(default_factory=list)
-    motors: Noted[MotorSpec] = field(default_factory=list)
-    points: Noted[PointSpec] = field(default_factory=list)
+    loops: WithComment[LoopSpec] = field(default_factory=list)
+    couplings: WithComment[CouplingSpec] = field(default_factory=list)
+    springs: WithComment[SpringSpec] = field(default_factory=list)
+    forces: WithComment[ForceSpec] = field(default_factory=list)
+    joints: WithComment[JointSpec] = field(default_factory=list)
+    motors: WithComment[MotorSpec] = field(default_factory=list)
+    points: WithComment[PointSpec] = field(default_factory=list)
     independent: list[str] | None = None
     actuated: list[str] | None = None
     why_independent: str = ""
@@ -90,13 +113,13 @@ class Draft:
         """Name of the URDF beside ``mechanism.toml``."""
         return f"{self.name}.urdf"
 
-    def urdf(self) -> str:
+    def urdf_text(self) -> str:
         """Return the text of the URDF."""
         ElementTree.indent(self.robot)
         return '<?xml version="1.0"?>\n' + ElementTree.tostring(self.robot, encoding="unicode") + "\n"
 
-    def spec(self) -> MechanismSpec:
-        """Return the content of ``mechanism.toml``."""
+    def to_spec(self) -> MechanismSpec:
+        """Return the content of ``mechanism.toml`` as typed structures."""
         return MechanismSpec(
             name=self.name,
             urdf=self.urdf_file,
@@ -113,9 +136,15 @@ class Draft:
             point=[spec for spec, _ in self.points],
         )
 
-    def tree(self) -> tuple[Tree, Frames, UrdfTree]:
-        """Build the tree alone, its frames, and what its checks found."""
-        text, urdf = merge([TreeText(self.urdf(), self.urdf_file)])
+    def build_tree(self) -> tuple[Tree, Frames, UrdfTree]:
+        """Build the tree without its loops, and return it with its frames and the checked URDF.
+
+        Raises
+        ------
+        MechanismError
+            Pinocchio cannot build the tree.
+        """
+        text, urdf = merge([TreeText(self.urdf_text(), self.urdf_file)])
         try:
             tree = Tree(pin.buildModelFromXML(text))
         except MechanismError as error:
@@ -124,57 +153,145 @@ class Draft:
             raise MechanismError(f"{self.name}: Pinocchio cannot build this tree: {error}") from None
         return tree, Frames(tree.model), urdf
 
-    def mechanism(self) -> Mechanism:
-        """Build the mechanism, as `ckc check` will.
+    def build_mechanism(self) -> Mechanism:
+        """Build and assemble the mechanism, as `ckc check` does for the written files.
 
         Raises
         ------
         MechanismError
-            Loops that do not close, `independent` that cannot serve.
+            The loops cannot be closed, or `independent` does not determine the configuration.
         """
-        return assemble_mechanism(self.spec(), Sources(self.name, None, {self.urdf_file: self.urdf()}))
+        return assemble_mechanism(self.to_spec(), Sources(self.name, None, {self.urdf_file: self.urdf_text()}))
 
 
-def frame(link: str, pose: pin.SE3) -> Frame:
-    """Return a frame at a pose in a link; the link's name alone where that says it all."""
-    xyz, rpy = vector(pose.translation), vector(to_rpy(pose.rotation))
+# --- independent coordinates ---------------------------------------------------------------------------------------
+
+
+def choose_independent(draft: Draft) -> None:
+    """Set `draft.independent`: the file's choice if it determines the configuration, otherwise the actuated joints.
+
+    A draft that cannot be assembled is not changed, because the user needs the file's choice to correct its loops.
+    """
+    if draft.independent is not None:
+        declared = draft.independent
+        try:
+            draft.build_mechanism()
+            return
+        except MechanismError as error:
+            draft.independent = None
+            mechanism = _try_to_build(draft)
+            if mechanism is None:
+                draft.independent = declared
+                return
+            reason = str(error).removeprefix(f"{draft.name}: ").removeprefix("independent: ")
+            draft.guessed.append(f"independent is chosen by the program; the file's choice does not work: {reason}")
+    elif draft.actuated and (draft.loops or draft.couplings):
+        mechanism = _try_to_build(draft)
+        if mechanism is None:
+            return
+        names = list(mechanism.independent)
+        if not set(draft.actuated) <= set(names):
+            return
+        draft.independent = names
+        others = [name for name in names if name not in draft.actuated]
+        draft.why_independent = "the actuated joints" + (
+            f"; the program chose {', '.join(others)} in addition" if others else ""
+        )
+        if _try_to_build(draft) is None:
+            draft.independent, draft.why_independent = None, ""
+
+
+def _try_to_build(draft: Draft) -> Mechanism | None:
+    try:
+        return draft.build_mechanism()
+    except MechanismError:
+        return None
+
+
+# --- names and frames ----------------------------------------------------------------------------------------------
+
+
+def make_frame(link: str, pose: pin.SE3) -> Frame:
+    """Return a frame at a pose in a link; only the link's name where the pose is the identity."""
+    xyz, rpy = round_vector(pose.translation), round_vector(to_rpy(pose.rotation))
     return FrameSpec(link=link, xyz=xyz, rpy=rpy) if any((*xyz, *rpy)) else link
 
 
-def number(x: float) -> float:
-    """Round away what conversions left in the last digits: lengths and angles, not inertias."""
-    return 0.0 if abs(x) < 1e-15 else float(f"{x:.15g}")
-
-
-def vector(values: Iterable[float]) -> Vector3:
-    """Return three rounded numbers."""
-    x, y, z = (number(float(value)) for value in values)
-    return (x, y, z)
-
-
-def safe_name(path: Path, declared: str = "") -> str:
-    """Name a mechanism after its file; after its folder, or as declared, when the file's name says nothing."""
+def choose_name(path: Path, declared: str = "") -> str:
+    """Name a mechanism after its file, or after its folder or its declared name where the file's name is generic."""
     for candidate in (path.stem, path.absolute().parent.name, declared):
-        cleaned = re.sub(r"[^\w-]+", "_", candidate).strip("_-")[:80]
-        if cleaned and cleaned.lower() not in WORDS_WITHOUT_MEANING:
+        cleaned = re.sub(r"[^\w-]+", "_", candidate).strip("_-")[:MAX_NAME_CHARACTERS]
+        if cleaned and cleaned.lower() not in GENERIC_NAMES:
             return cleaned
     return "imported"
 
 
-def some(names: Sequence[str]) -> str:
-    """Return a few of many names."""
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+def list_names(names: Sequence[str]) -> str:
+    """Return the first names as text, with the number of names that are not listed."""
+    omitted = len(names) - MAX_LISTED_NAMES
+    return ", ".join(names[:MAX_LISTED_NAMES]) + (f" and {omitted} more" if omitted > 0 else "")
 
 
-def unique(name: str, taken: Iterable[str]) -> str:
-    """Return the name, with a number behind it when it is taken."""
+def make_unique(name: str, taken: Iterable[str]) -> str:
+    """Return the name, with a number appended if it is already taken."""
     used = set(taken)
     return next(n for n in (name, *(f"{name}_{k}" for k in range(2, len(used) + 3))) if n not in used)
 
 
-def checked_direction(values: Iterable[float], where: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Return a direction, not normalised; InputError when it is none."""
+# --- numbers -------------------------------------------------------------------------------------------------------
+
+
+def round_number(x: float) -> float:
+    """Round a length or angle to 15 digits, which removes the rounding errors of a conversion.
+
+    Masses and inertias are not rounded: small ones are not errors.
+    """
+    return 0.0 if abs(x) < ZERO_TOLERANCE else float(f"{x:.15g}")
+
+
+def round_vector(values: Iterable[float]) -> Vector3:
+    """Return three numbers, rounded by `round_number`."""
+    x, y, z = (round_number(float(value)) for value in values)
+    return (x, y, z)
+
+
+def require_direction(values: Iterable[float], where: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Return a direction, not normalized.
+
+    Raises
+    ------
+    InputError
+        All three numbers are zero.
+    """
     direction = np.array([float(x) for x in values])
     if not np.linalg.norm(direction) > 0:
-        raise InputError(f"{where}: {direction.tolist()} is no direction, all three are zero")
+        raise InputError(f"{where}: expected a direction, got {direction.tolist()}")
     return direction
+
+
+# --- rotations -----------------------------------------------------------------------------------------------------
+
+
+def from_quaternion(quaternion: Sequence[float]) -> Array:
+    """Return the rotation matrix of a quaternion (w, x, y, z), which need not be normalized."""
+    return np.array(pin.Quaternion(*map(float, quaternion)).normalized().matrix())
+
+
+def from_axis_angle(axis: Array, angle: float) -> Array:
+    """Return the rotation matrix for an angle (rad) about an axis, which need not be normalized."""
+    return np.array(pin.AngleAxis(float(angle), np.asarray(axis, dtype=float) / np.linalg.norm(axis)).matrix())
+
+
+def from_rpy(rpy: Sequence[float]) -> Array:
+    """Return the rotation matrix of a URDF's roll, pitch and yaw (rad)."""
+    return np.array(pin.rpy.rpyToMatrix(*map(float, rpy)))
+
+
+def to_rpy(rotation: Array) -> tuple[float, float, float]:
+    """Return a URDF's roll, pitch and yaw (rad) of a rotation matrix.
+
+    At a pitch of +-90 degrees only the sum or difference of roll and yaw is determined; one of the solutions is
+    returned.
+    """
+    roll, pitch, yaw = map(float, pin.rpy.matrixToRpy(np.ascontiguousarray(rotation)))
+    return roll, pitch, yaw

@@ -1,4 +1,4 @@
-"""A mechanism in other programs' formats: one writer for each, and what the other program does differently."""
+"""Export a mechanism to the formats of other programs, with a list of how its motion differs there."""
 
 from __future__ import annotations
 
@@ -8,58 +8,59 @@ from pathlib import Path
 
 from ckc_pin.base.sources import write_texts
 from ckc_pin.errors import InputError
-from ckc_pin.formats.mjcf.writer import mjcf
+from ckc_pin.formats.mjcf.writer import to_mjcf
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["FORMATS", "Exported", "export", "write"]
 
-FORMATS = {"mjcf": mjcf}
+FORMATS = {"mjcf": to_mjcf}
 
 
 @dataclass(frozen=True)
 class Exported:
-    """A file for another program.
+    """A mechanism in another program's format.
 
     Attributes
     ----------
     file : str
-        Name that suits it.
+        Suggested file name.
     text : str
-    differs : list of str
-        What moves otherwise there than here.
+        Content of the file.
+    differences : list of str
+        How the motion in the other program differs from the mechanism's.
     """
 
     file: str
     text: str
-    differs: list[str]
+    differences: list[str]
 
 
 def export(mechanism: Mechanism, to: str) -> Exported:
-    """Write a mechanism for another program, assembled as it is here.
+    """Convert a mechanism, in its assembled configuration, to another program's format.
 
     Parameters
     ----------
     mechanism : Mechanism
     to : str
-        "mjcf", MuJoCo's models.
+        "mjcf": a MuJoCo model.
 
     Raises
     ------
     InputError
-        Another format, or something of the mechanism that the format has no counterpart of.
+        The format is unknown, or has no counterpart for a part of the mechanism.
     """
     if to not in FORMATS:
-        raise InputError(f"export: no format {to!r}; there are {', '.join(FORMATS)}")
-    text, differs = FORMATS[to](mechanism)
-    return Exported(re.sub(r"[^\w.-]+", "_", mechanism.name) + ".xml", text, differs)
+        raise InputError(f"export: unknown format {to!r}; expected one of {', '.join(FORMATS)}")
+    text, differences = FORMATS[to](mechanism)
+    return Exported(re.sub(r"[^\w.-]+", "_", mechanism.name) + ".xml", text, differences)
 
 
 def write(exported: Exported, folder: Path, overwrite: bool = False) -> Path:
-    """Write the file into a folder, which is made if it is not there.
+    """Write an exported mechanism into a folder, which is created if it does not exist, and return the file's path.
 
     Raises
     ------
     InputError
-        The file is there already, or cannot be written.
+        The file exists already, or the folder is not writable.
     """
     return write_texts(folder, {exported.file: exported.text}, overwrite)[0]

@@ -1,61 +1,195 @@
-"""Other people's files: one reader for each origin, one value between (`Draft`), one writer.
+"""Read a file of another program's format, and write it as ``mechanism.toml`` with a URDF.
 
-MuJoCo's MJCF (`mjcf`), URDFs with <loop> of generalized_rbda (`rbda_loops`), URDFs with a robot.yaml of
-example-parallel-robots (`robot_yaml`), pairs of closing frames of onshape-to-robot (`closing_frames`), plain URDFs.
+Supported: MuJoCo's MJCF, and URDFs whose loops are declared by <loop> (generalized_rbda), by a robot.yaml
+(example-parallel-robots), by pairs of closing frames (onshape-to-robot), or not at all.
 """
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, get_args
 
-from ckc_pin.base.sources import strict_xml
+import msgspec
+
+from ckc_pin.base.sources import strict_xml, write_texts
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError
-from ckc_pin.formats.draft import Draft
-from ckc_pin.formats.mechanism_file import mechanism_text, write
+from ckc_pin.formats.draft import Draft, choose_independent
 from ckc_pin.formats.mjcf.reader import read_mjcf
-from ckc_pin.formats.partition import settle_independent
-from ckc_pin.formats.urdf.reader import read_urdf, urdf_beside
+from ckc_pin.formats.urdf.reader import find_urdf_beside, read_urdf
+from ckc_pin.mechanism.library import MECHANISM_FILE
+from ckc_pin.mechanism.spec import LoopType
 
 __all__ = ["Draft", "mechanism_text", "read", "write"]
 
+LINE_WIDTH = 116  # characters of ``mechanism.toml``
+LOOP_TYPES = get_args(LoopType)
+
 
 def read(path: Path) -> Draft:
-    """Read a file of another format.
+    """Read a file of another program's format.
 
     Parameters
     ----------
     path : Path
-        A MuJoCo model, a URDF, or the robot.yaml of a URDF beside it.
+        A MuJoCo model, a URDF, or a robot.yaml with its URDF in the same folder.
+
+    Returns
+    -------
+    Draft
 
     Raises
     ------
     InputError, MechanismError
-        What it is not, or what in it cannot be; the message names the place.
+        The file is not of a supported format, or an element of it is invalid. The message names the element.
     """
     if path.suffix in (".yaml", ".yml"):
         if path.name != "robot.yaml":
-            raise InputError(f"{path}: of YAML files only a robot.yaml beside its URDF is read")
+            raise InputError(f"{path}: cannot import this YAML file; it would have to be a robot.yaml beside its URDF")
         read_text(path, "YAML file")
-        path = urdf_beside(path)
+        path = find_urdf_beside(path)
     text = read_text(path, "robot file")
     tag = strict_xml(text, str(path)).tag
     if tag not in ("mujoco", "robot"):
-        raise InputError(f"{path}: the root element is <{tag}>; read are <mujoco> (MJCF) and <robot> (URDF)")
+        raise InputError(f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF) or <robot> (URDF)")
     draft = read_mjcf(text, path) if tag == "mujoco" else read_urdf(text, path)
-    _drop_idle_loops(draft)
-    settle_independent(draft)
+    _remove_loops_within_a_body(draft)
+    choose_independent(draft)
     return draft
 
 
-def _drop_idle_loops(draft: Draft) -> None:
-    """Leave out loops within one rigid body: between two links on fixed joints, or with what moves in MuJoCo alone."""
-    _, frames, _ = draft.tree()
-    kept = []
+def _remove_loops_within_a_body(draft: Draft) -> None:
+    """Leave out loops between two frames of one rigid body, because they constrain no coordinate."""
+    _, frames, _ = draft.build_tree()
+    loops = []
     for spec, comment in draft.loops:
         ends = [frames.find(frame, f"loop {spec.name!r}").joint for frame in (spec.frame_a, spec.frame_b)]
         if ends[0] == ends[1]:
-            draft.left_out.append(f"loop {spec.name}: both of its frames are on one rigid body here")
+            draft.left_out.append(f"loop {spec.name}: both of its frames are on one rigid body")
         else:
-            kept.append((spec, comment))
-    draft.loops = kept
+            loops.append((spec, comment))
+    draft.loops = loops
+
+
+# --- writing ``mechanism.toml`` ------------------------------------------------------------------------------------
+
+
+def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
+    """Write ``mechanism.toml`` and the URDF of a draft.
+
+    Parameters
+    ----------
+    draft : Draft
+    folder : Path
+        Created if it does not exist.
+    overwrite : bool
+        Whether existing files may be replaced.
+
+    Returns
+    -------
+    list of Path
+        The files written, ``mechanism.toml`` first.
+
+    Raises
+    ------
+    InputError
+        A file exists already, or the folder is not writable.
+    """
+    texts = {MECHANISM_FILE: mechanism_text(draft), draft.urdf_file: draft.urdf_text()}
+    return write_texts(folder, texts, overwrite)
+
+
+def mechanism_text(draft: Draft) -> str:
+    """Return the text of ``mechanism.toml``, with the notes on what was guessed and left out as comments."""
+    lines = [*_comment(f"Imported from {draft.origin}. Read it, correct it, keep it."), ""]
+    for title, items in (("Guessed", draft.guessed), ("Left out", draft.left_out)):
+        if items:
+            lines += [f"# {title}:", *(line for item in items for line in _comment(item, "#   - ", "#     ")), ""]
+    spec = draft.to_spec()
+    lines += [f"name = {_value(spec.name)}", f"urdf = {_value(draft.urdf_file)}", f"gravity = {_value(spec.gravity)}"]
+    if draft.independent is not None:
+        lines += _comment(draft.why_independent) + _name_list("independent", draft.independent)
+    if spec.actuated is not None:
+        lines += _name_list("actuated", spec.actuated)
+    if draft.q_guess:
+        lines += ["", "[q_guess]", *(f"{_key(k)} = {_value(v)}" for k, v in draft.q_guess.items())]
+    tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
+        "loop": draft.loops,
+        "coupling": draft.couplings,
+        "spring": draft.springs,
+        "force": draft.forces,
+        "joint": draft.joints,
+        "motor": draft.motors,
+        "point": draft.points,
+    }
+    for table, entries in tables.items():
+        for entry, comment in entries:
+            lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
+    if not draft.loops:
+        lines += ["", *_loop_template(draft)]
+    return "\n".join(lines) + "\n"
+
+
+def _loop_template(draft: Draft) -> Iterator[str]:
+    """Yield a commented-out loop between two links without children, for the user to complete."""
+    names = [link.get("name", "") for link in draft.robot.findall("link")]
+    parents = {parent.get("link") for parent in draft.robot.iterfind("joint/parent")}
+    ends = [name for name in names if name not in parents]
+    other = ends[-2] if len(ends) > 1 else names[0]
+    yield from _comment(f"No loop is closed. Complete this table to close one; type is one of {', '.join(LOOP_TYPES)}:")
+    yield "# [[loop]]"
+    table = {"name": "closed", "type": "hinge"}
+    yield from (f"# {key} = {_value(value)}" for key, value in table.items())
+    for key, end in (("frame_a", ends[-1]), ("frame_b", other)):
+        yield f"# {key} = {{link = {_value(end)}, xyz = [0.0, 0.0, 0.0], rpy = [0.0, 0.0, 0.0]}}"
+    yield from (f"# axis_{end} = [0.0, 0.0, 1.0]" for end in "ab")
+
+
+def _entries(spec: msgspec.Struct) -> Iterator[str]:
+    """Yield the keys of a table whose values differ from the defaults."""
+    for field in msgspec.structs.fields(spec):
+        value = getattr(spec, field.name)
+        factory = field.default_factory
+        if field.required or value != (field.default if factory is msgspec.NODEFAULT else factory()):
+            yield f"{_key(field.encode_name)} = {_value(value)}"
+
+
+def _name_list(key: str, names: Iterable[str]) -> list[str]:
+    """Return a list of names as TOML, one name a line where one line would be too long."""
+    one_line = f"{key} = {_value(list(names))}"
+    if len(one_line) <= LINE_WIDTH:
+        return [one_line]
+    return [f"{key} = [", *(f"    {_value(name)}," for name in names), "]"]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float | int):
+        return repr(float(value))
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(x) for x in value)}]"
+    keys = {f.encode_name: getattr(value, f.name) for f in msgspec.structs.fields(value)}
+    pairs = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in keys.items() if isinstance(v, str) or any(v))
+    return f"{{{pairs}}}"
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+
+
+def _comment(text: str, first: str = "# ", rest: str = "# ") -> list[str]:
+    """Return a text as comment lines. Control characters, which could end a comment, become spaces."""
+    lines, line = [], ""
+    for word in re.sub(r"[\x00-\x1f\x7f\x85\u2028\u2029]+", " ", text).split():
+        if line and len(line) + len(word) + len(rest) > LINE_WIDTH:
+            lines.append(line)
+            line = ""
+        line = f"{line} {word}" if line else word
+    lines += [line] if line else []
+    return [f"{rest if k else first}{line}" for k, line in enumerate(lines)]

@@ -57,7 +57,7 @@ def given_back(draft: Draft) -> float:
     CkcError
         It has no motion, or not to the end.
     """
-    drawn = draft.mechanism()
+    drawn = draft.build_mechanism()
     numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.step_scale * drawn.freedoms.singular
     draft = replace(
         draft,

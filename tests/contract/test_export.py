@@ -1,4 +1,4 @@
-"""`ckc export --to mjcf` against MuJoCo itself: the same tree, the same closure, the same forces."""
+"""`ckc export --to mjcf` against MuJoCo itself: the same tree, constraints and forces."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.library import shipped
 from tests.contract.helpers.command import ckc
 
-# flat trees, free roots, hinges, welds, redundant rows, couplings, massless links, constant forces, springs; of
-# "spatial" rotors, friction and stops too
+# These have fixed and free roots, hinges, welds, redundant rows, couplings, massless links, constant forces and
+# springs. "spatial" has armature, friction and stops, too.
 SHIPPED = ["five_bar", "andrews", "bricard", "stewart", "two_ur5", "slider_crank_spatial"]
 
 EXACT = 1e-12  # relative to the largest entry
@@ -96,7 +96,7 @@ def spatial(tmp_path_factory: pytest.TempPathFactory) -> Mechanism:
     return load(write(tmp_path_factory.mktemp("spatial"), SPATIAL))
 
 
-class Peer:
+class MujocoModel:
     """MuJoCo's model of a mechanism, set to Pinocchio's states."""
 
     def __init__(self, mechanism: Mechanism) -> None:
@@ -141,145 +141,143 @@ def assert_same(ours: Any, theirs: Any, tolerance: float = 1e-9) -> None:
     assert np.abs(ours - theirs).max() < tolerance * max(1e-3, np.abs(theirs).max())
 
 
-def test_the_tree_is_the_same(mechanism: Mechanism) -> None:
-    peer, tree = Peer(mechanism), mechanism.tree
+def test_mass_matrix_and_bias_are_equal(mechanism: Mechanism) -> None:
+    mujoco_model, tree = MujocoModel(mechanism), mechanism.tree
     for q_tree, v_tree in states(mechanism):
-        to = peer.put(q_tree, v_tree)
-        M = np.zeros((peer.model.nv, peer.model.nv))
-        mujoco.mj_fullM(peer.model, peer.data, M)
+        to = mujoco_model.put(q_tree, v_tree)
+        M = np.zeros((mujoco_model.model.nv, mujoco_model.model.nv))
+        mujoco.mj_fullM(mujoco_model.model, mujoco_model.data, M)
         D = pin.crba(tree.model, tree.data, q_tree)
         assert_same(to.T @ M @ to, np.triu(D) + np.triu(D, 1).T, EXACT)
-        if tree.is_euclidean:  # a free root's axes turn, and the bias with them
-            assert_same(to.T @ peer.data.qfrc_bias, pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree))
+        if tree.is_euclidean:  # velocities of a free root are in rotating axes in Pinocchio only, so the bias differs
+            assert_same(to.T @ mujoco_model.data.qfrc_bias, pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree))
 
 
-def test_springs_dampers_and_constant_forces_are_the_same(mechanism: Mechanism) -> None:
-    peer, springs = Peer(mechanism), mechanism.springs
+def test_spring_damper_and_constant_forces_are_equal(mechanism: Mechanism) -> None:
+    mujoco_model, springs = MujocoModel(mechanism), mechanism.springs
     for q_tree, v_tree in states(mechanism):
-        to = peer.put(q_tree, v_tree)
+        to = mujoco_model.put(q_tree, v_tree)
         force = springs.elastic_force(q_tree) + springs.damping_force(q_tree, v_tree)
-        assert_same(to.T @ (peer.data.qfrc_passive + peer.data.qfrc_actuator), force)
+        assert_same(to.T @ (mujoco_model.data.qfrc_passive + mujoco_model.data.qfrc_actuator), force)
 
 
-def test_the_closure_is_the_same(mechanism: Mechanism) -> None:
-    """Closed where it is closed here, and for the same motions."""
-    peer = Peer(mechanism)
-    to = peer.put(mechanism.q_tree, np.zeros(mechanism.n))
-    rows = peer.data.efc_J.reshape(-1, peer.model.nv)[: peer.data.ne] @ to
-    assert np.abs(peer.data.efc_pos[: peer.data.ne]).max() < 1e-9 * mechanism.size
+def test_constraints_are_equivalent(mechanism: Mechanism) -> None:
+    """Satisfied at the assembled configuration, with the same admissible velocities."""
+    mujoco_model = MujocoModel(mechanism)
+    to = mujoco_model.put(mechanism.q_tree, np.zeros(mechanism.n))
+    rows = mujoco_model.data.efc_J.reshape(-1, mujoco_model.model.nv)[: mujoco_model.data.ne] @ to
+    assert np.abs(mujoco_model.data.efc_pos[: mujoco_model.data.ne]).max() < 1e-9 * mechanism.size
     assert np.linalg.matrix_rank(rows, tol=1e-9) == mechanism.rank
     assert np.abs(rows @ mechanism.assembled.rho).max() < 1e-9
-    assert_same(peer.model.key("assembled").qpos, peer.data.qpos)
+    assert_same(mujoco_model.model.key("assembled").qpos, mujoco_model.data.qpos)
 
 
 def test_points_are_sites_and_joints_have_motors(spatial: Mechanism) -> None:
-    peer = Peer(spatial)
+    mujoco_model = MujocoModel(spatial)
     for q_tree, v_tree in states(spatial):
-        peer.put(q_tree, v_tree)
-        assert_same(peer.data.site("tip").xpos, spatial.point_positions(q_tree)["tip"])
-    assert peer.model.actuator("a").trnid[0] == peer.model.joint("a").id
-    assert_same(peer.model.opt.gravity, [1.0, 2.0, -9.0])
+        mujoco_model.put(q_tree, v_tree)
+        assert_same(mujoco_model.data.site("tip").xpos, spatial.point_positions(q_tree)["tip"])
+    assert mujoco_model.model.actuator("a").trnid[0] == mujoco_model.model.joint("a").id
+    assert_same(mujoco_model.model.opt.gravity, [1.0, 2.0, -9.0])
 
 
-def test_joints_have_their_rotors_friction_and_stops(spatial: Mechanism) -> None:
-    """A range without stops is there, and does not act."""
-    model = Peer(spatial).model
-    found = {name: (model.joint(name), model.joint(name).dofadr[0]) for name in spatial.coordinates}
-    assert {name: model.dof_armature[dof] for name, (_, dof) in found.items()} == {"a": 0.04, "b": 0.3, "s": 2, "w": 0}
-    assert {name: model.dof_frictionloss[dof] for name, (_, dof) in found.items()} == {"a": 0.2, "b": 0, "s": 0, "w": 0}
-    assert {name: bool(joint.limited[0]) for name, (joint, _) in found.items() if joint.range.any()} == {
-        "b": True,
-        "s": False,
-    }
+def test_armature_friction_and_stops_are_exported(spatial: Mechanism) -> None:
+    """A range without stops is exported as inactive."""
+    model = MujocoModel(spatial).model
+    joints = {name: model.joint(name) for name in spatial.coordinates}
+    dofs = [joints[name].dofadr[0] for name in ("a", "b", "s", "w")]
+    assert model.dof_armature[dofs].tolist() == [0.04, 0.3, 2.0, 0.0]
+    assert model.dof_frictionloss[dofs].tolist() == [0.2, 0.0, 0.0, 0.0]
+    is_active = {name: bool(joint.limited[0]) for name, joint in joints.items() if joint.range.any()}
+    assert is_active == {"b": True, "s": False}
     assert model.joint("b").range.tolist() == model.joint("s").range.tolist() == [-9.0, 9.0]
-    said = export(spatial, "mjcf").differs
+    differences = export(spatial, "mjcf").differences
     for words in (
-        "dry friction lets joints creep there: a;",
-        "stops are soft springs there: b;",
-        "not rebound there: b",
+        "joints with dry friction creep in MuJoCo: a;",
+        "stops are soft springs in MuJoCo: b;",
+        "stops do not rebound in MuJoCo: b",
     ):
-        assert any(words in difference for difference in said), said
+        assert any(words in difference for difference in differences), differences
 
 
-def test_a_swing_is_the_same_as_far_as_springs_can_close_loops() -> None:
-    peer = Peer(load("five_bar"))
+def test_swing_of_the_five_bar_agrees_with_stiff_constraints() -> None:
+    mujoco_model = MujocoModel(load("five_bar"))
     run = ckc_pin.simulate("five_bar/swing", {"t_end": 0.3})
-    peer.model.opt.timestep, peer.model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
-    peer.model.eq_solref[:] = [2e-4, 1.0]
-    peer.put(run.q_tree[0], run.v_tree[0])
+    mujoco_model.model.opt.timestep, mujoco_model.model.opt.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    mujoco_model.model.eq_solref[:] = [2e-4, 1.0]
+    mujoco_model.put(run.q_tree[0], run.v_tree[0])
     for _ in range(3000):
-        mujoco.mj_step(peer.model, peer.data)
-    ends = [peer.data.joint(name).qpos[0] for name in run.coordinates]
+        mujoco.mj_step(mujoco_model.model, mujoco_model.data)
+    ends = [mujoco_model.data.joint(name).qpos[0] for name in run.coordinates]
     assert np.abs(run.q_tree[-1] - run.q_tree[0]).max() > 0.1
     assert np.abs(ends - run.q_tree[-1]).max() < 1e-3
 
 
 @pytest.fixture(params=[*shipped(), "spatial"], scope="module")
-def there_and_back(
+def round_trip(
     request: pytest.FixtureRequest, spatial: Mechanism, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Mechanism, Mechanism]:
-    """A mechanism, and what import makes of its export."""
-    here = spatial if request.param == "spatial" else load(request.param)
+    """A mechanism, and the mechanism imported from its export."""
+    original = spatial if request.param == "spatial" else load(request.param)
     folder = tmp_path_factory.mktemp("back")
-    file = exporting.write(export(here, "mjcf"), folder)
+    file = exporting.write(export(original, "mjcf"), folder)
     importing.write(importing.read(file), folder / "back")
-    return here, load(folder / "back")
+    return original, load(folder / "back")
 
 
-def test_it_comes_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
-    """Coordinates, freedoms, what is driven, gravity, the assembled configuration, points."""
-    here, back = there_and_back
-    assert back.coordinates == here.coordinates
-    assert (back.n, back.rank, back.d) == (here.n, here.rank, here.d)
-    assert set(back.actuated) == set(here.actuated)
-    assert_same(back.tree.model.gravity.linear, here.tree.model.gravity.linear)
-    assert np.abs(back.tree.difference(here.q_tree, back.q_tree)).max() < 1e-8
-    for q_tree, _ in states(here):
-        ours, theirs = (mechanism.point_positions(q_tree) for mechanism in there_and_back)
+def test_export_and_import_keep_coordinates_and_configuration(round_trip: tuple[Mechanism, Mechanism]) -> None:
+    """Coordinates, freedoms, actuated joints, gravity, assembled configuration and points."""
+    original, imported = round_trip
+    assert imported.coordinates == original.coordinates
+    assert (imported.n, imported.rank, imported.d) == (original.n, original.rank, original.d)
+    assert set(imported.actuated) == set(original.actuated)
+    assert_same(imported.tree.model.gravity.linear, original.tree.model.gravity.linear)
+    assert np.abs(imported.tree.difference(original.q_tree, imported.q_tree)).max() < 1e-8
+    for q_tree, _ in states(original):
+        ours, theirs = (mechanism.point_positions(q_tree) for mechanism in round_trip)
         assert set(ours) == set(theirs)
-        assert all(np.abs(theirs[name] - ours[name]).max() < 1e-12 * max(1.0, here.size) for name in ours)
+        assert all(np.abs(theirs[name] - ours[name]).max() < 1e-12 * max(1.0, original.size) for name in ours)
 
 
-def test_its_dynamics_come_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
-    """Mass matrix, bias and the forces of springs, dampers and constant drives at random states."""
-    for q_tree, v_tree in states(there_and_back[0]):
+def test_export_and_import_keep_dynamics(round_trip: tuple[Mechanism, Mechanism]) -> None:
+    """Mass matrix, bias, and the forces of springs, dampers and constant drives at random states."""
+    for q_tree, v_tree in states(round_trip[0]):
         masses, biases, forces = [], [], []
-        for mechanism in there_and_back:
+        for mechanism in round_trip:
             tree, springs = mechanism.tree, mechanism.springs
             D = pin.crba(tree.model, tree.data, q_tree)
             masses.append(np.triu(D) + np.triu(D, 1).T)
             biases.append(pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree))
             forces.append(springs.elastic_force(q_tree) + springs.damping_force(q_tree, v_tree))
-        for here, back in (masses, biases, forces):
-            assert_same(back, here, 1e-10)
+        for original, imported in (masses, biases, forces):
+            assert_same(imported, original, 1e-10)
 
 
-def test_its_joints_come_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
-    """Rotors, friction, ranges and stops; but for what they rebound."""
-    here, back = there_and_back
+def test_export_and_import_keep_joint_properties(round_trip: tuple[Mechanism, Mechanism]) -> None:
+    """Armature, friction, ranges and stops. Restitution is lost, because MuJoCo has none."""
+    original, imported = round_trip
     for name in ("lower", "upper", "friction"):
-        assert np.array_equal(getattr(back.joints, name), getattr(here.joints, name)), name
-    assert np.array_equal(back.tree.model.armature, here.tree.model.armature)
-    assert np.array_equal(back.tree.limits(), here.tree.limits())
-    assert not back.joints.restitution.any()
+        assert np.array_equal(getattr(imported.joints, name), getattr(original.joints, name)), name
+    assert np.array_equal(imported.tree.model.armature, original.tree.model.armature)
+    assert np.array_equal(imported.tree.limits(), original.tree.limits())
+    assert not imported.joints.restitution.any()
 
 
-def test_its_closure_comes_back(there_and_back: tuple[Mechanism, Mechanism]) -> None:
-    """Missed by as much everywhere, in the same direction; where it is closed it admits the same motions.
+def test_export_and_import_keep_constraints(round_trip: tuple[Mechanism, Mechanism]) -> None:
+    """The sum of squares of phi and its gradient are equal, and J has the same row space where the loops are closed.
 
-    Rows may be resolved in other axes, those of a planar loop be three: the sum of their squares and its gradient
-    are the same, and where they are zero the space that J spans.
+    The rows themselves may be resolved in other axes, and a planar loop has three rows after the round trip.
     """
-    here, _ = there_and_back
-    for q_tree, _ in states(here):
-        one, two = (mechanism.kinematics(q_tree) for mechanism in there_and_back)
+    original, _ = round_trip
+    for q_tree, _ in states(original):
+        one, two = (mechanism.kinematics(q_tree) for mechanism in round_trip)
         assert_same(two.phi @ two.phi, one.phi @ one.phi, 1e-10)
         assert_same(two.phi @ two.J, one.phi @ one.J, 1e-10)
-    one, two = (mechanism.kinematics(here.q_tree) for mechanism in there_and_back)
-    assert np.linalg.matrix_rank(np.vstack([one.J, two.J]), tol=1e-7) == here.rank
+    one, two = (mechanism.kinematics(original.q_tree) for mechanism in round_trip)
+    assert np.linalg.matrix_rank(np.vstack([one.J, two.J]), tol=1e-7) == original.rank
 
 
-def test_printed_or_written(tmp_path: Path) -> None:
+def test_model_is_printed_or_written(tmp_path: Path) -> None:
     printed = ckc("export", "five_bar")
     assert printed.code == 0
     assert mujoco.MjModel.from_xml_string(printed.out).nv == 4
@@ -299,15 +297,15 @@ def write(folder: Path, files: dict[str, str]) -> Path:
     return folder
 
 
-def test_a_plane_that_is_left_is_refused(tmp_path: Path) -> None:
+def test_point_2d_that_leaves_the_plane_is_refused(tmp_path: Path) -> None:
     text = SPATIAL["mechanism.toml"].replace('"distance"\nlength = 0.45', '"point_2d"')
     mechanism = load(write(tmp_path, SPATIAL | {"mechanism.toml": text}))
-    with pytest.raises(InputError, match="loop 'rod': MuJoCo has no equality for a point_2d whose frames leave"):
+    with pytest.raises(InputError, match=r"loop 'rod': .* no equality constraint for a point_2d whose frames leave"):
         export(mechanism, "mjcf")
 
 
 @pytest.mark.parametrize("kind", ["cylindrical", "universal", "prismatic"])
-def test_loops_that_mujoco_has_not_are_refused(kind: str, tmp_path: Path) -> None:
+def test_loops_without_equality_constraint_are_refused(kind: str, tmp_path: Path) -> None:
     axis = [0.0, float(kind == "universal"), 1.0]
     text = f"""
 name = "held"
@@ -317,11 +315,13 @@ loop = [{{name = "hold", type = "{kind}", frame_a = "world", frame_b = "b", axis
     mechanism = load(
         write(tmp_path, {"b.urdf": f'<robot name="b">{LINK.format("b", 1)}</robot>', "mechanism.toml": text})
     )
-    with pytest.raises(InputError, match=f"loop 'hold': MuJoCo has no equality for type '{kind}'; it has for point"):
+    with pytest.raises(
+        InputError, match=f"loop 'hold': MuJoCo has no equality constraint for type '{kind}'; supported are point"
+    ):
         export(mechanism, "mjcf")
 
 
-def test_another_format_is_refused() -> None:
+def test_unknown_format_is_refused() -> None:
     refused = ckc("export", "five_bar", "--to", "sdf")
     assert refused.code == 2
     assert "'sdf' is not 'mjcf'" in refused.err

@@ -1,4 +1,4 @@
-"""The command `ckc import`: what it writes and says, what it refuses, and published robots where they are at hand."""
+"""The command `ckc import`: files and output, refused input, and published robots if they are available."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-# --- what it writes -----------------------------------------------------------------------------------------------
+# --- files and output -----------------------------------------------------------------------------------------------
 
 
-def test_import_then_check(folder: Path) -> None:
+def test_imported_mechanism_passes_check(folder: Path) -> None:
     done = ckc("import", "linkage.xml")
     assert (done.code, done.err) == (0, "")
     for line in ("written: linkage/mechanism.toml", "written: linkage/linkage.urdf", "guessed: ranges are hard stops"):
@@ -41,32 +41,32 @@ def test_import_then_check(folder: Path) -> None:
     assert text.startswith("# Imported from linkage.xml, a MuJoCo model.")
     assert '[[joint]]\nname = "a"\nstops = true\n' in text
     assert '[[joint]]\nname = "c"\narmature = 0.1\n' in text
-    found = ckc("check", "linkage", "--json").json
-    assert (found["n"], found["rows"], found["rank"], found["d"]) == (3, 3, 2, 1)
+    check = ckc("check", "linkage", "--json").json
+    assert (check["n"], check["rows"], check["rank"], check["d"]) == (3, 3, 2, 1)
 
 
-def test_the_json_of_an_import(folder: Path) -> None:
-    found = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
-    assert set(found) == {"status", "written", "left_out", "guessed", "check"}
-    assert found["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
-    assert found["left_out"] == []
-    assert found["guessed"] == ["ranges are hard stops without rebound here, MuJoCo's give way: a"]
+def test_json_has_files_notes_and_check(folder: Path) -> None:
+    result = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
+    assert set(result) == {"status", "written", "left_out", "guessed", "check"}
+    assert result["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
+    assert result["left_out"] == []
+    assert result["guessed"] == ["ranges are hard stops without rebound; in MuJoCo they are soft: a"]
     check = ckc("check", "there/deep", "--json").json
-    assert found["check"] == {"status": "done", **check}
+    assert result["check"] == {"status": "done", **check}
 
 
-def test_a_robot_that_does_not_close_is_written_all_the_same(folder: Path) -> None:
+def test_robot_that_cannot_be_assembled_is_written(folder: Path) -> None:
     far = FOUR_BAR.replace("<connect", "<weld").replace('anchor="1 0 -.5"', 'relpose="9 0 0 1 0 0 0"')
     (folder / "far.xml").write_text(far, encoding="utf-8")
-    found = ckc("import", "far.xml", "--json")
-    assert found.code == 0
-    assert found.json["check"]["status"] == "error"
-    assert "not closed: nearest miss" in found.json["check"]["message"]
+    result = ckc("import", "far.xml", "--json")
+    assert result.code == 0
+    assert result.json["check"]["status"] == "error"
+    assert "not closed: nearest miss" in result.json["check"]["message"]
     assert "not closed" in ckc("import", "far.xml", "--out", "again").out
     assert (folder / "far" / "mechanism.toml").is_file()
 
 
-def test_files_that_are_there_are_kept_without_overwrite(folder: Path) -> None:
+def test_existing_files_are_kept_without_overwrite(folder: Path) -> None:
     ckc("import", "linkage.xml")
     file = folder / "linkage" / "mechanism.toml"
     file.write_text("mine", encoding="utf-8")
@@ -92,8 +92,8 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_any_name_survives(folder: Path, name: str) -> None:
-    """Names come from strangers: what is written is the TOML and the URDF that was meant, whatever they hold."""
+def test_any_name_is_written_as_valid_toml_and_urdf(folder: Path, name: str) -> None:
+    """Names are untrusted input: quotes, control characters and TOML syntax in them must be escaped."""
     quoted = name.replace('"', "&quot;")
     text = FOUR_BAR.replace('name="a"', f'name="{quoted}" ref="0.2" armature="0.1"').replace(
         'name="elbow"', f'name="{quoted}"'
@@ -110,13 +110,13 @@ def test_any_name_survives(folder: Path, name: str) -> None:
     assert meant in ckc("check", "odd", "--json").json["coordinates"]
 
 
-def test_a_file_named_after_nothing_takes_the_name_of_its_folder(folder: Path) -> None:
+def test_file_with_a_generic_name_takes_the_name_of_its_folder(folder: Path) -> None:
     (folder / "my robot").mkdir()
     (folder / "my robot" / "robot.xml").write_text(FOUR_BAR, encoding="utf-8")
     assert ckc("import", "my robot/robot.xml", "--json").json["written"][0] == "my_robot/mechanism.toml"
 
 
-# --- what it refuses ----------------------------------------------------------------------------------------------
+# --- refused input ----------------------------------------------------------------------------------------------
 
 
 def mjcf(body: str = "", rest: str = "", file: str = "m.xml") -> dict[str, str]:
@@ -149,14 +149,17 @@ CASES = [
     Bad("not XML", X, ["m.xml: malformed XML"], files={"m.xml": "solid"}),
     Bad("not text", X, ["m.xml", "not UTF-8"], files={"m.xml": b"\xff\xfe\x00"}),
     Bad("an entity bomb", X, ["document type declaration (x) is not accepted"], files={"m.xml": BOMB}),
-    Bad("an abyss", X, ["nested more than 300 deep"], files={"m.xml": "<body>" * 1000 + "</body>" * 1000}),
-    Bad("another XML", X, ["root element is <sdf>", "<mujoco> (MJCF) and <robot> (URDF)"], files={"m.xml": "<sdf/>"}),
-    Bad("another YAML", ["import", "x.yaml"], ["only a robot.yaml beside its URDF"], files={"x.yaml": ""}),
+    Bad("deep XML", X, ["nested more than 300 deep"], files={"m.xml": "<body>" * 1000 + "</body>" * 1000}),
+    Bad("another XML", X, ["root element is <sdf>", "<mujoco> (MJCF) or <robot> (URDF)"], files={"m.xml": "<sdf/>"}),
+    Bad("another YAML", ["import", "x.yaml"], ["have to be a robot.yaml beside its URDF"], files={"x.yaml": ""}),
     Bad(
-        "a yaml alone", ["import", "robot.yaml"], ["one URDF beside it is needed; found none"], files={"robot.yaml": ""}
+        "a yaml alone",
+        ["import", "robot.yaml"],
+        ["expected one URDF", "got none"],
+        files={"robot.yaml": ""},
     ),
     Bad("a folder that cannot be made", [*X, "--out", "m.xml/x"], ["m.xml/x: cannot be written"], files=mjcf(BODY)),
-    # MJCF: what MuJoCo's compiler refuses, with the element's name
+    # MJCF: refused by MuJoCo's compiler, with the name of the element
     Bad("global coordinates", X, ["<compiler>", "coordinate"], files=mjcf("", "<compiler coordinate='global'/>")),
     Bad("unknown unit", X, ["<compiler>", "'gon'"], files=mjcf("", "<compiler angle='gon'/>")),
     Bad("bad sequence", X, ["euler sequence"], files=mjcf("<body euler='1 2 3'/>", "<compiler eulerseq='xyq'/>")),
@@ -185,7 +188,7 @@ CASES = [
     Bad("neither true nor false", X, ["active='yes'"], files=mjcf(BODY, "<equality><weld active='yes'/></equality>")),
     Bad("bad solid", X, ["<mesh> 'm'", "m.stl"], files=mjcf(MESH, MESH_ASSET) | {"m.stl": "version of a pointer"}),
     Bad("a cable", X, ["'B_last'", "not read: <composite>"], files=mjcf("<composite/>" + BODY, CABLE)),
-    # MJCF: what MuJoCo does not get to see
+    # MJCF: refused before MuJoCo reads it
     Bad("an include from outside", X, ["include file='../x'"], files=mjcf("<include file='../x'/>")),
     Bad("an include of itself", X, ["'m.xml' is included twice"], files=mjcf("<include file='m.xml'/>")),
     Bad("an include of nothing", X, ["n.xml: no such MuJoCo model"], files=mjcf("<include file='n.xml'/>")),
@@ -205,18 +208,24 @@ CASES = [
         files=mjcf("", FINE),
     ),
     # URDF
-    Bad("a xacro", R, ["a xacro", "expand it first"], files=urdf('<link name="${x}"/>')),
+    Bad("a xacro", R, ["a xacro file", "expand it first"], files=urdf('<link name="${x}"/>')),
     Bad("two roots", R, ["roots found: 'base', 'lost'"], files=urdf('<link name="lost"/>')),
     Bad(
-        "unknown loop", R, ["loop 'l': type 'screw'", "known are revolute"], files=urdf(LOOP.format("screw", "arm", ""))
+        "unknown loop",
+        R,
+        ["unsupported type 'screw'", "one of revolute"],
+        files=urdf(LOOP.format("screw", "arm", "")),
     ),
-    Bad("loop from nothing", R, ["its predecessor 'x' is no link"], files=urdf(LOOP.format("revolute", "x", ""))),
+    Bad("loop from nothing", R, ["predecessor 'x' is not a link"], files=urdf(LOOP.format("revolute", "x", ""))),
     Bad(
-        "loop about nothing", R, ["is no direction"], files=urdf(LOOP.format("revolute", "arm", '<axis xyz="0 0 0"/>'))
+        "loop about nothing",
+        R,
+        ["a direction"],
+        files=urdf(LOOP.format("revolute", "arm", '<axis xyz="0 0 0"/>')),
     ),
     Bad("loop about a word", R, ["xyz='up'"], files=urdf(LOOP.format("revolute", "arm", '<axis xyz="up"/>'))),
-    Bad("coupling from nothing", R, ["coupling 'g': its predecessor 'x'"], files=urdf(GEAR.format("x", ""))),
-    Bad("coupling by nothing", R, ["coupling 'g': its <ratio> has no number"], files=urdf(GEAR.format("arm", ""))),
+    Bad("coupling from nothing", R, ["coupling 'g': predecessor 'x' is not a link"], files=urdf(GEAR.format("x", ""))),
+    Bad("coupling by nothing", R, ["coupling 'g': expected <ratio> with a number"], files=urdf(GEAR.format("arm", ""))),
     Bad(
         "neither independent nor not",
         R,
@@ -228,7 +237,7 @@ CASES = [
     ),
     # robot.yaml
     Bad("broken YAML", R, ["robot.yaml: malformed YAML"], files=urdf("", robot_yaml="a: [b")),
-    Bad("YAML of nothing", R, ["robot.yaml: not a table"], files=urdf("", robot_yaml="- a")),
+    Bad("YAML without a table", R, ["robot.yaml: expected a table"], files=urdf("", robot_yaml="- a")),
     Bad("YAML aliases", R, ["anchors and aliases"], files=urdf("", robot_yaml="type: &a [3d]\nname_mot: *a")),
     Bad(
         "YAML objects",
@@ -236,18 +245,23 @@ CASES = [
         ["robot.yaml: malformed YAML"],
         files=urdf("", robot_yaml="type: !!python/object:os.system x"),
     ),
-    Bad("much YAML", R, ["more than 65536"], files=urdf("", robot_yaml="#" * 70000)),
+    Bad("large YAML", R, ["more than 65536"], files=urdf("", robot_yaml="#" * 70000)),
     Bad("deep YAML", R, ["nested more than 20 deep"], files=urdf("", robot_yaml="[" * 60000)),
     Bad("deep YAML on a line", R, ["nested more than 20 deep"], files=urdf("", robot_yaml="- " * 30000)),
-    Bad("half a loop", R, ["robot.yaml", "closed_loop"], files=urdf("", robot_yaml="closed_loop: [[base]]")),
+    Bad("a loop of one frame", R, ["robot.yaml", "closed_loop"], files=urdf("", robot_yaml="closed_loop: [[base]]")),
     Bad(
         "loop to nothing",
         R,
-        ["no link or joint 'arn'; close to it: arm"],
+        ["no link or joint 'arn'; did you mean arm?"],
         files=urdf("", robot_yaml="closed_loop: [[base, arn]]"),
     ),
     Bad("unknown loop type", R, ["type '5d'"], files=urdf("", robot_yaml="closed_loop: [[base, arm]]\ntype: [5d]")),
-    Bad("a type too many", R, ["joint_name has 1 entries, joint_type 0"], files=urdf("", robot_yaml="joint_name: [j]")),
+    Bad(
+        "a type too many",
+        R,
+        ["1 entries but joint_type has 0"],
+        files=urdf("", robot_yaml="joint_name: [j]"),
+    ),
     Bad(
         "unknown joint to stand for",
         R,
@@ -258,11 +272,11 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
-def test_bad_robot(case: Bad, bar: Path) -> None:
+def test_bad_file_is_refused(case: Bad, bar: Path) -> None:
     expect(case, bar)
 
 
-def test_a_robot_yaml_without_its_library(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robot_yaml_needs_pyyaml(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, text in urdf("", robot_yaml="name_mot: [j]").items():
         (folder / name).write_text(text, encoding="utf-8")
     monkeypatch.setitem(sys.modules, "yaml", None)
@@ -273,7 +287,7 @@ def test_a_robot_yaml_without_its_library(folder: Path, monkeypatch: pytest.Monk
 
 # --- published robots ---------------------------------------------------------------------------------------------
 
-# rows, rank and freedoms; the freedoms are the robots' motors and the rods that spin about themselves
+# coordinates, rows, rank and freedoms: those of the motors and of rods that spin about their own axes
 PUBLISHED = {
     "example-parallel-robots/5bar_linkage_iso3d/robot.yaml": (5, 3, 3, 2),
     "example-parallel-robots/cassie_like/robot.urdf": (19, 12, 12, 5 + 2),
@@ -286,7 +300,7 @@ PUBLISHED = {
 
 @pytest.mark.skipif(not ROBOTS.is_dir(), reason="the folder of published robots is not beside the project")
 @pytest.mark.parametrize("file", PUBLISHED)
-def test_published_robots_close(file: str, folder: Path) -> None:
-    found = ckc("import", str(ROBOTS / file), "--out", "robot", "--json").json["check"]
-    assert found["status"] == "done", found
-    assert (found["n"], found["rows"], found["rank"], found["d"]) == PUBLISHED[file]
+def test_published_robots_are_imported(file: str, folder: Path) -> None:
+    check = ckc("import", str(ROBOTS / file), "--out", "robot", "--json").json["check"]
+    assert check["status"] == "done", check
+    assert (check["n"], check["rows"], check["rank"], check["d"]) == PUBLISHED[file]

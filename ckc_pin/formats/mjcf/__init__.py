@@ -1,1 +1,1 @@
-"""MuJoCo's models: read through MuJoCo's own compiler, and written for it."""
+"""Read MuJoCo models (MJCF) with MuJoCo's compiler, and write them."""

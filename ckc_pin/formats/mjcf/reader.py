@@ -1,17 +1,24 @@
-"""MuJoCo's MJCF: tree, equality constraints, tendons, actuated joints."""
+"""Read a MuJoCo model into a draft: tree, loops, springs, motors and points.
+
+Actuators become motors with their gears and limits, or constant forces. Gains are left out, because they belong to
+MuJoCo's own controllers.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
-from ckc_pin.formats.draft import Draft, safe_name, vector
-from ckc_pin.formats.mjcf.actuators import Actuators, moved_joints
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.formats.draft import Draft, choose_name, list_names, make_frame, round_number, round_vector
 from ckc_pin.formats.mjcf.compiled import Compiled
+from ckc_pin.formats.mjcf.constraints import Equalities, Tendons
 from ckc_pin.formats.mjcf.document import Document
-from ckc_pin.formats.mjcf.equality import Equalities
-from ckc_pin.formats.mjcf.points import free_sites
-from ckc_pin.formats.mjcf.tendons import Tendons
 from ckc_pin.formats.mjcf.tree import MjcfTree
+from ckc_pin.mechanism.spec import ForceSpec, MotorSpec, PointSpec
 
 __all__ = ["read_mjcf"]
 
@@ -23,27 +30,27 @@ def read_mjcf(text: str, path: Path) -> Draft:
     ----------
     text : str
     path : Path
-        Where the text is from; files that it names are looked for beside it.
+        File of the text. Files that the model names are resolved relative to it.
 
     Raises
     ------
     InputError
-        What is no MJCF, with the element's name; MuJoCo is not installed.
+        The text is not a valid MuJoCo model (the message names the element), or MuJoCo is not installed.
     """
     document = Document.read(text, path)
     compiled = Compiled.of(document)
     model = compiled.model
     tendons = Tendons(compiled)
-    geared = model.eq_type == int(compiled.mujoco.mjtEq.mjEQ_JOINT)
-    used = {int(joint) for joints in (model.eq_obj1id, model.eq_obj2id) for joint in joints[geared]}
-    tree = MjcfTree(compiled, used | moved_joints(compiled) | tendons.used_joints)
+    is_joint_equality = model.eq_type == int(compiled.mujoco.mjtEq.mjEQ_JOINT)
+    in_equalities = {int(joint) for ids in (model.eq_obj1id, model.eq_obj2id) for joint in ids[is_joint_equality]}
+    tree = MjcfTree(compiled, in_equalities | _actuated_joints(compiled) | tendons.used_joints)
     equalities = Equalities(compiled, tree, tendons)
-    springs, of_tendons = tendons.springs(tree)
-    actuators = Actuators(compiled, tree)
-    name = safe_name(path, document.root.get("model", ""))
+    springs, tendon_notes = tendons.springs(tree)
+    actuators = _Actuators(compiled, tree)
+    name = choose_name(path, document.root.get("model", ""))
     tree.robot.set("name", name)
-    medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
-    off = _switched_off(compiled)
+    has_medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
+    disabled = _disabled_effects(compiled)
     return Draft(
         name,
         f"{path.name}, a MuJoCo model",
@@ -54,25 +61,25 @@ def read_mjcf(text: str, path: Path) -> Draft:
         forces=actuators.forces,
         joints=tree.joints,
         motors=[(motor, "") for motor in actuators.motors],
-        points=free_sites(compiled, tree),
+        points=_free_sites(compiled, tree),
         actuated=actuators.joints or None,
-        gravity=vector((0.0, 0.0, 0.0) if "gravity" in off else model.opt.gravity),
+        gravity=round_vector((0.0, 0.0, 0.0) if "gravity" in disabled else model.opt.gravity),
         q_guess=tree.q_guess,
-        guessed=tree.guessed + [f"MuJoCo says: {said}" for said in compiled.warnings],
+        guessed=tree.guessed + [f"MuJoCo warns: {warning}" for warning in compiled.warnings],
         left_out=[
             *tree.left_out,
             *equalities.left_out,
-            *of_tendons,
+            *tendon_notes,
             *actuators.left_out,
             *document.left_out,
-            *(["forces of the medium (wind, density, viscosity)"] if medium else []),
-            *(f"that the model switches its {what} off" for what in off if what != "gravity"),
+            *(["forces of the medium (wind, density, viscosity)"] if has_medium else []),
+            *(f"the model's flag that disables {effect}: they act here" for effect in disabled if effect != "gravity"),
         ],
     )
 
 
-def _switched_off(compiled: Compiled) -> list[str]:
-    """Return what flags of the model switch off that would act here."""
+def _disabled_effects(compiled: Compiled) -> list[str]:
+    """Return the effects that flags of the model disable and that a mechanism has."""
     bits = compiled.mujoco.mjtDisableBit
     flags = {
         "gravity": bits.mjDSBL_GRAVITY,
@@ -82,4 +89,142 @@ def _switched_off(compiled: Compiled) -> list[str]:
         "dry friction": bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_CONSTRAINT,
         "ranges of joints": bits.mjDSBL_LIMIT | bits.mjDSBL_CONSTRAINT,
     }
-    return [what for what, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]
+    return [effect for effect, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]
+
+
+# --- actuators -----------------------------------------------------------------------------------------------------
+
+
+class _Actuators:
+    """Actuators of a compiled model.
+
+    Attributes
+    ----------
+    joints : list of str
+        Joints with a motor.
+    motors : list of MotorSpec
+        One for each joint; empty if all of them are direct drives without limits, which `actuated` expresses.
+    forces : list of (ForceSpec, comment)
+    left_out : list of str
+    """
+
+    def __init__(self, compiled: Compiled, tree: MjcfTree) -> None:
+        self.joints: list[str] = []
+        self.forces: list[tuple[ForceSpec, str]] = []
+        self.left_out: list[str] = []
+        motors: list[MotorSpec] = []
+        with_gains = []
+        for k in range(compiled.model.nactuator):
+            joint = _joint_of(compiled, k)
+            name = compiled.name("actuator", k)
+            if joint is None or joint not in tree.ref:
+                target = "a joint of several freedoms" if joint is not None else _describe_target(compiled, k)
+                rotor = ", with its armature" if joint is None and compiled.model.actuator_armature[k] else ""
+                self.left_out.append(f"actuator {name} on {target}{rotor}".replace("  ", " "))
+            elif value := _constant_force(compiled, k):
+                spec = ForceSpec(joint=compiled.joints[joint], value=round_number(value))
+                self.forces.append((spec, f"actuator {name}, which has no control input".replace("  ", " ")))
+            else:
+                if compiled.joints[joint] not in self.joints:
+                    self.joints.append(compiled.joints[joint])
+                    motors.append(_motor(compiled, k, compiled.joints[joint]))
+                with_gains += [] if _is_direct_drive(compiled, k) else [compiled.joints[joint]]
+        has_duplicate_names = len({motor.name for motor in motors}) < len(motors)
+        all_plain = all(motor.ratio == 1.0 and motor.torque_limit is None for motor in motors)
+        self.motors = [] if has_duplicate_names or all_plain else motors
+        if with_gains:
+            joints = list_names(list(dict.fromkeys(with_gains)))
+            self.left_out.append(f"gains and curves of actuators, whose joints have motors instead: {joints}")
+
+
+def _actuated_joints(compiled: Compiled) -> set[int]:
+    """Return the joints on which an actuator acts."""
+    joints = (_joint_of(compiled, k) for k in range(compiled.model.nactuator))
+    return {joint for joint in joints if joint is not None}
+
+
+def _joint_of(compiled: Compiled, k: int) -> int | None:
+    model, kinds = compiled.model, compiled.mujoco.mjtTrn
+    on_joint = int(model.actuator_trntype[k]) in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT)
+    return int(model.actuator_trnid[k, 0]) if on_joint else None
+
+
+def _describe_target(compiled: Compiled, k: int) -> str:
+    """Return type and name of the target of an actuator that does not act on a joint."""
+    model, kinds = compiled.model, compiled.mujoco.mjtTrn
+    targets = {
+        int(kinds.mjTRN_TENDON): "tendon",
+        int(kinds.mjTRN_SITE): "site",
+        int(kinds.mjTRN_SLIDERCRANK): "site",
+        int(kinds.mjTRN_BODY): "body",
+    }
+    kind = targets.get(int(model.actuator_trntype[k]), "")
+    return f"{kind} {compiled.name(kind, model.actuator_trnid[k, 0])}" if kind else "no joint"
+
+
+def _constant_force(compiled: Compiled, k: int) -> float:
+    """Return the force of an actuator without control input, as `ckc export` writes one; 0 for any other actuator."""
+    model, mujoco = compiled.model, compiled.mujoco
+    has_input = int(model.actuator_gaintype[k]) != mujoco.mjtGain.mjGAIN_FIXED or model.actuator_gainprm[k].any()
+    bias = model.actuator_biasprm[k]
+    if has_input or int(model.actuator_biastype[k]) != mujoco.mjtBias.mjBIAS_AFFINE or bias[1:].any():
+        return 0.0
+    return float(model.actuator_gear[k, 0] * bias[0])
+
+
+def _motor(compiled: Compiled, k: int, joint: str) -> MotorSpec:
+    """Return an actuator on a joint as a motor. The joint's armature includes the actuator's already."""
+    model = compiled.model
+    limit = math.inf
+    gain = abs(float(model.actuator_gainprm[k, 0]))
+    for is_limited, bounds, scale in (
+        (model.actuator_forcelimited[k], model.actuator_forcerange[k], 1.0),
+        (model.actuator_ctrllimited[k] and _is_direct_drive(compiled, k), model.actuator_ctrlrange[k], gain),
+    ):
+        if is_limited and bounds[0] < 0 < bounds[1]:
+            limit = min(limit, scale * float(min(-bounds[0], bounds[1])))
+    gear = float(model.actuator_gear[k, 0])
+    return MotorSpec(
+        name=compiled.name("actuator", k) or joint,
+        joint=joint,
+        ratio=round_number(gear) if gear else 1.0,
+        torque_limit=round_number(limit) if math.isfinite(limit) else None,
+    )
+
+
+def _is_direct_drive(compiled: Compiled, k: int) -> bool:
+    """Whether an actuator's force is proportional to its control."""
+    model, mujoco = compiled.model, compiled.mujoco
+    kinds = [int(kind[k]) for kind in (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)]
+    direct = [mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE]
+    return kinds == [int(kind) for kind in direct] and bool(model.actuator_gear[k, 0])
+
+
+# --- points --------------------------------------------------------------------------------------------------------
+
+
+def _free_sites(compiled: Compiled, tree: MjcfTree) -> list[tuple[PointSpec, str]]:
+    """Return a point for each named site that no equality, tendon or actuator uses."""
+    used, points = set(_used_sites(compiled)), []
+    for site in range(compiled.model.nsite):
+        name = compiled.name("site", site)
+        if name and site not in used:
+            placed = tree.site(site)
+            frame = make_frame(placed.link, pin.SE3(np.eye(3), placed.pose.translation))
+            points.append((PointSpec(name=name, frame=frame), ""))
+    return points
+
+
+def _used_sites(compiled: Compiled) -> Iterator[int]:
+    model, mujoco = compiled.model, compiled.mujoco
+    for k in range(model.neq):
+        if int(model.eq_objtype[k]) == mujoco.mjtObj.mjOBJ_SITE:
+            yield from (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]))
+    for k in range(model.nwrap):
+        if int(model.wrap_type[k]) == mujoco.mjtWrap.mjWRAP_SITE:
+            yield int(model.wrap_objid[k])
+        elif int(model.wrap_type[k]) in (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER):
+            yield int(model.wrap_prm[k])  # the side site, which selects the side on which a tendon wraps
+    for k in range(model.nactuator):
+        if int(model.actuator_trntype[k]) in (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtTrn.mjTRN_SLIDERCRANK):
+            yield from (int(site) for site in model.actuator_trnid[k])

@@ -1,8 +1,9 @@
-"""MuJoCo's bodies and joints to a URDF's links and joints, without a change of what the coordinates mean.
+"""Convert MuJoCo's bodies and joints to a URDF's links and joints, with the same coordinates.
 
-A URDF joint moves its child's frame, a MuJoCo joint turns a body about a point of that body. So the frame of
-a link is that of the body shifted to its last joint, and every body is remembered with its pose in its link.
-A joint's `ref`, its value in the reference pose, goes into the joint's origin: the numbers stay MuJoCo's.
+A URDF joint places the frame of its child link. A MuJoCo joint turns a body about a point of that body. The frame of a
+link is therefore the body's frame shifted to the body's last joint, and the tree stores the pose of every body in its
+link. A joint's `ref`, its value in MuJoCo's reference pose, becomes part of the joint's origin, so coordinates keep
+MuJoCo's values.
 """
 
 from __future__ import annotations
@@ -16,38 +17,177 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.formats.draft import number, some, unique, vector
+from ckc_pin.formats.draft import (
+    from_axis_angle,
+    from_quaternion,
+    list_names,
+    make_unique,
+    round_number,
+    round_vector,
+    to_rpy,
+)
 from ckc_pin.formats.mjcf.compiled import Compiled
-from ckc_pin.formats.mjcf.joints import Joint, is_free_root
-from ckc_pin.formats.mjcf.shapes import draw
-from ckc_pin.formats.orientation import from_quaternion, to_rpy
-from ckc_pin.formats.urdf.elements import UNLIMITED, Body, JointLimits, add_inertial, add_joint, add_link
+from ckc_pin.formats.urdf.elements import (
+    UNLIMITED,
+    Body,
+    JointLimits,
+    add_inertial,
+    add_joint,
+    add_link,
+    add_shape,
+    format_numbers,
+)
 from ckc_pin.mechanism.spec import JointSpec, SpringSpec
 
 __all__ = ["MjcfTree", "Placed"]
 
+JOINT_KINDS = ("free", "ball", "slide", "hinge")  # by mjtJoint
+SPHERE, CAPSULE, CYLINDER, BOX = 2, 3, 5, 6  # mjtGeom
+ORTHOGONAL_TOLERANCE = 1e-12  # between the axes of three slides
+FREE_LABELS = ("x", "y", "z", "rx", "ry", "rz")
+
 
 @dataclass(frozen=True)
 class Placed:
-    """Where something stands: its pose in a link."""
+    """A frame by its pose in a link."""
 
     link: str
     pose: pin.SE3
 
     def at(self, pose: pin.SE3) -> Placed:
-        """Return what stands at a pose in this."""
+        """Return the frame at a pose in this frame."""
         return Placed(self.link, self.pose * pose)
+
+
+# --- joints --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """A compiled joint, in the frame of its body.
+
+    Attributes
+    ----------
+    number : int
+        MuJoCo's.
+    name : str
+    kind : str
+        hinge, slide, ball or free.
+    qpos_index : int
+        Where its values begin in qpos.
+    position, axis : (3,) arrays
+        A point of the axis (m), and the unit direction.
+    ref : float
+        Value in the reference pose, rad or m.
+    limits : JointLimits
+    has_stops : bool
+        Whether the range acts.
+    stiffness, rest, damping, friction, armature : float
+        Damping and armature include those of the actuators on the joint.
+    is_nonlinear : bool
+        Whether stiffness or damping have terms of higher order.
+    """
+
+    number: int
+    name: str
+    kind: str
+    qpos_index: int
+    position: Array
+    axis: Array
+    ref: float
+    limits: JointLimits
+    has_stops: bool
+    stiffness: float
+    rest: float
+    damping: float
+    friction: float
+    armature: float
+    is_nonlinear: bool
+
+    @classmethod
+    def read(cls, compiled: Compiled, number: int) -> _Joint:
+        """Read a joint of the compiled model."""
+        model, kind = compiled.model, JOINT_KINDS[compiled.model.jnt_type[number]]
+        dof, qpos = int(model.jnt_dofadr[number]), int(model.jnt_qposadr[number])
+        damping, armature = float(model.dof_damping[dof]), float(model.dof_armature[dof])
+        on_joint = (compiled.mujoco.mjtTrn.mjTRN_JOINT, compiled.mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        for k in range(model.nactuator):
+            if int(model.actuator_trntype[k]) in on_joint and model.actuator_trnid[k, 0] == number:
+                gear = float(model.actuator_gear[k, 0])
+                damping += gear**2 * float(model.actuator_damping[k])
+                armature += gear**2 * float(model.actuator_armature[k])
+        return cls(
+            number=number,
+            name=compiled.joints[number],
+            kind=kind,
+            qpos_index=qpos,
+            position=np.zeros(3) if kind == "free" else model.jnt_pos[number].copy(),
+            axis=model.jnt_axis[number].copy(),
+            ref=float(model.qpos0[qpos]) if kind in ("hinge", "slide") else 0.0,
+            limits=_read_limits(compiled, number),
+            has_stops=bool(model.jnt_limited[number]),
+            stiffness=float(model.jnt_stiffness[number]),
+            rest=float(model.qpos_spring[qpos]),
+            damping=damping,
+            friction=float(model.dof_frictionloss[dof]),
+            armature=armature,
+            is_nonlinear=bool(model.jnt_stiffnesspoly[number].any() or model.dof_dampingpoly[dof].any()),
+        )
+
+    @property
+    def effects(self) -> list[str]:
+        """MuJoCo's names of the properties that produce forces or inertia at the joint."""
+        values = {
+            "damping": self.damping,
+            "stiffness": self.stiffness,
+            "frictionloss": self.friction,
+            "armature": self.armature,
+            "range": self.has_stops,
+        }
+        return [key for key, value in values.items() if value]
+
+    def displacement(self, value: float) -> pin.SE3:
+        """Return the displacement by a value of the joint (rad or m), relative to zero."""
+        if self.kind == "slide":
+            return pin.SE3(np.eye(3), value * self.axis)
+        return pin.SE3(from_axis_angle(self.axis, value) if value else np.eye(3), np.zeros(3))
+
+
+def _is_free_root(joints: Sequence[_Joint]) -> bool:
+    """Whether three slides and a ball are equivalent to a free joint.
+
+    The slides must be orthogonal, the ball at the body's origin, and no joint may have damping, stiffness, friction or
+    armature.
+    """
+    if [joint.kind for joint in joints] != ["slide", "slide", "slide", "ball"] or joints[3].position.any():
+        return False
+    if any(set(joint.effects) - {"range"} for joint in joints):
+        return False
+    axes = np.array([joint.axis for joint in joints[:3]])
+    return bool(np.abs(axes @ axes.T - np.eye(3)).max() < ORTHOGONAL_TOLERANCE)
+
+
+def _read_limits(compiled: Compiled, number: int) -> JointLimits:
+    model = compiled.model
+    lower, upper = (round_number(float(x)) for x in model.jnt_range[number])
+    if not model.jnt_limited[number] and not lower < upper:
+        return UNLIMITED
+    effort = float(np.abs(model.jnt_actfrcrange[number]).max()) if model.jnt_actfrclimited[number] else 0.0
+    return JointLimits(lower, upper, effort)
+
+
+# --- tree ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class MjcfTree:
-    """The tree of a model.
+    """The tree of a compiled model as a URDF.
 
     Parameters
     ----------
     compiled : Compiled
-    used : set of int
-        Joints that an actuator, a tendon or an equality names.
+    used_joints : set of int
+        Joints to which an actuator, a tendon or an equality constraint refers.
 
     Attributes
     ----------
@@ -56,17 +196,17 @@ class MjcfTree:
     bodies : list of Placed
         By MuJoCo's number.
     ref : dict of int to float
-        Joints of one freedom and their values in the reference pose.
+        By number, the joints of one freedom with their values in the reference pose, rad or m.
     q_guess : dict of str to float
-        The reference pose, or the key frame that `ckc export` writes, by coordinate, where it is not zero.
+        The reference pose, or the key frame that `ckc export` writes: coordinates that are not zero.
     springs : list of (SpringSpec, comment)
     joints : list of (JointSpec, comment)
-        Armature, and the ranges that act, which a URDF has no words for.
+        Armature, and ranges that act as stops, which a URDF cannot express.
     guessed, left_out : list of str
     """
 
     compiled: Compiled
-    used: set[int]
+    used_joints: set[int]
     robot: Element = field(default_factory=lambda: Element("robot"))
     bodies: list[Placed] = field(default_factory=list)
     ref: dict[int, float] = field(default_factory=dict)
@@ -78,154 +218,168 @@ class MjcfTree:
 
     def __post_init__(self) -> None:
         model = self.model = self.compiled.model
-        self._links, self._joints = {"world", *self.compiled.bodies}, set(self.compiled.joints)
+        self._link_names, self._joint_names = {"world", *self.compiled.bodies}, set(self.compiled.joints)
         self._start = model.key_qpos[0] if model.nkey else model.qpos0
-        self._elements = {"world": add_link(self.robot, "world")}
+        self._links = {"world": add_link(self.robot, "world")}
         self.bodies.append(Placed("world", pin.SE3.Identity()))
-        for number_ in range(1, model.nbody):
-            self._body(number_)
-        undrawn = self.compiled.undrawn + sum(not draw(model, k, *self._link_of(k)) for k in range(model.ngeom))
-        self._notes(undrawn)
+        for body in range(1, model.nbody):
+            self._add_body(body)
+        drawn = sum(_draw_shape(model, geom, *self._link_of(geom)) for geom in range(model.ngeom))
+        self._add_notes(self.compiled.undrawn + model.ngeom - drawn)
 
-    def site(self, number_: int) -> Placed:
-        """Return where a site is."""
+    def site(self, number: int) -> Placed:
+        """Return the frame of a site."""
         model = self.model
-        return self.bodies[model.site_bodyid[number_]].at(_pose(model.site_quat, model.site_pos, number_))
+        return self.bodies[model.site_bodyid[number]].at(_pose(model.site_quat, model.site_pos, number))
 
     def _link_of(self, geom: int) -> tuple[Element, pin.SE3]:
-        placed = self.bodies[self.model.geom_bodyid[geom]]
-        return self._elements[placed.link], placed.pose * _pose(self.model.geom_quat, self.model.geom_pos, geom)
+        body = self.bodies[self.model.geom_bodyid[geom]]
+        return self._links[body.link], body.pose * _pose(self.model.geom_quat, self.model.geom_pos, geom)
 
-    def _notes(self, undrawn: int) -> None:
+    def _add_notes(self, undrawn: int) -> None:
         model, names = self.model, self.compiled.bodies
         notes = {
-            "masses of shapes unknown here; give the link an <inertial>": self.compiled.unweighed,
+            "masses of shapes whose mesh is missing; give the link an <inertial>": self.compiled.unweighed,
             "gravity compensation of bodies": [names[k] for k in np.flatnonzero(model.body_gravcomp)],
         }
-        self.left_out += [f"{what}: {some(which)}" for what, which in notes.items() if which]
-        stopped = [spec.name for spec, _ in self.joints if spec.stops]
-        if stopped:
-            self.guessed.append(f"ranges are hard stops without rebound here, MuJoCo's give way: {some(stopped)}")
+        self.left_out += [f"{note}: {list_names(affected)}" for note, affected in notes.items() if affected]
+        with_stops = [spec.name for spec, _ in self.joints if spec.stops]
+        if with_stops:
+            self.guessed.append(
+                f"ranges are hard stops without rebound; in MuJoCo they are soft: {list_names(with_stops)}"
+            )
         for k in np.flatnonzero(model.body_mocapid >= 0):
-            self.left_out.append(f"body {names[k]} is moved from outside (mocap): it stands still here")
+            self.left_out.append(f"external motion (mocap) of body {names[k]}: the body is fixed")
         if undrawn:
-            self.left_out.append(f"{undrawn} shapes that are no box, cylinder or sphere: not drawn")
+            self.left_out.append(f"{undrawn} shapes that are not boxes, cylinders, capsules or spheres: not drawn")
 
-    # --- bodies ----------------------------------------------------------------------------------
+    # --- bodies ------------------------------------------------------------------------------------
 
-    def _body(self, at: int) -> None:
-        model, name = self.model, self.compiled.bodies[at]
-        start = self.bodies[model.body_parentid[at]].at(_pose(model.body_quat, model.body_pos, at))
-        first = model.body_jntadr[at]
-        joints = [Joint.read(self.compiled, first + k) for k in range(model.body_jntnum[at])]
-        on_world = model.body_parentid[at] == 0
+    def _add_body(self, number: int) -> None:
+        model, name = self.model, self.compiled.bodies[number]
+        start = self.bodies[model.body_parentid[number]].at(_pose(model.body_quat, model.body_pos, number))
+        first = model.body_jntadr[number]
+        joints = [_Joint.read(self.compiled, first + k) for k in range(model.body_jntnum[number])]
+        on_world = model.body_parentid[number] == 0
         if [joint.kind for joint in joints] == ["free"]:
-            if joints[0].acting:
-                self.left_out.append(f"{', '.join(joints[0].acting)} of free joint {joints[0].name}")
-            qpos = self._start[joints[0].at_qpos :]
-            pose = self._free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
-        elif on_world and is_free_root(joints) and not self.used & {joint.number for joint in joints}:
+            if joints[0].effects:
+                self.left_out.append(f"{', '.join(joints[0].effects)} of free joint {joints[0].name}")
+            qpos = self._start[joints[0].qpos_index :]
+            pose = self._add_free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
+        elif on_world and _is_free_root(joints) and not self.used_joints & {joint.number for joint in joints}:
             self.guessed.append(f"the three slides and the ball of body {name} are one free joint, 'root'")
-            self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.stops]
-            values = self._start[joints[0].at_qpos :]
-            moved = sum(((x - j.ref) * j.axis for x, j in zip(values[:3], joints, strict=False)), np.zeros(3))
-            pose = self._free(
-                unique("root", self._joints), name, start.pose * pin.SE3(from_quaternion(values[3:7]), moved)
+            self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.has_stops]
+            qpos = self._start[joints[0].qpos_index :]
+            shift = sum(((x - j.ref) * j.axis for x, j in zip(qpos[:3], joints, strict=False)), np.zeros(3))
+            pose = self._add_free(
+                make_unique("root", self._joint_names), name, start.pose * pin.SE3(from_quaternion(qpos[3:7]), shift)
             )
         else:
-            pose = self._chain(joints, name, start)
+            pose = self._add_chain(joints, name, start)
         self.bodies.append(Placed(name, pose))
-        add_inertial(self._elements[name], self._inertia(at).moved(pose))
+        add_inertial(self._links[name], self._inertia(number).transformed(pose))
 
-    def _inertia(self, at: int) -> Body:
-        """Mass and inertia in the body's frame."""
-        if at in self.compiled.weightless:
+    def _inertia(self, number: int) -> Body:
+        """Return mass and inertia of a body in the body's frame."""
+        if number in self.compiled.weightless:
             return Body(0.0, np.zeros(3), np.zeros((3, 3)))
         model = self.model
-        principal = Body(float(model.body_mass[at]), np.zeros(3), np.diag(model.body_inertia[at]))
-        return principal.moved(_pose(model.body_iquat, model.body_ipos, at))
+        principal = Body(float(model.body_mass[number]), np.zeros(3), np.diag(model.body_inertia[number]))
+        return principal.transformed(_pose(model.body_iquat, model.body_ipos, number))
 
-    # --- joints ----------------------------------------------------------------------------------
+    # --- joints ------------------------------------------------------------------------------------
 
-    def _free(self, name: str, body: str, start: pin.SE3) -> pin.SE3:
-        """Add a floating joint; its coordinates are the body's pose in the world."""
-        self._joints.add(name)
-        self._join(name, "floating", "world", body, pin.SE3.Identity())
+    def _add_free(self, name: str, body: str, start: pin.SE3) -> pin.SE3:
+        """Add a floating joint, whose coordinates are the body's world pose; return the body's pose in its link."""
+        self._joint_names.add(name)
+        self._add_joint(name, "floating", "world", body, pin.SE3.Identity())
         values = (*start.translation, *pin.log3(start.rotation))
-        self._guess((f"{name}.{label}" for label in ("x", "y", "z", "rx", "ry", "rz")), values)
+        self._set_guess((f"{name}.{label}" for label in FREE_LABELS), values)
         return pin.SE3.Identity()
 
-    def _chain(self, joints: Sequence[Joint], body: str, start: Placed) -> pin.SE3:
-        """Add a body's joints one after another, massless links between them; return its pose in its link."""
+    def _add_chain(self, joints: Sequence[_Joint], body: str, start: Placed) -> pin.SE3:
+        """Add a body's joints in series, connected by links without mass; return the body's pose in its link."""
         link, pose = start.link, start.pose
         if not joints:
-            self._join(unique(f"{body}_fixed", self._joints), "fixed", link, body, pose)
+            self._add_joint(make_unique(f"{body}_fixed", self._joint_names), "fixed", link, body, pose)
             return pin.SE3.Identity()
-        for position, joint in enumerate(joints):
-            last = position == len(joints) - 1
-            child = body if last else unique(f"{body}_{joint.name}_link", self._links)
-            origin = pose * pin.SE3(np.eye(3), joint.at)
+        for joint in joints:
+            is_last = joint is joints[-1]
+            child = body if is_last else make_unique(f"{body}_{joint.name}_link", self._link_names)
+            origin = pose * pin.SE3(np.eye(3), joint.position)
             if joint.kind == "ball":
-                self._ball(joint, link, child, origin)
+                self._add_ball(joint, link, child, origin)
             else:
-                self._scalar(joint, link, child, origin * joint.turned(-joint.ref))
-            link, pose = child, pin.SE3(np.eye(3), -joint.at)
+                self._add_hinge_or_slide(joint, link, child, origin * joint.displacement(-joint.ref))
+            link, pose = child, pin.SE3(np.eye(3), -joint.position)
         return pose
 
-    def _scalar(self, joint: Joint, link: str, child: str, origin: pin.SE3) -> None:
-        """Add a hinge or a slide, with its range, damping, friction and spring."""
+    def _add_hinge_or_slide(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
+        """Add a joint of one freedom with its range, damping, friction and spring."""
         kind = "prismatic" if joint.kind == "slide" else ("continuous" if joint.limits.lower is None else "revolute")
-        self._join(
-            joint.name, kind, link, child, origin, joint.axis, joint.limits, joint.damping, joint.friction
-        )  # fmt: skip
+        self._add_joint(
+            joint.name,
+            kind,
+            link,
+            child,
+            origin,
+            axis=round_vector(joint.axis),
+            limits=joint.limits,
+            damping=joint.damping,
+            friction=joint.friction,
+        )
         if joint.stiffness:
-            spec = SpringSpec(joint=joint.name, stiffness=joint.stiffness, rest=number(joint.rest))
+            spec = SpringSpec(joint=joint.name, stiffness=joint.stiffness, rest=round_number(joint.rest))
             self.springs.append((spec, "the joint's stiffness"))
         if joint.is_nonlinear:
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {joint.name}")
-        if joint.armature or joint.stops:
-            self.joints.append((JointSpec(name=joint.name, armature=joint.armature or None, stops=joint.stops), ""))
-        self.ref[joint.number] = number(joint.ref)
-        self._guess([joint.name], [self._start[joint.at_qpos]])
+        if joint.armature or joint.has_stops:
+            table = JointSpec(name=joint.name, armature=joint.armature or None, stops=joint.has_stops)
+            self.joints.append((table, ""))
+        self.ref[joint.number] = round_number(joint.ref)
+        self._set_guess([joint.name], [self._start[joint.qpos_index]])
 
-    def _ball(self, joint: Joint, link: str, child: str, origin: pin.SE3) -> None:
-        """Add three hinges through massless links for a ball joint."""
-        names = [unique(f"{joint.name}_{axis}", self._joints) for axis in "xyz"]
+    def _add_ball(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
+        """Add three hinges in series for a ball joint."""
+        names = [make_unique(f"{joint.name}_{axis}", self._joint_names) for axis in "xyz"]
         for position, (name, axis) in enumerate(zip(names, np.eye(3), strict=True)):
-            below = child if position == 2 else unique(f"{child}_{'xy'[position]}", self._links)
-            self._joints.add(name)
-            self._join(name, "continuous", link, below, origin, axis)
-            link, origin = below, pin.SE3.Identity()
-        turned = from_quaternion(self._start[joint.at_qpos : joint.at_qpos + 4])
-        self._guess(names, [-angle for angle in to_rpy(turned.T)])  # turns about x, y, z, one after another
+            next_link = child if position == 2 else make_unique(f"{child}_{'xy'[position]}", self._link_names)
+            self._joint_names.add(name)
+            self._add_joint(name, "continuous", link, next_link, origin, axis=round_vector(axis))
+            link, origin = next_link, pin.SE3.Identity()
+        rotation = from_quaternion(self._start[joint.qpos_index : joint.qpos_index + 4])
+        # The hinges turn about x, y and z in this order, so their angles are those of the inverse with opposite sign.
+        self._set_guess(names, [-angle for angle in to_rpy(rotation.T)])
         self.guessed.append(
             f"ball joint {joint.name} is three hinges, {', '.join(names)}: singular where {names[1]} is +-90 degrees"
         )
-        if joint.acting:
-            self.left_out.append(f"{', '.join(joint.acting)} of ball joint {joint.name}")
+        if joint.effects:
+            self.left_out.append(f"{', '.join(joint.effects)} of ball joint {joint.name}")
 
-    def _guess(self, labels: Iterable[str], values: Iterable[Any]) -> None:
-        self.q_guess |= {
-            label: number(float(x)) for label, x in zip(labels, values, strict=True) if abs(number(float(x))) > 0
-        }
+    def _set_guess(self, labels: Iterable[str], values: Iterable[Any]) -> None:
+        rounded = {label: round_number(float(x)) for label, x in zip(labels, values, strict=True)}
+        self.q_guess |= {label: x for label, x in rounded.items() if x != 0}
 
-    def _join(
-        self,
-        name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        origin: pin.SE3,
-        axis: Sequence[float] | Array = (),
-        limits: JointLimits = UNLIMITED,
-        damping: float = 0.0,
-        friction: float = 0.0,
-    ) -> None:
-        self._links.add(child)
-        self._elements[child] = add_link(self.robot, child)
-        direction = vector(axis) if len(axis) else ()
-        add_joint(self.robot, name, kind, parent, child, origin, direction, limits, damping, friction)
+    def _add_joint(self, name: str, kind: str, parent: str, child: str, origin: pin.SE3, **properties: Any) -> None:
+        self._link_names.add(child)
+        self._links[child] = add_link(self.robot, child)
+        add_joint(self.robot, name, kind, parent, child, origin, **properties)
 
 
-def _pose(quaternions: Array, positions: Array, at: int) -> pin.SE3:
-    return pin.SE3(from_quaternion(quaternions[at]), positions[at].copy())
+def _pose(quaternions: Array, positions: Array, number: int) -> pin.SE3:
+    return pin.SE3(from_quaternion(quaternions[number]), positions[number].copy())
+
+
+def _draw_shape(model: Any, geom: int, link: Element, pose: pin.SE3) -> bool:
+    """Add a shape to a link as a visual; return False if URDF has no such shape."""
+    kind = int(model.geom_type[geom])
+    radius, half, _ = (float(x) for x in model.geom_size[geom])
+    if kind == SPHERE:
+        add_shape(link, pose, "sphere", radius=repr(radius))
+    elif kind == BOX:
+        add_shape(link, pose, "box", size=format_numbers(2 * model.geom_size[geom]))
+    elif kind in (CYLINDER, CAPSULE):
+        add_shape(link, pose, "cylinder", radius=repr(radius), length=repr(2 * half))
+        for z in (-half, half) if kind == CAPSULE else ():
+            add_shape(link, pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, z])), "sphere", radius=repr(radius))
+    return kind in (SPHERE, BOX, CYLINDER, CAPSULE)

@@ -1,147 +1,215 @@
-"""MuJoCo's MJCF: bodies and joints from Pinocchio's tree, so that both programs have the same D', C' and h'."""
+"""Write a mechanism as a MuJoCo model.
+
+Bodies and joints are those of Pinocchio's tree, so both programs have the same D', C' and h'. Loops, couplings and
+springs become MuJoCo's equality constraints and tendons. A loop type without an exact equality constraint in MuJoCo is
+refused, because the model would look right and move differently.
+"""
 
 from __future__ import annotations
 
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
+import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.formats.mjcf.writer_loops import Sites, add_loops, add_springs, numbers, quaternion
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.pose import Anchors, Pose
+from ckc_pin.mechanism.rows import Affine
+from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
-__all__ = ["mjcf"]
+__all__ = ["place_in_plane", "to_mjcf"]
 
-LEAST = 1e-12  # kg, kg m^2: MuJoCo refuses a moving body without
-THICKNESS = 0.03  # of the mechanism's size: the sticks that it is drawn with
-SHORT = 1e-6  # of the size: a stick of no length
+MIN_MASS = 1e-12  # kg and kg m^2; MuJoCo refuses moving bodies with less
+TRIANGLE_TOLERANCE = 1e-9  # relative; of the triangle inequality between principal moments
+STICK_RADIUS = 0.03  # of the mechanism's size
+MIN_STICK_LENGTH = 1e-6  # of the mechanism's size
+PLANE_TOLERANCE = 1e-9  # of the mechanism's size; how far a planar loop may leave its plane
+PLANE_CONFIGURATIONS = 5  # random ones, at which this is checked
 
 
-def mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
-    """Return a MuJoCo model, and what differs in it.
+def to_mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
+    """Return a mechanism as a MuJoCo model, and how the model's motion differs.
 
-    Joints, bodies and motors have the mechanism's names; body frames are Pinocchio's joint frames. The key
-    frame "assembled" is the assembled configuration.
+    Joints, bodies and motors have the mechanism's names. Body frames are Pinocchio's joint frames. The key frame
+    "assembled" is the assembled configuration.
 
     Raises
     ------
     InputError
-        A loop that MuJoCo has no equality for.
+        MuJoCo has no equality constraint for a loop.
     """
     root = Element("mujoco", model=mechanism.name)
     SubElement(root, "compiler", angle="radian", autolimits="false")
-    SubElement(root, "option", gravity=numbers(mechanism.tree.model.gravity.linear))
+    SubElement(root, "option", gravity=_format(mechanism.tree.model.gravity.linear))
     world = SubElement(root, "worldbody")
-    bodies, order = _bodies(mechanism, world)
-    differs = ["loops are soft springs there: set solref and solimp of <equality>, and the time step, to taste"]
-    differs += _inertials(mechanism, bodies)
-    sites = Sites(bodies)
+    bodies, order = _add_bodies(mechanism, world)
+    differences = ["loops are soft constraints in MuJoCo; adjust solref and solimp of <equality>, and the time step"]
+    differences += _add_inertials(mechanism, bodies)
+    sites = _Sites(bodies)
     for name, frame in mechanism.points.items():
         sites.add(name, frame)
-    differs += add_loops(mechanism, root, sites)
-    add_springs(mechanism, root, sites)
-    differs += _soft_joints(mechanism)
-    _draw(mechanism, bodies, sites)
-    _motors(mechanism, root)
+    differences += _add_loops(mechanism, root, sites)
+    _add_springs(mechanism, root, sites)
+    differences += _joint_differences(mechanism)
+    _add_sticks(mechanism, bodies, sites)
+    _add_actuators(mechanism, root)
     key = SubElement(root, "keyframe")
-    SubElement(key, "key", name="assembled", qpos=numbers(_qpos(mechanism, order)))
+    SubElement(key, "key", name="assembled", qpos=_format(_assembled_qpos(mechanism, order)))
     indent(root)
-    return tostring(root, encoding="unicode") + "\n", differs
+    return tostring(root, encoding="unicode") + "\n", differences
 
 
-def _bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[int]]:
-    """Add a body for each joint; return them by joint (0: the world), and the joints in MuJoCo's order."""
+def _format(values: Array | float) -> str:
+    """Return numbers as text that is read back to the same doubles."""
+    return " ".join(repr(float(x)) for x in np.atleast_1d(values))
+
+
+def _quaternion(rotation: Array) -> Array:
+    """Return the quaternion (w, x, y, z) of a rotation matrix."""
+    x, y, z, w = pin.Quaternion(np.ascontiguousarray(rotation)).coeffs()
+    return np.array([w, x, y, z])
+
+
+# --- bodies and joints ---------------------------------------------------------------------------------------------
+
+
+def _add_bodies(mechanism: Mechanism, world: Element) -> tuple[list[Element], list[int]]:
+    """Add a body for each joint; return the bodies by joint (0: the world), and the joints in MuJoCo's order."""
     model = mechanism.tree.model
     children: dict[int, list[int]] = {}
     for joint in range(1, model.njoints):
         children.setdefault(int(model.parents[joint]), []).append(joint)
     names, bodies, order = mechanism.frames.bodies, {0: world}, []
-    waiting = children.get(0, [])[::-1]
-    while waiting:
-        joint = waiting.pop()
+    pending = children.get(0, [])[::-1]
+    while pending:
+        joint = pending.pop()
         placement = model.jointPlacements[joint]
-        place = {"pos": numbers(placement.translation), "quat": numbers(quaternion(placement.rotation))}
+        place = {"pos": _format(placement.translation), "quat": _format(_quaternion(placement.rotation))}
         bodies[joint] = SubElement(bodies[int(model.parents[joint])], "body", {"name": names[joint]} | place)
-        _joint(mechanism, joint, bodies[joint])
+        _add_joint(mechanism, joint, bodies[joint])
         order.append(joint)
-        waiting += children.get(joint, [])[::-1]
+        pending += children.get(joint, [])[::-1]
     return [bodies[joint] for joint in range(model.njoints)], order
 
 
-def _joint(mechanism: Mechanism, number: int, body: Element) -> None:
+def _add_joint(mechanism: Mechanism, number: int, body: Element) -> None:
     model, springs = mechanism.tree.model, mechanism.springs
     joint, name = model.joints[number], model.names[number]
     if joint.nv == 6:
         SubElement(body, "freejoint", name=name)
         return
-    at = joint.idx_v
+    k = joint.idx_v
     axis, turns = mechanism.tree.axis(number)
-    element = SubElement(body, "joint", name=name, type="hinge" if turns else "slide", axis=numbers(axis))
-    if springs.joint_damping[at]:
-        element.set("damping", numbers(springs.joint_damping[at]))
-    if springs.joint_stiffness[at]:
-        element.set("stiffness", numbers(springs.joint_stiffness[at]))
-        element.set("springref", numbers(springs.joint_rest[at]))
+    element = SubElement(body, "joint", name=name, type="hinge" if turns else "slide", axis=_format(axis))
+    if springs.joint_damping[k]:
+        element.set("damping", _format(springs.joint_damping[k]))
+    if springs.joint_stiffness[k]:
+        element.set("stiffness", _format(springs.joint_stiffness[k]))
+        element.set("springref", _format(springs.joint_rest[k]))
     joints, (lower, upper) = mechanism.joints, mechanism.tree.limits()
-    for key, value in (("armature", model.armature[at]), ("frictionloss", joints.friction[at])):
+    for key, value in (("armature", model.armature[k]), ("frictionloss", joints.friction[k])):
         if value:
-            element.set(key, numbers(value))
-    if np.isfinite(lower[at]) and lower[at] < upper[at]:
-        element.set("range", numbers(np.array([lower[at], upper[at]])))
-        element.set("limited", str(bool(joints.stopped[at])).lower())
+            element.set(key, _format(value))
+    if np.isfinite(lower[k]) and lower[k] < upper[k]:
+        element.set("range", _format(np.array([lower[k], upper[k]])))
+        element.set("limited", str(bool(joints.stopped[k])).lower())
 
 
-def _soft_joints(mechanism: Mechanism) -> list[str]:
-    """Say which joints have friction or stops, which give way in MuJoCo."""
+def _joint_differences(mechanism: Mechanism) -> list[str]:
+    """Return notes on dry friction, stops and rebound, which are soft or absent in MuJoCo."""
     joints, labels = mechanism.joints, np.array(mechanism.coordinates)
-    says = []
+    notes = []
     if joints.friction.any():
-        rubbing = ", ".join(labels[joints.friction > 0])
-        says.append(f"dry friction lets joints creep there: {rubbing}; set their solreffriction and solimpfriction")
+        names = ", ".join(labels[joints.friction > 0])
+        notes.append(f"joints with dry friction creep in MuJoCo: {names}; adjust solreffriction and solimpfriction")
     if joints.stopped.any():
-        stopped = ", ".join(labels[joints.stopped])
-        says.append(f"stops are soft springs there: {stopped}; set their solreflimit and solimplimit")
+        names = ", ".join(labels[joints.stopped])
+        notes.append(f"stops are soft springs in MuJoCo: {names}; adjust solreflimit and solimplimit")
     if joints.restitution.any():
-        says.append(f"stops do not rebound there: {', '.join(labels[joints.restitution > 0])}")
-    return says
+        notes.append(f"stops do not rebound in MuJoCo: {', '.join(labels[joints.restitution > 0])}")
+    return notes
 
 
-def _inertials(mechanism: Mechanism, bodies: list[Element]) -> list[str]:
-    """Give each body its mass; say which ones MuJoCo would have refused."""
+def _add_inertials(mechanism: Mechanism, bodies: list[Element]) -> list[str]:
+    """Add mass and inertia to each body; return notes on bodies that MuJoCo does not accept as they are."""
     light, impossible = [], []
     for element, inertia in list(zip(bodies, mechanism.tree.model.inertias, strict=True))[1:]:
         about_centre, mass = np.array(inertia.inertia), float(inertia.mass)
         principal = np.linalg.eigvalsh(about_centre)
-        if mass < LEAST or principal[0] < LEAST:
+        if mass < MIN_MASS or principal[0] < MIN_MASS:
             light.append(element.get("name", ""))
-            mass, about_centre = max(mass, LEAST), about_centre + max(LEAST - principal[0], 0.0) * np.eye(3)
-        elif principal[0] + principal[1] < principal[2] * (1 - 1e-9):
+            mass = max(mass, MIN_MASS)
+            about_centre = about_centre + max(MIN_MASS - principal[0], 0.0) * np.eye(3)
+        elif principal[0] + principal[1] < principal[2] * (1 - TRIANGLE_TOLERANCE):
             impossible.append(element.get("name", ""))
         full = about_centre[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        values = {"pos": numbers(inertia.lever), "mass": numbers(mass), "fullinertia": numbers(full)}
+        values = {"pos": _format(inertia.lever), "mass": _format(mass), "fullinertia": _format(full)}
         element.insert(0, Element("inertial", values))
-    says = []
+    notes = []
     if light:
-        says.append(f"{', '.join(light)}: mass and inertia raised to {LEAST:g}, the least that MuJoCo takes")
+        notes.append(f"{', '.join(light)}: mass and inertia are raised to {MIN_MASS:g}, MuJoCo's minimum")
     if impossible:
-        says.append(f"{', '.join(impossible)}: MuJoCo refuses this inertia, which breaks the triangle inequality")
-    return says
+        notes.append(f"{', '.join(impossible)}: MuJoCo refuses this inertia, which violates the triangle inequality")
+    return notes
 
 
-def _draw(mechanism: Mechanism, bodies: list[Element], sites: Sites) -> None:
-    """Draw sticks from each joint to the joints and sites that it carries; they neither weigh nor touch."""
+def _assembled_qpos(mechanism: Mechanism, order: list[int]) -> Array:
+    """Return the assembled configuration in MuJoCo's order. A free joint is a pose in the world, quaternion w first."""
+    model, q_tree = mechanism.tree.model, mechanism.q_tree
+    pose = Pose(mechanism.tree, mechanism.closure.anchors, q_tree)
+    values: list[float] = []
+    for joint in order:
+        k = model.joints[joint].idx_q
+        if model.joints[joint].nv == 6:
+            values += [*pose.translation[joint], *_quaternion(pose.rotation[joint])]
+        else:
+            values.append(q_tree[k])
+    return np.array(values)
+
+
+# --- sites, shapes and actuators -----------------------------------------------------------------------------------
+
+
+class _Sites:
+    """Sites of MuJoCo's bodies, for the frames of loops, tendons and points.
+
+    Attributes
+    ----------
+    places : list of (joint, translation)
+    """
+
+    def __init__(self, bodies: list[Element]) -> None:
+        self._bodies = bodies
+        self._names: set[str] = set()
+        self.places: list[tuple[int, Array]] = []
+
+    def add(self, name: str, frame: Frame) -> str:
+        """Add a site and return its name, with apostrophes appended if the name is already taken."""
+        while name in self._names:
+            name += "'"
+        self._names.add(name)
+        self.places.append((frame.joint, frame.translation))
+        place = {"pos": _format(frame.translation), "quat": _format(_quaternion(frame.rotation))}
+        SubElement(self._bodies[frame.joint], "site", {"name": name} | place)
+        return name
+
+
+def _add_sticks(mechanism: Mechanism, bodies: list[Element], sites: _Sites) -> None:
+    """Draw a stick from each joint to the joints and sites that it carries, without mass and without contact."""
     model, size = mechanism.tree.model, mechanism.size
-    look = {"contype": "0", "conaffinity": "0", "mass": "0", "rgba": "0.35 0.55 0.75 1"}
-    ends = [(int(model.parents[k]), model.jointPlacements[k].translation) for k in range(1, model.njoints)]
-    for joint, end in [*ends, *sites.places]:
-        if joint and np.linalg.norm(end) > SHORT * size:
-            stick = {"type": "capsule", "size": numbers(THICKNESS * size), "fromto": f"0 0 0 {numbers(end)}"}
-            SubElement(bodies[joint], "geom", stick | look)
+    style = {"contype": "0", "conaffinity": "0", "mass": "0", "rgba": "0.35 0.55 0.75 1"}
+    joints = [(int(model.parents[k]), model.jointPlacements[k].translation) for k in range(1, model.njoints)]
+    for joint, end in [*joints, *sites.places]:
+        if joint and np.linalg.norm(end) > MIN_STICK_LENGTH * size:
+            shape = {"type": "capsule", "size": _format(STICK_RADIUS * size), "fromto": f"0 0 0 {_format(end)}"}
+            SubElement(bodies[joint], "geom", shape | style)
 
 
-def _motors(mechanism: Mechanism, root: Element) -> None:
-    """Add the motors with their gears, one on several joints by a tendon; constant forces take no control."""
+def _add_actuators(mechanism: Mechanism, root: Element) -> None:
+    """Add motors with their gears, and constant forces. A motor on several joints acts on a fixed tendon."""
     constant = mechanism.springs.constant
     if not mechanism.actuated and not constant.any():
         return
@@ -153,35 +221,150 @@ def _motors(mechanism: Mechanism, root: Element) -> None:
         if len(joints) == 1:
             motor.set("joint", mechanism.coordinates[joints[0]])
             if turns[joints[0]] != 1.0:
-                motor.set("gear", numbers(turns[joints[0]]))
+                motor.set("gear", _format(turns[joints[0]]))
         else:
             motor.set("tendon", name)
-            tendon = SubElement(_tendons(root), "fixed", name=name)
+            tendon = SubElement(_tendon_section(root), "fixed", name=name)
             for k in joints:
-                SubElement(tendon, "joint", joint=mechanism.coordinates[k], coef=numbers(turns[k]))
+                SubElement(tendon, "joint", joint=mechanism.coordinates[k], coef=_format(turns[k]))
         if np.isfinite(limit):
             motor.set("forcelimited", "true")
-            motor.set("forcerange", numbers(np.array([-limit, limit])))
+            motor.set("forcerange", _format(np.array([-limit, limit])))
     for k in np.flatnonzero(constant):
         name = mechanism.coordinates[k]
-        force = {"gaintype": "fixed", "gainprm": "0", "biastype": "affine", "biasprm": f"{numbers(constant[k])} 0 0"}
+        bias = f"{_format(constant[k])} 0 0"
+        force = {"gaintype": "fixed", "gainprm": "0", "biastype": "affine", "biasprm": bias}
         SubElement(actuators, "general", {"name": f"force on {name}", "joint": name} | force)
 
 
-def _tendons(root: Element) -> Element:
-    found = root.find("tendon")
-    return SubElement(root, "tendon") if found is None else found
+def _tendon_section(root: Element) -> Element:
+    section = root.find("tendon")
+    return SubElement(root, "tendon") if section is None else section
 
 
-def _qpos(mechanism: Mechanism, order: list[int]) -> Array:
-    """The assembled configuration in MuJoCo's order; a free root's place is in the world, w first."""
-    model, q_tree = mechanism.tree.model, mechanism.q_tree
-    pose = Pose(mechanism.tree, mechanism.closure.anchors, q_tree)
-    values: list[float] = []
-    for joint in order:
-        at = model.joints[joint].idx_q
-        if model.joints[joint].nv == 6:
-            values += [*pose.translation[joint], *quaternion(pose.rotation[joint])]
+# --- loops, couplings and springs ----------------------------------------------------------------------------------
+
+
+def _add_loops(mechanism: Mechanism, root: Element, sites: _Sites) -> list[str]:
+    """Add equality constraints for all loops and couplings; return notes on what differs in MuJoCo.
+
+    Raises
+    ------
+    InputError
+        MuJoCo has no equality constraint for a loop.
+    """
+    equality, tendon, notes = Element("equality"), Element("tendon"), []
+    for loop in mechanism.spec.loop:
+        a = mechanism.frames.find(loop.frame_a, f"loop {loop.name!r}, frame_a")
+        b = mechanism.frames.find(loop.frame_b, f"loop {loop.name!r}, frame_b")
+        if loop.type in ("point", "weld"):
+            tag = "connect" if loop.type == "point" else "weld"
+            _add_equality(equality, tag, loop.name, sites, a, b)
+        elif loop.type == "hinge":
+            _add_hinge(mechanism, loop, a, b, equality, sites)
+            notes.append(
+                f"loop {loop.name}: the hinge is two points of its axis in MuJoCo, {mechanism.size:.3g} m apart"
+            )
+        elif loop.type == "point_2d":
+            _add_equality(equality, "connect", loop.name, sites, a, place_in_plane(mechanism, loop, a, b))
+            notes.append(f"loop {loop.name}: MuJoCo constrains all three components of the point")
+        elif loop.type == "distance":
+            _add_distance(mechanism, loop, a, b, equality, tendon, sites)
         else:
-            values.append(q_tree[at])
-    return np.array(values)
+            raise InputError(
+                f"{mechanism.name}: loop {loop.name!r}: MuJoCo has no equality constraint for type {loop.type!r}; "
+                "supported are point, point_2d in a plane, hinge, weld and distance"
+            )
+    _add_couplings(mechanism, equality)
+    root.extend(section for section in (tendon, equality) if len(section))
+    return notes
+
+
+def _add_springs(mechanism: Mechanism, root: Element, sites: _Sites) -> None:
+    """Add a spatial tendon for each spring between frames. Springs on joints are attributes of the joints."""
+    between = [spring for spring in mechanism.spec.spring if spring.frame_a is not None and spring.frame_b is not None]
+    for k, spring in enumerate(between):
+        force = {"stiffness": spring.stiffness, "springlength": spring.rest_length or 0.0, "damping": spring.damping}
+        ends = [
+            sites.add(f"spring {k + 1}.{end}", mechanism.frames.find(frame, f"spring {k + 1}"))
+            for end, frame in (("a", spring.frame_a), ("b", spring.frame_b))
+            if isinstance(frame, str | FrameSpec)
+        ]
+        attributes = {key: _format(value) for key, value in force.items()}
+        _add_line(_tendon_section(root), f"spring {k + 1}", ends, attributes)
+
+
+def _add_equality(equality: Element, tag: str, name: str, sites: _Sites, a: Frame, b: Frame) -> None:
+    SubElement(equality, tag, name=name, site1=sites.add(f"{name}.a", a), site2=sites.add(f"{name}.b", b))
+
+
+def _add_line(tendon: Element, name: str, sites: list[str], attributes: dict[str, str]) -> None:
+    """Add a straight tendon between sites."""
+    line = SubElement(tendon, "spatial", {"name": name} | attributes)
+    for site in sites:
+        SubElement(line, "site", site=site)
+
+
+def _add_hinge(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame, equality: Element, sites: _Sites) -> None:
+    """Add two connects at two points of the axis."""
+    axis_a, axis_b = (np.array(axis) / np.linalg.norm(axis) for axis in (loop.axis_a, loop.axis_b))
+    for suffix, distance in (("", 0.0), (" axis", mechanism.size)):
+        ends = [_shifted(a, distance * axis_a), _shifted(b, distance * axis_b)]
+        _add_equality(equality, "connect", loop.name + suffix, sites, *ends)
+
+
+def _shifted(frame: Frame, offset: Array) -> Frame:
+    """Return a frame shifted by an offset in its own axes."""
+    return Frame(frame.joint, frame.rotation, frame.translation + frame.rotation @ offset)
+
+
+def place_in_plane(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame) -> Frame:
+    """Return frame B of a `point_2d` shifted along the normal into frame A's plane.
+
+    Raises
+    ------
+    InputError
+        The loop leaves the plane, so the offset along the normal is not constant.
+    """
+    tree, random = mechanism.tree, np.random.default_rng(1)
+    axis = np.array(loop.axis_a) / np.linalg.norm(loop.axis_a)
+    joints, points = np.array([a.joint, b.joint], np.intp), np.array([a.translation, b.translation])
+    anchors = Anchors(joints, points, np.zeros(0, np.intp), np.zeros((0, 3)))
+    offsets, normals_in_b = [], []
+    for step in [np.zeros(tree.n), *random.normal(size=(PLANE_CONFIGURATIONS, tree.n))]:
+        pose = Pose(tree, anchors, tree.integrate(mechanism.q_tree, step))
+        normal = axis if loop.rows_in == "world" else pose.rotation[a.joint] @ a.rotation @ axis
+        offsets.append(normal @ pose.r[0])
+        normals_in_b.append(pose.rotation[b.joint].T @ normal)
+    if max(np.ptp(offsets), np.ptp(normals_in_b, axis=0).max()) > PLANE_TOLERANCE * mechanism.size:
+        raise InputError(
+            f"{mechanism.name}: loop {loop.name!r}: MuJoCo has no equality constraint for a point_2d whose frames "
+            "leave the plane"
+        )
+    return Frame(b.joint, b.rotation, b.translation + offsets[0] * normals_in_b[0])
+
+
+def _add_distance(
+    mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame, equality: Element, tendon: Element, sites: _Sites
+) -> None:
+    """Add a tendon of constant length. MuJoCo counts its length from the length at zero coordinates."""
+    ends = [sites.add(f"{loop.name}.{end}", frame) for end, frame in (("a", a), ("b", b))]
+    _add_line(tendon, loop.name, ends, {})
+    joints, points = np.array([a.joint, b.joint], np.intp), np.array([a.translation, b.translation])
+    anchors = Anchors(joints, points, np.zeros(0, np.intp), np.zeros((0, 3)))
+    length_at_zero = np.linalg.norm(Pose(mechanism.tree, anchors, mechanism.tree.neutral()).r[0])
+    polynomial = _format(np.array([(loop.length or 0.0) - length_at_zero, 0, 0, 0, 0]))
+    SubElement(equality, "tendon", name=loop.name, tendon1=loop.name, polycoef=polynomial)
+
+
+def _add_couplings(mechanism: Mechanism, equality: Element) -> None:
+    """Add the rows joint - ratio * other - offset = 0 of couplings and of a URDF's mimic joints."""
+    names = [name for name, row in mechanism.closure.names if row == "coupling"]
+    affine = [group for group in mechanism.closure.groups if isinstance(group, Affine)]
+    rows = [row for group in affine for row in zip(group.matrix, group.offset, strict=True)]
+    for name, (row, offset) in zip(names, rows, strict=True):
+        joint = int(np.flatnonzero(row == 1)[0])
+        others = [int(k) for k in np.flatnonzero(row) if k != joint]
+        joints = {f"joint{k + 1}": mechanism.coordinates[at] for k, at in enumerate([joint, *others])}
+        polynomial = [offset, -sum(row[others]), 0, 0, 0]
+        SubElement(equality, "joint", {"name": name} | joints, polycoef=_format(np.array(polynomial)))

@@ -1,1 +1,1 @@
-"""URDFs with loops, in each of the ways that others write them, and the elements of the URDFs that we write."""
+"""Read URDFs with each of the published conventions for loops, and build the elements of a URDF."""

@@ -1,4 +1,4 @@
-"""MuJoCo models that use what its compiler is there for: replicas, attached models, included files, meshes, classes."""
+"""MuJoCo models that need its compiler: replicas, attached models, included files, meshes, classes."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def tetrahedron(size: float = 1.0) -> bytes:
 
 
 def write_workshop(folder: Path) -> Path:
-    """Write the model and all that belongs to it; return its path."""
+    """Write the model with the files that it names; return its path."""
     files: dict[str, bytes] = {
         "workshop.xml": WORKSHOP.encode(),
         "leg.xml": LEG.encode(),
@@ -96,12 +96,12 @@ def write_workshop(folder: Path) -> Path:
 
 
 def model(tmp_path: Path, bodies: str, rest: str = "", name: str = "thing.xml") -> Draft:
-    """Import a MuJoCo model of these bodies."""
+    """Import a MuJoCo model with some bodies."""
     path = tmp_path / name
     path.write_text(f"<mujoco><compiler angle='radian'/><worldbody>{bodies}</worldbody>{rest}</mujoco>", "utf-8")
     return read(path)
 
 
-def said(notes: list[str], *fragments: str) -> bool:
-    """Whether one note holds all fragments."""
+def has_note(notes: list[str], *fragments: str) -> bool:
+    """Whether one note contains all fragments."""
     return any(all(fragment in note for fragment in fragments) for note in notes)
