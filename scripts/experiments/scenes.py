@@ -8,7 +8,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, as_ivp, load, simulate
-from ckc_pin.analysis.precision.settings import FORMULATIONS
+from ckc_pin.analysis.precision.motion import FORMULATIONS
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.scene.scene import catalogue
 

@@ -16,11 +16,10 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, as_ivp, load, load_scene, simulate
 from ckc_pin.analysis.precision import PrecisionRow, WorkPrecision, precision_plain, work_precision
-from ckc_pin.analysis.precision.advice import advise
-from ckc_pin.analysis.precision.motion import INSTANTS, Motion
+from ckc_pin.analysis.precision.compute import advise
+from ckc_pin.analysis.precision.motion import INSTANTS, Motion, settings
 from ckc_pin.analysis.precision.mujoco import model_of
 from ckc_pin.analysis.precision.reference import Reference, confirm, find_reference
-from ckc_pin.analysis.precision.settings import settings
 from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.formats.exporting import export
 from ckc_pin.scene.parts import scene_mechanism

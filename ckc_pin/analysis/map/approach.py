@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.map.aspect import Grid
-from ckc_pin.analysis.map.domain import Domain
+from ckc_pin.analysis.map.grid import Domain, Grid
 from ckc_pin.analysis.map.loci import seen
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.control.controllers import SetPoint, Tracking

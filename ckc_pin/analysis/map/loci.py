@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.map.aspect import Grid
-from ckc_pin.analysis.map.domain import Domain
-from ckc_pin.analysis.map.progress import Steps
+from ckc_pin.analysis.map.grid import Domain, Grid, Steps
 from ckc_pin.analysis.singular_curve import SingularCurve, trace
 from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
 from ckc_pin.base.arrays import Array, BoolArray, IntArray

@@ -13,11 +13,21 @@ from time import perf_counter
 
 import numpy as np
 
-from ckc_pin.analysis.map.aspect import CORNERS, HURRIED, SIDES, Grid, fill, flood
-from ckc_pin.analysis.map.domain import Domain, middles, reach
+from ckc_pin.analysis.map.compute import located, map_value
+from ckc_pin.analysis.map.grid import (
+    CORNERS,
+    HURRIED,
+    SIDES,
+    Domain,
+    Grid,
+    Progress,
+    Steps,
+    fill,
+    flood,
+    middles,
+    reach,
+)
 from ckc_pin.analysis.map.loci import find_loci
-from ckc_pin.analysis.map.progress import Progress, Steps
-from ckc_pin.analysis.map.value import located, map_value
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError

@@ -1,7 +1,6 @@
 """Work against precision on a scene of one's own: what each setting costs, and how far off it is."""
 
-from ckc_pin.analysis.precision.advice import TARGETS, Advice
-from ckc_pin.analysis.precision.compute import BUDGET, WorkPrecision, work_precision
+from ckc_pin.analysis.precision.compute import BUDGET, TARGETS, Advice, WorkPrecision, work_precision
 from ckc_pin.analysis.precision.motion import PrecisionRow
 from ckc_pin.analysis.precision.reference import Reference
 from ckc_pin.analysis.precision.report import (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from time import perf_counter
 from typing import Any
 
@@ -17,9 +18,27 @@ from ckc_pin.mechanism.tree import Tree
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import run_prepared
-from ckc_pin.scene.scene import Scene
+from ckc_pin.scene.scene import Scene, apply_overrides, make_scene
 
-__all__ = ["INSTANTS", "Apart", "Motion", "PrecisionRow", "apart", "move", "no_motion", "on_span"]
+__all__ = [
+    "FORMULATIONS",
+    "INSTANTS",
+    "REPEATS",
+    "SHORT",
+    "Apart",
+    "Motion",
+    "PrecisionRow",
+    "Setting",
+    "Stepper",
+    "apart",
+    "changed",
+    "move",
+    "no_motion",
+    "off_manifold",
+    "on_span",
+    "settings",
+]
+
 
 INSTANTS = 20  # at which motions are compared, the end among them
 REPEATS, ENOUGH = 20, 0.05  # runs and s: repeated up to whichever comes first
@@ -171,3 +190,121 @@ def move(scene: Scene, limit: float, *, fewest: int = 1, most: int = REPEATS) ->
 def _without_place(message: str) -> str:
     """Shorten a message by its configuration, which may be a line of 81 coordinates."""
     return re.sub(r" near [^:]*:", ":", message)
+
+
+# --- Which ways of running a scene are compared: formulation, method, tolerance.
+
+FORMULATIONS: dict[str, dict[str, Any]] = {
+    "dae": {"formulation": "dae"},
+    "reduced": {"formulation": "reduced"},
+    "spf, w": {"formulation": "spf", "spf_coordinates": "w"},
+    "spf, z": {"formulation": "spf", "spf_coordinates": "z"},
+}
+EVERY = tuple(10.0**-k for k in range(2, 13))
+METHODS = {"auto": EVERY, "DOP853": EVERY, "RK45": EVERY[::2], "Radau": EVERY[::2]}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a scene is run.
+
+    Attributes
+    ----------
+    formulation : str
+        A key of `FORMULATIONS`.
+    method : str
+    rtol : float
+    """
+
+    formulation: str
+    method: str
+    rtol: float
+
+    @property
+    def family(self) -> tuple[str, str]:
+        """All but the tolerance."""
+        return self.formulation, self.method
+
+    def overrides(self, scene: Scene) -> dict[str, Any]:
+        """Values of the scene by dotted key, those that a person would give with --set."""
+        found = {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
+        if scene.spec.solver.atol is not None:  # the scene's own goes with one rtol
+            found["solver.atol"] = float(f"{self.rtol / 100:.0e}")
+        if self.formulation != "dae":
+            found |= _no_projection(scene)
+        return found
+
+
+def _no_projection(scene: Scene) -> dict[str, Any]:
+    """Take away the keys that only a DAE has."""
+    solver = scene.spec.solver
+    return {"solver.baumgarte": None} if solver.baumgarte else {}
+
+
+def settings(scene: Scene) -> Iterator[Setting]:
+    """All settings, from loose to tight: first of "auto", so that a budget that is used up leaves out the others'."""
+    formulations = [name for name in FORMULATIONS if name.startswith("spf") or not off_manifold(scene)]
+    for methods in (["auto"], [name for name in METHODS if name != "auto"]):
+        for rtol, method, formulation in product(EVERY, methods, formulations):
+            if rtol in METHODS[method]:
+                yield Setting(formulation, method, rtol)
+
+
+def off_manifold(scene: Scene) -> bool:
+    """Whether a scene starts with phi = w other than 0, which only the SPF can."""
+    return any(scene.spec.initial.w or [])
+
+
+def changed(scene: Scene, overrides: Mapping[str, Any]) -> Scene:
+    """Return a scene with values replaced by dotted key; None removes a key."""
+    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)
+
+
+# --- A program with a fixed step: stepped from instant to instant, timed without what is read out in between.
+
+TRIAL = 50  # steps, to foresee how long all take
+REPEATS, ENOUGH, SHORT = 3, 0.05, 1.0  # runs, s of runs: what takes less than the last is repeated
+
+
+@dataclass(frozen=True)
+class Stepper:
+    """A program that takes steps.
+
+    Attributes
+    ----------
+    reset : callable
+        Puts it at the start.
+    step : callable
+        step(k) takes k steps.
+    state : callable
+        Returns q_tree and v_tree by coordinate.
+    """
+
+    reset: Callable[[], None]
+    step: Callable[[int], None]
+    state: Callable[[], tuple[Array, Array]]
+
+    def foreseen(self, many: int, instants: int) -> float:
+        """Return how long it would take, with so many steps between instants, s."""
+        self.reset()
+        trial = min(TRIAL, many)
+        began = perf_counter()
+        self.step(trial)
+        return (perf_counter() - began) / trial * many * instants
+
+    def run(self, many: int, instants: int) -> Motion:
+        """Return its motion, with so many steps between instants, up to where that is not finite."""
+        walls: list[float] = []
+        while not walls or (sum(walls) < SHORT and (len(walls) < REPEATS or sum(walls) < ENOUGH)):
+            self.reset()
+            states, wall = [self.state()], 0.0
+            for _ in range(instants):
+                began = perf_counter()
+                self.step(many)
+                wall += perf_counter() - began
+                states.append(self.state())
+                if not np.all(np.isfinite(states[-1][0])):
+                    break
+            walls.append(wall)
+        q_tree, v_tree = (np.array(rows) for rows in zip(*states, strict=True))
+        return Motion("done", "", q_tree, v_tree, min(walls), steps=many * instants, used="fixed step")

@@ -11,9 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion, no_motion
-from ckc_pin.analysis.precision.settings import off_manifold
-from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.analysis.precision.motion import Motion, Stepper, no_motion, off_manifold
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import find_start

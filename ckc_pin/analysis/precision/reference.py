@@ -10,8 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.precision.motion import INSTANTS, Motion, apart, move, on_span
-from ckc_pin.analysis.precision.settings import FORMULATIONS, changed, off_manifold
+from ckc_pin.analysis.precision.motion import (
+    FORMULATIONS,
+    INSTANTS,
+    Motion,
+    apart,
+    changed,
+    move,
+    off_manifold,
+    on_span,
+)
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run

@@ -9,8 +9,7 @@ from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.analysis.precision import reference as references
-from ckc_pin.analysis.precision.advice import Advice, fastest
-from ckc_pin.analysis.precision.compute import WorkPrecision
+from ckc_pin.analysis.precision.compute import Advice, WorkPrecision, fastest
 from ckc_pin.analysis.precision.motion import INSTANTS, PrecisionRow
 
 if TYPE_CHECKING:

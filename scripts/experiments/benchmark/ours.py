@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
-from ckc_pin.analysis.precision.motion import Motion, move
-from ckc_pin.analysis.precision.settings import FORMULATIONS, Setting, changed
+from ckc_pin.analysis.precision.motion import FORMULATIONS, Motion, Setting, changed, move
 from scripts.experiments.benchmark.row import Row
 from scripts.experiments.benchmark.work import Work
 

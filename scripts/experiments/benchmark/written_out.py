@@ -7,8 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from ckc_pin.analysis.precision.motion import move
-from ckc_pin.analysis.precision.settings import changed
+from ckc_pin.analysis.precision.motion import changed, move
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.errors import InputError
 from scripts.experiments.benchmark.work import Work

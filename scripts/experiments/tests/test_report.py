@@ -14,8 +14,7 @@ import pytest
 from joblib import Memory
 from scipy.integrate import solve_ivp
 
-from ckc_pin.analysis.precision.motion import Motion, no_motion
-from ckc_pin.analysis.precision.settings import Setting, changed
+from ckc_pin.analysis.precision.motion import Motion, Setting, changed, no_motion
 from ckc_pin.errors import InputError
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark import make, ours

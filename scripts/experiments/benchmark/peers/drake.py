@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.precision.motion import Motion
-from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.analysis.precision.motion import Motion, Stepper
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer import place_in_plane

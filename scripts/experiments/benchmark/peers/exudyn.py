@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion
-from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.analysis.precision.motion import Motion, Stepper
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame

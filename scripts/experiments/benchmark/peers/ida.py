@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.precision.motion import Motion, no_motion
-from ckc_pin.analysis.precision.stepping import REPEATS, SHORT
+from ckc_pin.analysis.precision.motion import REPEATS, SHORT, Motion, no_motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.dynamics.formulations import dae_acceleration

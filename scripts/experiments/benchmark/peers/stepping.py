@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ckc_pin.analysis.precision.motion import Motion, no_motion
-from ckc_pin.analysis.precision.stepping import Stepper
+from ckc_pin.analysis.precision.motion import Motion, Stepper, no_motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.scene.initial import find_start
 from scripts.experiments.benchmark.work import INSTANTS, Work
