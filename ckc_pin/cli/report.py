@@ -115,7 +115,7 @@ def _mjcf(mechanism: ckc_pin.Mechanism) -> tuple[str, list[str]]:
         found = exporting.export(mechanism, "mjcf")
     except InputError as error:
         return "", [f"MuJoCo is not beside it: {error}"]
-    return found.text, [f"in MuJoCo: {difference}" for difference in found.differences]
+    return found.text, found.differences
 
 
 def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], out: Path) -> list[Path]:

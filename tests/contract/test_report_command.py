@@ -73,7 +73,7 @@ def test_for_people(table: Path) -> None:
         "spf, z, Radau",
         "MuJoCo, RK4, solref 2 dt",
         "confirmed by",
-        "in MuJoCo: loops are soft springs there",
+        "loops are soft constraints in MuJoCo",
     ):
         assert words in answer.out
     assert max(map(len, answer.out.split("reference:")[0].splitlines())) <= 80
