@@ -84,7 +84,7 @@ def trace_singular(
             "sample them with search_singular"
         )
     if not 0 < step < np.inf:
-        raise InputError(f"step = {step}: a positive number is needed")
+        raise InputError(f"step = {step}: expected a positive number")
     return trace(SingularSystem(mechanism, point), start.at, start.null, step, max_points)
 
 

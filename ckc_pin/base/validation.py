@@ -1,4 +1,7 @@
-"""What public functions say of an argument of the wrong kind: once, at their door, with what they take."""
+"""Argument validation shared by the public API: types, paths, tables, callables and flags.
+
+Every function raises InputError with one sentence: ``function: argument: expected ..., got ...``.
+"""
 
 from __future__ import annotations
 
@@ -23,104 +26,103 @@ __all__ = [
     "require_type",
 ]
 
-PLAIN = (int, float, complex, str, bytes, type(None), np.generic)  # shown as they are; of the rest their kind
-MOST = 80  # characters of a value that is shown
+SHORT_TYPES = (int, float, complex, str, bytes, type(None), np.generic)  # quoted in messages; others by their type
+MAX_QUOTED = 80  # characters of a value in a message
 
 
-def describe_value(given: Any) -> str:
-    """Say what was given: a plain value as it is written, of anything else what it is."""
-    if isinstance(given, type):
-        return f"the class {given.__name__}"
-    if isinstance(given, PLAIN):
-        return f"{given!r:.{MOST}}"
-    kind = type(given).__name__
-    return f"{'an' if kind[0] in 'AEIOUaeiou' else 'a'} {kind}"
+def describe_value(value: Any) -> str:
+    """Return a value as messages quote it: numbers and strings as written, other objects by their type."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, SHORT_TYPES):
+        return f"{value!r:.{MAX_QUOTED}}"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
-def require_type(given: Any, kinds: type | tuple[type, ...], what: str, takes: str) -> None:
-    """Refuse an argument that is of none of some kinds.
+def require_type(value: Any, types: type | tuple[type, ...], where: str, expected: str) -> None:
+    """Require that an argument is an instance of one of some types.
 
     Parameters
     ----------
-    given
+    value : object
         The argument.
-    kinds : type or tuple of types
-    what : str
-        The function and its argument, as ``"simulate: scene"``.
-    takes : str
-        What would be right.
+    types : type or tuple of types
+    where : str
+        Function and argument, such as ``"simulate: scene"``. The message begins with it.
+    expected : str
+        What would be right, such as ``"a mechanism's shipped name or its path"``.
 
     Raises
     ------
     InputError
-        ``what``, what was given, what it takes.
+        The argument has another type.
     """
-    if not isinstance(given, kinds):
-        raise InputError(f"{what}: {describe_value(given)} was given; it takes {takes}")
+    if not isinstance(value, types):
+        raise InputError(f"{where}: expected {expected}, got {describe_value(value)}")
 
 
-def require_path(given: Any, what: str, takes: str = "a path, as a string or a Path") -> None:
-    """Refuse what is no path, or has characters that no path can have; errors are those of `require_type`."""
-    require_type(given, (str, PathLike), what, takes)
+def require_path(value: Any, where: str, expected: str = "a path, as a string or a Path") -> None:
+    """Require a string or Path without characters that no path can have. Raises as `require_type` does."""
+    require_type(value, (str, PathLike), where, expected)
     try:
-        possible = isinstance(fspath(given), str) and b"\0" not in fsencode(given)
+        is_valid = isinstance(fspath(value), str) and b"\0" not in fsencode(value)
     except UnicodeEncodeError:
-        possible = False
-    if not possible:
-        raise InputError(f"{what}: {describe_value(fspath(given))} is not a valid path; it takes {takes}")
+        is_valid = False
+    if not is_valid:
+        raise InputError(f"{where}: expected {expected}, but {describe_value(fspath(value))} is not a valid path")
 
 
-def require_table(given: Any, what: str, takes: str) -> None:
-    """Refuse what is no table, and one with keys that are no names; errors are those of `require_type`."""
-    require_type(given, Mapping, what, takes)
-    for key in given:
-        require_type(key, str, f"{what}, a key", takes)
+def require_table(value: Any, where: str, expected: str) -> None:
+    """Require a mapping whose keys are strings. Raises as `require_type` does."""
+    require_type(value, Mapping, where, expected)
+    for key in value:
+        require_type(key, str, f"{where}, a key", expected)
 
 
 def accepts_arguments(function: Callable[..., Any], count: int) -> bool:
-    """Whether a function can be called with so many arguments."""
+    """Whether a function can be called with `count` positional arguments."""
     try:
         signature(function).bind(*[None] * count)
     except TypeError:
         return False
-    except ValueError:  # of some builtins it is not known
+    except ValueError:  # some built-in functions have no signature
         pass
     return True
 
 
-def require_controller_signature(function: Callable[..., Any], called: str, what: str) -> None:
-    """Refuse a function that cannot be called with (t, terms).
+def require_controller_signature(function: Callable[..., Any], name: str, where: str) -> None:
+    """Require a function that can be called with (t, terms).
 
     Raises
     ------
     InputError
-        What it takes.
+        It takes other arguments.
     """
     if not accepts_arguments(function, 2):
-        raise InputError(
-            f"{what}: {called}({', '.join(signature(function).parameters)}) was given; it must take (t, terms)"
-        )
+        parameters = ", ".join(signature(function).parameters)
+        raise InputError(f"{where}: expected a function of (t, terms), got {name}({parameters})")
 
 
-def require_callable(given: Any, what: str, takes: str, count: int = 2) -> None:
-    """Refuse what cannot be called with so many arguments and is not absent.
+def require_callable(value: Any, where: str, expected: str, count: int = 2) -> None:
+    """Require None, or a function that can be called with `count` positional arguments.
 
     Raises
     ------
     InputError
-        What it takes.
+        It is not callable, or takes other arguments.
     """
-    if given is not None and not callable(given):
-        raise InputError(f"{what}: {describe_value(given)} was given; it takes {takes}")
-    if given is not None and not accepts_arguments(given, count):
-        raise InputError(f"{what}: a function of other arguments was given; it takes {takes}")
+    if value is not None and not callable(value):
+        raise InputError(f"{where}: expected {expected}, got {describe_value(value)}")
+    if value is not None and not accepts_arguments(value, count):
+        raise InputError(f"{where}: expected {expected}, got a function of other arguments")
 
 
-def require_flag(given: Any, what: str) -> None:
-    """Refuse what is neither True nor False; errors are those of `require_type`."""
-    require_type(given, (bool, np.bool_), what, "True or False")
+def require_flag(value: Any, where: str) -> None:
+    """Require True or False. Raises as `require_type` does."""
+    require_type(value, (bool, np.bool_), where, "True or False")
 
 
-def is_number(given: Any) -> bool:
-    """Whether something is a real number, Python's or NumPy's; True and False are none."""
-    return isinstance(given, int | float | np.integer | np.floating) and not isinstance(given, bool)
+def is_number(value: Any) -> bool:
+    """Whether a value is a real number of Python or NumPy; True and False are not numbers."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

@@ -70,5 +70,5 @@ def read_table(option: str, text: str) -> dict[str, float]:
     for name, value in table.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not abs(value) <= sys.float_info.max:
-            raise InputError(f"{option}: {name} = {json.dumps(value)[:80]}: a finite number is needed")
+            raise InputError(f"{option}: {name} = {json.dumps(value)[:80]}: expected a finite number")
     return table

@@ -52,7 +52,7 @@ def report(scenes: tuple[str, ...], overrides: tuple[str, ...], budget: float, o
     from ckc_pin.analysis.precision import precision_plain, work_precision
 
     if not 0 < budget < float("inf"):
-        raise InputError(f"--budget {budget:g}: a number of seconds above zero is needed")
+        raise InputError(f"--budget {budget:g}: expected a number of seconds above zero")
     loaded = [ckc_pin.load_scene(name, read_overrides("--set", overrides)) for name in scenes]
     mechanisms = [prepare(scene).mechanism for scene in loaded]  # what is wrong with one is told before the first
     if out is not None:

@@ -73,17 +73,15 @@ def as_controller(given: Any) -> Controller | TorqueController:
     """
     if isinstance(given, type):
         name = given.__name__
-        raise InputError(f"controller: the class {name} was given; give an object of it, as {name}() makes one")
+        raise InputError(f"controller: expected an object, got the class {name}; create one with {name}()")
     own = [name for name in ("u", "tau") if callable(getattr(given, name, None))]
     if not own and not callable(given):
-        raise InputError(f"controller: {describe_value(given)} was given; it takes {TAKES}")
+        raise InputError(f"controller: expected {TAKES}, got {describe_value(given)}")
     for name in own or [""]:
         law = getattr(given, name) if name else given
         called = name or getattr(given, "__name__", type(given).__name__)
         if isinstance(law, type):
-            raise InputError(
-                f"controller: {called}: {describe_value(law)} was given; it takes a function of (t, terms)"
-            )
+            raise InputError(f"controller: {called}: expected a function of (t, terms), got {describe_value(law)}")
         require_controller_signature(law, called, "controller")
     if own:
         _require_lyapunov(getattr(given, "lyapunov", None))
@@ -98,7 +96,7 @@ def _require_lyapunov(function: Any) -> None:
     """Refuse an attribute `lyapunov` that a run could not evaluate (InputError)."""
     takes = "a function of (t, terms, w) that returns a number, or None"
     if isinstance(function, type):
-        raise InputError(f"controller: lyapunov: {describe_value(function)} was given; it takes {takes}")
+        raise InputError(f"controller: lyapunov: expected {takes}, got {describe_value(function)}")
     require_callable(function, "controller: lyapunov", takes, 3)
 
 
@@ -290,19 +288,17 @@ def _require_array(given: Any, shape: tuple[int, ...], what: str) -> None:
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(
-            f"{what}: {describe_value(given)} was given; it takes an array of shape {shape} of finite numbers"
-        )
+        raise InputError(f"{what}: expected an array of shape {shape} of finite numbers, got {describe_value(given)}")
 
 
 def _dimension(desired: Any) -> int:
     """Return how many coordinates a trajectory is of; refuse what is none."""
     takes = "a function of t that returns q_d, its rate and its acceleration, each of shape (d,)"
     if desired is None or isinstance(desired, type):
-        raise InputError(f"Tracking: desired: {describe_value(desired)} was given; it takes {takes}")
+        raise InputError(f"Tracking: desired: expected {takes}, got {describe_value(desired)}")
     require_callable(desired, "Tracking: desired", takes, 1)
     at_start = desired(0.0)
     shapes = [np.shape(part) for part in at_start] if isinstance(at_start, tuple | list | np.ndarray) else []
     if len(shapes) != 3 or len(set(shapes)) != 1 or len(shapes[0]) != 1:
-        raise InputError(f"Tracking: desired(0) is {at_start!r:.80}; it takes {takes}")
+        raise InputError(f"Tracking: desired(0): expected {takes}, got {at_start!r:.80}")
     return int(shapes[0][0])

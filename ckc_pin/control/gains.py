@@ -50,7 +50,7 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
 def _numbers(gain: Any, what: str, shape: str) -> Array:
     if not isinstance(gain, list | tuple | np.ndarray):
         takes = "a number, a table by joint or a matrix"
-        raise InputError(f"controller.{what}: {describe_value(gain)} was given; it takes {takes}")
+        raise InputError(f"controller.{what}: expected {takes}, got {describe_value(gain)}")
     try:
         return np.array(gain, dtype=float)
     except (TypeError, ValueError):  # rows of several lengths, words among the numbers

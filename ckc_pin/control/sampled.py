@@ -62,7 +62,7 @@ class Sampled:
         ]
         for name, value, least in given:
             if not is_number(value) or not 0 <= value < np.inf or (name == "sample_time" and value == 0):
-                raise InputError(f"{name} = {value!r:.80}: a number {least} is needed, in seconds")
+                raise InputError(f"{name} = {value!r:.80}: expected a number {least}, in seconds")
         self.controller = as_controller(controller)
         self.sample_time, self.delay = float(sample_time), float(delay)
         self.sensor, self.drive = _table(sensor, SensorSpec, "sensor"), _table(drive, DriveSpec, "drive")

@@ -167,9 +167,7 @@ def _require_means(out: Any, threads: Any, workers: Any, scheduler: Any, chunk: 
     require_flag(progress, "ensemble: progress")
     for name, count in (("threads", threads), ("workers", workers), ("chunk", chunk)):
         if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-            raise InputError(
-                f"ensemble: {name}: {describe_value(count)} was given; it takes a whole number of at least 1"
-            )
+            raise InputError(f"ensemble: {name}: expected a whole number of at least 1, got {describe_value(count)}")
     if scheduler and workers:
         raise InputError("ensemble: workers and scheduler: give one of them")
 

@@ -232,6 +232,6 @@ def _check(name: str, variable: VariableSpec, source: str) -> None:
     if given[0] in ("uniform", "sobol", "lhs", "loguniform") and not pair[0] <= pair[1]:
         raise InputError(f"{where}: {given[0]} = [{pair[0]:g}, {pair[1]:g}]: from the smaller to the larger number")
     if given[0] == "loguniform" and not pair[0] > 0:
-        raise InputError(f"{where}: loguniform = [{pair[0]:g}, {pair[1]:g}]: numbers greater than 0 are needed")
+        raise InputError(f"{where}: loguniform = [{pair[0]:g}, {pair[1]:g}]: expected numbers greater than 0")
     if given[0] in ("normal", "lognormal") and not pair[1] >= 0:
         raise InputError(f"{where}: {given[0]} = [mean, deviation]: the deviation {pair[1]:g} is negative")

@@ -170,7 +170,7 @@ def _column(sources: Sources, file: str, name: str) -> Array:
         try:
             values.append(float(row[at]))
         except (IndexError, ValueError):
-            raise InputError(f"{where}: line {k}: {name}: a number is needed") from None
+            raise InputError(f"{where}: line {k}: {name}: expected a number") from None
         if not math.isfinite(values[-1]):
             raise InputError(f"{where}: line {k}: {name}: {row[at].strip()} is not a finite number")
     if not values:

@@ -60,7 +60,7 @@ def _as_read(overrides: Any) -> Overrides:
         several = isinstance(value, list | tuple)
         for x in value if several else (value,):
             if not is_number(x) or not abs(x) <= sys.float_info.max:
-                raise InputError(f"load: overrides: {name} = {given!r:.80}; it takes {takes}")
+                raise InputError(f"load: overrides: {name} = {given!r:.80}: expected {takes}")
         found[name] = tuple(map(float, value)) if several else float(value)
         if several and len(value) != 3:
             raise InputError(f"load: overrides: {name}: {len(value)} numbers were given; a vector has three")

@@ -83,7 +83,7 @@ class Motors:
             raise InputError(f"{what}: {unknown!r} is no actuator; there are {', '.join(self.names) or 'none'}")
         missing = [name for name in self.names if name not in values]
         if missing and fill is None:
-            raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(self.names)}")
+            raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(self.names)}")
         try:
             if all(map(is_number, values.values())):
                 return np.array([float(values.get(name, fill)) for name in self.names])
@@ -114,7 +114,7 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
         for joint, share in _joints(motor, where).items():
             transmission[k, tree.joint_index(joint, where)] = motor.ratio * share
         if not transmission[k].any():
-            raise MechanismError(f"{where}: its gear transmission no joint: a ratio other than 0 is needed")
+            raise MechanismError(f"{where}: its gear turns no joint; give a ratio other than 0")
         if motor.rotor_inertia and np.count_nonzero(transmission[k]) > 1:
             raise MechanismError(
                 f"{where}: rotor_inertia goes with a motor on one joint; on several it would couple their inertias. "

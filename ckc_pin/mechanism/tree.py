@@ -276,10 +276,10 @@ class Tree:
             raise InputError(f"{what}: no coordinate {unknown!r} here; there are {', '.join(names)}")
         missing = [name for name in names if name not in values]
         if missing and fill is None:
-            raise InputError(f"{what}: {', '.join(missing)} missing; needed are {', '.join(names)}")
+            raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(names)}")
         strange = next((name for name in names if not is_number(values.get(name, 0.0))), None)
         if strange is not None:
-            raise InputError(f"{what}: {strange} = {values[strange]!r:.80}: a number is needed")
+            raise InputError(f"{what}: {strange} = {values[strange]!r:.80}: expected a number")
         vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
         if not np.all(np.isfinite(vector)):
             bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]

@@ -62,9 +62,9 @@ class Event:
         if self.direction not in (-1, 0, 1) or isinstance(self.direction, bool):
             raise InputError(f"Event: direction = {self.direction!r:.80}; valid: -1, 0, 1")
         if not isinstance(self.stop, bool):
-            raise InputError(f"Event: stop = {self.stop!r:.80}: True or False is needed")
+            raise InputError(f"Event: stop = {self.stop!r:.80}: expected True or False")
         if not isinstance(self.name, str):
-            raise InputError(f"Event: name = {self.name!r:.80}: a string is needed")
+            raise InputError(f"Event: name = {self.name!r:.80}: expected a string")
 
 
 @dataclass(frozen=True)

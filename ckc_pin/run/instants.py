@@ -27,7 +27,9 @@ def part_of(run: Run, start: Any, stop: Any, step: Any) -> Run:
         No two times, a step, or no instant between them.
     """
     if step is not None or not (is_number(start) and is_number(stop)):
-        raise InputError(f"Run.sel: t: slice({start!r:.40}, {stop!r:.40}); it takes two times, s, and no step")
+        raise InputError(
+            f"Run.sel: t: expected a slice of two times, s, without a step, got slice({start!r:.40}, {stop!r:.40})"
+        )
     rows = (start <= run.t) & (run.t <= stop)
     if not rows.any():
         between, whole = f"from {start:g} to {stop:g} s", f"from {run.t[0]:g} to {run.t[-1]:g} s"

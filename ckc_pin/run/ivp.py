@@ -286,13 +286,13 @@ class Dae:
 def _state(t: Any, y: Any, y0: Array) -> Array:
     """Return a state as numbers (InputError where it, or t, is none)."""
     if not is_number(t):
-        raise InputError(f"as_ivp: t: {describe_value(t)} was given; it takes a number, s")
+        raise InputError(f"as_ivp: t: expected a number, s, got {describe_value(t)}")
     try:
         found = np.asarray(y, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"as_ivp: y: {describe_value(y)} was given; it takes {len(y0)} numbers, as y0 has") from None
+        raise InputError(f"as_ivp: y: expected {len(y0)} numbers, as y0 has, got {describe_value(y)}") from None
     if found.shape != y0.shape:
-        raise InputError(f"as_ivp: y: shape {found.shape} was given; it takes {len(y0)} numbers, as y0 has")
+        raise InputError(f"as_ivp: y: expected {len(y0)} numbers, as y0 has, got shape {found.shape}")
     return found
 
 

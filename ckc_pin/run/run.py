@@ -181,7 +181,7 @@ class Run(HasSummary):
         if isinstance(t, slice):
             return part_of(self, first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
         if not is_number(t):
-            raise InputError(f"Run.sel: t: {describe_value(t)} was given; it takes a time, s, or slice(start, stop)")
+            raise InputError(f"Run.sel: t: expected a time, s, or slice(start, stop), got {describe_value(t)}")
         if not first <= t <= last:
             raise InputError(f"Run.sel: t = {t:g} s; the run is from {first:g} to {last:g} s")
         return state_of(self, self.at(t))
@@ -195,7 +195,7 @@ class Run(HasSummary):
     def at(self, t: float) -> int:
         """Return the row of the output instant nearest to t, s."""
         if not is_number(t):
-            raise InputError(f"Run.at: {describe_value(t)} was given; it takes a time, s")
+            raise InputError(f"Run.at: expected a time, s, got {describe_value(t)}")
         return int(np.argmin(np.abs(self.t - t)))
 
     @cached_property

@@ -232,5 +232,5 @@ class Simulator(HasSummary):
 
     def _require_dt(self, dt: Any) -> float:
         if not is_number(dt) or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:
-            raise InputError(f"dt = {dt!r:.80}: a number greater than 0 is needed, in seconds")
+            raise InputError(f"dt = {dt!r:.80}: expected a number greater than 0, in seconds")
         return float(dt)

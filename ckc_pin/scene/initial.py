@@ -67,7 +67,7 @@ def _find(mechanism: Mechanism, spec: SceneSpec) -> Start:
     if lacking and mechanism.spec.independent is None:
         needed, file = ", ".join(mechanism.independent), mechanism.sources.name
         raise InputError(
-            f"initial.q: {', '.join(lacking)} missing; needed are {needed}, which were chosen because {file} does not: "
+            f"initial.q: {', '.join(lacking)} missing; expected {needed}, which were chosen because {file} does not: "
             "independent = [...] there says which it is to be"
         )
     needs_q = isinstance(spec.controller, FeedbackSpec) or np.any(q_dot)

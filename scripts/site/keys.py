@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
-from ckc_pin.base.toml import expected
+from ckc_pin.base.toml import describe_type
 from ckc_pin.control.point_path import PointPathSpec
 from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
 from ckc_pin.ensembles.spec import SweepSpec
@@ -111,7 +111,7 @@ def _kind(kind: Any) -> str:
         return f"list of {len(get_args(inner))} {'numbers of at least 0' if 'ge' in str(inner) else 'numbers'}"
     if get_origin(inner) is list and get_args(inner)[0] is not list and not _nested(inner):
         return "list of numbers" if get_args(inner)[0] is float else "list of names"
-    return re.sub(r"^an? ", "", expected(kind))
+    return re.sub(r"^an? ", "", describe_type(kind))
 
 
 def _by_name(values: Any) -> str:

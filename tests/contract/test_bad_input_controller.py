@@ -10,7 +10,7 @@ from tests.contract.helpers.bad import Bad, expect
 
 NAMED = "bar/tracking.scene.toml: "
 DESIRED = f"{NAMED}controller.desired"
-FINITE = "a finite number is needed"
+FINITE = "expected a finite number"
 JOINTS = "theta_1, theta_3"
 PENDULUM = """<robot name="p"><link name="a"/><link name="b"><inertial><mass value="1"/><origin xyz="1 0 0"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -44,22 +44,22 @@ def _way(first: int = 0, last: int = 10) -> list[str]:
 
 
 GAINS = [
-    _value("K_D=high", f"{NAMED}controller.K_D = 'high': a number, a table or a list is needed, not a string"),
+    _value("K_D=high", f"{NAMED}controller.K_D = 'high': expected a number, a table or a list, got a string"),
     _value("K_D=nan", f"{NAMED}controller.K_D = nan: {FINITE}"),
     _value("K_D=-1", "K_D is not positive definite: its least eigenvalue is -1"),
     _value("K_D=0", "K_D is not positive definite: its least eigenvalue is 0"),
-    _value("K_D=[1.0, 2.0]", "controller.K_D[0] = 1.0: a list is needed, not a number"),
+    _value("K_D=[1.0, 2.0]", "controller.K_D[0] = 1.0: expected a list, got a number"),
     _value("K_D=[]", "controller.K_D: a matrix must be 2 x 2", f"in the order {JOINTS}"),
     _value("K_D=[[1.0]]", "controller.K_D: a matrix must be 2 x 2"),
     _value("K_D=[[1.0, 0.0], [1.0]]", "controller.K_D: a matrix must be 2 x 2"),
-    _value('K_D=[[1.0, "a"], [0.0, 1.0]]', "controller.K_D[0][1] = 'a': a number is needed"),
+    _value('K_D=[[1.0, "a"], [0.0, 1.0]]', "controller.K_D[0][1] = 'a': expected a number"),
     _value("K_D=[[nan, 0.0], [0.0, 1.0]]", f"controller.K_D[0][0] = nan: {FINITE}"),
     _value("K_D=[[1.0, 0.5], [0.0, 1.0]]", "K_D is not symmetric: its entries [0][1] = 0.5 and [1][0] = 0 differ"),
     _value("K_D=[[1.0, 2.0], [2.0, 1.0]]", "K_D is not positive definite: its least eigenvalue is -1"),
     _value("K_D=[[1.0, 1.0], [1.0, 1.0]]", "K_D is not positive definite"),
     _value("K_D={theta_1=1.0}", f"controller.K_D: a table needs the joints {JOINTS}; 'theta_3' is missing"),
     _value("K_D={theta_1=1.0, theta_2=1.0}", f"a table needs the joints {JOINTS}; 'theta_2' is none of them"),
-    _value('K_D={theta_1=1.0, theta_3="x"}', "controller.K_D.theta_3 = 'x': a number is needed"),
+    _value('K_D={theta_1=1.0, theta_3="x"}', "controller.K_D.theta_3 = 'x': expected a number"),
     _value("Lambda=0", "Lambda^T K_D is not positive definite", "eq. 18"),
     _value("Lambda=-1", "Lambda^T K_D is not positive definite: its least eigenvalue is -10"),
     Bad(
@@ -74,7 +74,7 @@ GAINS = [
 CONTROLLER = [
     _value("type=pid", f"{NAMED}controller.type = 'pid'; valid: 'set_point', 'tracking'"),
     _value("K_P=3", "controller: unknown key 'K_P'; valid: type, Lambda, K_D, desired"),
-    Bad("no controller but a number", ("run", "bar", "--set", "controller=3"), ["controller = 3: a table is needed"]),
+    Bad("no controller but a number", ("run", "bar", "--set", "controller=3"), ["controller = 3: expected a table"]),
     Bad(
         "no type",
         _tracking(),
@@ -82,13 +82,13 @@ CONTROLLER = [
         {"tracking.scene.toml": ('type = "tracking"', "")},
     ),
     Bad("no K_D", _tracking(), ["the key 'K_D' is missing"], {"tracking.scene.toml": ("K_D = 10.0", "")}),
-    _value("torque_limit=0", "controller.torque_limit = 0: a number greater than 0 is needed"),
+    _value("torque_limit=0", "controller.torque_limit = 0: expected a number greater than 0"),
     _value("torque_limit={theta_2=3.0}", f"controller.torque_limit: 'theta_2' is no actuator; there are {JOINTS}"),
-    _value("torque_limit={theta_1=-3.0}", "controller.torque_limit.theta_1 = -3.0: a number greater than 0"),
-    _value("torque_limit=strong", "controller.torque_limit = 'strong': a number or a table is needed"),
-    _target("q_d=1", "controller.q_d = 1: a table is needed"),
+    _value("torque_limit={theta_1=-3.0}", "controller.torque_limit.theta_1 = -3.0: expected a number greater than 0"),
+    _value("torque_limit=strong", "controller.torque_limit = 'strong': expected a number or a table"),
+    _target("q_d=1", "controller.q_d = 1: expected a table"),
     _target("q_d.theta_7=1", f"controller.q_d: no coordinate 'theta_7' here; there are {JOINTS}"),
-    _target("q_d={theta_1=1.0}", f"controller.q_d: theta_3 missing; needed are {JOINTS}"),
+    _target("q_d={theta_1=1.0}", f"controller.q_d: theta_3 missing; expected {JOINTS}"),
     _target("q_d.theta_1=nan", f"controller.q_d.theta_1 = nan: {FINITE}"),
     _target("q_d={theta_1=3.1, theta_3=0.0}", "controller.q_d: the target theta_1 = 3.1, theta_3 = 0 is out of reach"),
     Bad(
@@ -107,15 +107,17 @@ CONTROLLER = [
 ]
 
 TRAJECTORY = [
-    _value("desired=3", f"{DESIRED} = 3: a table is needed"),
-    _value("desired.theta_1=3", f"{DESIRED}.theta_1 = 3: a table is needed, not an integer"),
+    _value("desired=3", f"{DESIRED} = 3: expected a table"),
+    _value("desired.theta_1=3", f"{DESIRED}.theta_1 = 3: expected a table, got an integer"),
     _value("desired.theta_2.offset=1.0", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_2' is none"),
     _value("desired={theta_1={offset=0.1}}", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_3' is missing"),
     _value("desired.theta_1.harmnics=[]", f"{DESIRED}.theta_1: unknown key 'harmnics'; valid: offset, harmonics"),
-    _value("desired.theta_1.offset=a", f"{DESIRED}.theta_1.offset = 'a': a number is needed"),
+    _value("desired.theta_1.offset=a", f"{DESIRED}.theta_1.offset = 'a': expected a number"),
     _value("desired.theta_1.offset=nan", f"{DESIRED}.theta_1.offset = nan: {FINITE}"),
-    _value("desired.theta_1.harmonics=[1.0, 2.0, 3.0]", f"{DESIRED}.theta_1.harmonics[0] = 1.0: a list is needed"),
-    _value("desired.theta_1.harmonics=[[1.0, 2.0]]", ".harmonics[0] = [1.0, 2.0]: a list of 3 is needed, not of 2"),
+    _value("desired.theta_1.harmonics=[1.0, 2.0, 3.0]", f"{DESIRED}.theta_1.harmonics[0] = 1.0: expected a list"),
+    _value(
+        "desired.theta_1.harmonics=[[1.0, 2.0]]", ".harmonics[0] = [1.0, 2.0]: expected a list of 3, got a list of 2"
+    ),
     _value("desired.file=way.csv", f"{DESIRED}: either file", f"or a table for each of {JOINTS}"),
     _value("desired={file=3}", f'{DESIRED}: either file = "NAME.csv" alone'),
     _value('desired={file="way.csv"}', "bar/way.csv: no such"),

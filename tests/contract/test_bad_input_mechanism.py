@@ -14,7 +14,7 @@ NAMED = "bar/mechanism.toml: "
 LINKS = "there are base, link_1, link_2, link_3, link_4, tip_left, tip_right"
 COORDINATES = "there are theta_1, theta_2, theta_3, theta_4"
 INDEPENDENT = '["theta_1", "theta_3"]'
-FINITE = "a finite number is needed"
+FINITE = "expected a finite number"
 
 
 def _edit(what: str, old: str, new: str, *says: str) -> Bad:
@@ -44,20 +44,22 @@ FILES = [
     _file("binary", b"\x00\xff\xfe", f"{NAMED}not a mechanism file, not UTF-8 text (byte 1)"),
     _file("nested without end", f"x = {'[' * 100_000}", "malformed TOML: nested too deeply"),
     _file("a number of 5000 digits", f"name = 1{'0' * 5000}", "malformed TOML"),
-    _file("17 MiB", b"#" * (17 * 2**20), f"{NAMED}more than 16 MiB"),
+    _file("17 MiB", b"#" * (17 * 2**20), f"{NAMED}larger than 16 MiB"),
     _file("a URDF", "<robot/>", "malformed TOML", "this is XML: a URDF is named in a mechanism.toml"),
-    _file("a name that is empty", 'name = ""', "name = '': a string that is not empty is needed"),
-    _file("a name that is a number", "name = 3", "name = 3: a string is needed, not an integer"),
+    _file("a name that is empty", 'name = ""', "name = '': expected a string that is not empty"),
+    _file("a name that is a number", "name = 3", "name = 3: expected a string, got an integer"),
     _edit("an unknown key", "gravity", "gravty", f"{NAMED}unknown key 'gravty'; valid: name, urdf, tree, gravity"),
     _named("no urdf", "", f'{NAMED}give either urdf = "FILE" or [[tree]] entries'),
     _named("urdf and tree", 'urdf = "a"\n[[tree]]\nfile = "b"', "give either urdf"),
     _named("a missing urdf", 'urdf = "nope.urdf"', "bar/nope.urdf: no such"),
     _named("a folder for a urdf", 'urdf = "."', "bar: a folder or a device, not a"),
     _named("a device for a urdf", 'urdf = "/dev/zero"', "/dev/zero: a folder or a device, not a"),
-    _named("a urdf of no possible name", 'urdf = "a\\u0000b"', "no name of a file"),
+    _named("a urdf of no possible name", 'urdf = "a\\u0000b"', "not a valid file name"),
     _named("an unknown package", 'urdf = "package://nope/x.urdf"', "no package 'nope' is installed"),
-    _named("gravity of two numbers", "gravity = [0.0, 1.0]", "gravity = [0.0, 1.0]: a list of 3 is needed, not of 2"),
-    _named("gravity of one number", "gravity = 9.81", "gravity = 9.81: a list is needed, not a number"),
+    _named(
+        "gravity of two numbers", "gravity = [0.0, 1.0]", "gravity = [0.0, 1.0]: expected a list of 3, got a list of 2"
+    ),
+    _named("gravity of one number", "gravity = 9.81", "gravity = 9.81: expected a list, got a number"),
     _named("gravity with nan", 'urdf = "five_bar.urdf"\ngravity = [0.0, nan, 0.0]', f"gravity[1] = nan: {FINITE}"),
     _named("tree root", '[[tree]]\nfile = "five_bar.urdf"\nroot = "loose"', "tree[0].root = 'loose'; valid: 'fixed'"),
     _named("tree parent", '[[tree]]\nfile = "five_bar.urdf"\nparent = "floor"', "five_bar.urdf: its parent 'floor' is"),
@@ -77,7 +79,7 @@ LOOPS = [
     _edit("loop joint frame", '"tip_left"', '"joint:tip"', "loop 'elbow', frame_a: no joint 'tip'", "theta_1"),
     _edit("loop frame table", '"tip_left"', '{link = "tip"}', "loop 'elbow', frame_a: no link 'tip'", LINKS),
     _edit("loop frame key", '"tip_left"', '{lnk = "tip"}', "loop[0].frame_a: unknown key 'lnk'; valid: link, xyz, rpy"),
-    _edit("loop frame number", '"tip_left"', "3", "loop[0].frame_a = 3: a string or a table is needed"),
+    _edit("loop frame number", '"tip_left"', "3", "loop[0].frame_a = 3: expected a string or a table"),
     _edit("loop frame at nan", '"tip_left"', '{link = "base", xyz = [0.0, nan, 0.0]}', f"xyz[1] = nan: {FINITE}"),
     _edit("loop on one body", '"tip_left"', '"link_4"', "loop 'elbow': frames A and B move together"),
     _add(
@@ -88,7 +90,7 @@ LOOPS = [
     _edit("zero loop axis", "rows_in", "axis_a = [0.0, 0.0, 0.0]\nrows_in", "loop 'elbow', axis_a", "not all zero"),
     _edit("length of a point", "rows_in", "length = 1.0\nrows_in", "'point_2d' has no key length"),
     _edit("distance without length", '"point_2d"', '"distance"', "loop 'elbow': type 'distance' needs the key length"),
-    _edit("length zero", "rows_in", "length = 0.0\nrows_in", "loop[0].length = 0.0: a number greater than 0"),
+    _edit("length zero", "rows_in", "length = 0.0\nrows_in", "loop[0].length = 0.0: expected a number greater than 0"),
     _edit(
         "a loop that cannot close",
         '"tip_right"',
@@ -101,7 +103,11 @@ LOOPS = [
     _add("coupling without ratio", '[[coupling]]\njoint = "theta_1"\nother = "theta_3"', "'ratio' is missing"),
     _add("spring on nothing", "[[spring]]\nstiffness = 1.0", "spring 1: give either joint, or frame_a and frame_b"),
     _add("spring on an unknown joint", '[[spring]]\njoint = "x"\nstiffness = 1.0', "'x'", COORDINATES),
-    _add("negative spring", '[[spring]]\njoint = "theta_1"\nstiffness = -1.0', "stiffness = -1.0: a number of at"),
+    _add(
+        "negative spring",
+        '[[spring]]\njoint = "theta_1"\nstiffness = -1.0',
+        "stiffness = -1.0: expected a number of at",
+    ),
     _add(
         "damper and spring on a joint",
         '[[spring]]\njoint = "theta_1"\ndamping = 1.0\n[[spring]]\njoint = "theta_1"\nstiffness = 1.0',
@@ -120,24 +126,36 @@ LIMITED = ('"theta_1" type="continuous">', '"theta_1" type="revolute"><limit low
 
 JOINTS = [
     _joint(
-        "negative armature", 'name = "theta_1"\narmature = -0.1', "joint[0].armature = -0.1: a number of at least 0"
+        "negative armature",
+        'name = "theta_1"\narmature = -0.1',
+        "joint[0].armature = -0.1: expected a number of at least 0",
     ),
     _joint(
-        "negative friction", 'name = "theta_1"\nfriction = -1.0', "joint[0].friction = -1.0: a number of at least 0"
+        "negative friction",
+        'name = "theta_1"\nfriction = -1.0',
+        "joint[0].friction = -1.0: expected a number of at least 0",
     ),
-    _joint("negative damping", 'name = "theta_1"\ndamping = -1.0', "joint[0].damping = -1.0: a number of at least 0"),
-    _joint("friction of nan", 'name = "theta_1"\nfriction = nan', "joint[0].friction = nan: a number of at least 0"),
+    _joint(
+        "negative damping",
+        'name = "theta_1"\ndamping = -1.0',
+        "joint[0].damping = -1.0: expected a number of at least 0",
+    ),
+    _joint(
+        "friction of nan",
+        'name = "theta_1"\nfriction = nan',
+        "joint[0].friction = nan: expected a number of at least 0",
+    ),
     _joint(
         "restitution above 1",
         'name = "theta_1"\nstops = true\nrestitution = 1.5',
-        "joint[0].restitution = 1.5: a number of at least 0 and at most 1 is needed",
+        "joint[0].restitution = 1.5: expected a number of at least 0 and at most 1",
     ),
     _joint(
         "restitution below 0",
         'name = "theta_1"\nstops = true\nrestitution = -0.5',
-        "joint[0].restitution = -0.5: a number of at least 0 and at most 1 is needed",
+        "joint[0].restitution = -0.5: expected a number of at least 0 and at most 1",
     ),
-    _joint("stops in words", 'name = "theta_1"\nstops = "yes"', "joint[0].stops = 'yes': true or false is needed"),
+    _joint("stops in words", 'name = "theta_1"\nstops = "yes"', "joint[0].stops = 'yes': expected true or false"),
     _joint(
         "stops without limits",
         'name = "theta_1"\nstops = true',
@@ -174,7 +192,7 @@ COORDINATE_CHOICES = [
     _edit("too many independent", INDEPENDENT, '["theta_1", "theta_2", "theta_3"]', "3 coordinates", "d = 2", "do"),
     _edit("none independent", INDEPENDENT, "[]", "independent: 0 coordinates (none)", "d = 2"),
     _edit("independent twice", INDEPENDENT, '["theta_1", "theta_1"]', "independent: a coordinate is named twice"),
-    _edit("independent as a string", INDEPENDENT, '"theta_1"', "independent = 'theta_1': a list is needed"),
+    _edit("independent as a string", INDEPENDENT, '"theta_1"', "independent = 'theta_1': expected a list"),
     _edit("unknown actuated", f"actuated = {INDEPENDENT}", 'actuated = ["x"]', "actuated: no coordinate 'x'"),
     _edit("actuated twice", f"actuated = {INDEPENDENT}", 'actuated = ["theta_1", "theta_1"]', "actuated: a joint is"),
     _motor("motor on no joint", 'joint = "x"', "motor 'x': no joint of one freedom called 'x'; there are theta_1"),
@@ -185,8 +203,14 @@ COORDINATE_CHOICES = [
     _motor("motor without a name", "joints = {theta_1 = 1.0}", "motor 1: give it a joint, or a name and joints"),
     _motor("motors of one name", 'joint = "theta_1"\n[[motor]]\njoint = "theta_1"', "two motors are called 'theta_1'"),
     _motor("motor that turns nothing", 'joint = "theta_1"\nratio = 0', "motor 'theta_1': its gear turns no joint"),
-    _motor("negative rotor", 'joint = "theta_1"\nrotor_inertia = -1.0', "rotor_inertia = -1.0: a number of at least 0"),
-    _motor("limit of nothing", 'joint = "theta_1"\ntorque_limit = 0', "torque_limit = 0: a number greater than 0"),
+    _motor(
+        "negative rotor",
+        'joint = "theta_1"\nrotor_inertia = -1.0',
+        "rotor_inertia = -1.0: expected a number of at least 0",
+    ),
+    _motor(
+        "limit of nothing", 'joint = "theta_1"\ntorque_limit = 0', "torque_limit = 0: expected a number greater than 0"
+    ),
     _motor("endless ratio", 'joint = "theta_1"\nratio = inf', f"motor[0].ratio = inf: {FINITE}"),
     _motor(
         "rotor on two joints",
@@ -201,7 +225,7 @@ COORDINATE_CHOICES = [
     _add("motors in two ways", '[[motor]]\njoint = "theta_1"', "actuated, motor: give one of them"),
     _edit("unknown guess", "theta_4 = -0.248", "theta_5 = 1.0", "q_guess: no coordinate 'theta_5'", COORDINATES),
     _edit("guess of nan", "theta_4 = -0.248", "theta_4 = nan", f"{NAMED}q_guess.theta_4 = nan: {FINITE}"),
-    _edit("guess in words", "theta_4 = -0.248", 'theta_4 = "a"', f"{NAMED}q_guess.theta_4 = 'a': a number is needed"),
+    _edit("guess in words", "theta_4 = -0.248", 'theta_4 = "a"', f"{NAMED}q_guess.theta_4 = 'a': expected a number"),
     Bad(
         "independent that cannot parametrise",
         CHECK,

@@ -18,9 +18,9 @@ from tests.contract.helpers.bad import Bad, expect
         ((3,), "Event: 3 is no function"),
         ((max, 2), "direction = 2; valid: -1, 0, 1"),
         ((max, True), "direction = True"),
-        ((max, 0, 1), "stop = 1: True or False is needed"),
-        ((max, 0, True, 5), "name = 5: a string is needed"),
-        ((lambda t: t - 0.5,), r"Event: <lambda>\(t\) was given; it must take \(t, terms\)"),
+        ((max, 0, 1), "stop = 1: expected True or False"),
+        ((max, 0, True, 5), "name = 5: expected a string"),
+        ((lambda t: t - 0.5,), r"Event: expected a function of \(t, terms\), got <lambda>\(t\)"),
     ],
 )
 def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
@@ -68,7 +68,7 @@ BAD = [
     ('{of="sigma_min_phi_z"}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
     ('{of="sigma_min_phi_z", value=-1.0}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
     ('{coordinate="x", of="limit"}', "event[0].coordinate: no coordinate 'x'; there are theta_1, theta_2"),
-    ('{coordinate="theta_1", value=nan}', "event[0].value = nan: a finite number is needed"),
+    ('{coordinate="theta_1", value=nan}', "event[0].value = nan: expected a finite number"),
 ]
 
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from ckc_pin import InputError
-from ckc_pin.base.toml import convert, faults
+from ckc_pin.base.toml import convert, find_faults
 from ckc_pin.formats.urdf.robot_yaml import RobotYaml
 from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.spec import FrameSpec, LoopType, MechanismSpec
@@ -27,7 +27,7 @@ def test_all_faults_of_a_file_are_found() -> None:
     data |= {"t_end": -1, "formulation": "ode", "event": [{"of": "v"}, {"coordinat": "theta_1"}]}
     data["controller"] |= {"K_D": [[1.0, "a"], [0.0, 1.0]], "sample_time": True}
     del data["mechanism"]
-    found = {(fault.steps, fault.what): fault for fault in faults(data, SceneSpec)}
+    found = {(fault.path, fault.kind): fault for fault in find_faults(data, SceneSpec)}
     assert set(found) == {
         (("t_end",), "value"),
         (("formulation",), "value"),
@@ -39,9 +39,9 @@ def test_all_faults_of_a_file_are_found() -> None:
     }
     assert found[("formulation",), "value"].choices == ("dae", "reduced", "spf")
     assert found[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop")
-    assert found[("event", 1), "unknown key"].near == "coordinate"
-    assert found[(), "missing key"].found == "mechanism"
-    assert found[("controller", "K_D", 0, 1), "value"].found == "a"
+    assert found[("event", 1), "unknown key"].suggestion == "coordinate"
+    assert found[(), "missing key"].value == "mechanism"
+    assert found[("controller", "K_D", 0, 1), "value"].value == "a"
 
 
 def test_one_message_names_all_places_and_counts_what_it_leaves_out() -> None:
@@ -56,17 +56,17 @@ def test_one_message_names_all_places_and_counts_what_it_leaves_out() -> None:
 
 
 def test_a_key_that_was_meant_is_not_missing_as_well() -> None:
-    (fault,) = faults({"lnk": "tip"}, FrameSpec)
-    assert (fault.what, fault.found, fault.near) == ("unknown key", "lnk", "link")
+    (fault,) = find_faults({"lnk": "tip"}, FrameSpec)
+    assert (fault.kind, fault.value, fault.suggestion) == ("unknown key", "lnk", "link")
 
 
 def test_choices_are_those_of_the_type() -> None:
-    (fault,) = faults("hing", LoopType)
+    (fault,) = find_faults("hing", LoopType)
     assert fault.choices == tuple(sorted(get_args(LoopType)))
 
 
 def test_entries_wrong_in_one_way_are_named_once() -> None:
-    found = [fault.steps for fault in faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
+    found = [fault.path for fault in find_faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
     assert found == [("gravity", 0)]
 
 
@@ -92,12 +92,12 @@ def test_there_is_a_fault_exactly_where_data_do_not_fit(kind: Any, file: str) ->
             fits = True
         except msgspec.ValidationError:
             fits = False
-        found = [*faults(data, kind)]
+        found = [*find_faults(data, kind)]
         assert fits == (not found), data
         refused += not fits
         for fault in found:
-            assert _at(data, fault.steps) is fault.found or fault.what != "value"
-            assert fault.needed or fault.choices or fault.what == "missing key"
+            assert _at(data, fault.path) is fault.value or fault.kind != "value"
+            assert fault.expected or fault.choices or fault.kind == "missing key"
     assert 50 < refused < 400
 
 

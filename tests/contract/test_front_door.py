@@ -167,9 +167,7 @@ def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> No
     other = next(name for name in ("shoulder", "hip") if name != chosen)
     answer = ckc("run", "mine/own", "--set", f"initial.q.{other}=1.2")
     assert answer.code == 2
-    assert answer.err.startswith(
-        f"error: mine/own: initial.q: {chosen} missing; needed are {chosen}, which were chosen"
-    )
+    assert answer.err.startswith(f"error: mine/own: initial.q: {chosen} missing; expected {chosen}, which were chosen")
     assert "because mine/mechanism.toml does not: independent = [...] there says" in answer.err
 
 

@@ -82,5 +82,5 @@ def test_what_acts_on_a_joint_needs_one_of_one_freedom(tmp_path: Path, key: str)
 
 def test_a_number_that_is_none(tmp_path: Path) -> None:
     write(tmp_path, "fixed", "turn = 0.0", '[[force]]\njoint = "turn"\nvalue = nan\n')
-    with pytest.raises(InputError, match=r"force\[0\]\.value = nan: a finite number is needed"):
+    with pytest.raises(InputError, match=r"force\[0\]\.value = nan: expected a finite number"):
         load(tmp_path)

@@ -113,7 +113,7 @@ def test_the_state_at_an_instant_is_the_nearest_output(swing: Run) -> None:
     for t in (-0.1, 0.5, np.nan):
         with pytest.raises(InputError, match=r"the run is from 0 to 0\.4 s"):
             swing.sel(t=t)
-    with pytest.raises(InputError, match=r"it takes a time, s, or slice\(start, stop\)"):
+    with pytest.raises(InputError, match=r"expected a time, s, or slice\(start, stop\), got"):
         swing.sel(t="end")  # type: ignore[call-overload]
 
 
@@ -149,7 +149,7 @@ def test_a_part_of_a_run_is_a_run(swing: Run, tmp_path: Path) -> None:
     assert np.array_equal(again["theta_1"], part["theta_1"])
     with pytest.raises(InputError, match=r"no output instant from 0\.101 to 0\.102 s; the run is from 0 to 0\.4 s"):
         whole.sel(t=slice(0.101, 0.102))
-    with pytest.raises(InputError, match="two times, s, and no step"):
+    with pytest.raises(InputError, match="two times, s, without a step"):
         whole.sel(t=slice(0.1, 0.2, 0.01))
 
 

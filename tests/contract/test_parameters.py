@@ -128,7 +128,7 @@ REFUSED = [
     ({"link.link_2.mass": -1.0}, "link 'link_2': negative mass -1 kg"),
     ({"link.link_2.mass": float("nan")}, "parameters.link.link_2.mass = nan"),
     ({"link.link_2.inertia.izz": -1.0}, "negative principal moment"),
-    ({"link.link_2.mass": "heavy"}, "a number or a list is needed"),
+    ({"link.link_2.mass": "heavy"}, "expected a number or a list"),
     ({"joint.theta_2.xyz.x": 9.0}, "not closed"),
 ]  # fmt: skip
 

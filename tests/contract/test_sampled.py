@@ -152,11 +152,11 @@ def test_a_sampled_nan_stops_at_its_instant() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ((0.0,), "sample_time = 0.0: a number greater than 0"),
+        ((0.0,), "sample_time = 0.0: expected a number greater than 0"),
         ((-0.1,), "sample_time = -0.1"),
         ((np.nan,), "sample_time = nan"),
         (("1",), "sample_time = '1'"),
-        ((0.1, -1.0), "delay = -1.0: a number of at least 0"),
+        ((0.1, -1.0), "delay = -1.0: expected a number of at least 0"),
         ((0.1, np.inf), "delay = inf"),
     ],
 )
@@ -166,10 +166,10 @@ def test_a_bad_clock_is_refused(arguments: tuple[Any, ...], says: str) -> None:
 
 
 BAD = [
-    (("sample_time=0",), "controller.sample_time = 0: a number greater than 0 is needed"),
-    (("sample_time=-.1",), "controller.sample_time = -0.1: a number greater than 0 is needed"),
-    (("sample_time=fast",), "controller.sample_time = 'fast': a number is needed, not a string"),
-    (("sample_time=.1", "delay=-1"), "controller.delay = -1: a number of at least 0 is needed"),
+    (("sample_time=0",), "controller.sample_time = 0: expected a number greater than 0"),
+    (("sample_time=-.1",), "controller.sample_time = -0.1: expected a number greater than 0"),
+    (("sample_time=fast",), "controller.sample_time = 'fast': expected a number, got a string"),
+    (("sample_time=.1", "delay=-1"), "controller.delay = -1: expected a number of at least 0"),
     (("delay=.1",), "controller.delay: give sample_time too; what is sampled is delayed"),
     (("sample_time=1e-300",), "sample_time = 1e-300 gives more than 10000000 samples in 9.5 s"),
 ]

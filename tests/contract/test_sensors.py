@@ -297,19 +297,19 @@ def _set(*overrides: str) -> tuple[str, ...]:
 
 JOINTS = "theta_1, theta_3"
 BAD = [
-    (_set("sensor.resolution=-1"), "controller.sensor.resolution = -1: a number of at least 0"),
+    (_set("sensor.resolution=-1"), "controller.sensor.resolution = -1: expected a number of at least 0"),
     (_set("sensor.resolution={theta_2=0.1}"), "controller.sensor.resolution: 'theta_2' follows from the loops"),
     (_set("sensor.q_noise={x=0.1}"), f"controller.sensor.q_noise: no coordinate 'x' here; there are {JOINTS}"),
     (_set("sensor.rate=fast"), "controller.sensor.rate = 'fast'; valid: 'difference', 'exact'"),
-    (_set("sensor.filter=0"), "controller.sensor.filter = 0: a number greater than 0"),
-    (_set("sensor.seed=-1"), "controller.sensor.seed = -1: an integer of at least 0"),
+    (_set("sensor.filter=0"), "controller.sensor.filter = 0: expected a number greater than 0"),
+    (_set("sensor.seed=-1"), "controller.sensor.seed = -1: expected an integer of at least 0"),
     (_set("sensor.seed=1.5"), "controller.sensor.seed = 1.5"),
     (_set("sensor.steps=1"), "controller.sensor: unknown key 'steps'; valid: resolution, rate, filter"),
     (
         _set("sensor.rate=difference", "sensor.q_dot_noise=1"),
         'q_dot_noise: with rate = "difference" no rate is measured',
     ),
-    (_set("drive.torque_resolution=0"), "controller.drive.torque_resolution = 0: a number greater than 0"),
+    (_set("drive.torque_resolution=0"), "controller.drive.torque_resolution = 0: expected a number greater than 0"),
     (
         _set("drive.torque_rate={theta_2=1.0}"),
         f"controller.drive.torque_rate: 'theta_2' is no actuator; there are {JOINTS}",

@@ -304,7 +304,7 @@ def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> No
         ([np.nan, 0.0], 0.01, "u is not finite"),
         ([np.inf, 0.0], 0.01, "u is not finite"),
         (["a", "b"], 0.01, "u is no vector of numbers"),
-        (None, 0.0, "dt = 0.0: a number greater than 0"),
+        (None, 0.0, "dt = 0.0: expected a number greater than 0"),
         (None, -1, "dt = -1"),
         (None, np.nan, "dt = nan"),
         (None, np.inf, "dt = inf"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ckc_pin import Run, simulate
 from ckc_pin.errors import NumericalError
-from tests.regression import joint_index
+from tests.regression import one_freedom
 from tests.regression.test_reference_cases import first_top_pin
 
 # --- flat every half turn ------------------------------------------------------------------------
@@ -107,7 +107,7 @@ PIN = """<joint name="{name}" type="continuous"><parent link="{parent}"/><child 
     <origin xyz="{x} 0 0"/><axis xyz="0 0 1"/></joint>"""
 
 
-def four_bar(theta: float, rocker: float = ROCKER) -> joint_index.State:
+def four_bar(theta: float, rocker: float = ROCKER) -> one_freedom.State:
     """Of the crank's angle; the pin of coupler and rocker is beside the line from the crank's pin to the rocker's.
 
     16 times the squared area of its triangle is ((b + c)^2 - r^2)(r^2 - (b - c)^2); with a change point the first
@@ -128,10 +128,10 @@ def four_bar(theta: float, rocker: float = ROCKER) -> joint_index.State:
         ends = [(np.zeros(2), pin), (pin, top), (np.array([g, 0.0]), top)]
         return np.array([[*(p + q) / 2, *(q - p)] for p, q in ends])
 
-    values, rates = joint_index._with_rate(place, theta)
+    values, rates = one_freedom._with_rate(place, theta)
     masses = np.array([a, b, c])
     M = masses @ (np.sum(rates[:, :2] ** 2, axis=1) + np.sum(rates[:, 2:] ** 2, axis=1) / 12)
-    return joint_index.State(float(M), float(joint_index.G * masses @ values[:, 1]), 0.0)
+    return one_freedom.State(float(M), float(one_freedom.G * masses @ values[:, 1]), 0.0)
 
 
 def write_four_bar(folder: Path, rocker: float, formulation: str, rtol: float) -> Path:
@@ -178,7 +178,7 @@ output_dt = 0.1
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-11])
 def test_a_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float) -> None:
     run = simulate(write_four_bar(tmp_path, ROCKER, "dae", rtol))
-    theta, theta_dot = joint_index.turning(four_bar, 0.5, SPEED, run.t)
+    theta, theta_dot = one_freedom.turning(four_bar, 0.5, SPEED, run.t)
     assert theta[-1] > 3 * np.pi  # in line at pi and at 3 pi
     assert run.status == "done", run.message
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
@@ -190,11 +190,11 @@ def test_a_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float
 def test_branches_that_only_come_near_are_not_mistaken_for_crossing(tmp_path: Path, excess: float, rtol: float) -> None:
     """With a longer rocker the rods are never in line, and its pin stays on the side where it was."""
 
-    def near_miss(theta: float) -> joint_index.State:
+    def near_miss(theta: float) -> one_freedom.State:
         return four_bar(theta, ROCKER + excess)
 
     run = simulate(write_four_bar(tmp_path, ROCKER + excess, "dae", rtol))
-    theta, _ = joint_index.turning(near_miss, 0.5, SPEED, run.t)
+    theta, _ = one_freedom.turning(near_miss, 0.5, SPEED, run.t)
     assert run.status == "done", run.message
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import Run, simulate
-from tests.regression import flyball, joint_index
+from tests.regression import flyball, one_freedom
 
 FORMULATIONS = ("dae", "reduced", "spf")
 
@@ -83,13 +83,13 @@ def test_bricard_swings_over_and_back_in_its_period(formulation: str) -> None:
 @pytest.mark.parametrize(
     ("scene", "rate", "mechanism"),
     [
-        ("slider_crank", 20.0, joint_index.slider_crank),
-        ("slider_crank_spatial", 6.0, joint_index.slider_crank_spatial),
+        ("slider_crank", 20.0, one_freedom.slider_crank),
+        ("slider_crank_spatial", 6.0, one_freedom.slider_crank_spatial),
     ],
 )
-def test_slider_cranks(scene: str, rate: float, mechanism: joint_index.Mechanism, formulation: str) -> None:
+def test_slider_cranks(scene: str, rate: float, mechanism: one_freedom.Mechanism, formulation: str) -> None:
     run = simulate(scene, {"formulation": formulation, "t_end": 1.5, "solver.rtol": 1e-11, "solver.output_dt": 0.5})
-    theta, theta_dot = joint_index.turning(mechanism, 0.0, rate, run.t)
+    theta, theta_dot = one_freedom.turning(mechanism, 0.0, rate, run.t)
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= 1e-9
     assert np.abs(run.v_tree[:, run.column("crank")] - theta_dot).max() <= 1e-8
     slider = [mechanism(x).slider for x in theta]
@@ -221,7 +221,7 @@ length = 1.0
     # x is no chart where the mass is level with the pin, so it starts a little below, as the whole swing does
     start = -0.3
     run = period(tmp_path, CARRIAGE, loop, f"x = {np.cos(start)}\ny = {np.sin(start)}", "x", -1, "dae")
-    assert run.t[-1] == pytest.approx(joint_index.pendulum_period(start), abs=1e-9)
+    assert run.t[-1] == pytest.approx(one_freedom.pendulum_period(start), abs=1e-9)
 
 
 def test_trial_stages_far_away_are_not_followed() -> None:

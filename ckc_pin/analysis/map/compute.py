@@ -75,7 +75,7 @@ def singularity_map(
         require_type(scene, (Scene, str, FilePath), "singularity_map: scene", TAKES)
     require_type(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
-        raise InputError(f"singularity_map: over: {over!r} was given; it takes one or two names, as [{over!r}]")
+        raise InputError(f"singularity_map: over: expected one or two names, as [{over!r}], got {over!r}")
     require_callable(progress, "singularity_map: progress", "a function of the part that is done", 1)
     named = mechanism if isinstance(mechanism, str | FilePath) else mechanism.name
     mechanism = found

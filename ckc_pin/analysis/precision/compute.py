@@ -109,7 +109,7 @@ def work_precision(
         Its start is singular.
     """
     if not (np.isfinite(budget) and budget > 0):
-        raise InputError(f"budget = {budget:g}: a number of seconds above zero is needed")
+        raise InputError(f"budget = {budget:g}: expected a number of seconds above zero")
     if not isinstance(scene, Scene):
         scene = load_scene(scene, overrides)
     elif overrides:
