@@ -110,7 +110,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         r"^controller: lyapunov: expected a function of \(t, terms, w\).*, got a function of other arguments",
     ),
     "a class as lyapunov": (of(own_with(lyapunov=dict)), "^controller: lyapunov: expected a.*, got the class dict"),
-    "lyapunov that is sampled": (lambda: Sampled(own_with(lyapunov="V"), 0.1), "^lyapunov: expected .*got 'V'"),
+    "lyapunov that is sampled": (lambda: Sampled(own_with(lyapunov="V"), 0.1), "lyapunov: expected .*got 'V'"),
     "a word from lyapunov": (
         of(own_with(lyapunov=lambda t, terms, w: "V")), "^controller: lyapunov at t = 0 gave 'V'; a number is needed$"
     ),
