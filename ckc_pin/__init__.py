@@ -5,14 +5,31 @@
 >>> terms = ckc_pin.terms(mechanism, {"theta_1": -1.2, "theta_3": -1.9}, {"theta_1": 0.4, "theta_3": -0.3})
 >>> run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced"})
 
-Rooms, bottom to top: `errors`, `mechanism` (what it is), `dynamics` (terms and the three formulations),
-`control`, `generated` (terms written out for one mechanism), `simulation`, and side by side `formats`, `analysis` and
-`view`. README.md says where each equation lives.
+Subpackages, bottom to top; a module imports only from subpackages below its own:
+
+============================ ==========================================================================
+`errors`, `base`             exceptions; files, argument validation, summaries, small dense matrices
+`mechanism`                  the mechanism file, the URDF tree, loop closures, rank, named parameters
+`kinematics`                 sigma (eq. 4), assembly, continuation, points as tools
+`dynamics`                   terms of the equations of motion, the three formulations, equilibria
+`control`                    controllers, desired motions, motors, sampling
+`codegen`                    compiled terms of one mechanism
+`native`                     the C++ core: systems, integrators, events, the step loop
+`scene`                      scene files and the objects they describe
+`run`                        simulation, runs, the stepwise simulator, inverse dynamics
+`linear`, `sensitivity`      linear models and stability; derivatives of runs, Floquet multipliers
+`ensembles`                  many runs with different parameters
+`formats`, `analysis`        import and export; checks, singularity maps, work-precision reports
+`view`, `cli`                figures and 3-D playback; the command `ckc`
+============================ ==========================================================================
+
+docs/architecture.md describes them, and what happens in a call of `simulate`.
 """
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # importing `typing`, NumPy or Pinocchio here would delay the signal handlers of `ckc`
+# Importing `typing`, NumPy or Pinocchio here would delay the signal handlers of `ckc`.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -136,7 +153,7 @@ ROOMS = (
 
 
 def __getattr__(name: str) -> Any:
-    """Import the module of a public name when the name is used first."""
+    """Import the module of a public name at its first use."""
     from importlib import import_module
 
     if name in ROOMS:
@@ -149,8 +166,8 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Name what is loaded later, too."""
-    return sorted({*globals(), *__all__})
+    """List the public names, whether they are imported already or not."""
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
 
 
 def play(
@@ -164,30 +181,37 @@ def play(
     block: bool = True,
     inline: bool | None = None,
 ) -> Playback | ViewServer | None:
-    """Play runs: in a notebook below the cell, elsewhere in the browser, on this machine only.
+    """Play runs in 3-D: in a notebook below the cell, otherwise in a browser on this machine.
 
     Parameters
     ----------
     runs : Run
-        They lie on each other; all of one mechanism.
+        Runs of one mechanism, drawn on top of each other.
     speed : float
-        Seconds of the run in a second of playback, to begin with.
+        Initial speed: seconds of the run in a second of playback.
     gap : float
-        Above zero: how many times larger the gaps of the loops are drawn.
+        Magnification of the gaps in the loops; 0 draws them as they are.
     meshes : path, optional
-        The mechanism's folder, where the URDF's mesh files are.
+        Folder of the mechanism, which has the URDF's mesh files.
     forces : bool
-        Draw what the loops carry and what the motors give as arrows; the page can hide them.
-    open_browser, port, block
-        In the browser: open the address too; a port of 127.0.0.1, 0 for any free one; wait until Ctrl-C, or return the
-        server at once, which plays until its `stop`.
+        Draw loop forces and motor torques as arrows. The page can hide them.
+    open_browser : bool
+        Open the address in the default browser.
+    port : int
+        Port on 127.0.0.1; 0 takes a free one.
+    block : bool
+        Wait until Ctrl-C. Otherwise return the server, which plays until its `stop` is called.
     inline : bool, optional
-        Return a page that a notebook shows, and `save` writes; absent: in a notebook.
+        Return a page that a notebook displays and `save` writes. Default: True in a notebook.
+
+    Returns
+    -------
+    Playback, ViewServer or None
 
     Raises
     ------
     InputError
-        No run, runs of several mechanisms, numbers that cannot be, a port in use, meshcat missing.
+        No run, runs of several mechanisms, an invalid number, a port in use, or meshcat is not installed.
     """
     from ckc_pin.base.summary import in_notebook
     from ckc_pin.view.inline import Playback
@@ -201,22 +225,22 @@ def play(
 
 
 def plot(*shown: Run | LinearModel | GainLocus | Sensitivities) -> Figures:
-    """Draw runs, a linear model, a locus or sensitivities; a notebook shows the figures, `save(folder)` writes them.
+    """Draw figures of runs, a linear model, a root locus or sensitivities.
 
     Parameters
     ----------
     shown : Run, or one LinearModel, GainLocus or Sensitivities
-        Runs of one mechanism under one kind of control share a figure. A linear model has poles and modes.
+        Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
 
     Returns
     -------
     Figures
-        matplotlib's figures by name.
+        Matplotlib figures by name. A notebook displays them, and `save(folder)` writes them.
 
     Raises
     ------
     InputError
-        Nothing, or something else; matplotlib missing.
+        An argument of another type, no argument, or matplotlib is not installed.
     """
     from ckc_pin.view.inline import Figures
 
@@ -233,14 +257,14 @@ def singularity_map(
     cells: int = 200,
     progress: Callable[[float], None] | None = None,
 ) -> SingularityMap:
-    """Map where a mechanism can go and is singular; see `ckc_pin.analysis.map.singularity_map`, which this loads."""
+    """Compute the workspace and the singular configurations of a mechanism: `ckc_pin.analysis.map.singularity_map`."""
     from ckc_pin.analysis.map import singularity_map as compute
 
     return compute(mechanism, scene=scene, space=space, over=over, point=point, cells=cells, progress=progress)
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
-    """Write a mechanism's terms out as CasADi functions; see `ckc_pin.codegen.symbolic`, which this loads."""
-    from ckc_pin.codegen.symbolic import symbolic as write
+    """Return the terms of a mechanism as CasADi functions: `ckc_pin.codegen.symbolic.symbolic`."""
+    from ckc_pin.codegen.symbolic import symbolic as generate
 
-    return write(mechanism)
+    return generate(mechanism)

@@ -1,18 +1,18 @@
-"""What can go wrong, all of it.
+"""The exceptions of ckc_pin.
 
 ::
 
     CkcError
-    ├── MechanismError        an unknown name, a closure that makes no sense, loops that cannot be
-    │                         assembled, coordinates that cannot parametrise the mechanism
-    ├── InputError            (also a ValueError) a value of the wrong shape, not finite, out of its
-    │                         range; a file that is missing, malformed or has a key nobody knows
-    └── NumericalError        the numerics stopped: sigma did not converge, a singular
-                              configuration, an integration that cannot meet its tolerance
+    ├── MechanismError        the mechanism cannot exist as described: an unknown name, an invalid loop
+    │                         closure, loops that cannot be assembled, unsuitable independent coordinates
+    ├── InputError            (also a ValueError) an argument or file is invalid: a wrong type, shape or
+    │                         range, a number that is not finite, a missing file, an unknown key
+    └── NumericalError        a computation stopped: sigma did not converge, a singular configuration,
+                              an integration that cannot meet its tolerance
 
-Every message says what was wrong, where, and what would be right. On the command line the first two
-are exit code 2 (known before the first step), the third is exit code 3 (everything computed so far is
-kept and printed).
+Every message says where the error is, what is wrong, and what would be right. On the command line the first
+two end with exit code 2, before the first step. The third ends with exit code 3, and everything computed so
+far is kept and printed.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ __all__ = ["CkcError", "InputError", "MechanismError", "NumericalError"]
 
 
 class CkcError(Exception):
-    """Base of every error that ckc_pin raises on purpose.
+    """Base of the exceptions that ckc_pin raises on purpose.
 
-    Its message is one line: what cannot be printed, of a stranger's names and paths, stands as an escape.
+    The message is one line. Characters of a user's names and paths that cannot be printed are escaped.
     """
 
     def __init__(self, message: str) -> None:
@@ -37,33 +37,33 @@ class CkcError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return a line of text whose letters can all be printed: the others stand as escapes, and move no cursor."""
-    return text if text.isprintable() else "".join(map(_shown, text))
+    """Return a text as one line: characters that cannot be printed, such as cursor movements, are escaped."""
+    return text if text.isprintable() else "".join(map(_escape, text))
 
 
-def _shown(letter: str) -> str:
+def _escape(letter: str) -> str:
     return letter if letter.isprintable() else letter.encode("unicode_escape").decode()
 
 
 class MechanismError(CkcError):
-    """A mechanism that does not exist as described."""
+    """The mechanism cannot exist as described."""
 
 
 class InputError(CkcError, ValueError):
-    """A value or a file that cannot be used, known before any computation."""
+    """An argument or a file is invalid, found before any computation."""
 
 
 class NumericalError(CkcError):
-    """The numerics stopped.
+    """A computation stopped before its end.
 
     Attributes
     ----------
     t : float or None
-        Time of the stop in seconds, where there is one.
+        Time at which it stopped, s.
     q_tree : dict of str to float, or None
-        The configuration it stopped at, by coordinate.
+        Configuration at which it stopped, by coordinate.
     run : Run or None
-        Everything computed up to there.
+        The results until then.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Types of NumPy arrays."""
+"""Array types, properties that are computed once, and a base of immutable data classes with arrays."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ T = TypeVar("T")
 
 
 class lazy(Generic[T]):
-    """A property computed once per object.
+    """A property that is computed at the first access and then stored in the object.
 
-    Like `functools.cached_property` without its lock, which costs more than some of our values on Python 3.11.
+    As `functools.cached_property`, but without its lock, which on Python 3.11 costs more than some of these values.
     """
 
     def __init__(self, compute: Callable[[Any], T]) -> None:
@@ -46,7 +46,7 @@ class lazy(Generic[T]):
 
 
 class Immutable:
-    """A frozen dataclass whose arrays are read-only: a copy of it is itself."""
+    """Base of frozen data classes whose arrays are read-only. A deep copy shares them."""
 
     def __post_init__(self) -> None:
         for value in self.__dict__.values():

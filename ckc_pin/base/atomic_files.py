@@ -1,7 +1,7 @@
-"""Files that stand whole or not at all: written beside their place and moved there.
+"""Write files atomically: to a temporary file in the same folder, which then replaces the target.
 
-What is being written is locked, so that a process killed meanwhile leaves something that the next one to write there
-knows for left over, and one still at work leaves something that it does not touch.
+The temporary file is locked while it is written. The next process that writes the same target removes temporary files
+that no process locks, since a killed process left them, and leaves locked ones alone.
 """
 
 from __future__ import annotations
@@ -20,25 +20,32 @@ from ckc_pin.errors import InputError
 
 __all__ = ["lock_folder", "open_atomic", "temporary_folder", "write_atomic"]
 
-UNFINISHED = ".unfinished"
-PATIENCE = 10.0  # s
+UNFINISHED = ".unfinished"  # suffix of temporary files
+LOCK_TIMEOUT_S = 10.0
+LOCK_POLL_S = 0.02
+MAX_NAME = 50  # characters of the target's name in the temporary one; a file system allows 255 bytes
 
 
 @contextmanager
 def open_atomic(path: Path) -> Iterator[BinaryIO]:
-    """Give a file to write to; it takes its place when all is written, and on a failure what was there stays.
+    """Open a file that replaces `path` when the block ends without an error; otherwise `path` stays as it was.
+
+    Parameters
+    ----------
+    path : Path
+        The target. Missing folders are created.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     if not path.name:
-        raise InputError(f"{path}: a folder, not the name of a file")
+        raise InputError(f"{path}: expected the name of a file, got a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _clear(path)
-        with _unfinished(path) as file:
+        _remove_leftovers(path)
+        with _temporary_file(path) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -49,7 +56,7 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text as UTF-8 (InputError where that cannot be)."""
+    """Write a text atomically, as UTF-8. Raises as `open_atomic` does."""
     with open_atomic(path) as file:
         file.write(text.encode())
 
@@ -73,39 +80,40 @@ def temporary_folder(place: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Let one process at a time write the files of a result to a folder, so that they belong together.
+    """Let one process at a time write to a folder, so that the files of a result belong together.
 
-    After `PATIENCE` it goes on beside the other one.
+    If another process still holds the lock after `LOCK_TIMEOUT_S`, the block runs without it.
     """
     handle = os.open(folder, os.O_RDONLY)
-    until = monotonic() + PATIENCE
+    deadline = monotonic() + LOCK_TIMEOUT_S
     try:
-        while not _locked(handle) and monotonic() < until:
-            sleep(0.02)
+        while not _try_lock(handle) and monotonic() < deadline:
+            sleep(LOCK_POLL_S)
         yield
     finally:
         os.close(handle)
 
 
-def _locked(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     try:
         flock(handle, LOCK_EX | LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # a file system without locks
+    except OSError:  # the file system has no locks
         pass
     return True
 
 
 @contextmanager
-def _unfinished(path: Path) -> Iterator[BinaryIO]:
-    """Make the file beside its place, locked, under a name of its own; it is gone afterwards unless it was moved."""
+def _temporary_file(path: Path) -> Iterator[BinaryIO]:
+    """Create a locked file with a unique name in the folder of `path`. It is removed afterwards unless it was moved."""
     temporary = path.with_name(f"{_prefix(path)}{uuid4().hex}{UNFINISHED}")
     try:
         with ExitStack() as stack:
-            while not lexists(temporary):  # at first, and when it was taken for left over before it was locked
+            # Another process may remove the file before it is locked; then it is created again.
+            while not lexists(temporary):
                 file = stack.enter_context(temporary.open("xb"))
-                with suppress(OSError):  # a file system without locks
+                with suppress(OSError):  # the file system has no locks
                     flock(file, LOCK_EX)
             yield file
     finally:
@@ -113,11 +121,11 @@ def _unfinished(path: Path) -> Iterator[BinaryIO]:
 
 
 def _prefix(path: Path) -> str:
-    return f".{path.name[:50]}."  # a file system takes 255 bytes
+    return f".{path.name[:MAX_NAME]}."
 
 
-def _clear(path: Path) -> None:
-    """Remove what processes that are no more have left of this file."""
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files of `path` that killed processes have left."""
     for name in os.listdir(path.parent):
         if not (name.startswith(_prefix(path)) and name.endswith(UNFINISHED)):
             continue
@@ -127,7 +135,7 @@ def _clear(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the new name last as well when the machine goes down; some file systems have no such thing."""
+    """Flush the folder to disk, so that the new name survives a power failure; not all file systems can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

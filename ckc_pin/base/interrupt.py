@@ -1,4 +1,4 @@
-"""KeyboardInterrupt where it ends a computation whose results so far are kept."""
+"""Interrupts of computations that keep their results so far, and work that must not be interrupted."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ __all__ = ["CommandInterrupt", "acknowledge", "interrupt_again", "uninterrupted_
 
 
 class CommandInterrupt(KeyboardInterrupt):
-    """A signal to the `ckc` command, which raises it again until it is acknowledged: some libraries swallow it."""
+    """A signal to the `ckc` command. It is raised again until it is acknowledged, since some libraries swallow it."""
 
     acknowledged = False
 
 
 def acknowledge(interrupt: KeyboardInterrupt) -> str:
-    """Take note that an interrupt is dealt with; return by which signal, " by SIGTERM" or an empty text."""
+    """Mark an interrupt as handled. Return ``" by SIGTERM"`` for that signal, otherwise an empty text."""
     if isinstance(interrupt, CommandInterrupt):
         interrupt.acknowledged = True
     return f" by {interrupt}" if str(interrupt) else ""
 
 
 def interrupt_again(message: str) -> KeyboardInterrupt:
-    """Return the interrupt that ended a run, from the run's message."""
+    """Return the exception of the interrupt that ended a run, according to the run's message."""
     return KeyboardInterrupt("SIGTERM") if "SIGTERM" in message else KeyboardInterrupt()
 
 
 @contextmanager
 def uninterrupted_thread(initializer: Callable[[], None] | None = None) -> Iterator[ThreadPoolExecutor]:
-    """Give a pool of one thread, for work that KeyboardInterrupt must not stop half-way; wait for it at the end.
+    """Provide a thread for work that KeyboardInterrupt must not stop half-way, and wait for it at the end.
 
-    Python raises KeyboardInterrupt in the main thread only. The thread is started before there is work for it: a pool
-    forgets a thread, and does not wait for it, if `submit` is interrupted while the thread starts.
+    Python raises KeyboardInterrupt in the main thread only. The thread is started before it gets work: if `submit` is
+    interrupted while it starts a thread, the pool forgets that thread and does not wait for it.
     """
     from concurrent.futures import ThreadPoolExecutor
 

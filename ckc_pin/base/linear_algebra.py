@@ -1,7 +1,7 @@
-"""Factorizations of small dense matrices: LU by eigenpy, which Pinocchio brings along, QR by NumPy.
+"""Factorizations of small dense matrices, null spaces, pivoted column selection, and BLAS on one thread.
 
-SciPy's `linalg` takes 0.3 s to import, more than Pinocchio itself, and `numpy.linalg.solve` is ten times
-slower for a 4 x 4 matrix than a factorization that is kept.
+LU comes from eigenpy, which Pinocchio depends on, and QR from NumPy. Importing `scipy.linalg` would take 0.3 s, longer
+than Pinocchio itself. For a 4 x 4 matrix `numpy.linalg.solve` takes ten times as long as a stored factorization.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from ckc_pin.base.arrays import Array, IntArray
 
 __all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns"]
 
-TIED = 1e-8  # of a pivot: less than that apart, rounding would choose, on each machine another
-SCIPY = "scipy.linalg"  # loaded by who needs it, with a BLAS of its own
+TIE_TOLERANCE = 1e-8  # relative: of pivots closer than this the first is taken, since rounding differs by machine
+SCIPY = "scipy.linalg"  # comes with a BLAS library of its own
 
 
 class _OneThread:
-    """How many `with` blocks keep BLAS on one thread, in all of Python's threads, and what it had before them."""
+    """Counts the `with` blocks of all Python threads that keep BLAS on one thread, and restores the previous number."""
 
     def __init__(self) -> None:
         self.lock = Lock()
         self.blocks = 0
         self.libraries: Any = None
-        self.of_scipy = False  # whether SciPy's own BLAS is one of them
+        self.includes_scipy = False  # whether SciPy's BLAS is among the libraries
         self.before: list[int] = []
 
     def enter(self) -> None:
         with self.lock:
-            if not self.blocks and (self.libraries is None or (SCIPY in sys.modules and not self.of_scipy)):
+            if not self.blocks and (self.libraries is None or (SCIPY in sys.modules and not self.includes_scipy)):
                 from threadpoolctl import ThreadpoolController
 
                 self.libraries = ThreadpoolController().select(user_api="blas").lib_controllers
-                self.of_scipy = SCIPY in sys.modules
-            if not self.blocks:  # threadpoolctl's own `limit` asks for much else: 60 us
+                self.includes_scipy = SCIPY in sys.modules
+            if not self.blocks:  # threadpoolctl's `limit` would query every library again, which takes 60 us
                 self.before = [library.num_threads for library in self.libraries]
                 for library in self.libraries:
                     library.set_num_threads(1)
@@ -62,8 +62,8 @@ _one_thread = _OneThread()
 def one_blas_thread(*, with_scipy: bool = False) -> Iterator[None]:
     """Keep BLAS on one thread within a `with` block.
 
-    A mechanism's matrices are small: threads cost more than they give, and with the cores busy the
-    factorization of a 200 x 200 matrix took 0.9 s instead of 4 ms.
+    The matrices of a mechanism are small, so threads cost more than they save. On a busy machine the factorization of
+    a 200 x 200 matrix took 0.9 s with threads and 4 ms without.
 
     Parameters
     ----------
@@ -81,15 +81,21 @@ def one_blas_thread(*, with_scipy: bool = False) -> Iterator[None]:
 
 
 class Factorization:
-    """LU of a square matrix, QR of a tall one, with solves by either.
+    """Factorization of a square matrix (LU) or a tall one (QR), stored to solve several right-hand sides.
 
-    A tall matrix is what redundant loops give: its least-squares solution is the exact one where the
-    right-hand side is consistent, as it is for every motion that the loops allow.
+    Redundant constraints make phi_z tall. Its least-squares solution is exact if the right-hand side is consistent,
+    which it is for every motion that the loops allow.
 
     Parameters
     ----------
     matrix : (m, k) array, m >= k
-        Finite entries; full column rank unless `singular` says otherwise.
+        Finite entries.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    singular : bool
+        A pivot is exactly zero, so that the matrix cannot be solved with.
     """
 
     __slots__ = ("_lu", "_lu_transposed", "_matrix", "_q", "shape", "singular")
@@ -100,22 +106,22 @@ class Factorization:
             self._q, self._matrix = None, matrix
         else:
             self._q, self._matrix = np.linalg.qr(matrix)
-        self._lu = eigenpy.PartialPivLU(self._matrix)  # of a triangle it is the triangle
+        self._lu = eigenpy.PartialPivLU(self._matrix)  # after QR the matrix is R, whose LU factorization is R itself
         self._lu_transposed: Any = None
         self.singular = not bool(np.all(np.diagonal(self._lu.matrixLU())))
 
     def solve(self, right: Array) -> Array:
-        """Solve A x = right (least squares when tall), right of shape (m,) or (m, p)."""
+        """Solve A x = right, in the least-squares sense if A is tall; right has shape (m,) or (m, p)."""
         if right.ndim == 2:
-            return _by_columns(self.solve, right, self.shape[1])
+            return _solve_columns(self.solve, right, self.shape[1])
         if self.shape[1] == 0:
             return np.zeros(0)
-        return np.ravel(self._lu.solve(right if self._q is None else self._q.T @ right))  # eigenpy makes (1, 1) of one
+        return np.ravel(self._lu.solve(right if self._q is None else self._q.T @ right))
 
     def solve_transposed(self, right: Array) -> Array:
-        """Solve A^T x = right (minimum norm when tall), right of shape (k,) or (k, p)."""
+        """Solve A^T x = right, with minimum norm if A is tall; right has shape (k,) or (k, p)."""
         if right.ndim == 2:
-            return _by_columns(self.solve_transposed, right, self.shape[0])
+            return _solve_columns(self.solve_transposed, right, self.shape[0])
         if self.shape[1] == 0:
             return np.zeros(self.shape[0])
         if self._lu_transposed is None:
@@ -124,17 +130,17 @@ class Factorization:
         return x if self._q is None else np.asarray(self._q @ x)
 
     def determinant(self) -> float:
-        """Return the determinant; a tall matrix has none (ValueError)."""
+        """Return the determinant (ValueError for a tall matrix)."""
         if self._q is not None:
-            raise ValueError("a tall matrix has no determinant")
+            raise ValueError("determinant: the matrix is not square")
         return float(self._lu.determinant()) if self.shape[0] else 1.0
 
 
-def _by_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> Array:
-    """Solve for one column at a time.
+def _solve_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> Array:
+    """Solve for one column after the other.
 
-    For several at once OpenBLAS starts its threads whatever the size: with the cores busy that made a
-    2 x 2 solve take 3 ms instead of 0.7 us.
+    For several columns at once OpenBLAS starts threads whatever the size. On a busy machine that made a 2 x 2 solve
+    take 3 ms instead of 0.7 us.
     """
     x = np.empty((rows, right.shape[1]))
     for k in range(right.shape[1]):
@@ -143,45 +149,46 @@ def _by_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> Arr
 
 
 def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, Array]:
-    """Split the tangent space by a pivoted QR of J: J P = Q [R S].
+    """Return a basis of the null space of J and a particular solution of J x = -residual, by a pivoted QR of J.
 
-    The basis is that of the columns which the pivoting left over, with ones and zeros exact in their rows. An
-    orthonormal one would mix the rounding of all columns: where a light link moves far and a heavy one by 1e-4 of
-    that, the heavy one's part would be off by as much as the light one's.
+    The basis vectors have exact ones and zeros in the columns that the pivoting did not choose. An orthonormal basis
+    would mix the rounding errors of all columns: if a light link moves far and a heavy one by 1e-4 of that, the error
+    of the heavy link's part would be as large as the light link's.
 
     Parameters
     ----------
     jacobian : (m, n) array
     rank : int
-        The rank of J, known from the assembled configuration.
+        The rank of J, from the assembled configuration.
     residual : (m,) array, or (m, k)
-        With redundant rows consistent.
+        Consistent if rows of J are redundant.
 
     Returns
     -------
     tangent : (n, n - rank) array
-        Basis of the velocities that the loops allow; no entry is much larger than 1.
+        Basis of the null space; no entry is much larger than 1.
     particular : (n,) array, or (n, k)
-        x with J x = -residual that leaves the same columns alone.
+        A solution of J x = -residual that is zero in the same columns.
     pivots : (rank,) array
-        Sizes of R's diagonal, which falls.
+        Absolute values of the diagonal of R, decreasing.
     """
     n = jacobian.shape[1]
     tangent, particular = np.zeros((n, n - rank)), np.zeros((n, *residual.shape[1:]))
     order, pivots = pivoted_columns(jacobian)
-    order, left_over, pivots = order[:rank], order[rank:], pivots[:rank]
-    tangent[left_over] = np.eye(n - rank)
+    order, remaining, pivots = order[:rank], order[rank:], pivots[:rank]
+    tangent[remaining] = np.eye(n - rank)
     if rank and pivots[-1] > 0:
         basis = Factorization(jacobian[:, order])
-        tangent[order] = -basis.solve(jacobian[:, left_over])
+        tangent[order] = -basis.solve(jacobian[:, remaining])
         particular[order] = -basis.solve(residual)
     return tangent, particular, pivots
 
 
 def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
-    """Order columns as a pivoted QR does: next is the one of which most is left beside those before it.
+    """Order columns as a pivoted QR factorization does.
 
-    Of several that are as large, but for rounding, the first.
+    The next column is the one with the largest part orthogonal to the columns before it. Of columns that are equal up
+    to rounding, the first is taken, so that the order is the same on every machine.
 
     Parameters
     ----------
@@ -191,20 +198,20 @@ def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
     -------
     order : (n,) int array
     pivots : (min(m, n),) array
-        What is left of each, falling but for rounding: the sizes of R's diagonal.
+        Norms of the orthogonal parts, decreasing up to rounding: the absolute values of the diagonal of R.
     """
-    left = matrix.copy()
+    remainder = matrix.copy()
     order = np.arange(matrix.shape[1])
     pivots = np.zeros(min(matrix.shape))
     for k in range(len(pivots)):
-        sizes = np.linalg.norm(left[:, order[k:]], axis=0)
+        sizes = np.linalg.norm(remainder[:, order[k:]], axis=0)
         largest = sizes.max()
         if not largest > 0:
             break
-        best = int(np.argmax(sizes > (1 - TIED) * largest))
+        best = int(np.argmax(sizes > (1 - TIE_TOLERANCE) * largest))
         order[[k, k + best]] = order[[k + best, k]]
         pivots[k] = sizes[best]
-        direction = left[:, order[k]] / sizes[best]
-        rest = order[k + 1 :]
-        left[:, rest] -= np.outer(direction, direction @ left[:, rest])
+        direction = remainder[:, order[k]] / sizes[best]
+        others = order[k + 1 :]
+        remainder[:, others] -= np.outer(direction, direction @ remainder[:, others])
     return order, pivots

@@ -1,4 +1,4 @@
-"""Where texts come from: a folder, a package of robots, or the texts that a saved run carries. And where they go."""
+"""Texts of mechanism files and where they come from, package paths, and strict parsing of XML."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError, MechanismError
 
 __all__ = [
-    "MAX_DEPTH",
+    "MAX_XML_DEPTH",
     "Sources",
-    "resolve",
-    "strict_xml",
+    "parse_xml",
+    "resolve_path",
     "write_texts",
 ]
 
 PACKAGE = "package://"
+MAX_XML_DEPTH = 300  # nested elements; ElementTree writes by recursion
 
 
 class Sources:
-    """Texts by the name that a mechanism file gives them; what was read is kept, so a run can carry it.
+    """Texts of the files that a mechanism file names. Each text is kept, so that a run can store it.
 
     Parameters
     ----------
     name : str
-        What messages call the mechanism file.
+        Name of the mechanism file, for messages.
     folder : Path or None
-        Relative names are resolved here. None: only `texts` exist.
+        Folder that relative names refer to. None: `texts` is complete.
     texts : mapping, optional
-        Texts that are there already.
+        Texts by file name.
     """
 
     def __init__(self, name: str, folder: Path | None, texts: Mapping[str, str] | None = None) -> None:
@@ -44,8 +45,8 @@ class Sources:
         self.texts = dict(texts or {})
 
     @contextmanager
-    def naming(self) -> Iterator[None]:
-        """Have messages begin with the file: what reads a part of it knows its table alone."""
+    def prefix_errors(self) -> Iterator[None]:
+        """Prepend the file's name to errors raised in the block, which name only the table or key."""
         try:
             yield
         except (InputError, MechanismError) as error:
@@ -54,22 +55,28 @@ class Sources:
             raise type(error)(f"{self.name}: {error}") from None
 
     def text(self, file: str) -> str:
-        """Return a file's text.
+        """Return the text of a file.
 
         Raises
         ------
         InputError
-            No such file or package.
+            The file or package does not exist.
         """
         if file not in self.texts:
             if self.folder is None:
-                raise InputError(f"{self.name}: the text of {file!r} is not part of it")
-            self.texts[file] = read_text(resolve(file, self.folder, self.name), "file")
+                raise InputError(f"{self.name}: it does not contain the text of {file!r}")
+            self.texts[file] = read_text(resolve_path(file, self.folder, self.name), "file")
         return self.texts[file]
 
 
-def resolve(file: str, folder: Path, where: str) -> Path:
-    """Return the path of a file named relative to a folder, or as ``package://PACKAGE/PATH``."""
+def resolve_path(file: str, folder: Path, where: str) -> Path:
+    """Return the path of a file that is named relative to a folder, or as ``package://PACKAGE/PATH``.
+
+    Raises
+    ------
+    InputError
+        The package is not installed, or the path leaves it.
+    """
     if not file.startswith(PACKAGE):
         return folder / file
     package, _, rest = file.removeprefix(PACKAGE).partition("/")
@@ -77,7 +84,7 @@ def resolve(file: str, folder: Path, where: str) -> Path:
         raise InputError(f"{where}: {file!r} names no package; write package://PACKAGE/PATH")
     if "\0" in file:
         raise InputError(f"{where}: {file!r} is not a valid path; it has a null character")
-    for share in _shares():
+    for share in _share_folders():
         base = (share / package).resolve()
         if isdir(base):
             path = (base / rest).resolve()
@@ -89,16 +96,16 @@ def resolve(file: str, folder: Path, where: str) -> Path:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list[Path]:
-    """Write texts by file name into a folder, which is made if it is not there.
+    """Write texts by file name into a folder, which is created if it does not exist. Return their paths.
 
     Raises
     ------
     InputError
-        A file is there already and may not be replaced, or the folder cannot be written to.
+        A file exists and `overwrite` is False, or the folder cannot be written to.
     """
-    there = [str(folder / file) for file in texts if lexists(folder / file)]
-    if there and not overwrite:
-        raise InputError(f"{' and '.join(there)}: there already; write elsewhere with --out DIR, or say --overwrite")
+    existing = [str(folder / file) for file in texts if lexists(folder / file)]
+    if existing and not overwrite:
+        raise InputError(f"{' and '.join(existing)}: there already; write elsewhere with --out DIR, or say --overwrite")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -108,44 +115,41 @@ def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list
     return [folder / file for file in texts]
 
 
-def _shares() -> list[Path]:
-    """Folders that hold robot packages: beside Pinocchio's wheel, and the interpreter's own."""
-    import pinocchio
+def _share_folders() -> list[Path]:
+    """Return the folders of installed robot packages: Pinocchio's wheel and the interpreter's."""
+    import pinocchio  # imported here because most mechanisms name no package
 
     wheel = Path(pinocchio.__file__).resolve().parents[4] / "share"
     return [wheel, Path(sys.prefix) / "share"]
 
 
-MAX_DEPTH = 300  # of nested elements; ElementTree writes by recursion
-
-
-def strict_xml(text: str, source: str) -> ElementTree.Element:
-    """Parse XML from a stranger: no recovery, no document type, hence no entities, no abyss of nested elements.
+def parse_xml(text: str, source: str) -> ElementTree.Element:
+    """Parse XML from an untrusted file: no error recovery, no document type, no entities, limited nesting.
 
     Raises
     ------
     InputError
-        With the line, where expat has one.
+        The text is not valid XML (the message has the line), declares a document type, or is nested too deeply.
     """
     depth = 0
 
-    def refuse(name: str, *_: object) -> None:
+    def reject_doctype(name: str, *_: object) -> None:
         raise InputError(f"{source}: a document type declaration ({name}) is not accepted")
 
-    def enter(*_: object) -> None:
+    def count_start(*_: object) -> None:
         nonlocal depth
         depth += 1
-        if depth > MAX_DEPTH:
-            raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
+        if depth > MAX_XML_DEPTH:
+            raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
 
-    def leave(_: str) -> None:
+    def count_end(_: str) -> None:
         nonlocal depth
         depth -= 1
 
-    # The text is UTF-8, or it would not have been read, whatever its first line says.
+    # The text was decoded as UTF-8, so an encoding named in its first line is ignored.
     checker = expat.ParserCreate("utf-8")
-    checker.StartDoctypeDeclHandler = refuse
-    checker.StartElementHandler, checker.EndElementHandler = enter, leave
+    checker.StartDoctypeDeclHandler = reject_doctype
+    checker.StartElementHandler, checker.EndElementHandler = count_start, count_end
     try:
         checker.Parse(text.encode(), True)
         return ElementTree.fromstring(text.encode(), ElementTree.XMLParser(encoding="utf-8"))

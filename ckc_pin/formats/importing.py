@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import msgspec
 
-from ckc_pin.base.sources import strict_xml, write_texts
+from ckc_pin.base.sources import parse_xml, write_texts
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft, choose_independent
@@ -52,7 +52,7 @@ def read(path: Path) -> Draft:
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
     text = read_text(path, "robot file")
-    tag = strict_xml(text, str(path)).tag
+    tag = parse_xml(text, str(path)).tag
     if tag not in ("mujoco", "robot"):
         raise InputError(f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF) or <robot> (URDF)")
     draft = read_mjcf(text, path) if tag == "mujoco" else read_urdf(text, path)

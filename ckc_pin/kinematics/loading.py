@@ -103,5 +103,5 @@ def _build(text: str, sources: Sources, overrides: Overrides | None) -> Mechanis
     data = read_toml(text, sources.name)
     join_dotted_keys(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
-    with sources.naming():
+    with sources.prefix_errors():
         return assemble_mechanism(spec, sources, overrides)

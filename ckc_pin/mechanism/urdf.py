@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ckc_pin.base.sources import strict_xml
+from ckc_pin.base.sources import parse_xml
 from ckc_pin.errors import InputError, MechanismError
 
 __all__ = [
@@ -87,7 +87,7 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     MechanismError
         A tree that is none, or a body that cannot be.
     """
-    root = strict_xml(text, source)
+    root = parse_xml(text, source)
     if root.tag != "robot":
         raise InputError(f"{source}: the root element is <{root.tag}>, a URDF's is <robot>")
     if prefix:

@@ -180,7 +180,7 @@ def prepare(
     if setup is not None:
         library = setup.library
         formulation["variation"] = setup.table
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         control = control_table(
             controller, actuation, partial(controller_call, mechanism=mechanism), differs=setup is not None
         )

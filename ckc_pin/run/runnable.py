@@ -34,7 +34,7 @@ def require_runnable(
         It cannot: no freedoms, no or a singular start, motors that cannot do what the controller wants.
     """
     if isinstance(controller, Sampled):
-        with scene.sources.naming():
+        with scene.sources.prefix_errors():
             controller.require_countable(scene.spec.t_end)
             controller.require_sensible(mechanism)
     if mechanism.d == 0:
@@ -42,7 +42,7 @@ def require_runnable(
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     start = find_start(mechanism, scene)
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         if beyond := describe_stop_violation(mechanism, start.at.q_tree):
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within them")
     refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)

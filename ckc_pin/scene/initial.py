@@ -45,7 +45,7 @@ def find_start(mechanism: Mechanism, scene: Scene) -> Start:
     NumericalError
         A start that is singular.
     """
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         return _find(mechanism, scene.spec)
 
 

@@ -54,7 +54,7 @@ def scene_controller(
     if spec.controller is None:
         return None
     of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         start = {name: x for name, x in spec.initial.q.items() if name in mechanism.coordinates}
         near = branch(mechanism, start)
         if not is_chart(near):  # between branches; the start itself is refused
@@ -66,7 +66,7 @@ def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
     """Return how a scene's controller, or who stands in for it, moves the motors."""
     spec = scene.spec.controller
     allocation = spec.allocation if isinstance(spec, FeedbackSpec) else None
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
 
 
@@ -77,5 +77,5 @@ def in_samples(
     spec = scene.spec.controller
     if controller is None or not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
         return controller
-    with scene.sources.naming():
+    with scene.sources.prefix_errors():
         return Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)

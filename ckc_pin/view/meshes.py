@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.sources import PACKAGE, resolve
+from ckc_pin.base.sources import PACKAGE, resolve_path
 from ckc_pin.errors import InputError
 
 __all__ = ["Surface", "load_surface"]
@@ -48,7 +48,7 @@ def _candidates(file: str, folder: Path | None) -> Iterator[Path]:
     if file.startswith(PACKAGE):
         name = file.removeprefix(PACKAGE).partition("/")[2]
         with suppress(InputError, OSError, ValueError):  # no such package, or one that is left
-            yield resolve(file, Path(), "mesh")
+            yield resolve_path(file, Path(), "mesh")
     if folder is None or "://" in name or "\0" in name:
         return
     path = (folder / name).resolve()

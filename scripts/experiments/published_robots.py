@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ckc_pin
-from ckc_pin.base.sources import resolve
+from ckc_pin.base.sources import resolve_path
 from ckc_pin.formats.importing import read, write
 from scripts.experiments.published_robots_motion import given_back
 
@@ -172,7 +172,7 @@ def main(root: Path) -> None:
         print(_line(*["---"] * 11))
         for file in origin.files:
             named = origin.title == "example-robot-data"
-            path = resolve(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file
+            path = resolve_path(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file
             if not path.is_file():
                 raise FileNotFoundError(f"{path}: not there")
             stem = path.parent.name if path.stem == "robot" else path.stem

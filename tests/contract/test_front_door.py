@@ -154,7 +154,7 @@ def test_a_page_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.chdir(tmp_path)
     simulate("five_bar/swing", {"t_end": 0.01}).save("o")
     answer = ckc("play", "o", "--html", ".")
-    assert (answer.code, answer.err) == (2, "error: .: a folder, not the name of a file\n")
+    assert (answer.code, answer.err) == (2, "error: .: expected the name of a file, got a folder\n")
 
 
 def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ckc_pin import InputError, MechanismError, inverse_dynamics, load, simulate
-from ckc_pin.base.sources import resolve
+from ckc_pin.base.sources import resolve_path
 from ckc_pin.formats.importing import Draft, read, write
 from scripts.experiments.published_robots_motion import given_back
 from tests.contract.helpers.models import TWO_ARMS, model
@@ -56,7 +56,7 @@ ROBOTS = {
 
 
 def robot(file: str) -> Draft:
-    return read(resolve(f"package://example-robot-data/robots/{file}", Path(), "test"))
+    return read(resolve_path(f"package://example-robot-data/robots/{file}", Path(), "test"))
 
 
 def written(draft: Draft, folder: Path) -> Path:

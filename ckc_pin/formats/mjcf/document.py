@@ -18,7 +18,7 @@ from pathlib import Path
 from stat import S_ISREG
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from ckc_pin.base.sources import MAX_DEPTH, strict_xml
+from ckc_pin.base.sources import MAX_XML_DEPTH, parse_xml
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError
 
@@ -138,8 +138,8 @@ def _expand_includes(
     InputError
         A file is included twice, is not in the model's folder, or is not XML.
     """
-    if depth > MAX_DEPTH:
-        raise InputError(f"{source}: elements nested more than {MAX_DEPTH} deep are not accepted")
+    if depth > MAX_XML_DEPTH:
+        raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
     position = 0
     while position < len(element):
         child = element[position]
@@ -152,7 +152,7 @@ def _expand_includes(
         if path in seen:
             raise InputError(f"{source}: {file!r} is included twice")
         seen.add(path)
-        element[position : position + 1] = list(strict_xml(read_text(path, "MuJoCo model"), file))
+        element[position : position + 1] = list(parse_xml(read_text(path, "MuJoCo model"), file))
 
 
 # --- document ------------------------------------------------------------------------------------------------------
@@ -213,7 +213,7 @@ class Document:
 
     @classmethod
     def _read(cls, text: str, path: Path, source: str, files: _ModelFiles, attached_by: tuple[Path, ...]) -> Document:
-        root = strict_xml(text, source)
+        root = parse_xml(text, source)
         if root.tag != "mujoco":
             raise InputError(f"{source}: the root element is <{root.tag}>; expected <mujoco>")
         _expand_includes(root, path.parent, files, {path.resolve()}, source)

@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ckc_pin.base.sources import strict_xml
+from ckc_pin.base.sources import parse_xml
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.draft import (
@@ -67,7 +67,7 @@ def read_urdf(text: str, path: Path) -> Draft:
     InputError, MechanismError
         The text is not a valid URDF, or an element names a link or joint that does not exist.
     """
-    robot = strict_xml(text, str(path))
+    robot = parse_xml(text, str(path))
     _refuse_xacro(robot, path)
     parse(text, str(path))  # for its checks; it modifies its own copy of the tree only
     draft = Draft(choose_name(path, robot.get("name", "")), f"{path.name}, a URDF", robot)
