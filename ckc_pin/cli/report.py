@@ -49,7 +49,7 @@ __all__ = ["report"]
 @options.as_json
 def report(scenes: tuple[str, ...], overrides: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
     """Error against run time of your own scenes. Formulations, methods and tolerances, and which of them to take."""
-    from ckc_pin.analysis.precision import precision_plain, work_precision
+    from ckc_pin.analysis.precision import work_precision
 
     if not 0 < budget < float("inf"):
         raise InputError(f"--budget {budget:g}: expected a number of seconds above zero")
@@ -73,7 +73,7 @@ def report(scenes: tuple[str, ...], overrides: tuple[str, ...], budget: float, o
             _print(found)
         if found.status == "interrupted":
             break
-    plain = [precision_plain(found) for found in every]
+    plain = [found.to_dict() for found in every]
     last = every[-1]
     stopped = [found for found in every if found.status == "stopped"]
     status = last.status if last.status == "interrupted" else "stopped" if stopped else "done"
@@ -96,12 +96,12 @@ def _part(bar: Callable[[float, float], None], part: float) -> None:
 
 
 def _print(found: WorkPrecision) -> None:
-    from ckc_pin.analysis.precision import precision_lines, precision_table
+    from ckc_pin.analysis.precision import make_time_table
 
     print(f"{found.scene}: {found.message or f'{len(found.rows)} settings in {found.seconds:.1f} s'}")
     if found.reference is not None:
-        print_table(precision_table(found))
-    for line in precision_lines(found):
+        print_table(make_time_table(found))
+    for line in found.describe():
         print(line)
 
 
@@ -110,11 +110,11 @@ def _mjcf(mechanism: ckc_pin.Mechanism) -> tuple[str, list[str]]:
     from ckc_pin.formats import exporting
 
     if find_spec("mujoco") is None:
-        return "", ["MuJoCo is not beside it: not installed (pip install 'ckc_pin[peers]')"]
+        return "", ["MuJoCo is not compared: not installed (pip install 'ckc_pin[peers]')"]
     try:
         found = exporting.export(mechanism, "mjcf")
     except InputError as error:
-        return "", [f"MuJoCo is not beside it: {error}"]
+        return "", [f"MuJoCo is not compared: {error}"]
     return found.text, found.differences
 
 
@@ -140,9 +140,9 @@ def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], o
 
 
 def _write_texts(every: Sequence[WorkPrecision], figures: dict[int, str], out: Path) -> list[Path]:
-    from ckc_pin.analysis.precision import precision_csv, precision_markdown
+    from ckc_pin.analysis.precision import make_csv, make_markdown
 
-    texts = {"rows.csv": precision_csv(every), "report.md": precision_markdown(every, figures)}
+    texts = {"rows.csv": make_csv(every), "report.md": make_markdown(every, figures)}
     for name, text in texts.items():
         write_atomic(out / name, text)
     return [out / name for name in texts]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
-from ckc_pin.analysis.precision.mujoco import INTEGRATORS, STIFFNESSES, StateMap, model_of, set_up
+from ckc_pin.analysis.precision.mujoco import INTEGRATORS, STIFFNESSES, StateMap, configure_model, load_model
 from ckc_pin.base.arrays import Array
 from ckc_pin.ensembles.members import Members
 from ckc_pin.formats.exporting import export
@@ -64,7 +64,7 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
     from mujoco.rollout import Rollout
 
     mechanism = ckc_pin.load("five_bar")
-    model = model_of(export(mechanism, "mjcf").text)
+    model = load_model(export(mechanism, "mjcf").text)
     joints, size = StateMap(mechanism, model), mjtState.mjSTATE_FULLPHYSICS
     datas: list[Any] = [MjData(model) for _ in range(threads)]
     first, _ = ckc_pin.simulate(SCENE, {"t_end": 1e-3}), None
@@ -72,7 +72,7 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
     states = []
     for value in values:
         run = ckc_pin.simulate(SCENE, {START[0]: float(value[0]), "t_end": 1e-9})
-        joints.put(datas[0], run.q_tree[0], run.v_tree[0])
+        joints.set_state(datas[0], run.q_tree[0], run.v_tree[0])
         datas[0].time = 0.0
         state = np.empty(model.nq + model.nv + 1)
         mj_getState(model, datas[0], state, size)
@@ -83,7 +83,7 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
         for k, integrator, stiffness in product(range(7), INTEGRATORS, STIFFNESSES):
             model.eq_solref[:], model.eq_solimp[:] = solref, solimp
             steps = round(100 * 2**k * T_END)
-            set_up(model, integrator, stiffness, T_END / steps)
+            configure_model(model, integrator, stiffness, T_END / steps)
             started = time.perf_counter()
             found, _ = pool.rollout(model, datas, initial, nstep=steps)
             seconds = time.perf_counter() - started
@@ -91,7 +91,7 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
             for row in found[:, -1]:
                 datas[0].qpos[:] = row[1 : 1 + model.nq]
                 datas[0].qvel[:] = row[1 + model.nq :]
-                ends.append(joints.state(datas[0])[0])
+                ends.append(joints.get_state(datas[0])[0])
             yield f"{integrator}, {stiffness}", T_END / steps, seconds, np.array(ends)
 
 

@@ -1,4 +1,4 @@
-"""`ckc report`: what it prints and writes of a person's own scenes, and what it refuses."""
+"""`ckc report` on a user's scenes: output, files, and refused arguments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.analysis.swing_table import SCENE, pendulum, write_table
 from tests.contract.helpers.command import ckc
 from tests.contract.helpers.under_way import under_way
 
-PLAIN = {"status", "message", "scenes", "written"}
+ANSWER = {"status", "message", "scenes", "written"}
 SECTION = {"scene", "status", "message", "reference", "model_difference", "rows", "advice", "notes", "seconds"}
 REFERENCE = {"of", "confirmed_by", "rtol", "accuracy", "t_end", "t", "q_tree", "v_tree"}
 ROW = """program formulation method rtol dt overrides status reason error error_q error_v resolved rhs steps used wall_s
@@ -35,13 +35,13 @@ def no_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "find_spec", lambda name: None)
 
 
-def test_json_of_ones_own_scene(table: Path) -> None:
+def test_json_of_a_users_scene(table: Path) -> None:
     answer = ckc("report", "table/default.scene.toml", "--budget", "5", "--json")
     assert (answer.code, answer.err) == (0, "")
-    found = answer.json
-    assert set(found) == PLAIN
-    assert (found["status"], found["message"], found["written"]) == ("done", "", [])
-    (section,) = found["scenes"]
+    data = answer.json
+    assert set(data) == ANSWER
+    assert (data["status"], data["message"], data["written"]) == ("done", "", [])
+    (section,) = data["scenes"]
     assert set(section) == SECTION
     assert section["scene"] == "table/default.scene.toml"
     assert set(section["reference"]) == REFERENCE
@@ -53,22 +53,22 @@ def test_json_of_ones_own_scene(table: Path) -> None:
     assert [advice["target"] for advice in section["advice"]] == [1e-3, 1e-6, 1e-9]
 
 
-def test_the_advice_can_be_pasted(table: Path, no_mujoco: None) -> None:
-    found = ckc("report", "table", "--budget", "5", "--json").json["scenes"][0]
-    said = ckc("report", "table", "--budget", "5").out
-    assert "for an error of 1e-03: --set formulation=" in said
-    for advice in found["advice"][:2]:
+def test_advised_options_can_be_pasted_into_run(table: Path, no_mujoco: None) -> None:
+    section = ckc("report", "table", "--budget", "5", "--json").json["scenes"][0]
+    printed = ckc("report", "table", "--budget", "5").out
+    assert "for an error of 1e-03: --set formulation=" in printed
+    for advice in section["advice"][:2]:
         options = [word for option in advice["set"] for word in ("--set", option)]
         run = ckc("run", "table", *options, "--json").json
         q_tree, _ = pendulum(np.array([0.0, 1.5]))
         assert np.abs(np.array(run["q_tree"]) - q_tree[-1]).max() <= advice["target"]
 
 
-def test_for_people(table: Path) -> None:
+def test_terminal_output_has_table_notes_and_advice(table: Path) -> None:
     answer = ckc("report", "table", "--budget", "5")
     assert (answer.code, answer.err) == (0, "")
     for words in (
-        "least time (ms) to an error of",
+        "shortest time (ms) within an error of",
         "reduced, auto",
         "spf, z, Radau",
         "MuJoCo, RK4, solref 2 dt",
@@ -79,7 +79,7 @@ def test_for_people(table: Path) -> None:
     assert max(map(len, answer.out.split("reference:")[0].splitlines())) <= 80
 
 
-def test_the_folder_has_page_rows_and_figure(table: Path) -> None:
+def test_folder_has_page_rows_and_figures(table: Path) -> None:
     answer = ckc("report", "table", "five_bar/swing", "--budget", "3", "--set", "t_end=0.2", "--out", "out", "--json")
     assert answer.code == 0
     written = [Path(path) for path in answer.json["written"]]
@@ -107,30 +107,30 @@ def test_one_scene_has_one_figure(table: Path, no_mujoco: None) -> None:
     assert {path.name for path in Path("out").iterdir()} == {"report.md", "rows.csv", "work_precision.png"}
 
 
-def test_what_takes_long_is_announced(table: Path, no_mujoco: None) -> None:
+def test_long_reports_are_announced(table: Path, no_mujoco: None) -> None:
     quick = ckc("report", "table", "--set", "t_end=0.01", "--budget", "10")
     assert quick.err == ""
     several = ckc("report", "table", "table", "--set", "t_end=0.01", "--budget", "5.5")
     assert several.err == "this may take 11 s, 5.5 s for each of 2 scenes; --budget SECONDS changes that\n"
 
 
-def test_without_mujoco(table: Path, no_mujoco: None) -> None:
+def test_report_without_mujoco_has_a_note(table: Path, no_mujoco: None) -> None:
     section = ckc("report", "table", "--budget", "2", "--json").json["scenes"][0]
     assert {row["program"] for row in section["rows"]} == {"ckc_pin"}
-    assert any("MuJoCo is not beside it: not installed" in note for note in section["notes"])
+    assert any("MuJoCo is not compared: not installed" in note for note in section["notes"])
 
 
-def test_a_loop_that_mujoco_does_not_have(table: Path) -> None:
+def test_loop_without_mujoco_equality_is_noted(table: Path) -> None:
     text = (table / "mechanism.toml").read_text(encoding="utf-8")
     text = text.replace('"point_2d"', '"cylindrical"').replace("axis_a", "axis_b = [0.0, 1.0, 0.0]\naxis_a")
     (table / "mechanism.toml").write_text(text, encoding="utf-8")
     section = ckc("report", "table", "--budget", "2", "--json").json["scenes"][0]
     assert {row["program"] for row in section["rows"]} == {"ckc_pin"}
-    assert any("MuJoCo has no equality for type 'cylindrical'" in note for note in section["notes"])
+    assert any("MuJoCo has no equality constraint for type 'cylindrical'" in note for note in section["notes"])
 
 
-def test_no_reference_is_a_stop_and_the_other_scenes_are_kept(table: Path, no_mujoco: None) -> None:
-    """Nobody confirms a motion within a budget that is none."""
+def test_missing_reference_stops_and_writes_the_page(table: Path, no_mujoco: None) -> None:
+    """A budget of 1e-6 s is too short to confirm a reference."""
     answer = ckc("report", "table", "--budget", "1e-6", "--json", "--out", "out")
     assert answer.code == 3
     assert answer.json["status"] == "stopped"
@@ -154,15 +154,15 @@ def test_no_reference_is_a_stop_and_the_other_scenes_are_kept(table: Path, no_mu
         (["table", "broken"], "theta"),
     ],
 )
-def test_what_is_wrong_is_said_before_anything_is_run(
+def test_invalid_arguments_are_refused_before_any_run(
     words: list[str], says: str, table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def never(*_: Any, **__: Any) -> None:
-        raise AssertionError("it was run")
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError("a scene was run")
 
     broken = write_table(table.parent / "broken", SCENE + "theta = 1.0\n")
     assert broken.is_dir()
-    monkeypatch.setattr("ckc_pin.analysis.precision.work_precision", never)
+    monkeypatch.setattr("ckc_pin.analysis.precision.work_precision", fail)
     answer = ckc("report", *words, "--json")
     assert answer.code == 2
     assert answer.json["status"] == "error"
@@ -170,26 +170,26 @@ def test_what_is_wrong_is_said_before_anything_is_run(
     assert "Traceback" not in answer.err
 
 
-# The command, in a process of its own, which says on standard error when it has ten rows.
+# The command in its own process. It prints "under way" to standard error after ten settings.
 CKC = """
 import sys
 import ckc_pin.cli
 from ckc_pin.analysis.precision import compute
-apart, compared = compute.apart, []
+compare_motions, calls = compute.compare_motions, []
 
-def announced(*arguments):
-    compared.append(arguments)
-    if len(compared) == 10:
+def count_calls(*arguments):
+    calls.append(arguments)
+    if len(calls) == 10:
         print("under way", file=sys.stderr, flush=True)
-    return apart(*arguments)
+    return compare_motions(*arguments)
 
-compute.apart = announced
+compute.compare_motions = count_calls
 ckc_pin.cli.main()
 """
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"])
-def test_an_interrupted_report_is_printed_and_saved(number: signal.Signals, code: int, table: Path) -> None:
+def test_interrupted_report_is_printed_and_saved(number: signal.Signals, code: int, table: Path) -> None:
     words = ["report", "table", "five_bar/swing", "--budget", "500", "--json", "--out", "out"]
     with under_way(CKC, *words) as process:
         assert process.stderr is not None
@@ -198,9 +198,9 @@ def test_an_interrupted_report_is_printed_and_saved(number: signal.Signals, code
         process.send_signal(number)
         out, _ = process.communicate(timeout=120)
     assert process.returncode == code
-    found = json.loads(out)
-    assert found["status"] == "interrupted"
-    (section,) = found["scenes"]
+    data = json.loads(out)
+    assert data["status"] == "interrupted"
+    (section,) = data["scenes"]
     assert 9 <= len(section["rows"]) < 136
     with Path("out/rows.csv").open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == len(section["rows"])

@@ -1,27 +1,19 @@
-"""Work against precision on a scene of one's own: what each setting costs, and how far off it is."""
+"""Work-precision comparison of the formulations, methods and tolerances of one scene: error against run time."""
 
-from ckc_pin.analysis.precision.compute import BUDGET, TARGETS, Advice, WorkPrecision, work_precision
+from ckc_pin.analysis.precision.compute import DEFAULT_BUDGET_S, TARGET_ERRORS, Advice, WorkPrecision, work_precision
 from ckc_pin.analysis.precision.motion import PrecisionRow
 from ckc_pin.analysis.precision.reference import Reference
-from ckc_pin.analysis.precision.report import (
-    precision_csv,
-    precision_lines,
-    precision_markdown,
-    precision_plain,
-    precision_table,
-)
+from ckc_pin.analysis.precision.report import make_csv, make_markdown, make_time_table
 
 __all__ = [
-    "BUDGET",
-    "TARGETS",
+    "DEFAULT_BUDGET_S",
+    "TARGET_ERRORS",
     "Advice",
     "PrecisionRow",
     "Reference",
     "WorkPrecision",
-    "precision_csv",
-    "precision_lines",
-    "precision_markdown",
-    "precision_plain",
-    "precision_table",
+    "make_csv",
+    "make_markdown",
+    "make_time_table",
     "work_precision",
 ]

@@ -1,4 +1,4 @@
-"""A scene's motion under one setting, timed, and how far two motions are apart."""
+"""Run a scene under one setting (formulation, method, tolerance), time it, and compare two motions."""
 
 from __future__ import annotations
 
@@ -23,43 +23,118 @@ from ckc_pin.scene.scene import Scene, apply_overrides, make_scene
 __all__ = [
     "FORMULATIONS",
     "INSTANTS",
-    "REPEATS",
-    "SHORT",
-    "Apart",
+    "MAX_REPEATS",
+    "REPEAT_BELOW_S",
+    "FixedStepProgram",
     "Motion",
+    "MotionError",
     "PrecisionRow",
     "Setting",
-    "Stepper",
-    "apart",
-    "changed",
-    "move",
-    "no_motion",
-    "off_manifold",
-    "on_span",
-    "settings",
+    "compare_motions",
+    "list_settings",
+    "motion_without_data",
+    "override_scene",
+    "span_overrides",
+    "starts_off_manifold",
+    "time_scene",
 ]
 
+INSTANTS = 20  # at which motions are compared, including the end
+MIN_TIMED_S = 0.05  # runs are repeated until they took this time together
+MAX_SCENE_REPEATS = 20
+MAX_REPEATS, REPEAT_BELOW_S = 3, 1.0  # repeats of a fixed-step program, and the time above which it is not repeated
+TRIAL_STEPS = 50  # to estimate how long a fixed-step program will take
 
-INSTANTS = 20  # at which motions are compared, the end among them
-REPEATS, ENOUGH = 20, 0.05  # runs and s: repeated up to whichever comes first
+FORMULATIONS: dict[str, dict[str, Any]] = {
+    "dae": {"formulation": "dae"},
+    "reduced": {"formulation": "reduced"},
+    "spf, w": {"formulation": "spf", "spf_coordinates": "w"},
+    "spf, z": {"formulation": "spf", "spf_coordinates": "z"},
+}
+TOLERANCES = tuple(10.0**-k for k in range(2, 13))
+METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "RK45": TOLERANCES[::2], "Radau": TOLERANCES[::2]}
+
+
+# --- settings ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Formulation, method and tolerance of a run.
+
+    Attributes
+    ----------
+    formulation : str
+        A key of `FORMULATIONS`.
+    method : str
+    rtol : float
+    """
+
+    formulation: str
+    method: str
+    rtol: float
+
+    @property
+    def family(self) -> tuple[str, str]:
+        """Formulation and method."""
+        return self.formulation, self.method
+
+    def overrides(self, scene: Scene) -> dict[str, Any]:
+        """Return the setting as values of the scene by dotted key, as `--set` takes them; None removes a key."""
+        overrides = {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
+        solver = scene.spec.solver
+        if solver.atol is not None:  # the scene's absolute tolerance belongs to the scene's relative tolerance
+            overrides["solver.atol"] = float(f"{self.rtol / 100:.0e}")
+        if self.formulation != "dae" and solver.baumgarte:  # only the DAE accepts this key
+            overrides["solver.baumgarte"] = None
+        return overrides
+
+
+def list_settings(scene: Scene) -> Iterator[Setting]:
+    """Yield all settings from loose to tight tolerances, those of "auto" first in case the budget runs out."""
+    formulations = [name for name in FORMULATIONS if name.startswith("spf") or not starts_off_manifold(scene)]
+    for methods in (["auto"], [name for name in METHODS if name != "auto"]):
+        for rtol, method, formulation in product(TOLERANCES, methods, formulations):
+            if rtol in METHODS[method]:
+                yield Setting(formulation, method, rtol)
+
+
+def starts_off_manifold(scene: Scene) -> bool:
+    """Whether a scene starts with phi = w other than 0, which only the SPF supports."""
+    return any(scene.spec.initial.w or [])
+
+
+def override_scene(scene: Scene, overrides: Mapping[str, Any]) -> Scene:
+    """Return a scene with values replaced by dotted key; None removes a key."""
+    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)
+
+
+def span_overrides(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
+    """Return overrides that make all runs of a scene comparable: equal span and output instants, no stopping event."""
+    events = [{**event, "stop": False} for event in scene.to_dict().get("event", [])]
+    return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
+
+
+# --- motions -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What a setting made of a scene.
+    """The motion of a scene under one setting, and what it cost.
 
     Attributes
     ----------
     status : "done", "stopped", "refused", "failed" or "not tried"
     reason : str
-        Where it is not "done".
+        Why the status is not "done".
     q_tree, v_tree : (m, n) arrays
-        By coordinate, at the first m of the instants.
+        By coordinate, at the first m instants.
     wall_s : float or None
-        Least time of its repeats, without `setup_s`.
+        Shortest time of the repeats, s, without `setup_s`.
     setup_s : float or None
-        Time of loading and assembling, s.
+        Time to load and assemble, s.
     rhs, steps : int or None
+        Numbers of right-hand sides and steps.
     used : str
         The method that made the steps.
     """
@@ -75,25 +150,25 @@ class Motion:
     used: str = ""
 
 
-def no_motion(status: str, reason: str, n: int = 0) -> Motion:
-    """Return what is known of n coordinates where a setting was not run, or failed."""
+def motion_without_data(status: str, reason: str, n: int = 0) -> Motion:
+    """Return the motion of n coordinates of a setting that was not run or failed."""
     return Motion(status, reason, np.empty((0, n)), np.empty((0, n)))
 
 
 @dataclass(frozen=True)
 class PrecisionRow:
-    """A line of the comparison: a setting, what it cost, how far off it is.
+    """One setting of a comparison: its cost and its error.
 
     Attributes
     ----------
     program : "ckc_pin" or "MuJoCo"
     formulation : str or None
-        "dae", "reduced", "spf, w" (eq. 17's coordinates) or "spf, z" (eq. 8 as printed).
+        "dae", "reduced", "spf, w" (coordinates of eq. 17) or "spf, z" (eq. 8 as printed).
     method : str
     rtol, dt : float or None
-        The tolerance, or the step, s.
+        Relative tolerance, or fixed step in s.
     overrides : dict
-        The setting as values of the scene by dotted key; None: the key is to be taken out.
+        The setting as values of the scene by dotted key; None removes a key.
     status, reason, rhs, steps, used, wall_s, setup_s
         As in `Motion`.
     error_q, error_v : float or None
@@ -101,7 +176,7 @@ class PrecisionRow:
     error : float or None
         The larger of both, each relative to its largest value where that is above 1.
     resolved : bool or None
-        Whether the error is well above the reference's own uncertainty.
+        Whether the error is clearly above the reference's own uncertainty.
     """
 
     program: str
@@ -122,158 +197,106 @@ class PrecisionRow:
     wall_s: float | None
     setup_s: float | None
 
+    @property
+    def family(self) -> str:
+        """Formulation, or program, with the method."""
+        return f"{self.formulation or self.program}, {self.method}"
+
 
 @dataclass(frozen=True)
-class Apart:
-    """How far two motions are apart at each of the instants that both have: (m,) arrays."""
+class MotionError:
+    """Difference of two motions at each common instant: (m,) arrays of the largest entry.
+
+    Attributes
+    ----------
+    q, v : (m,) arrays
+        rad or m, and per s.
+    scaled : (m,) array
+        The larger of both, each relative to the second motion's largest value where that is above 1.
+    """
 
     q: Array
     v: Array
     scaled: Array
 
 
-def apart(tree: Tree, motion: Motion, other: Motion) -> Apart:
-    """Compare two motions of one mechanism; the second one's size is the scale."""
-    m = min(len(motion.q_tree), len(other.q_tree))
-    q, theirs = motion.q_tree[:m], other.q_tree[:m]
+def compare_motions(tree: Tree, motion: Motion, reference: Motion) -> MotionError:
+    """Return the difference of a motion from a reference at the instants that both have."""
+    m = min(len(motion.q_tree), len(reference.q_tree))
+    q, q_reference = motion.q_tree[:m], reference.q_tree[:m]
     if tree.is_euclidean:
-        difference = q - theirs
-    else:  # a rotation vector jumps where it has turned by pi
-        from_numbers = tree.from_coordinates
-        rows = [tree.difference(from_numbers(b), from_numbers(a)) for a, b in zip(q, theirs, strict=True)]
+        difference = q - q_reference
+    else:  # the difference of rotation vectors is wrong where one of them wraps at an angle of pi
+        to_q_tree = tree.from_coordinates
+        rows = [tree.difference(to_q_tree(b), to_q_tree(a)) for a, b in zip(q, q_reference, strict=True)]
         difference = np.reshape(rows, (m, tree.n))
-    error_q, error_v = (np.abs(x).max(axis=1, initial=0.0) for x in (difference, motion.v_tree[:m] - other.v_tree[:m]))
-    scales = (max(1.0, float(np.abs(x).max(initial=0.0))) for x in (other.q_tree, other.v_tree))
+    differences = difference, motion.v_tree[:m] - reference.v_tree[:m]
+    error_q, error_v = (np.abs(x).max(axis=1, initial=0.0) for x in differences)
+    scales = (max(1.0, float(np.abs(x).max(initial=0.0))) for x in (reference.q_tree, reference.v_tree))
     scaled = np.maximum(*(error / scale for error, scale in zip((error_q, error_v), scales, strict=True)))
-    return Apart(error_q, error_v, scaled)
+    return MotionError(error_q, error_v, scaled)
 
 
-def on_span(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:
-    """Return the overrides that make all runs of a scene comparable: one span, its instants, no event that ends it."""
-    events = [{**event, "stop": False} for event in scene.to_dict().get("event", [])]
-    return {"t_end": t_end, "solver.output_dt": dt, **({"event": events} if events else {})}
-
-
-def move(scene: Scene, limit: float, *, fewest: int = 1, most: int = REPEATS) -> tuple[Motion, Run | None]:
-    """Run a scene, each run for no more than a limit in s; short runs are repeated, the fastest counts.
-
-    KeyboardInterrupt: a signal stopped a run.
+def time_scene(
+    scene: Scene, limit_s: float, *, min_runs: int = 1, max_runs: int = MAX_SCENE_REPEATS
+) -> tuple[Motion, Run | None]:
+    """Run a scene, repeatedly if it is short, and return its motion with the shortest time.
 
     Parameters
     ----------
     scene : Scene
-    limit : float
-    fewest, most : int
-        Runs; of two, the first one warms up.
+    limit_s : float
+        Runs are not repeated after this time, s.
+    min_runs, max_runs : int
+        With two runs, the first one warms up.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        A signal interrupted a run. It ends the comparison, too.
     """
-    began, walls = perf_counter(), list[float]()
+    start, wall_times = perf_counter(), list[float]()
     try:
         ready = prepare(scene)
-        setup = perf_counter() - began
+        setup_s = perf_counter() - start
         while True:
             run = run_prepared(ready)
-            if run.status == "interrupted":  # the comparison is, not only this run
+            if run.status == "interrupted":
                 raise interrupt_again(run.message)
-            walls.append(float(run.stats["wall_s"]))
-            enough = len(walls) >= fewest and sum(walls) > min(ENOUGH, limit)
-            if run.status != "done" or enough or len(walls) >= most:
+            wall_times.append(float(run.stats["wall_s"]))
+            is_timed = len(wall_times) >= min_runs and sum(wall_times) > min(MIN_TIMED_S, limit_s)
+            if run.status != "done" or is_timed or len(wall_times) >= max_runs:
                 break
     except CkcError as error:
-        return no_motion("refused", str(error)), None
-    stats = run.stats
-    reason = "" if run.status == "done" else _without_place(run.message)
-    return Motion(
-        run.status, reason, run.q_tree, run.v_tree, min(walls), setup, stats["rhs"], stats["steps"], stats["method"]
-    ), run
+        return motion_without_data("refused", str(error)), None
+    reason = "" if run.status == "done" else _without_configuration(run.message)
+    motion = Motion(
+        run.status,
+        reason,
+        run.q_tree,
+        run.v_tree,
+        wall_s=min(wall_times),
+        setup_s=setup_s,
+        rhs=run.stats["rhs"],
+        steps=run.stats["steps"],
+        used=run.stats["method"],
+    )
+    return motion, run
 
 
-def _without_place(message: str) -> str:
-    """Shorten a message by its configuration, which may be a line of 81 coordinates."""
+def _without_configuration(message: str) -> str:
+    """Remove the configuration from a message, which may be a line of 81 coordinates."""
     return re.sub(r" near [^:]*:", ":", message)
 
 
-# --- Which ways of running a scene are compared: formulation, method, tolerance.
-
-FORMULATIONS: dict[str, dict[str, Any]] = {
-    "dae": {"formulation": "dae"},
-    "reduced": {"formulation": "reduced"},
-    "spf, w": {"formulation": "spf", "spf_coordinates": "w"},
-    "spf, z": {"formulation": "spf", "spf_coordinates": "z"},
-}
-EVERY = tuple(10.0**-k for k in range(2, 13))
-METHODS = {"auto": EVERY, "DOP853": EVERY, "RK45": EVERY[::2], "Radau": EVERY[::2]}
-
-
 @dataclass(frozen=True)
-class Setting:
-    """How a scene is run.
-
-    Attributes
-    ----------
-    formulation : str
-        A key of `FORMULATIONS`.
-    method : str
-    rtol : float
-    """
-
-    formulation: str
-    method: str
-    rtol: float
-
-    @property
-    def family(self) -> tuple[str, str]:
-        """All but the tolerance."""
-        return self.formulation, self.method
-
-    def overrides(self, scene: Scene) -> dict[str, Any]:
-        """Values of the scene by dotted key, those that a person would give with --set."""
-        found = {**FORMULATIONS[self.formulation], "solver.method": self.method, "solver.rtol": self.rtol}
-        if scene.spec.solver.atol is not None:  # the scene's own goes with one rtol
-            found["solver.atol"] = float(f"{self.rtol / 100:.0e}")
-        if self.formulation != "dae":
-            found |= _no_projection(scene)
-        return found
-
-
-def _no_projection(scene: Scene) -> dict[str, Any]:
-    """Take away the keys that only a DAE has."""
-    solver = scene.spec.solver
-    return {"solver.baumgarte": None} if solver.baumgarte else {}
-
-
-def settings(scene: Scene) -> Iterator[Setting]:
-    """All settings, from loose to tight: first of "auto", so that a budget that is used up leaves out the others'."""
-    formulations = [name for name in FORMULATIONS if name.startswith("spf") or not off_manifold(scene)]
-    for methods in (["auto"], [name for name in METHODS if name != "auto"]):
-        for rtol, method, formulation in product(EVERY, methods, formulations):
-            if rtol in METHODS[method]:
-                yield Setting(formulation, method, rtol)
-
-
-def off_manifold(scene: Scene) -> bool:
-    """Whether a scene starts with phi = w other than 0, which only the SPF can."""
-    return any(scene.spec.initial.w or [])
-
-
-def changed(scene: Scene, overrides: Mapping[str, Any]) -> Scene:
-    """Return a scene with values replaced by dotted key; None removes a key."""
-    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)
-
-
-# --- A program with a fixed step: stepped from instant to instant, timed without what is read out in between.
-
-TRIAL = 50  # steps, to foresee how long all take
-REPEATS, ENOUGH, SHORT = 3, 0.05, 1.0  # runs, s of runs: what takes less than the last is repeated
-
-
-@dataclass(frozen=True)
-class Stepper:
-    """A program that takes steps.
+class FixedStepProgram:
+    """A simulator with a fixed step, timed without the time to read its states.
 
     Attributes
     ----------
     reset : callable
-        Puts it at the start.
+        Sets the initial state.
     step : callable
         step(k) takes k steps.
     state : callable
@@ -284,27 +307,30 @@ class Stepper:
     step: Callable[[int], None]
     state: Callable[[], tuple[Array, Array]]
 
-    def foreseen(self, many: int, instants: int) -> float:
-        """Return how long it would take, with so many steps between instants, s."""
+    def estimate_wall_s(self, steps_per_instant: int, instants: int) -> float:
+        """Return the estimated time of `run`, s, from a few trial steps."""
         self.reset()
-        trial = min(TRIAL, many)
-        began = perf_counter()
+        trial = min(TRIAL_STEPS, steps_per_instant)
+        start = perf_counter()
         self.step(trial)
-        return (perf_counter() - began) / trial * many * instants
+        return (perf_counter() - start) / trial * steps_per_instant * instants
 
-    def run(self, many: int, instants: int) -> Motion:
-        """Return its motion, with so many steps between instants, up to where that is not finite."""
-        walls: list[float] = []
-        while not walls or (sum(walls) < SHORT and (len(walls) < REPEATS or sum(walls) < ENOUGH)):
+    def run(self, steps_per_instant: int, instants: int) -> Motion:
+        """Return the motion, which ends early if a state is not finite, with its shortest time."""
+        wall_times: list[float] = []
+        while not wall_times or (
+            sum(wall_times) < REPEAT_BELOW_S and (len(wall_times) < MAX_REPEATS or sum(wall_times) < MIN_TIMED_S)
+        ):
             self.reset()
-            states, wall = [self.state()], 0.0
+            states, wall_s = [self.state()], 0.0
             for _ in range(instants):
-                began = perf_counter()
-                self.step(many)
-                wall += perf_counter() - began
+                start = perf_counter()
+                self.step(steps_per_instant)
+                wall_s += perf_counter() - start
                 states.append(self.state())
                 if not np.all(np.isfinite(states[-1][0])):
                     break
-            walls.append(wall)
+            wall_times.append(wall_s)
         q_tree, v_tree = (np.array(rows) for rows in zip(*states, strict=True))
-        return Motion("done", "", q_tree, v_tree, min(walls), steps=many * instants, used="fixed step")
+        steps = steps_per_instant * instants
+        return Motion("done", "", q_tree, v_tree, min(wall_times), steps=steps, used="fixed step")

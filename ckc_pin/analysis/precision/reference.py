@@ -1,4 +1,4 @@
-"""What is right: the scene at a tight tolerance, by two formulations, which tell how right by how well they agree."""
+"""Reference motion of a scene: runs at a tight tolerance, whose agreement tells how accurate the reference is."""
 
 from __future__ import annotations
 
@@ -14,65 +14,88 @@ from ckc_pin.analysis.precision.motion import (
     FORMULATIONS,
     INSTANTS,
     Motion,
-    apart,
-    changed,
-    move,
-    off_manifold,
-    on_span,
+    compare_motions,
+    override_scene,
+    span_overrides,
+    starts_off_manifold,
+    time_scene,
 )
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.scene.scene import Scene
 
-__all__ = ["TIGHT", "Reference", "confirm", "find_reference", "said"]
+__all__ = ["REFERENCE_RTOL", "Reference", "find_confirmed_span", "find_reference"]
 
-TIGHT = 1e-13
-GOOD = 1e-10  # no other pair is tried where two agree to that
-CONFIRMED = 1e-6  # scaled; further apart, neither of two is right
-LEAST = 1e-15  # nothing is known better than rounding
+REFERENCE_RTOL = 1e-13
+GOOD_AGREEMENT = 1e-10  # scaled; if two runs agree this well, no further run is made
+MAX_DISAGREEMENT = 1e-6  # scaled; above it, two runs do not confirm each other
+MIN_UNCERTAINTY = 1e-15  # scaled; rounding errors limit every reference
 ON_MANIFOLD = (("dae", "auto"), ("reduced", "auto"), ("dae", "DOP853"), ("reduced", "Radau"), ("dae", "Radau"))
 OFF_MANIFOLD = (("spf, w", "auto"), ("spf, z", "auto"), ("spf, w", "DOP853"), ("spf, w", "Radau"))
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A scene's motion as far as it can be confirmed.
+    """The motion of a scene as far as two runs confirm it.
 
     Attributes
     ----------
     motion : Motion
-        Its values at the instants.
+        Values at the instants.
     t : (m,) array
-        The instants, s; the last one is how far the motion is confirmed.
+        Instants, s. The motion is confirmed up to the last one.
     accuracy : float
-        How far the two runs that confirm each other are apart, scaled as errors are; errors are not told below that.
-    of, by : str
-        Which runs these are.
+        Largest scaled difference of the two runs. Errors below it cannot be resolved.
+    source, confirmed_by : str
+        Formulation and method of the two runs.
     notes : tuple of str
-        Why it does not go to the scene's end, and the like.
+        Such as why the reference ends before the scene.
     """
 
     motion: Motion
     t: Array
     accuracy: float
-    of: str
-    by: str
+    source: str
+    confirmed_by: str
     notes: tuple[str, ...]
 
     @property
     def t_end(self) -> float:
-        """How far it goes, s."""
+        """Last confirmed instant, s."""
         return float(self.t[-1])
 
     @property
     def dt(self) -> float:
-        """Between its instants, s."""
+        """Time between instants, s."""
         return float(self.t[1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the reference as JSON-ready data."""
+        return {
+            "of": self.source,
+            "confirmed_by": self.confirmed_by,
+            "rtol": REFERENCE_RTOL,
+            "accuracy": self.accuracy,
+            "t_end": self.t_end,
+            "t": self.t.tolist(),
+            "q_tree": self.motion.q_tree.tolist(),
+            "v_tree": self.motion.v_tree.tolist(),
+        }
+
+    def describe(self) -> Iterator[str]:
+        """Yield sentences about the reference: its runs, its accuracy, its notes."""
+        yield (
+            f"reference: {self.source} at rtol {REFERENCE_RTOL:.0e}, confirmed by {self.confirmed_by} to "
+            f"{self.accuracy:.1e} up to t = {self.t_end:.6g} s"
+        )
+        yield from self.notes
 
 
 @dataclass(frozen=True)
-class _Tight:
+class _TightRun:
+    """A run at the reference tolerance."""
+
     formulation: str
     method: str
     motion: Motion
@@ -83,109 +106,117 @@ class _Tight:
         return f"{self.formulation}, {self.method}"
 
 
-def find_reference(scene: Scene, mechanism: Mechanism, seconds: float) -> Reference | str:
-    """Run a scene at a tight tolerance until two runs agree; return a sentence where none do.
+@dataclass(frozen=True)
+class _Agreement:
+    """How far two runs agree: the last instant's number, and the largest scaled difference up to there."""
+
+    last: int
+    difference: float
+    first: _TightRun
+    second: _TightRun
+
+    @property
+    def is_good(self) -> bool:
+        return self.last == INSTANTS and self.difference <= GOOD_AGREEMENT
+
+
+def find_reference(scene: Scene, mechanism: Mechanism, limit_s: float) -> Reference | str:
+    """Run a scene at a tight tolerance with several formulations and methods, until two runs agree.
+
+    On the manifold all formulations have the same flow. Off it, with phi = w, only the SPF's two coordinates have.
 
     Parameters
     ----------
     scene : Scene
     mechanism : Mechanism
         The scene's.
-    seconds : float
-        What all runs together may take.
+    limit_s : float
+        Time for all runs together, s.
 
-    Notes
-    -----
-    On the manifold all formulations are one flow; off it, with phi = w, only the SPF's two coordinates are.
+    Returns
+    -------
+    Reference, or str
+        A sentence if no two runs agree.
     """
-    deadline, notes = perf_counter() + seconds, list[str]()
-    t_end, event = _end(scene, seconds)
-    if event:
-        notes.append(event)
-    found: list[_Tight] = []
-    best: tuple[int, float, _Tight, _Tight] | None = None
+    deadline, notes = perf_counter() + limit_s, list[str]()
+    t_end, end_note = _find_end(scene, limit_s)
+    if end_note:
+        notes.append(end_note)
+    runs: list[_TightRun] = []
+    best: _Agreement | None = None
     failures: list[str] = []
-    pairs = OFF_MANIFOLD if off_manifold(scene) else ON_MANIFOLD
-    for formulation, method in pairs:
-        left = deadline - perf_counter()
-        if left <= 0 or (best and best[0] == INSTANTS and best[1] <= GOOD):
+    for formulation, method in OFF_MANIFOLD if starts_off_manifold(scene) else ON_MANIFOLD:
+        remaining = deadline - perf_counter()
+        if remaining <= 0 or (best and best.is_good):
             break
-        motion, run = move(_tight(scene, formulation, method, t_end, min(left, seconds / 3)), left, most=1)
+        tight = _tighten(scene, formulation, method, t_end, min(remaining, limit_s / 3))
+        motion, run = time_scene(tight, remaining, max_runs=1)
         if motion.status != "done":
             failures.append(f"{formulation}, {method}: {motion.reason}")
         if run is None:
             continue
-        found.append(_Tight(formulation, method, motion, run))
-        others = (pair for pair in combinations(found, 2) if _independent(*pair))
-        best = max((_agreed(mechanism, *pair) for pair in others), key=_rank, default=None)
-    if best is None or best[0] == 0:
-        why = "; ".join(failures) or f"two runs at rtol {TIGHT:.0e} are more than {CONFIRMED:.0e} apart from the start"
+        runs.append(_TightRun(formulation, method, motion, run))
+        agreements = (
+            _Agreement(*find_confirmed_span(mechanism, first.motion, second.motion), first, second)
+            for first, second in combinations(runs, 2)
+            if _are_independent(first, second)
+        )
+        best = max(agreements, key=lambda agreement: (agreement.last, -agreement.difference), default=None)
+    if best is None or best.last == 0:
+        why = "; ".join(failures) or (
+            f"two runs at rtol {REFERENCE_RTOL:.0e} differ by more than {MAX_DISAGREEMENT:.0e} from the start"
+        )
         return f"no reference could be confirmed: {why}"
-    last, accuracy, one, other = best
-    t = one.run.t[: last + 1]
-    if last < INSTANTS:
-        notes.append(_why_not_further(t, failures))
-    motion = Motion("done", "", one.motion.q_tree[: last + 1], one.motion.v_tree[: last + 1])
-    return Reference(motion, t, accuracy, one.name, other.name, tuple(notes))
+    count = best.last + 1
+    t = best.first.run.t[:count]
+    if best.last < INSTANTS:
+        notes.append(_explain_early_end(t, failures))
+    motion = Motion("done", "", best.first.motion.q_tree[:count], best.first.motion.v_tree[:count])
+    return Reference(motion, t, best.difference, best.first.name, best.second.name, tuple(notes))
 
 
-def confirm(mechanism: Mechanism, one: Motion, other: Motion) -> tuple[int, float]:
-    """Return up to which instant two motions confirm each other, and how far apart they are up to there."""
-    scaled = apart(mechanism.tree, other, one).scaled
-    lost = np.flatnonzero(~(scaled <= CONFIRMED))
-    many = int(lost[0]) if len(lost) else len(scaled)
-    return max(0, min(many - 1, INSTANTS)), max(float(scaled[:many].max(initial=0.0)), LEAST)
+def find_confirmed_span(mechanism: Mechanism, first: Motion, second: Motion) -> tuple[int, float]:
+    """Return the number of the last instant up to which two motions agree, and their largest scaled difference."""
+    scaled = compare_motions(mechanism.tree, second, first).scaled
+    disagreeing = np.flatnonzero(~(scaled <= MAX_DISAGREEMENT))
+    count = int(disagreeing[0]) if len(disagreeing) else len(scaled)
+    return max(0, min(count - 1, INSTANTS)), max(float(scaled[:count].max(initial=0.0)), MIN_UNCERTAINTY)
 
 
-def _independent(one: _Tight, other: _Tight) -> bool:
-    """Whether two runs can confirm each other: "auto" may have taken the very steps of a method that is named."""
-    used = ({name for name, steps in each.run.stats["steps_by_method"].items() if steps} for each in (one, other))
-    return one.formulation != other.formulation or set.isdisjoint(*used)
+def _are_independent(first: _TightRun, second: _TightRun) -> bool:
+    """Whether two runs can confirm each other. "auto" may have taken the very steps of the other run's method."""
+    used = ({name for name, steps in each.run.stats["steps_by_method"].items() if steps} for each in (first, second))
+    return first.formulation != second.formulation or set.isdisjoint(*used)
 
 
-def _agreed(mechanism: Mechanism, one: _Tight, other: _Tight) -> tuple[int, float, _Tight, _Tight]:
-    return (*confirm(mechanism, one.motion, other.motion), one, other)
+def _tighten(scene: Scene, formulation: str, method: str, t_end: float, limit_s: float, **extra: Any) -> Scene:
+    """Return a scene at the reference tolerance, without the scene's own settings of accuracy."""
+    removed = dict.fromkeys(f"solver.{key}" for key in ("atol", "baumgarte", "projection", "max_rhs", "min_step"))
+    values = {"solver.method": method, "solver.rtol": REFERENCE_RTOL, "solver.max_wall_s": max(limit_s, 0.05)}
+    span = span_overrides(scene, t_end, t_end / INSTANTS)
+    return override_scene(scene, {**removed, **span, **FORMULATIONS[formulation], **values, **extra})
 
 
-def _rank(found: tuple[int, float, _Tight, _Tight]) -> tuple[int, float]:
-    return found[0], -found[1]
-
-
-def _tight(scene: Scene, formulation: str, method: str, t_end: float, limit: float, **more: Any) -> Scene:
-    loosened = dict.fromkeys(f"solver.{key}" for key in ("atol", "baumgarte", "projection", "max_rhs", "min_step"))
-    values = {"solver.method": method, "solver.rtol": TIGHT, "solver.max_wall_s": max(limit, 0.05)}
-    return changed(
-        scene, {**loosened, **on_span(scene, t_end, t_end / INSTANTS), **FORMULATIONS[formulation], **values, **more}
-    )
-
-
-def _end(scene: Scene, seconds: float) -> tuple[float, str]:
-    """Return where a scene ends: at an event that stops it, if there is one; and that as a sentence."""
+def _find_end(scene: Scene, limit_s: float) -> tuple[float, str]:
+    """Return the end of a scene, which may be an event that stops it, and a note about that event."""
     t_end = scene.spec.t_end
     if not any(event.stop for event in scene.spec.event):
         return t_end, ""
-    formulation = "spf, w" if off_manifold(scene) else "dae"
-    own = {"event": scene.to_dict()["event"]}
-    _, run = move(_tight(scene, formulation, "auto", t_end, seconds / 3, **own), seconds, most=1)
-    met = [event for event in run.events if event["stop"]] if run is not None else []
-    if not met or not met[-1]["t"] > 0:
+    formulation = "spf, w" if starts_off_manifold(scene) else "dae"
+    with_events = {"event": scene.to_dict()["event"]}
+    tight = _tighten(scene, formulation, "auto", t_end, limit_s / 3, **with_events)
+    _, run = time_scene(tight, limit_s, max_runs=1)
+    stops = [event for event in run.events if event["stop"]] if run is not None else []
+    if not stops or not stops[-1]["t"] > 0:
         return t_end, ""
-    return met[-1]["t"], f"compared up to the event that ends it, at t = {met[-1]['t']:.6g} s: {met[-1]['name']}"
+    event = stops[-1]
+    return event["t"], f"compared up to the event that ends the scene, at t = {event['t']:.6g} s: {event['name']}"
 
 
-def _why_not_further(t: Array, failures: list[str]) -> str:
+def _explain_early_end(t: Array, failures: list[str]) -> str:
     why = "; ".join(failures) or (
-        f"later, runs at rtol {TIGHT:.0e} are more than {CONFIRMED:.0e} apart: the motion forgets what it comes from, "
-        "and no setting is right there"
+        f"later, runs at rtol {REFERENCE_RTOL:.0e} differ by more than {MAX_DISAGREEMENT:.0e}, as in a chaotic motion, "
+        "and no setting is accurate there"
     )
-    more = "; a larger budget gets further" if "max_wall_s" in why else ""
-    return f"compared up to t = {t[-1]:.6g} s, as far as the reference is confirmed ({why}){more}"
-
-
-def said(reference: Reference) -> Iterator[str]:
-    """Yield what there is to say of a reference, a sentence each."""
-    yield (
-        f"reference: {reference.of} at rtol {TIGHT:.0e}, confirmed by {reference.by} to {reference.accuracy:.1e} "
-        f"up to t = {reference.t_end:.6g} s"
-    )
-    yield from reference.notes
+    remedy = "; a larger budget gets further" if "max_wall_s" in why else ""
+    return f"compared up to t = {t[-1]:.6g} s, as far as the reference is confirmed ({why}){remedy}"

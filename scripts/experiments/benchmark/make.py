@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 from joblib import Memory
 
-from ckc_pin.analysis.precision.motion import no_motion
+from ckc_pin.analysis.precision.motion import motion_without_data
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.scene.parts import scene_mechanism
 from ckc_pin.scene.scene import load_scene
@@ -139,7 +139,7 @@ def rows_of(work: Work, quick: bool, memory: Memory, others: Sequence[Peer], bud
     for setting in ours.settings(quick):
         name = ours.name_of(setting)
         if setting.family in spent:
-            yield judged(work, ours.PROGRAM, name, no_motion("refused", spent[setting.family]), exact())
+            yield judged(work, ours.PROGRAM, name, motion_without_data("refused", spent[setting.family]), exact())
             continue
         row = run(own, ours.PROGRAM, name, budget.own, work, None, exact)
         if ours.used_up(row):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
-from ckc_pin.analysis.precision.motion import FORMULATIONS, Motion, Setting, changed, move
+from ckc_pin.analysis.precision.motion import FORMULATIONS, Motion, Setting, override_scene, time_scene
 from scripts.experiments.benchmark.row import Row
 from scripts.experiments.benchmark.work import Work
 
@@ -47,8 +47,10 @@ def used_up(row: Row) -> bool:
 def compute(work: Work, setting: Setting, budget: float) -> Motion:
     """Run a work, stopped after a budget in s; its reason names the method that "auto" took."""
     scene = work.load()
-    limited = changed(scene, {**setting.overrides(scene), "solver.terms": work.terms, "solver.max_wall_s": budget})
-    motion, _ = move(limited, budget, fewest=2)
+    limited = override_scene(
+        scene, {**setting.overrides(scene), "solver.terms": work.terms, "solver.max_wall_s": budget}
+    )
+    motion, _ = time_scene(limited, budget, min_runs=2)
     if motion.status == "done":
         return replace(motion, reason=motion.used)
     return replace(motion, reason=f"{motion.reason} ({motion.used})") if motion.used != setting.method else motion

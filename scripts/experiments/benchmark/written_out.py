@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from ckc_pin.analysis.precision.motion import changed, move
+from ckc_pin.analysis.precision.motion import override_scene, time_scene
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.errors import InputError
 from scripts.experiments.benchmark.work import Work
@@ -52,7 +52,11 @@ def written_out(work: Work, budget: float) -> WrittenOut:
             return WrittenOut(refused=str(error))
         found = WrittenOut(perf_counter() - began)
         runs = [
-            move(changed(work.load(), {**AT, "solver.terms": terms, "solver.max_wall_s": budget}), budget, fewest=2)[0]
+            time_scene(
+                override_scene(work.load(), {**AT, "solver.terms": terms, "solver.max_wall_s": budget}),
+                budget,
+                min_runs=2,
+            )[0]
             for terms in ("generated", "pinocchio")
         ]
     if any(run.status != "done" for run in runs):

@@ -14,7 +14,7 @@ import pytest
 from joblib import Memory
 from scipy.integrate import solve_ivp
 
-from ckc_pin.analysis.precision.motion import Motion, Setting, changed, no_motion
+from ckc_pin.analysis.precision.motion import Motion, Setting, motion_without_data, override_scene
 from ckc_pin.errors import InputError
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark import make, ours
@@ -150,7 +150,7 @@ def test_every_formulation_is_measured_by_every_method() -> None:
     assert {setting.method for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
     assert {setting.overrides(scene).get("spf_coordinates") for setting in full} == {None, "w", "z"}
     for setting in full:
-        assert changed(scene, setting.overrides(scene))
+        assert override_scene(scene, setting.overrides(scene))
 
 
 def test_a_setting_is_read_back_from_its_name() -> None:
@@ -234,7 +234,7 @@ class Breaks:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         self.runs += 1
-        return no_motion("failed", "it fell, over a comma")
+        return motion_without_data("failed", "it fell, over a comma")
 
 
 def test_what_was_measured_is_not_measured_again(tmp_path: Path) -> None:

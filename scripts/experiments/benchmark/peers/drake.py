@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.precision.motion import Motion, Stepper
+from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer import place_in_plane
@@ -110,7 +110,7 @@ class Drake:
         def state() -> tuple[Array, Array]:
             return plant.state(running["simulator"].get_context())
 
-        motion = stepped(work, dt, Stepper(reset, step, state), budget)
+        motion = stepped(work, dt, FixedStepProgram(reset, step, state), budget)
         if discrete or motion.status != "done":
             return motion
         return replace(motion, steps=running["simulator"].get_integrator().get_num_steps_taken())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion, Stepper
+from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame
@@ -82,7 +82,7 @@ class Exudyn:
             q_tree, v_tree = running["system"].state()
             return q_tree, v_tree
 
-        return stepped(work, dt, Stepper(reset, step, state), budget)
+        return stepped(work, dt, FixedStepProgram(reset, step, state), budget)
 
 
 class _System(Steps):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.analysis.precision.motion import REPEATS, SHORT, Motion, no_motion
+from ckc_pin.analysis.precision.motion import MAX_REPEATS, REPEAT_BELOW_S, Motion, motion_without_data
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.dynamics.formulations import dae_acceleration
@@ -72,7 +72,7 @@ class Ida:
             max_num_steps=MANY,
         )
         walls: list[float] = []
-        while not walls or (walls[-1] < SHORT and len(walls) < REPEATS):
+        while not walls or (walls[-1] < REPEAT_BELOW_S and len(walls) < MAX_REPEATS):
             form.begin(budget)
             ida.init_step(0.0, *form.start)
             states, began = [dae.y0], perf_counter()
@@ -80,9 +80,9 @@ class Ida:
                 try:
                     at = ida.step(t, tstop=work.t_end)
                 except TimeoutError as error:
-                    return no_motion("refused", str(error))
+                    return motion_without_data("refused", str(error))
                 if not at.success:
-                    return no_motion("failed", str(at.message))
+                    return motion_without_data("failed", str(at.message))
                 states.append(np.array(at.y[: 2 * n]))
             walls.append(perf_counter() - began)
         q_tree, v_tree = np.split(np.array(states), 2, axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.analysis.precision.motion import Motion
-from ckc_pin.analysis.precision.mujoco import StateMap, model_of, set_up, stepper
+from ckc_pin.analysis.precision.mujoco import StateMap, configure_model, load_model, make_program
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
@@ -42,7 +42,7 @@ class Mujoco:
         if work.controlled:
             return CONTROLLED
         try:
-            model_of(_text(work.mechanism))
+            load_model(_text(work.mechanism))
         except (InputError, ValueError) as error:
             return str(error)
         return None
@@ -64,10 +64,10 @@ class Mujoco:
 
         tree = work.mechanism.tree
         q_tree, v_tree = start_of(work)
-        model = model_of(_text(work.mechanism))
+        model = load_model(_text(work.mechanism))
         data = mujoco.MjData(model)
         joints = StateMap(work.mechanism, model)
-        to = joints.put(data, q_tree, v_tree)
+        to = joints.set_state(data, q_tree, v_tree)
         mujoco.mj_forward(model, data)
         M = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, M)
@@ -84,9 +84,9 @@ class Mujoco:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         integrator, stiffness, step = setting.split(", ")
-        dt, model = float(step.removeprefix("dt ")), model_of(_text(work.mechanism))
-        set_up(model, integrator, stiffness, divided(work, dt))
-        return stepped(work, dt, stepper(model, work.mechanism, start_of(work)), budget)
+        dt, model = float(step.removeprefix("dt ")), load_model(_text(work.mechanism))
+        configure_model(model, integrator, stiffness, divided(work, dt))
+        return stepped(work, dt, make_program(model, work.mechanism, start_of(work)), budget)
 
 
 def _installed() -> bool:

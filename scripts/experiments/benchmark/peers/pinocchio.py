@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion, Stepper
+from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -76,7 +76,7 @@ class Pinocchio:
         def read() -> tuple[Array, Array]:
             return mechanism.tree.to_coordinates(state["q"]), state["v"]
 
-        return stepped(work, dt, Stepper(reset, step, read), budget)
+        return stepped(work, dt, FixedStepProgram(reset, step, read), budget)
 
 
 def not_closed(work: Work) -> str | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.analysis.precision.motion import Motion, no_motion
+from ckc_pin.analysis.precision.motion import Motion, motion_without_data
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
@@ -74,10 +74,10 @@ class PinocchioLoop:
         try:
             given = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
         except subprocess.TimeoutExpired:
-            return no_motion("refused", f"takes longer than the budget, {budget:.0f} s")
+            return motion_without_data("refused", f"takes longer than the budget, {budget:.0f} s")
         except subprocess.CalledProcessError as error:
             said = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
-            return no_motion("failed", said)
+            return motion_without_data("failed", said)
         states = np.array(given["state"])
         q_tree = np.array([tree.to_coordinates(state) for state in states[:, : tree.model.nq]])
         wall, steps, rhs = given["cost"][0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ckc_pin.analysis.precision.motion import Motion, Stepper, no_motion
+from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion, motion_without_data
 from ckc_pin.base.arrays import Array
 from ckc_pin.scene.initial import find_start
 from scripts.experiments.benchmark.work import INSTANTS, Work
@@ -36,13 +36,13 @@ def divided(work: Work, dt: float) -> float:
     return between / max(1, round(between / dt))
 
 
-def stepped(work: Work, dt: float, program: Stepper, budget: float) -> Motion:
+def stepped(work: Work, dt: float, program: FixedStepProgram, budget: float) -> Motion:
     """Run a work with a fixed step, the nearest to dt that divides the instants; a budget in s."""
     many = round(work.t_end / INSTANTS / divided(work, dt))
     try:
-        foreseen = program.foreseen(many, INSTANTS)
+        foreseen = program.estimate_wall_s(many, INSTANTS)
         if foreseen > budget:
-            return no_motion("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s")
+            return motion_without_data("refused", f"would take {foreseen:.0f} s, the budget is {budget:.0f} s")
         return program.run(many, INSTANTS)
     except Exception as error:  # whatever a program raises where its solver fails
-        return no_motion("failed", " ".join(str(error).split()) or type(error).__name__)
+        return motion_without_data("failed", " ".join(str(error).split()) or type(error).__name__)
