@@ -1,4 +1,4 @@
-"""From the force u of eq. 6 to the motors' tau and the generalized force on the tree, or from tau itself."""
+"""Actuation: motor torques tau from eq. 6's force u, torque limits, and the generalized force u' on the tree."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import pivoted_columns
-from ckc_pin.control.allocation import allocate, least
+from ckc_pin.control.allocation import allocate, minimum_norm_torques
 from ckc_pin.control.spec import AllocationSpec, Limit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -19,51 +19,54 @@ from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["Actuation", "Effort", "require_tau", "require_u"]
 
-NO_NUMBERS = "cSUmMV"  # what NumPy would make real numbers of, in silence or with a warning
+NOT_REAL_KINDS = "cSUmMV"  # NumPy kinds that `astype(float)` converts silently or with a warning
+DRIVE_TOLERANCE = 1e-6  # relative singular value below which motors do not drive a motion
 
 
 def require_u(u: Any, mechanism: Mechanism, what: str = "the controller's u") -> Array:
-    """Return u as an array of the right shape, finite or not.
+    """Return u as an array of shape (d,). Its entries may be NaN or infinite.
 
     Raises
     ------
     InputError
-        Not numbers, or not one for each independent coordinate.
+        u is not a vector of numbers, or not of that length.
     """
     return _vector(u, mechanism.independent, what)
 
 
 def require_tau(tau: Any, mechanism: Mechanism, what: str = "the controller's tau") -> Array:
-    """Return torques as an array by motor, finite or not; in a table, motors that are not named have none.
+    """Return torques as an array by motor. Its entries may be NaN or infinite.
+
+    In a table, motors without an entry have zero torque.
 
     Raises
     ------
     InputError
-        Not numbers, not one for each motor, a name that is no motor's.
+        tau is not a vector of numbers, not one number a motor, or names something that is not a motor.
     """
     if isinstance(tau, Mapping):
         return mechanism.motors.vector(tau, what, fill=0.0)
     return _vector(tau, mechanism.actuated, what)
 
 
-def _vector(given: Any, names: Sequence[str], what: str) -> Array:
-    if given is None:
-        raise InputError(f"{what} is None; {len(names)} numbers are needed: {', '.join(names)}; is a return missing?")
+def _vector(value: Any, names: Sequence[str], what: str) -> Array:
+    if value is None:
+        raise InputError(f"{what}: expected {len(names)} numbers ({', '.join(names)}), got None; is a return missing?")
     try:
-        array = np.asarray(given)
-        if array.dtype.kind in NO_NUMBERS:
+        array = np.asarray(value)
+        if array.dtype.kind in NOT_REAL_KINDS:
             raise TypeError
         vector = array.astype(float, copy=False)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} is no vector of numbers: {given!r:.80}") from None
+        raise InputError(f"{what}: expected a vector of numbers, got {value!r:.80}") from None
     if vector.shape != (len(names),):
-        raise InputError(f"{what} has shape {vector.shape}; ({len(names)},) is needed: {', '.join(names)}")
+        raise InputError(f"{what}: expected shape ({len(names)},) ({', '.join(names)}), got {vector.shape}")
     return vector
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What the actuators do at one instant: tau by motor, u' on the tree, u = rho^T u'."""
+    """Forces of the actuators at one instant: tau by motor, u' on the tree, u = rho^T u'."""
 
     tau: Array
     u_tree: Array
@@ -71,20 +74,29 @@ class Effort:
 
 
 class Actuation:
-    """Maps u to tau, limits tau, and gives what that does to the tree.
+    """Motors of a mechanism with torque limits and the allocation of redundant motors.
 
     Parameters
     ----------
     mechanism : Mechanism
     torque_limit : number or {motor: number}, optional
-        |tau| never exceeds it, N m or N, nor the motor's own limit.
+        Limit of |tau|, N m or N, in addition to the motors' own limits.
     allocation : AllocationSpec, optional
-        How redundant motors share u; absent, tau is the least there is.
+        Weights and preload of redundant motors; default: minimum-norm torques.
+
+    Attributes
+    ----------
+    is_direct : bool
+        Whether each motor drives one independent coordinate, in order and without gear: tau = u.
+    scene_limit, limit : (motors,) array
+        `torque_limit` alone, and with the motors' own limits; infinite where there is none.
+    weights, preload : (motors,) array
+    zero : Effort
 
     Raises
     ------
     InputError
-        A limit, a weight or a preload for what is no motor; weights or a preload without redundancy.
+        A limit, a weight or a preload for something that is not a motor; weights or a preload without redundant motors.
     """
 
     def __init__(
@@ -95,100 +107,95 @@ class Actuation:
     ) -> None:
         self.mechanism, self.motors = mechanism, mechanism.motors
         motors, count = self.motors, len(self.motors.names)
-        self.direct = mechanism.has_direct_drives
-        given = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
-        self.given_limit = motors.vector(given, "controller.torque_limit", np.inf)
-        self.limit = np.minimum(self.given_limit, motors.torque_limit)
+        self.is_direct = mechanism.has_direct_drives
+        limits = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
+        self.scene_limit = motors.vector(limits, "controller.torque_limit", np.inf)
+        self.limit = np.minimum(self.scene_limit, motors.torque_limit)
         allocation = allocation or AllocationSpec()
         self.weights = motors.vector(allocation.weights, "controller.allocation.weights", 1.0)
         self.preload = motors.vector(allocation.preload, "controller.allocation.preload", 0.0)
         for key in ("weights", "preload"):
             if getattr(allocation, key) and count <= mechanism.d:
                 raise InputError(
-                    f"controller.allocation.{key}: {mechanism.name} has no redundancy, its {count} motors for "
-                    f"{mechanism.d} freedoms leave no choice of tau"
+                    f"controller.allocation.{key}: {mechanism.name} has no redundant motors: u determines the torques "
+                    f"of its {count} motors for {mechanism.d} freedoms; remove {key}"
                 )
-        self.none = Effort(np.zeros(count), np.zeros(mechanism.n), np.zeros(mechanism.d))
+        self.zero = Effort(np.zeros(count), np.zeros(mechanism.n), np.zeros(mechanism.d))
 
-    def undriven(self, at: Kinematics) -> list[str]:
-        """Name freedoms that no motor drives, as many as there are."""
-        if self.direct:
+    def find_undriven_freedoms(self, at: Kinematics) -> list[str]:
+        """Return independent coordinates that no motor drives, as many as there are undriven freedoms."""
+        if self.is_direct:
             return []
         transmission = self.motors.transmission @ at.rho
         sizes = np.linalg.norm(transmission, axis=1, keepdims=True)
         _, values, directions = np.linalg.svd(transmission / np.where(sizes > 0, sizes, 1.0), full_matrices=True)
-        rank = int(np.sum(values > 1e-6 * max(values.max(initial=0.0), 1e-150)))
-        loose = pivoted_columns(directions[rank:])[0][: self.mechanism.d - rank]
-        return [self.mechanism.independent[k] for k in sorted(loose)]
+        rank = int(np.sum(values > DRIVE_TOLERANCE * max(values.max(initial=0.0), 1e-150)))
+        undriven = pivoted_columns(directions[rank:])[0][: self.mechanism.d - rank]
+        return [self.mechanism.independent[k] for k in sorted(undriven)]
 
-    def refusal(self, at: Kinematics) -> str:
-        """Say why the motors cannot produce every u, with the freedoms that none drives; empty where they can."""
-        loose = self.undriven(at)
-        if not loose:
+    def explain_undriven_freedoms(self, at: Kinematics) -> str:
+        """Return why the motors cannot produce every u, or an empty text if they can."""
+        undriven = self.find_undriven_freedoms(at)
+        if not undriven:
             return ""
         names = ", ".join(self.motors.names) or "no joint"
         return (
-            f"{self.motors.key}: {names} cannot hold every freedom; "
-            f"the motion along {', '.join(loose)} is held by none of them"
+            f"{self.motors.key}: {names} cannot drive every freedom; "
+            f"the motion along {', '.join(undriven)} is driven by none of them"
         )
 
-    def require_transmission(self, at: Kinematics) -> None:
-        """Refuse motors that cannot produce every u: some freedom is held by none of them.
+    def require_driven_freedoms(self, at: Kinematics) -> None:
+        """Raise InputError, with the undriven freedoms' names, if the motors cannot produce every u."""
+        if reason := self.explain_undriven_freedoms(at):
+            raise InputError(reason)
 
-        Raises
-        ------
-        InputError
-            Names the freedoms.
-        """
-        if says := self.refusal(at):
-            raise InputError(says)
-
-    def distribute(self, tangent: Array, force: Array) -> Array:
-        """Return the least tau, by the motors' weights, that does what a force on the mechanism does, unlimited.
+    def minimum_norm_torques(self, tangent: Array, force: Array) -> Array:
+        """Return minimum-norm motor torques equivalent to a generalized force, ignoring limits.
 
         Parameters
         ----------
         tangent : (n, d) array
-            Basis of the velocities that the loops allow; rho, or any other.
+            Basis of the velocities that the loops allow: rho, or any other.
         force : (d,) array
-            Along that basis: tangent^T u'.
+            In that basis: tangent^T u'.
 
         Returns
         -------
         (motors,) array
-            Where they cannot do it, as nearly as they can.
+            Minimum of the norm weighted by `weights`. If the motors cannot produce the force, the least-squares
+            solution.
         """
-        return least((self.motors.transmission @ tangent).T, force, self.weights)
+        return minimum_norm_torques((self.motors.transmission @ tangent).T, force, self.weights)
 
-    def apply(self, terms: Terms, u: Array) -> Effort:
-        """Map u to tau within limits; of redundant motors, as `allocate` does.
+    def apply_u(self, terms: Terms, u: Array) -> Effort:
+        """Return motor torques for u, within limits. `allocate` shares u among redundant motors.
 
         Raises
         ------
         InputError
-            A controller's u of the wrong shape.
+            u has the wrong shape.
         NumericalError
-            A controller's u that is not finite.
+            u is not finite.
         """
         u = require_u(u, self.mechanism)
         if not np.isfinite(u).all():
             raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
-        if self.direct:
+        if self.is_direct:
             tau = np.clip(u, -self.limit, self.limit)
             return Effort(tau, self.motors.force(tau), tau)
         transmission = (self.motors.transmission @ terms.rho).T  # u = transmission tau
         tau = allocate(transmission, u, self.limit, self.weights, self.preload)
         return Effort(tau, self.motors.force(tau), transmission @ tau)
 
-    def drive(self, terms: Terms, tau: Any) -> Effort:
-        """Take the motors' own torques, within limits.
+    def apply_tau(self, terms: Terms, tau: Any) -> Effort:
+        """Return the effort of motor torques, clipped at their limits.
 
         Raises
         ------
         InputError
-            A controller's tau of the wrong shape, or for what is no motor.
+            tau has the wrong shape, or names something that is not a motor.
         NumericalError
-            A controller's tau that is not finite.
+            tau is not finite.
         """
         tau = require_tau(tau, self.mechanism)
         if not np.isfinite(tau).all():

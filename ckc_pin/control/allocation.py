@@ -6,7 +6,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 
-__all__ = ["allocate", "least"]
+__all__ = ["allocate", "minimum_norm_torques"]
 
 ROUNDING = 1e-13  # of u, scaled: what a tau may miss it by
 FLAT = 1e-12  # of the dual's largest curvature: a direction in which it has none
@@ -29,7 +29,7 @@ def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preloa
     limit, weights, preload : (m,) arrays
         Nearest is what makes sum weights (tau - preload)^2 least; |tau| <= limit, which may be infinite.
     """
-    tau = preload + least(transmission, u - transmission @ preload, weights)
+    tau = preload + minimum_norm_torques(transmission, u - transmission @ preload, weights)
     if np.any(np.abs(tau) > limit):
         found = None
         for give in (0.0, GIVES) if np.ptp(transmission.shape) else ():
@@ -39,7 +39,7 @@ def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preloa
     return np.asarray(tau, dtype=float)
 
 
-def least(transmission: Array, u: Array, weights: Array) -> Array:
+def minimum_norm_torques(transmission: Array, u: Array, weights: Array) -> Array:
     """Return the tau with u = transmission tau, or as nearly as can be, whose sum of weights tau^2 is least."""
     scale = 1.0 / np.sqrt(weights)
     return np.asarray(scale * np.linalg.lstsq(transmission * scale, u, rcond=1e-9)[0], dtype=float)

@@ -1,7 +1,7 @@
-"""The paper's two controllers on the independent coordinates, with their Lyapunov functions.
+"""Controllers: set-point control (eq. 14), tracking (eq. 16), recorded torques, and the user's own functions.
 
-Errors are q - q_d everywhere. A controller sees the plant's measured state through `Terms`; with its own
-`model` it evaluates D, C, h of that model at the measured (q, z), as eq. 16 writes it.
+Errors are q - q_d everywhere. A controller gets the plant's measured state as `Terms`. With a model of its own it
+evaluates D, C and h of that model at the measured (q, z), as eq. 16 writes it.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, require_callable, require_controller_signature, require_type
 from ckc_pin.control.desired import Desired
-from ckc_pin.control.gains import gain_matrix, require_positive_definite
-from ckc_pin.control.spec import Gain
+from ckc_pin.control.spec import Gain, gain_matrix, require_positive_definite
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, MechanismError
@@ -23,30 +22,40 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Controller", "Law", "Model", "SetPoint", "TorqueController", "Tracking", "as_controller", "gives_tau"]
+__all__ = [
+    "ControlLaw",
+    "Controller",
+    "ControllerModel",
+    "RecordedTorques",
+    "SetPoint",
+    "TorqueController",
+    "Tracking",
+    "as_controller",
+    "is_torque_controller",
+]
 
 
-TAKES = (
+CONTROLLER_FORMS = (
     "an object with one of the methods u(t, terms), for the force on the independent coordinates, and tau(t, terms), "
     "for the motors' torques; or a function u(t, terms)"
 )
 
 
 class Controller(Protocol):
-    """Anything that gives eq. 6's force u."""
+    """A controller that returns eq. 6's force u."""
 
     def u(self, t: float, terms: Terms) -> Array:
         """Return the force on the independent coordinates at time t (s), shape (d,), N m or N."""
 
 
 class TorqueController(Protocol):
-    """Anything that gives the motors' own torques."""
+    """A controller that returns motor torques."""
 
     def tau(self, t: float, terms: Terms) -> Array | Mapping[str, float]:
-        """Return tau at time t (s) by motor, N m or N: shape (motors,), or a table; motors not in it have none."""
+        """Return torques at time t (s), N m or N: shape (motors,), or a table by motor without those that are zero."""
 
 
-Law = Callable[[float, Terms], Any]  # a controller that is a plain function: (t, terms) to u
+ControlLaw = Callable[[float, Terms], Any]  # a controller as a plain function from (t, terms) to u
 
 
 class FunctionController:
@@ -55,71 +64,71 @@ class FunctionController:
     Parameters
     ----------
     function : callable
-        (t, terms) to u.
+        From (t, terms) to u.
     """
 
-    def __init__(self, function: Law) -> None:
-        self.u: Law = function
+    def __init__(self, function: ControlLaw) -> None:
+        self.u: ControlLaw = function
 
 
-def as_controller(given: Any) -> Controller | TorqueController:
-    """Return what a caller gave as a controller: an object that is one, or a plain function u(t, terms).
+def as_controller(value: Any) -> Controller | TorqueController:
+    """Return a caller's argument as a controller: an object with method u or tau, or a plain function u(t, terms).
 
     Raises
     ------
     InputError
-        A class in the place of an object of it, a function of other arguments, anything else; an attribute `u`, `tau`
-        or `lyapunov` that is no method as required; attributes of a SetPoint or Tracking that were replaced by others.
+        The argument is a class, or a function of other arguments, or anything else; an attribute `u`, `tau` or
+        `lyapunov` is not such a method; attributes of a SetPoint or Tracking were replaced by unusable values.
     """
-    if isinstance(given, type):
-        name = given.__name__
+    if isinstance(value, type):
+        name = value.__name__
         raise InputError(f"controller: expected an object, got the class {name}; create one with {name}()")
-    own = [name for name in ("u", "tau") if callable(getattr(given, name, None))]
-    if not own and not callable(given):
-        raise InputError(f"controller: expected {TAKES}, got {describe_value(given)}")
-    for name in own or [""]:
-        law = getattr(given, name) if name else given
-        called = name or getattr(given, "__name__", type(given).__name__)
-        if isinstance(law, type):
-            raise InputError(f"controller: {called}: expected a function of (t, terms), got {describe_value(law)}")
-        require_controller_signature(law, called, "controller")
-    if own:
-        _require_lyapunov(getattr(given, "lyapunov", None))
-    if type(given) is SetPoint or type(given) is Tracking:  # a subclass may have attributes of its own
-        given.require_attributes()
-    found: Controller | TorqueController = given if own else FunctionController(given)
-    gives_tau(found)
-    return found
+    methods = [name for name in ("u", "tau") if callable(getattr(value, name, None))]
+    if not methods and not callable(value):
+        raise InputError(f"controller: expected {CONTROLLER_FORMS}, got {describe_value(value)}")
+    for method in methods or [""]:
+        function = getattr(value, method) if method else value
+        name = method or getattr(value, "__name__", type(value).__name__)
+        if isinstance(function, type):
+            raise InputError(f"controller: {name}: expected a function of (t, terms), got {describe_value(function)}")
+        require_controller_signature(function, name, "controller")
+    if methods:
+        _require_lyapunov(getattr(value, "lyapunov", None))
+    if type(value) is SetPoint or type(value) is Tracking:  # a subclass may have other attributes
+        value.validate_attributes()
+    controller: Controller | TorqueController = value if methods else FunctionController(value)
+    is_torque_controller(controller)  # refuses a controller with both methods
+    return controller
 
 
 def _require_lyapunov(function: Any) -> None:
-    """Refuse an attribute `lyapunov` that a run could not evaluate (InputError)."""
+    """Raise InputError if a run could not evaluate an attribute `lyapunov`."""
     takes = "a function of (t, terms, w) that returns a number, or None"
     if isinstance(function, type):
         raise InputError(f"controller: lyapunov: expected {takes}, got {describe_value(function)}")
     require_callable(function, "controller: lyapunov", takes, 3)
 
 
-def gives_tau(controller: Controller | TorqueController) -> bool:
-    """Whether a controller gives torques of motors, by the method that it has.
+def is_torque_controller(controller: Controller | TorqueController) -> bool:
+    """Return whether a controller returns motor torques (method `tau`) instead of u.
 
     Raises
     ------
     InputError
-        It has both methods, or neither.
+        It has both methods or neither.
     """
-    u, tau = (callable(getattr(controller, name, None)) for name in ("u", "tau"))
-    if u == tau:
-        has = "both u and tau" if u else "neither u nor tau"
+    has_u, has_tau = (callable(getattr(controller, name, None)) for name in ("u", "tau"))
+    if has_u == has_tau:
+        methods = "both u and tau" if has_u else "neither u nor tau"
         raise InputError(
-            f"{type(controller).__name__} has {has}; a controller has one of the methods u(t, terms), for the force on "
-            "the independent coordinates, and tau(t, terms), for the motors' torques"
+            f"{type(controller).__name__} has {methods}; a controller has one of the methods u(t, terms), for the "
+            "force on the independent coordinates, and tau(t, terms), for the motors' torques"
         )
-    return tau
+    return has_tau
 
 
-class Model:
-    """The controller's own idea of the plant: another mechanism with the same coordinates.
+class ControllerModel:
+    """A controller's own model of the plant: another mechanism with the same coordinates.
 
     Parameters
     ----------
@@ -130,15 +139,15 @@ class Model:
     Raises
     ------
     MechanismError
-        The two do not have the same coordinates, split in the same way.
+        The two mechanisms differ in their coordinates or in the independent ones.
     """
 
     def __init__(self, mechanism: Mechanism, plant: Mechanism, convention: CoriolisVelocity) -> None:
-        for what in ("coordinates", "independent"):
-            own, theirs = getattr(mechanism, what), getattr(plant, what)
-            if own != theirs:
+        for attribute in ("coordinates", "independent"):
+            ours, theirs = getattr(mechanism, attribute), getattr(plant, attribute)
+            if ours != theirs:
                 raise MechanismError(
-                    f"controller.model: its {what} are {', '.join(own)}, the plant's {', '.join(theirs)}"
+                    f"controller.model: its {attribute} are {', '.join(ours)}, the plant's {', '.join(theirs)}"
                 )
         self.mechanism = mechanism
         self.convention = convention
@@ -156,18 +165,18 @@ class SetPoint:
     Parameters
     ----------
     mechanism : Mechanism
-        Whose h is compensated: the plant, or the controller's own model.
+        Mechanism whose h is compensated: the plant, or the controller's own model.
     K_P, K_V : number, {joint: number} or (d, d) array
         Symmetric positive definite, in the order of `independent`; K_V may be semi-definite.
     q_d : (d,) array or {coordinate: number}
         The target.
     near : Kinematics, optional
-        On whose assembly branch h is that at the target, where a run starts; default: as assembled.
+        A configuration of the assembly branch on which h(q_d) is evaluated; default: the assembled configuration.
 
     Raises
     ------
     InputError
-        Gains that are not as required, a target that the mechanism cannot reach.
+        Wrong gains, or a target that the mechanism cannot reach.
     """
 
     def __init__(
@@ -191,27 +200,27 @@ class SetPoint:
         self.q_d = q_d = mechanism.vector(q_d, names, "controller.q_d")
         target = sigma(mechanism, q_d, near)
         if target.verdict != "converged":
-            wanted = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
-            raise InputError(f"controller.q_d: the target {wanted} is {target.verdict}: {target.reason}")
+            values = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
+            raise InputError(f"controller.q_d: the target {values} is {target.verdict}: {target.reason}")
         self.target = Terms(mechanism, target.at, np.zeros(mechanism.n))
 
     def u(self, t: float, terms: Terms) -> Array:
-        """Eq. 14."""
+        """Return eq. 14's force."""
         return -self.K_P @ (terms.q - self.q_d) - self.K_V @ terms.q_dot + self.target.h
 
-    def require_attributes(self) -> None:
-        """Refuse attributes that were replaced by values that the law cannot use (InputError)."""
+    def validate_attributes(self) -> None:
+        """Raise InputError if attributes were replaced by values that the controller cannot use."""
         require_type(self.target, Terms, "SetPoint: target", "Terms, those at the target")
         d = self.target.mechanism.d
         for name, shape in (("K_P", (d, d)), ("K_V", (d, d)), ("q_d", (d,))):
             _require_array(getattr(self, name), shape, f"SetPoint: {name}")
 
     def u_rate_gradient(self, t: float, terms: Terms) -> Array:
-        """d u / d q_dot, shape (d, d)."""
+        """Return d u / d q_dot, shape (d, d)."""
         return -self.K_V
 
     def lyapunov(self, t: float, terms: Terms, w: Array) -> float:
-        """The function of section II-B minus its value at q_d, joules."""
+        """Return the Lyapunov function of section II-B minus its value at q_d, J."""
         error = terms.q - self.q_d
         potential = terms.potential_energy - self.target.potential_energy - error @ self.target.h
         return float(0.5 * terms.q_dot @ terms.D @ terms.q_dot + potential + 0.5 * error @ self.K_P @ error)
@@ -226,20 +235,26 @@ class Tracking:
         In the order of `independent`. K_D and Lambda^T K_D symmetric positive definite (eq. 18 needs both).
     desired : Desired
         A function of t (s) that returns q_d, its rate and its acceleration, each of shape (d,).
-    model : Model, optional
-        The controller's own idea of the plant.
+    model : ControllerModel, optional
+        The controller's own model of the plant.
 
     Raises
     ------
     InputError
-        Gains that are not as required.
+        Wrong gains, or a desired trajectory that is not such a function.
     """
 
-    def __init__(self, Lambda: float | Array, K_D: float | Array, desired: Desired, model: Model | None = None) -> None:
-        of_each = [f"coordinate {k + 1}" for k in range(_dimension(desired))]
+    def __init__(
+        self,
+        Lambda: float | Array,
+        K_D: float | Array,
+        desired: Desired,
+        model: ControllerModel | None = None,
+    ) -> None:
+        names = [f"coordinate {k + 1}" for k in range(_trajectory_dimension(desired))]
         if model is not None:
-            require_type(model, Model, "Tracking: model", "a Model")
-        Lambda, K_D = gain_matrix(Lambda, of_each, "Lambda"), gain_matrix(K_D, of_each, "K_D")
+            require_type(model, ControllerModel, "Tracking: model", "a ControllerModel")
+        Lambda, K_D = gain_matrix(Lambda, names, "Lambda"), gain_matrix(K_D, names, "K_D")
         require_positive_definite(K_D, "K_D")
         try:
             require_positive_definite(Lambda.T @ K_D, "Lambda^T K_D")
@@ -248,33 +263,33 @@ class Tracking:
         self.Lambda, self.K_D, self.desired, self.model = Lambda, K_D, desired, model
 
     def u(self, t: float, terms: Terms) -> Array:
-        """Eq. 16."""
+        """Return eq. 16's force."""
         q_d, q_d_dot, q_d_ddot = self.desired(t)
         error_dot = terms.q_dot - q_d_dot
         v = q_d_dot - self.Lambda @ (terms.q - q_d)
         a = q_d_ddot - self.Lambda @ error_dot
         r = terms.q_dot - v
-        own = self.model(terms) if self.model else terms
-        return own.D @ a + own.C_times(v) + own.h - self.K_D @ r
+        model_terms = self.model(terms) if self.model else terms
+        return model_terms.D @ a + model_terms.C_times(v) + model_terms.h - self.K_D @ r
 
-    def require_attributes(self) -> None:
-        """Refuse attributes that were replaced by values that the law cannot use (InputError)."""
-        d = _dimension(self.desired)
+    def validate_attributes(self) -> None:
+        """Raise InputError if attributes were replaced by values that the controller cannot use."""
+        d = _trajectory_dimension(self.desired)
         for name in ("Lambda", "K_D"):
             _require_array(getattr(self, name), (d, d), f"Tracking: {name}")
         if self.model is not None:
-            require_type(self.model, Model, "Tracking: model", "a Model")
+            require_type(self.model, ControllerModel, "Tracking: model", "a ControllerModel")
 
     def u_rate_gradient(self, t: float, terms: Terms) -> Array:
-        """d u / d q_dot, shape (d, d); C is linear in its velocity and C(x) y = C(y) x."""
+        """Return d u / d q_dot, shape (d, d). C is linear in its velocity, and C(x) y = C(y) x."""
         q_d, q_d_dot, _ = self.desired(t)
         v = q_d_dot - self.Lambda @ (terms.q - q_d)
-        own = self.model(terms) if self.model else terms
-        along_v = Terms(own.mechanism, own.at, own.rho @ v)
-        return along_v.C - own.D @ self.Lambda - self.K_D
+        model_terms = self.model(terms) if self.model else terms
+        terms_at_v = Terms(model_terms.mechanism, model_terms.at, model_terms.rho @ v)
+        return terms_at_v.C - model_terms.D @ self.Lambda - self.K_D
 
     def lyapunov(self, t: float, terms: Terms, w: Array) -> float:
-        """Eq. 18 with d1 = d2 = 1 and M = I, joules (w's part: square metres)."""
+        """Return eq. 18's function with d1 = d2 = 1 and M = I, J (the part of w: m^2)."""
         q_d, q_d_dot, _ = self.desired(t)
         error = terms.q - q_d
         r = terms.q_dot - q_d_dot + self.Lambda @ error
@@ -282,17 +297,41 @@ class Tracking:
         return float(on_manifold + 0.5 * w @ w)
 
 
-def _require_array(given: Any, shape: tuple[int, ...], what: str) -> None:
+class RecordedTorques:
+    """Motor torques over time, held from each sample to the next one or interpolated linearly.
+
+    Parameters
+    ----------
+    times : (k,) array
+        Increasing, s; the first one at most 0.
+    values : (k, motors) array
+        N m or N.
+    interpolates : bool
+        Whether to interpolate.
+    """
+
+    def __init__(self, times: Array, values: Array, *, interpolates: bool) -> None:
+        first = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
+        self.times, self.values, self.interpolates = times[first:], values[first:], interpolates
+
+    def tau(self, t: float, terms: Terms) -> Array:
+        """Return the torques at time t (s), shape (motors,)."""
+        if self.interpolates:
+            return np.array([np.interp(t, self.times, column) for column in self.values.T])
+        return np.asarray(self.values[max(int(np.searchsorted(self.times, t, side="right")) - 1, 0)])
+
+
+def _require_array(value: Any, shape: tuple[int, ...], what: str) -> None:
     try:
-        array = np.asarray(given, dtype=float)
+        array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         array = np.array(np.nan)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{what}: expected an array of shape {shape} of finite numbers, got {describe_value(given)}")
+        raise InputError(f"{what}: expected an array of shape {shape} of finite numbers, got {describe_value(value)}")
 
 
-def _dimension(desired: Any) -> int:
-    """Return how many coordinates a trajectory is of; refuse what is none."""
+def _trajectory_dimension(desired: Any) -> int:
+    """Return the number of coordinates of a desired trajectory; raise InputError if it is not a trajectory."""
     takes = "a function of t that returns q_d, its rate and its acceleration, each of shape (d,)"
     if desired is None or isinstance(desired, type):
         raise InputError(f"Tracking: desired: expected {takes}, got {describe_value(desired)}")

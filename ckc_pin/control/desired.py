@@ -1,4 +1,4 @@
-"""Desired trajectories q_d(t) with their first two derivatives."""
+"""Desired trajectories q_d(t) with their first two derivatives, and CSV files with columns over time."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from ckc_pin.base.toml import convert
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.errors import InputError
 
-__all__ = ["Desired", "Harmonics", "Table", "cycles", "read_columns", "read_desired", "read_table"]
+__all__ = ["Desired", "Harmonics", "Table", "count_cycles", "read_columns", "read_desired", "read_table"]
 
-FEWEST = 6  # rows that a quintic spline needs
-STILL = 1e-9  # rad or m, of a table's numbers: what moves no further does not move
+MIN_SPLINE_ROWS = 6  # of a quintic spline
+CONSTANT_TOLERANCE = 1e-9  # relative to 1 + largest value: range of a table's column that counts as constant
 
 
 class Desired(Protocol):
-    """A trajectory of the independent coordinates; any callable of this form will do."""
+    """A trajectory of the independent coordinates. Any callable of this form can be used."""
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
         """Return q_d, its rate and its acceleration at time t (s), each of shape (d,)."""
 
 
-def cycles(desired: Desired, t_end: float) -> float:
-    """Return how often the quickest part of a trajectory comes round in t_end (s): 0 where it does not say."""
-    return float(getattr(desired, "fastest", 0.0)) * t_end / (2 * np.pi)
+def count_cycles(desired: Desired, t_end: float) -> float:
+    """Return the number of periods of a trajectory's highest frequency until t_end (s), 0 if it is unknown."""
+    return float(getattr(desired, "max_frequency", 0.0)) * t_end / (2 * np.pi)
 
 
 class Harmonics:
@@ -42,18 +42,20 @@ class Harmonics:
 
     Attributes
     ----------
-    fastest : float
-        Of its waves' frequencies, rad/s.
+    max_frequency : float
+        Highest frequency of the waves, rad/s.
+    end : float
+        Infinite: the trajectory has no end.
     """
 
     def __init__(self, specs: Sequence[HarmonicsSpec]) -> None:
-        most = max((len(spec.harmonics) for spec in specs), default=0)
-        waves = np.zeros((3, len(specs), most))  # amplitude 0 where a coordinate has fewer waves
+        count = max((len(spec.harmonics) for spec in specs), default=0)
+        waves = np.zeros((3, len(specs), count))  # padded with zero amplitudes
         for k, spec in enumerate(specs):
             waves[:, k, : len(spec.harmonics)] = np.array(spec.harmonics).reshape(-1, 3).T
         self.offset = np.array([spec.offset for spec in specs])
         self.amplitude, self.frequency, self.phase = waves
-        self.fastest = float(np.abs(self.frequency[self.amplitude != 0]).max(initial=0.0))
+        self.max_frequency = float(np.abs(self.frequency[self.amplitude != 0]).max(initial=0.0))
         self.end = np.inf
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
@@ -67,21 +69,23 @@ class Harmonics:
 
 
 class Table:
-    """Samples over time, interpolated by a quintic spline: the acceleration is smooth.
+    """Samples over time, interpolated by a quintic spline, so that the acceleration is smooth.
 
     Parameters
     ----------
     t : (m,) array
-        Increasing times, at least six.
+        Increasing times, at least six, s.
     q : (m, d) array
 
     Attributes
     ----------
     spline : scipy.interpolate.BSpline
         q_d.
-    fastest : float
-        Frequency of a wave with the ratio of largest acceleration to largest rate of the table's quickest column,
+    max_frequency : float
+        Frequency of a sine wave with the ratio of largest acceleration to largest rate of the table's fastest column,
         rad/s.
+    end : float
+        Last time, s.
     """
 
     def __init__(self, t: Array, q: Array) -> None:
@@ -90,9 +94,9 @@ class Table:
         self.spline = make_interp_spline(t, q, k=5)
         self._q_dot = self.spline.derivative()
         self._q_ddot = self._q_dot.derivative()
-        moves = np.ptp(q, axis=0) > STILL * (1 + np.abs(q).max(axis=0))
-        rates, changes = (np.abs(f(t)[:, moves]).max(axis=0) for f in (self._q_dot, self._q_ddot))
-        self.fastest = float((changes / rates).max(initial=0.0))
+        varies = np.ptp(q, axis=0) > CONSTANT_TOLERANCE * (1 + np.abs(q).max(axis=0))
+        rates, accelerations = (np.abs(f(t)[:, varies]).max(axis=0) for f in (self._q_dot, self._q_ddot))
+        self.max_frequency = float((accelerations / rates).max(initial=0.0))
         self.end = float(t[-1])
 
     def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
@@ -105,7 +109,7 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
     Raises
     ------
     InputError
-        An unknown or missing joint, a file that is not a trajectory.
+        An unknown or missing joint, or a file that is not a trajectory.
     """
     where = f"{sources.name}: controller.desired"
     if "file" in desired:
@@ -123,45 +127,59 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
 
 
 def read_table(text: str, names: Sequence[str], file: str) -> Table:
-    """Read a trajectory: `t` and a column for each name, splined."""
-    return Table(*read_columns(text, names, file, FEWEST, "a smooth trajectory needs"))
+    """Read a trajectory from CSV text with `t` and a column for each name."""
+    return Table(*read_columns(text, names, file, MIN_SPLINE_ROWS, "a smooth trajectory needs"))
 
 
-def read_columns(text: str, names: Sequence[str], file: str, fewest: int, who: str) -> tuple[Array, Array]:
-    """Read `t` and a column for each name, in any order, empty lines passed over: shapes (m,) and (m, names).
+def read_columns(text: str, names: Sequence[str], file: str, min_rows: int, requirement: str) -> tuple[Array, Array]:
+    """Read `t` and a column for each name from CSV text, columns in any order, empty lines ignored.
+
+    Parameters
+    ----------
+    text : str
+    names : sequence of str
+    file : str
+        For messages.
+    min_rows : int
+    requirement : str
+        What needs that many rows, as the message begins: ``"a smooth trajectory needs"``.
+
+    Returns
+    -------
+    (m,) array, (m, names) array
 
     Raises
     ------
     InputError
-        Other columns, too few rows, what is no finite number, times that do not increase or start after 0.
+        Other columns, too few rows, a value that is not a finite number, times that do not increase or start after 0.
     """
     import csv
 
-    reader = csv.reader(text.splitlines())  # names may be quoted, and then have commas
+    reader = csv.reader(text.splitlines())  # quoted names may contain commas
     try:
         lines = [(reader.line_num, cells) for cells in reader if cells and (len(cells) > 1 or cells[0].strip())]
     except csv.Error as error:
         raise InputError(f"{file}, line {reader.line_num}: {error}") from None
-    wanted = ["t", *names]
+    columns = ["t", *names]
     header = [cell.strip() for cell in lines[0][1]] if lines else []
-    if sorted(header) != sorted(wanted):
-        found = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
-        raise InputError(f"{file}: {found}; the first line names the columns {', '.join(wanted)}")
-    if len(lines) - 1 < fewest:
-        raise InputError(f"{file}: {len(lines) - 1} rows; {who} at least {fewest}")
-    table = np.array([_row(cells, len(wanted), f"{file}, line {number}") for number, cells in lines[1:]])
-    table = table[:, [header.index(name) for name in wanted]]
+    if sorted(header) != sorted(columns):
+        problem = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
+        raise InputError(f"{file}: {problem}; the first line must name the columns {', '.join(columns)}")
+    if len(lines) - 1 < min_rows:
+        raise InputError(f"{file}: {len(lines) - 1} rows; {requirement} at least {min_rows}")
+    table = np.array([_read_row(cells, len(columns), f"{file}, line {number}") for number, cells in lines[1:]])
+    table = table[:, [header.index(name) for name in columns]]
     t = table[:, 0]
-    back = np.flatnonzero(np.diff(t) <= 0)
-    if len(back):
-        number = lines[back[0] + 2][0]
-        raise InputError(f"{file}, line {number}: t = {t[back[0] + 1]:g} after t = {t[back[0]]:g}; t must increase")
+    decreasing = np.flatnonzero(np.diff(t) <= 0)
+    if len(decreasing):
+        k = decreasing[0]
+        raise InputError(f"{file}, line {lines[k + 2][0]}: t = {t[k + 1]:g} after t = {t[k]:g}; t must increase")
     if t[0] > 0:
         raise InputError(f"{file}: starts at t = {t[0]:g} s; a run starts at 0")
     return t, table[:, 1:]
 
 
-def _row(cells: Sequence[str], count: int, where: str) -> list[float]:
+def _read_row(cells: Sequence[str], count: int, where: str) -> list[float]:
     try:
         row = [float(cell) for cell in cells]
     except ValueError:

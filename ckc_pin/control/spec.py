@@ -1,10 +1,17 @@
-"""The `[controller]` table of a scene, as a typed structure."""
+"""The `[controller]` table of a scene as typed structures, and its gains as matrices."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
+import numpy as np
+
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.toml import FileStruct
+from ckc_pin.base.validation import describe_value, is_number
+from ckc_pin.errors import InputError
 
 __all__ = [
     "AllocationSpec",
@@ -17,27 +24,29 @@ __all__ = [
     "SetPointSpec",
     "TorquesSpec",
     "TrackingSpec",
+    "gain_matrix",
+    "require_positive_definite",
 ]
+
+MAX_GAIN = 1e100  # products of gains and their squares do not overflow
+SYMMETRY_TOLERANCE = 1e-12  # relative to the largest entry
+EIGENVALUE_TOLERANCE = 1e-14  # relative to the largest entry: [[1, 1], [1, 1]] is semi-definite up to rounding
 
 Gain = float | dict[str, float] | list[list[float]]
 Limit = Annotated[float, msgspec.Meta(gt=0)]
 Size = Annotated[float, msgspec.Meta(ge=0)]
 
 
-class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class AllocationSpec(_Part, frozen=True):
-    """How redundant motors share u: the sum of weight * (tau - preload)^2 is the least there is.
+class AllocationSpec(FileStruct, frozen=True):
+    """Allocation of u among redundant motors: minimize the sum of weight * (tau - preload)^2.
 
     Attributes
     ----------
     weights
-        By motor: what its torque costs; 1 for what is not named.
+        By motor: cost of its torque; default 1.
         ``weights = {left = 2.0}``
     preload : N m, N
-        By motor: what tau is without u, as far as it moves nothing; 0 for what is not named.
+        By motor: torque without u, as far as it moves nothing (the null space); default 0.
         ``preload = {left = 1.0, right = 1.0}``
     """
 
@@ -45,10 +54,10 @@ class AllocationSpec(_Part, frozen=True):
     preload: dict[str, float] = {}
 
 
-class SensorSpec(_Part, frozen=True):
-    """What a sampled controller sees of q and q_dot; a number, or a table by coordinate.
+class SensorSpec(FileStruct, frozen=True):
+    """Sensors of a sampled controller's q and q_dot. Values are numbers, or tables by coordinate.
 
-    Noise is added to the position before it is quantised, and to the rate.
+    Noise is added to the position before quantization, and to the rate.
 
     Attributes
     ----------
@@ -56,11 +65,11 @@ class SensorSpec(_Part, frozen=True):
         Step of the encoders; a table is by coordinate; 0: exact.
         ``resolution = {theta_1 = 1e-4, theta_3 = 2e-4}``
     rate
-        Q̇ as it is, or (q - q before) / sample_time of what is measured, 0 at the first sample.
+        The exact rate, or the difference quotient of measured positions, which is 0 at the first sample.
         ``rate = "difference"``
     filter : s
-        Time constant T of a first-order filter of the rate: y += (1 - exp(-sample_time / T)) (rate - y),
-        from the first rate on.
+        Time constant T of a first-order filter of the rate, y += (1 - exp(-sample_time / T)) (rate - y),
+        which starts at the first rate.
         ``filter = 0.005``
     q_noise : rad, m
         Standard deviation; a table is by coordinate.
@@ -69,7 +78,7 @@ class SensorSpec(_Part, frozen=True):
         Standard deviation, of ``rate = "exact"``.
         ``q_dot_noise = 1e-3``
     seed
-        Of the noise.
+        Seed of the noise.
         ``seed = 7``
     """
 
@@ -81,8 +90,8 @@ class SensorSpec(_Part, frozen=True):
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
 
 
-class DriveSpec(_Part, frozen=True):
-    """What a sampled controller's drives make of tau; a number, or a table by motor.
+class DriveSpec(FileStruct, frozen=True):
+    """Drives of a sampled controller, which quantize torques and limit their rates. Values may be tables by motor.
 
     Attributes
     ----------
@@ -90,7 +99,7 @@ class DriveSpec(_Part, frozen=True):
         Step of tau; a table is by motor.
         ``torque_resolution = 0.01``
     torque_rate : N m/s, N/s
-        The fastest that tau changes, from 0 at the start; a table is by motor.
+        Limit of the rate of tau, which starts at 0; a table is by motor.
         ``torque_rate = {theta_1 = 50.0}``
     """
 
@@ -98,41 +107,41 @@ class DriveSpec(_Part, frozen=True):
     torque_rate: Limit | dict[str, Limit] | None = None
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="type"):
-    """What every controller takes.
+class _ControllerSpec(FileStruct, frozen=True, kw_only=True, tag_field="type"):
+    """Keys of every controller.
 
     Attributes
     ----------
     torque_limit : N m, N
-        Acts on tau, with the motors' own limits; a table is by motor.
+        Limit of |tau| in addition to the motors' own limits; a table is by motor.
         ``torque_limit = {theta_1 = 30.0, theta_3 = 20.0}``
     """
 
     torque_limit: Limit | dict[str, Limit] | None = None
 
 
-class _Feedback(_Spec, frozen=True, kw_only=True):
-    """What eqs. 14 and 16 take.
+class _FeedbackSpec(_ControllerSpec, frozen=True, kw_only=True):
+    """Keys of the controllers of eqs. 14 and 16.
 
     Attributes
     ----------
     allocation
-        How redundant motors share u.
+        Allocation of u among redundant motors.
         ``allocation = {weights = {left = 2.0}}``
     model
-        The controller's own idea of the plant: a mechanism file.
+        The controller's own model of the plant: a mechanism file.
         ``model = "lighter.toml"``
     sample_time : s
-        Zero-order hold of u between samples; absent: continuous.
+        Period of a sampled controller, which holds u between samples; default: continuous.
         ``sample_time = 0.002``
     delay : s
-        From a sample to its action; needs ``sample_time``.
+        Time from a sample to its action; needs ``sample_time``.
         ``delay = 0.001``
     sensor
-        What the controller sees; needs ``sample_time``.
+        Sensors of q and q̇; needs ``sample_time``.
         ``sensor = {resolution = 1e-4}``
     drive
-        What becomes of its torques; needs ``sample_time``.
+        Drives of the motors; needs ``sample_time``.
         ``drive = {torque_resolution = 0.01}``
     """
 
@@ -144,7 +153,7 @@ class _Feedback(_Spec, frozen=True, kw_only=True):
     drive: DriveSpec | None = None
 
 
-class SetPointSpec(_Feedback, frozen=True, tag="set_point"):
+class SetPointSpec(_FeedbackSpec, frozen=True, tag="set_point"):
     """Set-point control, eq. 14: ``type = "set_point"``.
 
     Attributes
@@ -153,7 +162,7 @@ class SetPointSpec(_Feedback, frozen=True, tag="set_point"):
         Positive definite: a number, a table by joint, or a matrix in ``independent`` order.
         ``K_P = 10.0``
     K_V : N m s/rad, N s/m
-        Positive semi-definite, in the same ways.
+        Positive semi-definite; the same forms.
         ``K_V = {theta_1 = 1.0, theta_3 = 2.0}``
     q_d : rad, m
         The target.
@@ -165,7 +174,7 @@ class SetPointSpec(_Feedback, frozen=True, tag="set_point"):
     q_d: dict[str, float]
 
 
-class TrackingSpec(_Feedback, frozen=True, tag="tracking"):
+class TrackingSpec(_FeedbackSpec, frozen=True, tag="tracking"):
     """Tracking control, eq. 16: ``type = "tracking"``.
 
     Attributes
@@ -186,16 +195,16 @@ class TrackingSpec(_Feedback, frozen=True, tag="tracking"):
     desired: dict[str, Any]
 
 
-class TorquesSpec(_Spec, frozen=True, tag="torques"):
-    """The motors' torques over time, measured or computed elsewhere: ``type = "torques"``.
+class TorquesSpec(_ControllerSpec, frozen=True, tag="torques"):
+    """Recorded motor torques over time: ``type = "torques"``.
 
     Attributes
     ----------
     file
-        CSV with the column ``t``, s, and one for each motor, N m or N.
+        CSV with the column ``t``, s, and a column for each motor, N m or N.
         ``file = "torques.csv"``
     interpolation
-        Each row until the next one, or lines between them.
+        Each row is held until the next one, or interpolated linearly.
         ``interpolation = "linear"``
     """
 
@@ -207,13 +216,13 @@ FeedbackSpec = SetPointSpec | TrackingSpec
 ControllerSpec = SetPointSpec | TrackingSpec | TorquesSpec
 
 
-class HarmonicsSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class HarmonicsSpec(FileStruct, frozen=True, kw_only=True):
     """Offset + sum of amplitude * sin(frequency * t + phase).
 
     Attributes
     ----------
     offset : rad, m
-        What the waves swing about.
+        Mean value.
         ``offset = -1.4``
     harmonics : rad or m, rad/s, rad
         Any number of waves, ``[amplitude, frequency, phase]`` each.
@@ -222,3 +231,67 @@ class HarmonicsSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     offset: float = 0.0
     harmonics: list[tuple[float, float, float]] = []
+
+
+def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
+    """Return a gain as a (d, d) matrix.
+
+    Parameters
+    ----------
+    gain : number, {joint: number} or (d, d) array
+        A number or a table makes a diagonal matrix.
+    names : sequence of str
+        Independent coordinates.
+    what : str
+        Name of the gain, for messages.
+
+    Raises
+    ------
+    InputError
+        Wrong shape, an unknown or missing joint, or a number that is not finite.
+    """
+    d = len(names)
+    if isinstance(gain, dict):
+        unknown = [name for name in gain if name not in names]
+        missing = [name for name in names if name not in gain]
+        if unknown or missing:
+            problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
+            raise InputError(f"controller.{what}: a table needs the joints {', '.join(names)}; {problem}")
+        matrix = np.diag([float(gain[name]) for name in names])
+    elif is_number(gain):
+        matrix = float(cast(float, gain)) * np.eye(d)
+    else:
+        shape = f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}"
+        matrix = _read_matrix(gain, what, shape)
+        if matrix.shape != (d, d):
+            raise InputError(shape)
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"controller.{what}: an entry is not a finite number")
+    if np.abs(matrix).max(initial=0.0) > MAX_GAIN:
+        raise InputError(f"controller.{what}: an entry is above {MAX_GAIN:g}")
+    return matrix
+
+
+def _read_matrix(gain: Any, what: str, shape_message: str) -> Array:
+    if not isinstance(gain, list | tuple | np.ndarray):
+        forms = "a number, a table by joint or a matrix"
+        raise InputError(f"controller.{what}: expected {forms}, got {describe_value(gain)}")
+    try:
+        return np.array(gain, dtype=float)
+    except (TypeError, ValueError):  # rows of different lengths, or words among the numbers
+        raise InputError(shape_message) from None
+
+
+def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:
+    """Raise InputError unless a matrix is symmetric and positive definite, or semi-definite if `semi`."""
+    size = float(np.abs(matrix).max(initial=0.0))
+    skew = np.abs(matrix - matrix.T)
+    if skew.max(initial=0.0) > SYMMETRY_TOLERANCE * size:
+        i, j = np.unravel_index(int(np.argmax(skew)), skew.shape)
+        entries = f"[{i}][{j}] = {matrix[i, j]:g} and [{j}][{i}] = {matrix[j, i]:g}"
+        raise InputError(f"controller: {what} is not symmetric: its entries {entries} differ")
+    smallest = float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 1.0
+    rounding = EIGENVALUE_TOLERANCE * size
+    if smallest < -rounding or (smallest <= rounding and not semi):
+        kind = "positive semi-definite" if semi else "positive definite"
+        raise InputError(f"controller: {what} is not {kind}: its smallest eigenvalue is {smallest:.3g}")

@@ -1,4 +1,4 @@
-"""Whether a desired trajectory stays where the mechanism can follow: inside, and away from singularity."""
+"""Check that a mechanism can follow a desired trajectory: inside its workspace and away from singularities."""
 
 from __future__ import annotations
 
@@ -6,35 +6,38 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ckc_pin.control.desired import Desired, cycles
+from ckc_pin.control.desired import Desired, count_cycles
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["DesiredCheck", "follow_desired", "leaving"]
+__all__ = ["DesiredCheck", "find_workspace_exit", "follow_desired"]
 
-SAMPLES, OF_A_CYCLE = 1000, 32  # at least so many, and of the quickest wave: a straight way between two is off by 0.5 %
-MOST = 10_000  # samples: seconds
-CANDIDATES = 5  # places where the margin may be least
-REFINEMENTS = 50  # bisections: to 1e-15 of a sample interval
+MIN_SAMPLES = 1000
+SAMPLES_PER_CYCLE = 32  # of the fastest wave: linear interpolation between them has an error of 0.5 %
+MAX_SAMPLES = 10_000  # some seconds of computing time
+MAX_MINIMA = 5  # local minima of the singular value that are refined
+BISECTIONS = 50  # to 1e-15 of a sample interval
+
+Sample = tuple[float, float, Kinematics]  # time, smallest singular value of phi_z, configuration
 
 
 @dataclass(frozen=True)
 class DesiredCheck:
-    """What happens along a desired trajectory.
+    """Result of following a desired trajectory.
 
     Attributes
     ----------
     leaves_at : float or None
-        When it leaves the workspace (of its assembly branch), s.
+        When it leaves the workspace of its assembly branch, s.
     closest_t : float
-        When it comes closest to a singular configuration; `leaves_at` when it leaves.
+        When it is closest to a singular configuration, s; `leaves_at` if it leaves.
     sigma_min : float
-        Smallest singular value of phi_z then; on the edge of the workspace it is zero.
+        Smallest singular value of phi_z at that time; zero at the edge of the workspace.
     until : float
-        How far it was followed, s: to its end, or as far as ten thousand samples go along quick waves. Infinite of
-        a set point.
+        Time until which it was followed, s: its end, or the time that ten thousand samples of fast waves cover.
+        Infinite for a set point.
     """
 
     leaves_at: float | None
@@ -46,21 +49,31 @@ class DesiredCheck:
 def follow_desired(
     mechanism: Mechanism, desired: Desired, t_end: float, start: Kinematics | None = None
 ) -> DesiredCheck:
-    """Follow sigma(q_d(t)) over a run, on the branch of `start`, and find where it comes closest to a singularity."""
-    samples = max(SAMPLES, int(np.ceil(OF_A_CYCLE * min(cycles(desired, t_end), MOST))))
-    times = np.linspace(0.0, t_end, samples + 1)[: MOST + 1]
+    """Follow sigma(q_d(t)) and find where it leaves the workspace or is closest to a singularity.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    desired : Desired
+    t_end : float
+        s.
+    start : Kinematics, optional
+        A configuration of the assembly branch; default: the assembled configuration.
+    """
+    samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_CYCLE * min(count_cycles(desired, t_end), MAX_SAMPLES))))
+    times = np.linspace(0.0, t_end, samples + 1)[: MAX_SAMPLES + 1]
     first = sigma(mechanism, desired(0.0)[0], start)
     if first.verdict != "converged":
         return DesiredCheck(0.0, 0.0, 0.0, 0.0)
     at, t_at = first.at, 0.0
-    way = [(0.0, at.sigma_min(), at)]
+    path = [(0.0, at.sigma_min(), at)]
     for t in times[1:]:
         moved = _move(mechanism, at, desired, float(t))
         if moved is None:
-            return leaving(mechanism, desired, at, t_at, float(t))
+            return find_workspace_exit(mechanism, desired, at, t_at, float(t))
         at, t_at = moved, float(t)
-        way.append((t_at, at.sigma_min(), at))
-    return _closest(mechanism, desired, way)
+        path.append((t_at, at.sigma_min(), at))
+    return _find_closest(mechanism, desired, path)
 
 
 def _move(
@@ -70,13 +83,25 @@ def _move(
         q = desired(t)[0]
     except NumericalError:  # a point's path has no q outside the workspace
         return None
-    outcome = sigma(mechanism, q, at, anywhere=anywhere)
-    return outcome.at if outcome.verdict == "converged" else None
+    solution = sigma(mechanism, q, at, anywhere=anywhere)
+    return solution.at if solution.verdict == "converged" else None
 
 
-def leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: float, outside: float) -> DesiredCheck:
-    """Bisect for the last instant that can be reached, along the way: within a sample nothing is behind a gap."""
-    for _ in range(REFINEMENTS):
+def find_workspace_exit(
+    mechanism: Mechanism, desired: Desired, at: Kinematics, inside: float, outside: float
+) -> DesiredCheck:
+    """Bisect for the last instant at which a trajectory is in the workspace.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    desired : Desired
+    at : Kinematics
+        The configuration at `inside`.
+    inside, outside : float
+        Times in and outside the workspace, s, at most a sample apart.
+    """
+    for _ in range(BISECTIONS):
         middle = 0.5 * (inside + outside)
         moved = _move(mechanism, at, desired, middle, anywhere=False)
         if moved is None:
@@ -86,35 +111,37 @@ def leaving(mechanism: Mechanism, desired: Desired, at: Kinematics, inside: floa
     return DesiredCheck(inside, inside, at.sigma_min(), inside)
 
 
-def _closest(mechanism: Mechanism, desired: Desired, way: list[tuple[float, float, Kinematics]]) -> DesiredCheck:
-    """Look between samples where the margin is least: there the motion may also be outside for a moment."""
-    margins = np.array([margin for _, margin, _ in way])
-    around = np.concatenate([[np.inf], margins, [np.inf]])
-    lows = np.flatnonzero((margins <= around[:-2]) & (margins <= around[2:]))
-    lowest = lows[np.argsort(margins[lows], kind="stable")][:CANDIDATES]
-    finer = [_around(mechanism, desired, way, int(k)) for k in lowest]
-    if any(found.leaves_at is not None for found in finer):
-        every = (_around(mechanism, desired, way, int(k)) for k in lows)
-        return next(found for found in every if found.leaves_at is not None)
-    least = min(finer, key=lambda found: found.sigma_min)
-    return replace(least, until=way[-1][0])
+def _find_closest(mechanism: Mechanism, desired: Desired, path: list[Sample]) -> DesiredCheck:
+    """Refine the local minima of the singular value, where the motion may also leave the workspace for a moment."""
+    values = np.array([value for _, value, _ in path])
+    padded = np.concatenate([[np.inf], values, [np.inf]])
+    minima = np.flatnonzero((values <= padded[:-2]) & (values <= padded[2:]))
+    smallest = minima[np.argsort(values[minima], kind="stable")][:MAX_MINIMA]
+    checks = [_refine_minimum(mechanism, desired, path, int(k)) for k in smallest]
+    if any(check.leaves_at is not None for check in checks):
+        in_order = (_refine_minimum(mechanism, desired, path, int(k)) for k in minima)
+        return next(check for check in in_order if check.leaves_at is not None)
+    closest = min(checks, key=lambda check: check.sigma_min)
+    return replace(closest, until=path[-1][0])
 
 
-def _around(mechanism: Mechanism, desired: Desired, way: list[tuple[float, float, Kinematics]], k: int) -> DesiredCheck:
-    """Look between a sample's two neighbours."""
+def _refine_minimum(mechanism: Mechanism, desired: Desired, path: list[Sample], k: int) -> DesiredCheck:
+    """Minimize the singular value between a sample's two neighbours."""
     from scipy.optimize import minimize_scalar
 
-    (t, margin, at), near, outside = way[k], way[max(k - 1, 0) : k + 2], []
+    (t, value, at), neighbours = path[k], path[max(k - 1, 0) : k + 2]
+    outside: list[float] = []
 
-    def margin_at(time: float) -> float:
+    def singular_value(time: float) -> float:
         moved = _move(mechanism, at, desired, time, anywhere=False)
         if moved is None:
             outside.append(time)
         return 0.0 if moved is None else moved.sigma_min()
 
-    finer = minimize_scalar(margin_at, bounds=(near[0][0], near[-1][0]), method="bounded", options={"xatol": 1e-9})
+    bounds = (neighbours[0][0], neighbours[-1][0])
+    minimum = minimize_scalar(singular_value, bounds=bounds, method="bounded", options={"xatol": 1e-9})
     if outside:
-        before = [sample for sample in near if sample[0] < min(outside)][-1]
-        return leaving(mechanism, desired, before[2], before[0], min(outside))
-    margin, t = min((margin, t), (float(finer.fun), float(finer.x)))
-    return DesiredCheck(None, t, margin)
+        before = [sample for sample in neighbours if sample[0] < min(outside)][-1]
+        return find_workspace_exit(mechanism, desired, before[2], before[0], min(outside))
+    value, t = min((value, t), (float(minimum.fun), float(minimum.x)))
+    return DesiredCheck(None, t, value)

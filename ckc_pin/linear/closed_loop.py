@@ -172,9 +172,9 @@ class LimitedClosedLoop:
         actuation = self.actuation
         if actuation is not None and np.isfinite(actuation.limit).any():
             u = self.law.u(t, state)
-            limited = actuation.apply(state, u)
+            limited = actuation.apply_u(state, u)
             if np.abs(limited.u - u).max() > U_TOLERANCE * np.abs(u).max():
-                tau = actuation.distribute(state.rho, u)
+                tau = actuation.minimum_norm_torques(state.rho, u)
                 k = int(np.argmax(np.abs(tau) / actuation.limit))
                 raise NumericalError(
                     f"{where} {actuation.motors.names[k]} would need {abs(tau[k]):.4g}, its limit is "

@@ -16,9 +16,8 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.spec import FeedbackSpec
-from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
@@ -192,8 +191,8 @@ def _linearize_at_target(subject: _Subject) -> LinearModel:
     if violation := describe_stop_violation(mechanism, solution.at.q_tree):
         raise InputError(f'{mechanism.name}: at = "target": {violation}; give another controller.q_d')
     state, actuation = Terms(mechanism, solution.at, np.zeros(mechanism.n)), subject.actuation
-    actuation.require_transmission(state.at)
-    tau = actuation.apply(state, law.u(0.0, state)).tau
+    actuation.require_driven_freedoms(state.at)
+    tau = actuation.apply_u(state, law.u(0.0, state)).tau
     model = _linearize_at_rest(subject, state, tau, NONE, "at the target of its controller")
     return _add_closed_loop(subject, model, law, 0.0, state, 0.0)
 
@@ -283,13 +282,13 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
 def _add_closed_loop(
     subject: _Subject,
     model: LinearModel,
-    law: SetPoint | Tracking | Torques,
+    law: SetPoint | Tracking | RecordedTorques,
     t: float,
     state: Terms,
     friction: Array | float,
 ) -> LinearModel:
     """Add the closed loop to a model, or a note why it has none."""
-    if isinstance(law, Torques):
+    if isinstance(law, RecordedTorques):
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
     locked = np.array([model.coordinates.index(name) for name in model.locked], np.intp)
     try:

@@ -184,7 +184,7 @@ def _allocate_along(state: Terms, tangent: Array, turns: Array, limit: Array, we
 
 def _explain_imbalance(state: Terms, tangent: Array, actuation: Actuation) -> str:
     mechanism, names = state.mechanism, state.mechanism.actuated
-    unlimited = actuation.distribute(tangent, tangent.T @ state.h_tree)
+    unlimited = actuation.minimum_norm_torques(tangent, tangent.T @ state.h_tree)
     load = np.abs(unlimited) / np.maximum(actuation.limit, 1e-300)
     motors = f"the motor{'s' if len(names) > 1 else ''} ({', '.join(names)})"
     if not has_unbalanced_force(state, mechanism.motors.force(unlimited), tangent):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
-from ckc_pin.control.desired import cycles
+from ckc_pin.control.desired import count_cycles
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
@@ -52,7 +52,7 @@ def tracking_stability(
     NumericalError
         The motion is too fast or leaves the workspace, or the loop cannot be linearized along it.
     """
-    cycle_count = cycles(law.desired, t_end)
+    cycle_count = count_cycles(law.desired, t_end)
     if 2 * STEPS_PER_CYCLE * cycle_count > MAX_STEPS:
         longest = MAX_STEPS / (2 * STEPS_PER_CYCLE * cycle_count) * t_end
         raise NumericalError(f"the desired motion is too fast to be analyzed for longer than {longest:.3g} s")

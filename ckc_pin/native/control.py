@@ -10,12 +10,18 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
+from ckc_pin.control.controllers import (
+    Controller,
+    RecordedTorques,
+    SetPoint,
+    TorqueController,
+    Tracking,
+    is_torque_controller,
+)
 from ckc_pin.control.desired import Desired, Harmonics, Table
-from ckc_pin.control.point_path import Circle, Line, Place, PointPath
+from ckc_pin.control.point_path import Circle, Line, PointPath, PointTrajectory
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
-from ckc_pin.control.torques import Torques
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.tables import closure_table, core_table, packed
 
@@ -51,17 +57,17 @@ def control_table(
     if isinstance(controller, Sampled):
         clock, controller = controller, controller.controller
         table["clock"] = _clock(clock.sample_time, clock.delay)
-        looks = type(controller) is not SetPoint or (clock.drive is not None and not actuation.direct)
+        looks = type(controller) is not SetPoint or (clock.drive is not None and not actuation.is_direct)
         if clock.sensor is not None:
             table["sensor"] = _sensor(clock.sensor, actuation.mechanism, clock.sample_time, closes=looks)
         if clock.drive is not None:
             table["drive"] = _drive(clock.drive, actuation)
     if controller is None:
         return table
-    torques = gives_tau(controller)
-    if type(controller) is Torques:
+    torques = is_torque_controller(controller)
+    if type(controller) is RecordedTorques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
-        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.lines)
+        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.interpolates)
     own = {"kind": "call", "function": call(controller), "of_motors": torques, "differs": differs}
     return table | {"law": law_table(controller) or own}
 
@@ -70,7 +76,7 @@ def actuation_table(actuation: Actuation) -> dict[str, Any]:
     """Describe how motors turn u to their torques."""
     return {
         "turns": np.asfortranarray(actuation.motors.transmission),
-        "direct": actuation.direct,
+        "direct": actuation.is_direct,
         "limit": actuation.limit,
         "weights": actuation.weights,
         "preload": actuation.preload,
@@ -107,9 +113,9 @@ def _drive(drive: DriveSpec, actuation: Actuation) -> dict[str, Any]:
 
 def law_table(controller: Controller | TorqueController) -> dict[str, Any] | None:
     """Return eq. 14, eq. 16 or torques over time; None for any other controller."""
-    if type(controller) is Torques:
+    if type(controller) is RecordedTorques:
         tau = np.asfortranarray(controller.values.T)
-        return {"kind": "torques", "times": controller.times, "tau": tau, "lines": controller.lines}
+        return {"kind": "torques", "times": controller.times, "tau": tau, "lines": controller.interpolates}
     if type(controller) is SetPoint:
         target = controller.target  # what it compensates is a constant, whichever model that is of
         gains = {"K_P": controller.K_P, "K_V": controller.K_V}
@@ -124,7 +130,7 @@ def law_table(controller: Controller | TorqueController) -> dict[str, Any] | Non
     return table if model is None else {**table, "model": core_table(model.mechanism)}
 
 
-def _desired(desired: Desired | Place) -> dict[str, Any] | None:
+def _desired(desired: Desired | PointTrajectory) -> dict[str, Any] | None:
     match desired:
         case Harmonics():
             return _harmonics(desired.offset, desired.amplitude, desired.frequency, desired.phase)
@@ -162,7 +168,7 @@ def _spline(table: Table) -> dict[str, Any]:
 
 def _point(path: PointPath) -> dict[str, Any] | None:
     """Return a point's path: the rows of Psi, which of them are prescribed, and configurations along it."""
-    point, place = path.point, _desired(path.place)
+    point, place = path.point, _desired(path.path)
     extended, mechanism = point.extended, point.mechanism
     if place is None:
         return None
@@ -185,5 +191,5 @@ def _point(path: PointPath) -> dict[str, Any] | None:
         "knots": np.asfortranarray(path.knots.T),
         "tolerance": mechanism.tolerance,
         "end": np.inf if path.leaves_at is None else path.leaves_at,
-        "past_end": path.past_end,
+        "past_end": path.exit_message,
     }

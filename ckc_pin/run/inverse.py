@@ -21,10 +21,9 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Tracking
+from ckc_pin.control.controllers import RecordedTorques, Tracking
 from ckc_pin.control.desired import Desired
-from ckc_pin.control.torques import Torques
-from ckc_pin.control.workspace import leaving
+from ckc_pin.control.workspace import find_workspace_exit
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
@@ -165,7 +164,7 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
     if np.any(np.abs(lacking) > enough + ROUNDING * enough.max(initial=0.0)):
         _require_grip(mechanism, tangent, actuation, t)
-    tau = instant.tau + actuation.distribute(tangent, lacking)
+    tau = instant.tau + actuation.minimum_norm_torques(tangent, lacking)
     forces = multipliers(terms, mechanism.motors.force(tau) + instant.of_joints, acceleration)
     return {
         "t": t,
@@ -196,7 +195,7 @@ def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t:
 def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
     """What the controller of a scene wants, from sigma: v' = rho q_dot, its rate rho q_ddot + rho_dot q_dot."""
     controller = scene_controller(scene, mechanism)
-    if controller is None or isinstance(controller, Torques):
+    if controller is None or isinstance(controller, RecordedTorques):
         lacks = "no [controller]" if controller is None else 'the controller\'s type is "torques"'
         raise InputError(
             f"{scene.name}: {lacks}, so no motion is prescribed; give controller.desired, or a run of the scene"
@@ -208,13 +207,13 @@ def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Ite
         q_d, q_d_dot, q_d_ddot = desired(t)
         found = sigma(mechanism, q_d, at)
         if found.verdict != "converged" and before is not None:
-            end = leaving(mechanism, desired, at, before, t).leaves_at
+            end = find_workspace_exit(mechanism, desired, at, before, t).leaves_at
             raise NumericalError(f"the motion cannot be followed beyond t = {end:.5f} s: {found.reason}", t=end)
         if found.verdict != "converged":
             kind = NumericalError if found.verdict == "singular" else InputError
             raise kind(f"{scene.name}: the motion cannot be started: q_d(0) is {found.verdict}: {found.reason}")
         if before is None:
-            actuation.require_transmission(found.at)
+            actuation.require_driven_freedoms(found.at)
         at, before = found.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
         friction = friction_force(mechanism, terms.v_tree)

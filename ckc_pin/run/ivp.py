@@ -26,7 +26,7 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
@@ -131,10 +131,10 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
 def force_of(controller: Controller | TorqueController | None, actuation: Actuation) -> Force:
     """Return u' on the tree as a function of (t, terms)."""
     if controller is None:
-        return lambda t, terms: actuation.none.u_tree
-    torques = gives_tau(controller)
+        return lambda t, terms: actuation.zero.u_tree
+    torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
-    act = actuation.drive if torques else actuation.apply
+    act = actuation.apply_tau if torques else actuation.apply_u
     return lambda t, terms: act(terms, law(t, terms)).u_tree
 
 

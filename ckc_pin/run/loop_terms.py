@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.control.actuation import require_tau, require_u
-from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
@@ -95,7 +95,7 @@ for _name in NATIVE:
 
 def controller_call(controller: Controller | TorqueController, mechanism: Mechanism) -> Callable[..., Any]:
     """Return what the loop calls for a controller that only Python knows: (view) to u or tau, or why there is none."""
-    torques = gives_tau(controller)
+    torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Any] = getattr(controller, "tau" if torques else "u")
     require = require_tau if torques else require_u
 

@@ -13,7 +13,7 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, Law, TorqueController, as_controller
+from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController, as_controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -131,7 +131,7 @@ class Prepared:
 
 def prepare(
     scene: Scene,
-    controller: Controller | TorqueController | Sampled | Law | None = None,
+    controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
     *,
     free: bool = False,

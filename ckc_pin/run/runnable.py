@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, TorqueController, gives_tau
+from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.formulations import refuse_massless
 from ckc_pin.dynamics.terms import Terms
@@ -35,8 +35,8 @@ def require_runnable(
     """
     if isinstance(controller, Sampled):
         with scene.sources.prefix_errors():
-            controller.require_countable(scene.spec.t_end)
-            controller.require_sensible(mechanism)
+            controller.require_sample_count(scene.spec.t_end)
+            controller.require_usable_sensor(mechanism)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, the loops leave no freedom: nothing can move")
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
@@ -47,7 +47,7 @@ def require_runnable(
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within them")
     refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = controller.controller if isinstance(controller, Sampled) else controller
-    if law is not None and not gives_tau(law):
+    if law is not None and not is_torque_controller(law):
         require_chart(mechanism, start)
-        actuation.require_transmission(start.at)
+        actuation.require_driven_freedoms(start.at)
     return start

@@ -14,7 +14,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.validation import require_callable, require_flag
 from ckc_pin.codegen.library import compile_terms
-from ckc_pin.control.controllers import Controller, Law, TorqueController
+from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -43,7 +43,7 @@ def simulate(
     scene: Scene | str | Path,
     overrides: Mapping[str, Any] | None = None,
     *,
-    controller: Controller | TorqueController | Sampled | Law | None = None,
+    controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,

@@ -93,7 +93,7 @@ class Simulator(HasSummary):
         self._loop = self._ready.loop
         self.mechanism = self._ready.mechanism
         self.controller: Controller | TorqueController | None = scene_controller(scene, self.mechanism)
-        self._no_u = self._ready.actuation.refusal(self._ready.start.at)
+        self._no_u = self._ready.actuation.explain_undriven_freedoms(self._ready.start.at)
         self._none = np.zeros(self.mechanism.d)
         gate = _core.Gate(InputError)  # the loop has one state
         self._step, self._reset, self._events, self._stats = (

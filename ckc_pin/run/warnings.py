@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.torques import Torques
+from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import CkcError
 from ckc_pin.kinematics.sigma import sigma
@@ -35,7 +34,7 @@ def run_warnings(scene: Scene) -> list[str]:
 
 
 def check_desired(
-    controller: SetPoint | Tracking | Torques | None, mechanism: Mechanism, t_end: float, start: Start | None
+    controller: SetPoint | Tracking | RecordedTorques | None, mechanism: Mechanism, t_end: float, start: Start | None
 ) -> DesiredCheck | None:
     """Follow the desired motion from the start on: whether the mechanism can, and how close to singular it comes."""
     near = None if start is None else start.at

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
-from ckc_pin.control.torques import Torques
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -41,7 +40,7 @@ def _beside(scene: Scene, name: str) -> str | Path:
 
 def scene_controller(
     scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
-) -> SetPoint | Tracking | Torques | None:
+) -> SetPoint | Tracking | RecordedTorques | None:
     """Build a scene's controller; the texts of its own model are added to `texts`."""
 
     def load_model(name: str) -> Mechanism:
@@ -71,8 +70,8 @@ def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
 
 
 def in_samples(
-    scene: Scene, controller: SetPoint | Tracking | Torques | None
-) -> SetPoint | Tracking | Torques | Sampled | None:
+    scene: Scene, controller: SetPoint | Tracking | RecordedTorques | None
+) -> SetPoint | Tracking | RecordedTorques | Sampled | None:
     """Return a scene's controller on the clock that the scene gives it, if it does."""
     spec = scene.spec.controller
     if controller is None or not isinstance(spec, FeedbackSpec) or spec.sample_time is None:

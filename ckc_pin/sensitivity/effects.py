@@ -302,7 +302,7 @@ def _of_motor(mechanism: Mechanism, actuation: Actuation, name: str, key: str) -
             yield Effect("armature", joint, np.array([2 * turns[joint] ** 2 / motor.ratio * motor.rotor_inertia]))
         yield Effect("gear", number, turns / motor.ratio)
     elif key == "torque_limit" and motor.torque_limit == actuation.limit[number]:
-        if actuation.given_limit[number] == motor.torque_limit:
+        if actuation.scene_limit[number] == motor.torque_limit:
             raise InputError(
                 f"sensitivities: motor.{name}.torque_limit: the controller's is the same, so that it matters only "
                 "one way; give one of them"

@@ -14,10 +14,9 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.summary import HasSummary, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import describe_value, is_number, require_path
-from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.spec import FeedbackSpec
-from ckc_pin.control.torques import Torques
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -237,15 +236,15 @@ class _Drive(NamedTuple):
     is_angle: BoolArray
 
 
-def _find_drive(law: SetPoint | Tracking | Torques | None, mechanism: Mechanism) -> _Drive | None:
-    if isinstance(law, Torques):
+def _find_drive(law: SetPoint | Tracking | RecordedTorques | None, mechanism: Mechanism) -> _Drive | None:
+    if isinstance(law, RecordedTorques):
         rest = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
         return _Drive("the torque over time", lambda t: law.tau(t, rest), float(law.times[-1]), np.zeros(0, bool))
     if not isinstance(law, Tracking):
         return None
     desired, is_angle = law.desired, ~mechanism.tree.in_metres[mechanism.partition.q]
     if isinstance(desired, PointPath):
-        desired, is_angle = desired.place, is_angle[:0]
+        desired, is_angle = desired.path, is_angle[:0]
     end = float(getattr(desired, "end", np.inf))
     return _Drive("the desired motion", lambda t: np.concatenate(desired(t)[:2]), end, is_angle)
 

@@ -15,10 +15,16 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking, gives_tau
+from ckc_pin.control.controllers import (
+    Controller,
+    RecordedTorques,
+    SetPoint,
+    TorqueController,
+    Tracking,
+    is_torque_controller,
+)
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.control.torques import Torques
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import (
@@ -99,7 +105,7 @@ def require_known_motion(
                     "derivatives; leave it out"
                 )
         controller = controller.controller
-    if controller is not None and type(controller) is not Torques and gives_tau(controller):
+    if controller is not None and type(controller) is not RecordedTorques and is_torque_controller(controller):
         raise InputError(
             f"sensitivities: {type(controller).__name__}: how torques that a function gives change is not known; let "
             "it give u"

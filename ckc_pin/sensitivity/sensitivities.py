@@ -15,7 +15,7 @@ from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_callable, require_path, require_type
-from ckc_pin.control.controllers import Controller, Law
+from ckc_pin.control.controllers import ControlLaw, Controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.native.variation import SensitivityParameter
@@ -156,7 +156,7 @@ def sensitivities(
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     *,
-    controller: Controller | Sampled | Law | None = None,
+    controller: Controller | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
 ) -> Sensitivities:
     """Run a scene together with how its motion changes with parameters, to first order.

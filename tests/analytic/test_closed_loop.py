@@ -94,7 +94,7 @@ def closed_by_differences(
     def acceleration(x: Array) -> Array:
         at = sigma(mechanism, x[:d], start).at
         state = Terms(mechanism, at, at.rho @ x[d:])
-        force = actuation.apply(state, controller.u(t, state)).u_tree
+        force = actuation.apply_u(state, controller.u(t, state)).u_tree
         return dae_acceleration(state, force + (0.0 if extra_force is None else extra_force(state.v_tree)))[q]
 
     def slope(k: int, h: float) -> Array:

@@ -9,7 +9,7 @@ import pytest
 
 from ckc_pin import InputError, load
 from ckc_pin.control import Harmonics, SetPoint, Tracking
-from ckc_pin.control.controllers import Model
+from ckc_pin.control.controllers import ControllerModel
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.dynamics import Terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, Array, Q, complex_step, desired, set_point, tracking
@@ -55,7 +55,7 @@ def test_set_point_with_the_right_and_a_wrong_model(five_bar: Pair) -> None:
 @pytest.mark.parametrize("off", [0.0, 0.05])
 def test_tracking_with_the_right_and_a_wrong_model(five_bar: Pair, off: float) -> None:
     """The wrong one has other lengths: its rho, and with it the velocity in its C, are its own."""
-    wrong = Model(load("five_bar_as_printed"), five_bar[0], "rho")
+    wrong = ControllerModel(load("five_bar_as_printed"), five_bar[0], "rho")
     for model, reference in ((None, FIVE_BAR), (wrong, AS_PRINTED)):
         ours, theirs = Tracking(np.eye(2), 10 * np.eye(2), EQ_21, model), tracking(reference)
         for t, q_tree, q_dot in states(off):
@@ -65,7 +65,7 @@ def test_tracking_with_the_right_and_a_wrong_model(five_bar: Pair, off: float) -
 
 def test_tracking_with_the_actual_velocity_in_C(five_bar: Pair) -> None:
     """Eq. 16's convention, plant and controller alike: C at whatever v' is measured."""
-    model = Model(load("five_bar_as_printed"), five_bar[0], "actual")
+    model = ControllerModel(load("five_bar_as_printed"), five_bar[0], "actual")
     ours, random = Tracking(LAMBDA, K_D, EQ_21, model), np.random.default_rng(1)
     for t, q_tree, _ in states(off=0.05):
         v_tree = random.uniform(-5, 5, 4)
@@ -77,7 +77,7 @@ def test_tracking_with_the_actual_velocity_in_C(five_bar: Pair) -> None:
 
 def test_rate_gradient_is_the_derivative_along_q_dot(five_bar: Pair) -> None:
     """d u / d q_dot, what stiffness comes from: by a complex step on the numpy controller's formula."""
-    model = Model(load("five_bar_as_printed"), five_bar[0], "rho")
+    model = ControllerModel(load("five_bar_as_printed"), five_bar[0], "rho")
     ours = Tracking(LAMBDA, K_D, EQ_21, model)
     for t, q_tree, q_dot in states():
         q_d, q_d_dot, _ = desired(t)

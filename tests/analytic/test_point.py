@@ -166,7 +166,7 @@ def test_a_table_of_the_tip(pair):
     for a in (0.7, 1.93):
         x = 0.15 + 0.05 * np.sin(a) + 1j * (-0.45 + 0.03 * np.cos(a))
         assert np.abs(wrapped(inverses(model, x) - follow(a)[0])).max(axis=1).min() < 1e-6  # the spline's
-    with pytest.raises(InputError, match=r"x\.csv: ends at t = 3 s, the scene at t_end = 4 s"):
+    with pytest.raises(InputError, match=r"x\.csv: .* ends at t = 3 s, before the scene's t_end = 4 s"):
         make_desired({"point": "tip", "file": "x.csv"}, mechanism, sources, 4.0)
 
 
@@ -197,28 +197,28 @@ def test_a_path_that_leaves(pair):
         ("three_rrr", {"point": "plate", "circle": {"centre": [0.01, 0.01, 0], "radius": 0.02, "frequency": 1.0}}, 9.0),
     ],
 )
-def test_knots_met_together_are_those_followed_one_by_one(name, desired, t_end):
+def test_interpolated_knots_are_those_of_following_the_path(name, desired, t_end):
     """And each of them puts the point on the path, in closed form."""
     mechanism = load(name)
     follow = make_desired(desired, mechanism, Sources("test", None, {}), t_end)
-    together = follow._together()
+    together = follow._solve_interpolated()
     if desired.get("circle", {}).get("frequency") == 40.0:
         assert together is None
     else:
-        assert_close(together, follow._one_by_one(), 1e-9)
+        assert_close(together, follow._follow_all(), 1e-9)
     for t, q_tree in zip(follow.times[::10], follow.knots[::10], strict=True):
-        assert_close(mechanism.point_positions(q_tree)[desired["point"]], follow.place(t)[0], 1e-9)
+        assert_close(mechanism.point_positions(q_tree)[desired["point"]], follow.path(t)[0], 1e-9)
         assert_close(mechanism.kinematics(q_tree).phi, 0.0, 1e-9)
 
 
 @pytest.mark.parametrize(
     ("desired", "says"),
     [
-        ({}, "give one of file, circle and line"),
-        ({"circle": CIRCLE, "line": {"start": [0, 0, 0], "end": [1, 0, 0], "frequency": 1.0}}, "give one of"),
+        ({}, "needs exactly one of file, circle and line"),
+        ({"circle": CIRCLE, "line": {"start": [0, 0, 0], "end": [1, 0, 0], "frequency": 1.0}}, "needs exactly one of"),
         ({"circle": {**CIRCLE, "radius": -1.0}}, "radius"),
-        ({"circle": {**CIRCLE, "normal": [0, 0, 0]}}, "normal is no direction"),
-        ({"circle": {**CIRCLE, "centre": [3.0, 0, 0]}}, "the path cannot be started"),
+        ({"circle": {**CIRCLE, "normal": [0, 0, 0]}}, "normal must not be zero"),
+        ({"circle": {**CIRCLE, "centre": [3.0, 0, 0]}}, "the start of the path cannot be reached"),
         ({"spiral": 1}, "spiral"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.control.desired import Desired, Harmonics, Table, cycles
+from ckc_pin.control.desired import Desired, Harmonics, Table, count_cycles
 from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.control.workspace import follow_desired
 from tests.analytic.five_bar import FIVE_BAR
@@ -38,7 +38,7 @@ def test_a_tables_quickest_wave_is_about_that_which_it_was_made_of() -> None:
         slow, quick = random.uniform(1.0, 2.0), random.uniform(10.0, 40.0)
         waves = np.column_stack([np.sin(slow * t), 0.3 * np.sin(quick * t + random.uniform(0, 6))])
         table: Desired = Table(t, waves)
-        assert cycles(table, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-3)
+        assert count_cycles(table, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-3)
         written = Table(t, np.round(waves, 7))  # as a file has it: rounding is no wave
-        assert cycles(written, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-2)
-    assert cycles(Table(t, np.ones((2001, 1))), 3.0) == 0.0
+        assert count_cycles(written, 3.0) == pytest.approx(3.0 * quick / (2 * np.pi), rel=1e-2)
+    assert count_cycles(Table(t, np.ones((2001, 1))), 3.0) == 0.0

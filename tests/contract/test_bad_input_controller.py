@@ -46,8 +46,8 @@ def _way(first: int = 0, last: int = 10) -> list[str]:
 GAINS = [
     _value("K_D=high", f"{NAMED}controller.K_D = 'high': expected a number, a table or a list, got a string"),
     _value("K_D=nan", f"{NAMED}controller.K_D = nan: {FINITE}"),
-    _value("K_D=-1", "K_D is not positive definite: its least eigenvalue is -1"),
-    _value("K_D=0", "K_D is not positive definite: its least eigenvalue is 0"),
+    _value("K_D=-1", "K_D is not positive definite: its smallest eigenvalue is -1"),
+    _value("K_D=0", "K_D is not positive definite: its smallest eigenvalue is 0"),
     _value("K_D=[1.0, 2.0]", "controller.K_D[0] = 1.0: expected a list, got a number"),
     _value("K_D=[]", "controller.K_D: a matrix must be 2 x 2", f"in the order {JOINTS}"),
     _value("K_D=[[1.0]]", "controller.K_D: a matrix must be 2 x 2"),
@@ -55,20 +55,20 @@ GAINS = [
     _value('K_D=[[1.0, "a"], [0.0, 1.0]]', "controller.K_D[0][1] = 'a': expected a number"),
     _value("K_D=[[nan, 0.0], [0.0, 1.0]]", f"controller.K_D[0][0] = nan: {FINITE}"),
     _value("K_D=[[1.0, 0.5], [0.0, 1.0]]", "K_D is not symmetric: its entries [0][1] = 0.5 and [1][0] = 0 differ"),
-    _value("K_D=[[1.0, 2.0], [2.0, 1.0]]", "K_D is not positive definite: its least eigenvalue is -1"),
+    _value("K_D=[[1.0, 2.0], [2.0, 1.0]]", "K_D is not positive definite: its smallest eigenvalue is -1"),
     _value("K_D=[[1.0, 1.0], [1.0, 1.0]]", "K_D is not positive definite"),
     _value("K_D={theta_1=1.0}", f"controller.K_D: a table needs the joints {JOINTS}; 'theta_3' is missing"),
     _value("K_D={theta_1=1.0, theta_2=1.0}", f"a table needs the joints {JOINTS}; 'theta_2' is none of them"),
     _value('K_D={theta_1=1.0, theta_3="x"}', "controller.K_D.theta_3 = 'x': expected a number"),
     _value("Lambda=0", "Lambda^T K_D is not positive definite", "eq. 18"),
-    _value("Lambda=-1", "Lambda^T K_D is not positive definite: its least eigenvalue is -10"),
+    _value("Lambda=-1", "Lambda^T K_D is not positive definite: its smallest eigenvalue is -10"),
     Bad(
         "Lambda and K_D that do not commute",
         _tracking("Lambda={theta_1=1.0, theta_3=2.0}", "K_D=[[2.0, 1.0], [1.0, 2.0]]"),
         ["Lambda^T K_D is not symmetric: its entries [0][1] = 1 and [1][0] = 2 differ"],
     ),
     _target("K_P=0", "K_P is not positive definite"),
-    _target("K_V=-0.1", "K_V is not positive semi-definite: its least eigenvalue is -0.1"),
+    _target("K_V=-0.1", "K_V is not positive semi-definite: its smallest eigenvalue is -0.1"),
 ]
 
 CONTROLLER = [
@@ -94,7 +94,7 @@ CONTROLLER = [
     Bad(
         "too few actuators",
         _tracking(),
-        ["actuated: theta_1 cannot hold every freedom", "theta_3 is held by none"],
+        ["actuated: theta_1 cannot drive every freedom", "theta_3 is driven by none"],
         {"mechanism.toml": ('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]')},
     ),
     _value("model=other.toml", "bar/other.toml: no such mechanism file"),
@@ -131,7 +131,7 @@ TRAJECTORY = [
     _csv("nan", _rows(*_way(last=5), "6,nan,0"), "way.csv, line 8: '6,nan,0' is not 3 finite numbers"),
     _csv("time that steps back", _rows(*_way(), *_way(5, 9)), "line 13: t = 5 after t = 10; t must increase"),
     _csv("a late start", _rows(*_way(1)), "way.csv: starts at t = 1 s; a run starts at 0"),
-    _csv("an early end", _rows(*_way(last=8)), "ends at t = 8 s, the scene at t_end = 9.5 s", "shorten the run"),
+    _csv("an early end", _rows(*_way(last=8)), "ends at t = 8 s, before the scene's t_end = 9.5 s", "shorten the run"),
     _csv("a picture", b"\x89PNG\r\n\x1a\n", "bar/way.csv: not a", "not UTF-8 text"),
     _csv("an endless cell", _rows("x" * 200_000), "way.csv"),
 ]

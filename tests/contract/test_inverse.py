@@ -191,11 +191,11 @@ BAD = [
     Bad("a start out of reach", ["inverse", "bar/tracking.scene.toml", "--set", "controller.desired.theta_1.offset=3"],
         ["the motion cannot be started", "q_d(0) is out of reach"]),
     Bad("a path out of reach", ["inverse", "five_bar/tracking", "--set", CIRCLE.replace("-0.42", "-4.2")],
-        ["the path cannot be started", "'tip'"]),
+        ["the start of the path cannot be reached", "'tip'"]),
     Bad("an unknown motor", ["inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_2 = 1.0}"],
         ["torque_limit", "theta_2", "theta_1, theta_3"]),
     Bad("too few motors", ["inverse", "bar/tracking.scene.toml"],
-        ["actuated: theta_1 cannot hold every freedom", "theta_3 is held by none"],
+        ["actuated: theta_1 cannot drive every freedom", "theta_3 is driven by none"],
         edits={"mechanism.toml": ('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]')}),
 ]  # fmt: skip
 

@@ -175,7 +175,7 @@ def test_a_state_cannot_be_changed() -> None:
 def test_what_numpy_would_take_for_numbers_is_no_u(u: Any) -> None:
     """A complex u lost its imaginary part, text was read."""
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
-    with pytest.raises(InputError, match="u is no vector of numbers"):
+    with pytest.raises(InputError, match="u: expected a vector of numbers, got"):
         simulator.step(u, 1e-3)
 
 

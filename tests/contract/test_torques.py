@@ -238,14 +238,19 @@ BAD = [
     _file("nan", f"{HEADER}0,1,1\n0.5,nan,1\n1,1,1\n", "drive.csv, line 3"),
     _file("time that stands still", f"{HEADER}0,1,1\n0.5,1,1\n0.5,1,1\n", "line 4: t = 0.5 after t = 0.5; t must"),
     _file("a late start", f"{HEADER}0.1,1,1\n1,1,1\n", "starts at t = 0.1 s; a run starts at 0"),
-    _file("an early end", f"{HEADER}0,1,1\n0.4,1,1\n", "drive.csv: ends at t = 0.8 s, the scene at t_end = 1 s"),
+    _file(
+        "an early end",
+        f"{HEADER}0,1,1\n0.4,1,1\n",
+        "drive.csv: the torques end at t = 0.8 s, before the scene's t_end = 1 s",
+    ),
     _file("one row", f"{HEADER}0,1,1\n", "drive.csv: 1 rows; torques over time need at least 2"),
     _file("between rows", f"{HEADER}0,1,1\n1,1,1\n", "valid: 'hold', 'linear'", entry='interpolation = "spline"\n'),
     _file("a clock", f"{HEADER}0,1,1\n1,1,1\n", "unknown key 'sample_time'", entry="sample_time = 0.1\n"),
     _tracking(
-        "allocation.preload={theta_1=1.0}", "controller.allocation.preload: five_bar has no redundancy, its 2 motors"
+        "allocation.preload={theta_1=1.0}",
+        "allocation.preload: five_bar has no redundant motors: u determines the torques of its 2",
     ),
-    _tracking("allocation.weights={theta_1=1.0}", "controller.allocation.weights: five_bar has no redundancy"),
+    _tracking("allocation.weights={theta_1=1.0}", "controller.allocation.weights: five_bar has no redundant motors"),
     _tracking(
         "allocation.preloads={theta_1=1.0}", "controller.allocation: unknown key 'preloads'; valid: weights, preload"
     ),
@@ -262,7 +267,7 @@ def test_bad_torques(case: Bad, bar: Path) -> None:
     [
         ({"tau": {"x": 1.0}}, "tau: 'x' is no actuator; there are left, belt"),
         ({"tau": {"left": "strong"}}, "tau: .* is no table of numbers by actuator"),
-        ({"tau": [1.0]}, r"tau has shape \(1,\); \(2,\) is needed: left, belt"),
+        ({"tau": [1.0]}, r"tau: expected shape \(2,\) \(left, belt\), got \(1,\)"),
         ({"tau": [1.0, np.nan]}, r"tau is not finite: \[1.0, nan\]"),
         ({"tau": [0.0, 0.0], "u": [0.0, 0.0]}, "give either u or tau, not both"),
     ],
@@ -324,14 +329,14 @@ def test_what_no_motor_drives_is_named_and_torques_still_act(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text("utf-8")
     (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', "actuated = []"), "utf-8")
     with pytest.raises(
-        InputError, match="no joint cannot hold every freedom; the motion along theta_1, theta_3 is held"
+        InputError, match="no joint cannot drive every freedom; the motion along theta_1, theta_3 is driven by none"
     ):
         simulate(bar / "tracking.scene.toml")
     (bar / "mechanism.toml").write_text(
         text.replace('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_4"]'), "utf-8"
     )
     simulator = Simulator(bar / "swing.scene.toml", {"formulation": "reduced", "solver.rtol": 1e-11})
-    with pytest.raises(InputError, match=r"u: actuated: theta_4 cannot hold every freedom.*give tau by motor instead"):
+    with pytest.raises(InputError, match=r"u: actuated: theta_4 cannot drive every freedom.*give tau by motor instead"):
         simulator.step([0.1, 0.0], 0.01)
     y = np.concatenate([simulator.state.q, simulator.state.q_dot])
     state = simulator.step(tau={"theta_4": 0.05}, dt=0.2)

@@ -98,7 +98,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a class as a controller": (of(Own), r"expected an object, got the class Own"),
     "a function of one": (of(lambda t: t), r"controller: expected a function of \(t, terms\), got <lambda>\(t\)"),
     "a method of one": (of(OfOne()), r"controller: expected a function of \(t, terms\), got u\(t\)"),
-    "a forgotten return": (of(lambda t, terms: None), "controller's u is None; 2 numbers are .*is a return missing"),
+    "a forgotten return": (of(lambda t, terms: None), r"u: expected 2 numbers .*, got None; is a return missing"),
     "a string as a controller": (of("pd"), r"controller: expected an object with one of the methods.*, got 'pd'"),
     "an object as a controller": (of(object()), r"controller: expected .*or a function u\(t, terms\).*, got an object"),
     "a class that is sampled": (lambda: Sampled(Own, 0.1), "expected .*, got the class Own"),

@@ -97,7 +97,7 @@ def test_what_published_robots_are_measured_by(tmp_path: Path) -> None:
 
 def test_what_no_motor_holds_is_named(tmp_path: Path) -> None:
     scene = written(imported(tmp_path, legs(), YAML), tmp_path / "written")
-    with pytest.raises(InputError, match=r"a_hip cannot hold every freedom; the motion along b_knee is held by none"):
+    with pytest.raises(InputError, match=r"a_hip cannot drive every freedom; the motion along b_knee is driven by"):
         inverse_dynamics(scene, waves(load(tmp_path / "written" / "mechanism.toml"), 0.1))
 
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Model, Tracking
+from ckc_pin.control.controllers import ControllerModel, Tracking
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
@@ -79,7 +79,7 @@ def error_law(name: str, own: Mechanism, believed: Mechanism | None = None, rtol
     rtol : float
     """
     _, desired, _ = tracking(FIVE_BAR)
-    model = Model(believed, own, "rho") if believed else None
+    model = ControllerModel(believed, own, "rho") if believed else None
     controller = Tracking(np.eye(2), 10.0 * np.eye(2), desired, model)
     start = own.kinematics(stable_equilibrium(load(FIVE_BAR)).q_tree)
     reduced = LevelSet(own, start, np.zeros(2), force_of(controller, Actuation(own)), (0.0, AT))
