@@ -215,7 +215,7 @@ def play(
     """
     from ckc_pin.base.summary import in_notebook
     from ckc_pin.view.inline import Playback
-    from ckc_pin.view.player import play as play_runs
+    from ckc_pin.view.player import play_runs
 
     if in_notebook() if inline is None else inline:
         return Playback(runs, speed=speed, gap=gap, meshes=meshes, forces=forces)

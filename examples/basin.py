@@ -9,12 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 GRID = {"start": -1.9, "stop": 1.9, "count": 15}  # rad, for both angles
 
 
-@look()
+@figure_style()
 def main():
     results = ckc_pin.ensemble(
         "five_bar/set_point",

@@ -8,12 +8,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 CIRCLE = {"point": "plate", "circle": {"centre": [0.0, 0.0, -0.38], "radius": 0.08, "frequency": 4.0}}
 
 
-@look()
+@figure_style()
 def main():
     report = ckc_pin.check("delta")
     print(f"{report.d} freedoms, {report.rows} rows of which {len(report.redundant)} are redundant")

@@ -7,12 +7,12 @@ The other one stops the run when the tip first rises above a height.
 import matplotlib.pyplot as plt
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 HEIGHT = -0.45  # m
 
 
-@look()
+@figure_style()
 def main():
     mechanism = ckc_pin.load("five_bar")
 

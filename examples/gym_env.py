@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 GOAL = np.array([0.15, -0.45])
 TORQUE = 1.0  # N m
@@ -52,7 +52,7 @@ class FiveBar(gym.Env):
         return np.concatenate([np.sin(state.q), np.cos(state.q), state.q_dot, tip])
 
 
-@look()
+@figure_style()
 def main(steps=150):
     check_env(FiveBar(), skip_render_check=True)
     env = FiveBar()

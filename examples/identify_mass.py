@@ -10,13 +10,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 NAME = "theta_2.mass"
 NOISE = 0.01  # N m, standard deviation of the measured torques
 
 
-@look()
+@figure_style()
 def main():
     run = ckc_pin.simulate("five_bar/tracking", {"formulation": "reduced", "solver.rtol": 1e-10})
     forces = ckc_pin.inverse_dynamics(run)

@@ -11,12 +11,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 SCENE = Path(__file__).parent / "leg" / "step.scene.toml"
 
 
-@look()
+@figure_style()
 def main():
     run = ckc_pin.simulate(SCENE)
     foot = run.points["foot"]

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.linalg import solve_continuous_are
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 POINT = {"theta_1": 1.9, "theta_3": 1.2}
 OFFSET = {"theta_1": 0.08, "theta_3": -0.05}  # rad, at the start
@@ -49,7 +49,7 @@ def hold(regulator: Regulator | None) -> ckc_pin.Run:
     return ckc_pin.simulate("five_bar/swing", overrides, controller=regulator)
 
 
-@look()
+@figure_style()
 def main() -> Figure:
     """Design the regulator, run with and without it, and plot the errors."""
     model, regulator = design()

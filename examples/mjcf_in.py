@@ -12,7 +12,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.formats import importing
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 MODEL = """
 <mujoco model="press">
@@ -48,7 +48,7 @@ output_dt = 0.005
 """
 
 
-@look()
+@figure_style()
 def main():
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "press.xml"

@@ -10,10 +10,10 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.formats.exporting import export
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 
-@look()
+@figure_style()
 def main():
     exported = export(ckc_pin.load("five_bar"), "mjcf")
     print("Differences in MuJoCo:", *exported.differences, sep="\n  ")

@@ -8,10 +8,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 
-@look()
+@figure_style()
 def main():
     model = ckc_pin.linearize("five_bar")
     mode = model.modes[0]

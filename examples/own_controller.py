@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 TARGET = np.array([0.2, 0.4])
 RATE = 4.0  # 1/s
@@ -23,7 +23,7 @@ class ComputedTorque:
         return terms.D @ q_ddot + terms.C @ terms.q_dot + terms.h
 
 
-@look()
+@figure_style()
 def main():
     overrides = {"formulation": "reduced", "initial": {"at": "equilibrium"}, "t_end": 3.0}
     run = ckc_pin.simulate("five_bar/swing", overrides, controller=ComputedTorque())

@@ -16,12 +16,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 PERIOD = 0.002  # s
 
 
-@look()
+@figure_style()
 def main(seconds=0.5):
     plant = ckc_pin.Simulator("five_bar/swing", {"formulation": "dae", "solver.rtol": 1e-6})
     cycles = round(seconds / PERIOD)

@@ -8,12 +8,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 SENSOR = {"resolution": 2 * np.pi / 4096, "rate": "difference", "filter": 0.002}
 
 
-@look()
+@figure_style()
 def main():
     figure, ax = plt.subplots()
     ends = []

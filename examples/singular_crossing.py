@@ -10,13 +10,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 N = 4
 K = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))  # 1/s²
 
 
-@look()
+@figure_style()
 def main():
     run = ckc_pin.simulate("n_four_bar", {"t_end": 2.0, "mechanism.N": N})
     theta = run.q_tree[:, run.column("theta_0")]

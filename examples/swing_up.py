@@ -23,8 +23,7 @@ import ckc_pin
 from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.symbolic import Symbolic
 from ckc_pin.errors import NumericalError
-from ckc_pin.view.canvas import look
-from ckc_pin.view.style import COLOURS
+from ckc_pin.view.style import COLOURS, figure_style
 
 T_END, INTERVALS = 1.6, 40  # s, and the number of intervals with constant u
 PIECES, DEGREE = 2, 4  # pieces per interval, Gauss points per piece
@@ -142,7 +141,7 @@ def replay(solution: Plan) -> Array:
     return np.array([np.concatenate([state.q_tree, state.v_tree]) for state in states])
 
 
-@look()
+@figure_style()
 def figure(solution: Plan, replayed: Array) -> Any:
     """Plot angles, torques, and poses with the path of the tip."""
     import matplotlib.pyplot as plt

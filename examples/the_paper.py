@@ -8,8 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import limit, look
-from ckc_pin.view.style import COLOURS
+from ckc_pin.view.layout import clip_end_peaks
+from ckc_pin.view.style import COLOURS, figure_style
 
 FORMULATIONS = {"reduced": {"formulation": "reduced"},
                 "SPF, ε = 1e-3": {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-3}}  # fmt: skip
@@ -17,7 +17,7 @@ CASES = {"set_point": ("Set-point control", 0.6), "tracking": ("Tracking control
 LOOKS = {"lw": 3, "alpha": 0.4}, {"ls": "--", "lw": 1.2}
 
 
-@look()
+@figure_style()
 def main():
     figure, axes = plt.subplots(2, 2, figsize=(7.0, 4.6), sharex="col")
     for (angles, torques), (case, (title, shown)) in zip(axes.T, CASES.items(), strict=True):
@@ -34,7 +34,7 @@ def main():
         assert np.abs(ends[0] - ends[1]).max() < 1e-6
         angles.set(title=title, ylabel="angle (rad)")
         torques.set(xlabel="t (s)", ylabel="torque (N m)", xlim=(0, shown))
-        torques.set(title=f"Torques {limit(torques, [(run.t, run.u)], shown)}")
+        torques.set(title=f"Torques {clip_end_peaks(torques, [(run.t, run.u)], shown)}")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 

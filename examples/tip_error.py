@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 LENGTHS = {
     "joint.theta_2.xyz.x": "left proximal",
@@ -22,7 +22,7 @@ ERROR = 1e-4  # m, of each length
 SETTINGS = {"formulation": "reduced", "controller.model": "mechanism.toml", "solver.rtol": 1e-10}
 
 
-@look()
+@figure_style()
 def main():
     result = ckc_pin.sensitivities("five_bar/tracking", list(LENGTHS), SETTINGS)
     moved = ERROR * result.points["tip"]  # by instant, axis and length

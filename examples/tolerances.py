@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
+from ckc_pin.view.style import figure_style
 
 LENGTHS = {"joint.theta_2.xyz.x": 0.2794, "joint.tip_left_fixed.xyz.x": 0.3048,
            "joint.theta_4.xyz.x": 0.2794, "joint.tip_right_fixed.xyz.x": 0.3048}  # fmt: skip
@@ -35,7 +35,7 @@ def sweep(lengths, masses):
     return results, tip_position(results["end"].to_numpy(), left)
 
 
-@look()
+@figure_style()
 def main():
     drawn = ckc_pin.simulate("five_bar/set_point", OVERRIDES)
     target = tip_position(drawn.q_tree[-1], list(LENGTHS.values())[:2])

@@ -8,11 +8,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
-from ckc_pin.view.style import COLOURS
+from ckc_pin.view.style import COLOURS, figure_style
 
 
-@look()
+@figure_style()
 def main():
     run = ckc_pin.simulate("two_ur5/lift", {"formulation": "reduced", "t_end": 2.0})
     assert run.status == "done"

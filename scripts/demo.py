@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 import ckc_pin
-from ckc_pin.view.figures import plot
+from ckc_pin.view.figures import plot_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = ("set_point", "tracking")
@@ -38,7 +38,7 @@ def main() -> int:
         for case in CASES:
             pair = [run for run in runs if run.scene_name.endswith(case)]
             files += [run.save(out / case / run.scene["formulation"] / "run.npz") for run in pair]
-            files += plot(pair, out / case)
+            files += plot_runs(pair, out / case)
     except OSError as error:
         fail(f"--out {out}: {error.strerror}")
     except ckc_pin.InputError as error:

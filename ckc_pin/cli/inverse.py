@@ -67,8 +67,8 @@ def _write(found: ckc_pin.MotionForces, out: Path, figures: bool) -> None:
         if not figures:
             return
         try:
-            from ckc_pin.view.inverse_figure import save_inverse
+            from ckc_pin.view.result_figures import save_motion_forces
 
-            save_inverse(found, out)
+            save_motion_forces(found, out)
         except InputError as error:  # matplotlib is an extra; the forces are saved
             errors().print(f"no figure: {error}")

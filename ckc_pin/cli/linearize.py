@@ -128,7 +128,7 @@ def _write(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...], ou
         except CkcError as error:
             errors().print(f"no root locus: {error}")
         try:
-            from ckc_pin.view.linear_figure import save_linear_figures
+            from ckc_pin.view.linear_figures import save_linear_figures
 
             save_linear_figures(model, locus, out)
         except InputError as error:  # matplotlib is an extra; the model is saved

@@ -52,12 +52,11 @@ def map_(
 ) -> None:
     """Where it can go and where it is singular. Branch by branch, as the paper's Fig. 2."""
     from ckc_pin.analysis import map as maps
-    from ckc_pin.view.map_figure import require_figures, save_map
-    from ckc_pin.view.sections_figure import save_sections
+    from ckc_pin.view.map_figures import require_matplotlib, save_map, save_sections
 
     if out is not None:
         make_folder(out)
-        require_figures()
+        require_matplotlib()
     if sections is not None and (space != "cartesian" or scene is not None):
         raise InputError("--sections goes with --space cartesian, and without --scene")
     axes = None if over is None else [name.strip() for name in over.split(",")]

@@ -130,7 +130,7 @@ def _write(every: Sequence[WorkPrecision], plain: Sequence[dict[str, object]], o
                 continue
             stem = "work_precision" if len(every) == 1 else f"work_precision_{k + 1}_{_as_file(found.scene)}"
             try:
-                from ckc_pin.view.precision_figure import save_precision
+                from ckc_pin.view.result_figures import save_precision
 
                 written += save_precision(data, out, stem)
                 figures[k] = f"{stem}.png"

@@ -135,7 +135,7 @@ def _write(finished: ckc_pin.Run, out: Path, figures: bool) -> KeyboardInterrupt
 
 def _draw(finished: ckc_pin.Run, out: Path) -> None:
     try:
-        from ckc_pin.view.figures import plot as plot_runs
+        from ckc_pin.view.figures import plot_runs
 
         plot_runs([finished], out)
     except InputError as error:  # matplotlib is an extra; the run itself is saved

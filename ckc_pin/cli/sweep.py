@@ -113,9 +113,9 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
             rows.append(f"{name},{variable},{float(one['first_order'])!r},{float(one['total_order'])!r}")
         if figures:
             try:
-                from ckc_pin.view.ensemble_figures import draw_importance
+                from ckc_pin.view.ensemble_figures import draw_sobol_indices
 
-                draw_importance(of, out / f"indices_{array_name(str(name))}.png")
+                draw_sobol_indices(of, out / f"indices_{array_name(str(name))}.png")
             except InputError as error:
                 errors().print(f"no figures: {error}")
     write_atomic(out / "indices.csv", "\n".join(rows) + "\n")
@@ -128,9 +128,9 @@ def _afterwards(found: SweepResult, out: Path, worst: tuple[str, ...], figures: 
     results = xr.open_zarr(found.place, consolidated=False, decode_timedelta=False)
     if figures:
         try:
-            from ckc_pin.view.ensemble_figures import draw
+            from ckc_pin.view.ensemble_figures import draw_ensemble
 
-            draw(results, out)
+            draw_ensemble(results, out)
         except InputError as error:  # matplotlib is an extra; the results are there
             errors().print(f"no figures: {error}")
     for name in worst:

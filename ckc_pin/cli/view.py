@@ -19,7 +19,7 @@ __all__ = ["play", "plot"]
 @options.out(default=Path(), help="Folder for the figures.")
 def plot(runs: tuple[Path, ...], out: Path) -> None:
     """Figures of one or several runs, PNG and SVG."""
-    from ckc_pin.view.figures import plot as plot_runs
+    from ckc_pin.view.figures import plot_runs
 
     with Working("drawing"):
         written = plot_runs([ckc_pin.Run.load(path) for path in runs], out, ("png", "svg"))

@@ -1,1 +1,1 @@
-"""Figures and playback of saved runs. matplotlib, tornado and meshcat's files are loaded by what needs them."""
+"""Figures, playback and notebook display of results. matplotlib, tornado and meshcat are imported only when needed."""

@@ -1,4 +1,4 @@
-"""Forces of a run as arrows: what the loops carry, and what the motors give; a torque is an arrow round its axis."""
+"""Force arrows of a playback: loop forces as straight arrows, motor torques as arrows around their joint's axis."""
 
 from __future__ import annotations
 
@@ -13,71 +13,85 @@ from ckc_pin.dynamics.inverse import loop_wrenches
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.run.run import Run
 from ckc_pin.view import commands
-from ckc_pin.view.bodies import safe
+from ckc_pin.view.bodies import escape_path
 from ckc_pin.view.commands import Command, Track
-from ckc_pin.view.gaps import opening_loops
-from ckc_pin.view.skeleton import Placements
+from ckc_pin.view.geometry import Placements, find_position_loops
 from ckc_pin.view.visuals import Colour
 
-__all__ = ["Arrow", "arrow_scales", "arrow_tracks", "arrows", "draw_arrows", "forces_path"]
+__all__ = ["Arrow", "compute_arrow_scales", "compute_arrows", "create_arrow_tracks", "draw_arrows", "forces_path"]
 
-LOOPS: Colour = (0.00, 0.62, 0.45)
-MOTORS: Colour = (0.55, 0.20, 0.60)
-LONG = 0.35  # of the mechanism's size, for a large force
-USUAL = 98.0  # percentile of sizes that is a large force: a singular end does not count
-MOST = 1.5  # times as long at most
-CORNERS = 12  # round an arrow
-BENDS = 24  # of an arrow round an axis
+LOOP_COLOUR: Colour = (0.00, 0.62, 0.45)
+MOTOR_COLOUR: Colour = (0.55, 0.20, 0.60)
+FULL_LENGTH = 0.35  # of the mechanism's size: the length of an arrow at full scale
+FULL_SCALE_PERCENTILE = 98.0  # of all sizes; a peak near a singularity does not set the scale
+MAX_LENGTH_RATIO = 1.5  # of an arrow's length to the full length
+MIN_LENGTH_RATIO = 1e-6  # the viewer cannot draw an object of size zero
+CIRCUMFERENCE_POINTS = 12  # of an arrow's cross section
+ARC_POINTS = 24  # along an arrow around an axis
 
 
 @dataclass(frozen=True)
 class Arrow:
-    """A vector that is drawn: where (m, 3) and what (m, 3), N, or N m where it turns."""
+    """A force or a torque at output times of a run.
+
+    Attributes
+    ----------
+    name : str
+    colour : (r, g, b)
+    is_torque : bool
+    position : (m, 3) array
+        Point of application in the world, m.
+    vector : (m, 3) array
+        In the world, N or N m.
+    """
 
     name: str
     colour: Colour
-    turns: bool
-    at: Array
+    is_torque: bool
+    position: Array
     vector: Array
 
 
-def arrows(run: Run, rows: IntArray, moved: Placements) -> list[Arrow]:
-    """Return the arrows of a run at output instants: of each loop on its frame A, and of each driven joint.
+def compute_arrows(run: Run, rows: IntArray, poses: Placements) -> list[Arrow]:
+    """Compute the arrows of a run at output times: one for each loop at its frame A, one for each driven joint.
 
-    Where nothing determines a loop's force its vector is zero.
+    A loop force that the dynamics do not determine is zero.
     """
-    mechanism, found = run.mechanism, []
+    mechanism, arrows = run.mechanism, []
     multipliers = np.zeros((len(rows), mechanism.closure.rows))
     for loop, forces in run.loop_forces().items():
         multipliers[:, [name == loop for name, _ in mechanism.closure.names]] = np.nan_to_num(forces[rows])
-    carried = {loop: np.zeros((len(rows), 3)) for loop in opening_loops(mechanism)}
+    loop_forces = {loop: np.zeros((len(rows), 3)) for loop in find_position_loops(mechanism)}
     for k, row in enumerate(rows):
-        at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[row]))
-        for loop, wrench in loop_wrenches(Terms(mechanism, at, run.v_tree[row]), multipliers[k]).items():
-            if loop in carried:
-                carried[loop][k] = wrench[:3]
+        kinematics = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[row]))
+        terms = Terms(mechanism, kinematics, run.v_tree[row])
+        for loop, wrench in loop_wrenches(terms, multipliers[k]).items():
+            if loop in loop_forces:
+                loop_forces[loop][k] = wrench[:3]
     for spec in mechanism.spec.loop:
-        if spec.name in carried:
+        if spec.name in loop_forces:
             frame = mechanism.frames.find(spec.frame_a, spec.name)
-            where = moved.of(frame.joint, frame.translation)
-            found.append(Arrow(f"loop:{spec.name}", LOOPS, False, where, carried[spec.name]))
+            position = poses.point_positions(frame.joint, frame.translation)
+            arrows.append(Arrow(f"loop:{spec.name}", LOOP_COLOUR, False, position, loop_forces[spec.name]))
     model, efforts = mechanism.tree.model, run.tau[rows] @ mechanism.motors.transmission
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
         if model.joints[joint].nv == 1 and np.any(mechanism.motors.transmission[:, column]):
-            axis, turns = mechanism.tree.axis(joint)
-            vector = (moved.rotation[:, joint] @ axis) * np.nan_to_num(efforts[:, column, None])
-            found.append(Arrow(f"motor:{model.names[joint]}", MOTORS, turns, moved.translation[:, joint], vector))
-    return found
+            axis, is_rotation = mechanism.tree.axis(joint)
+            vector = (poses.rotation[:, joint] @ axis) * np.nan_to_num(efforts[:, column, None])
+            name = f"motor:{model.names[joint]}"
+            arrows.append(Arrow(name, MOTOR_COLOUR, is_rotation, poses.translation[:, joint], vector))
+    return arrows
 
 
-def arrow_scales(groups: Sequence[Sequence[Arrow]]) -> dict[bool, float]:
+def compute_arrow_scales(groups: Sequence[Sequence[Arrow]]) -> dict[bool, float]:
     """Return the sizes that are drawn at full length: of forces (False), N, and of torques (True), N m."""
     sizes: dict[bool, list[Array]] = {False: [], True: []}
     for arrow in (arrow for group in groups for arrow in group):
-        sizes[arrow.turns].append(np.linalg.norm(arrow.vector, axis=1))
-    usual = {turns: float(np.percentile(np.concatenate(own), USUAL)) for turns, own in sizes.items() if own}
-    return {turns: size for turns, size in usual.items() if size > 0}
+        sizes[arrow.is_torque].append(np.linalg.norm(arrow.vector, axis=1))
+    scales = {kind: float(np.percentile(np.concatenate(arrays), FULL_SCALE_PERCENTILE))
+              for kind, arrays in sizes.items() if arrays}  # fmt: skip
+    return {kind: scale for kind, scale in scales.items() if scale > 0}
 
 
 def forces_path(root: str) -> str:
@@ -85,55 +99,57 @@ def forces_path(root: str) -> str:
     return f"{root}/forces"
 
 
-def draw_arrows(root: str, found: Sequence[Arrow], opacity: float) -> Iterator[Command]:
-    """Draw arrows of one metre along z, or round it."""
-    for arrow in found:
-        corners, faces = _round_arrow() if arrow.turns else _straight_arrow()
-        look = commands.material(arrow.colour, opacity)
-        yield commands.surface(f"{forces_path(root)}/{safe(arrow.name)}/arrow", corners, faces, np.eye(4), look)
+def draw_arrows(root: str, arrows: Sequence[Arrow], opacity: float) -> Iterator[Command]:
+    """Draw arrows of one metre, forces along z and torques around z; `create_arrow_tracks` places and scales them."""
+    for arrow in arrows:
+        corners, faces = _create_round_arrow() if arrow.is_torque else _create_straight_arrow()
+        material = commands.create_material(arrow.colour, opacity)
+        path = f"{forces_path(root)}/{escape_path(arrow.name)}/arrow"
+        yield commands.draw_surface(path, corners, faces, np.eye(4), material)
 
 
-def arrow_tracks(
-    root: str, found: Sequence[Arrow], t: Array, size: float, scales: dict[bool, float]
+def create_arrow_tracks(
+    root: str, arrows: Sequence[Arrow], t: Array, size: float, scales: dict[bool, float]
 ) -> Iterator[Track]:
-    """Place, turn and stretch the arrows along a run of a mechanism of a size, metres."""
-    up = np.array([0.0, 0.0, 1.0])
-    for arrow in found:
-        lengths = np.linalg.norm(arrow.vector, axis=1) / scales.get(arrow.turns, 1.0)
-        scale = LONG * size * np.maximum(np.minimum(lengths, MOST), 1e-6)  # none at all cannot be drawn
-        turned = np.array([pin.Quaternion.FromTwoVectors(up, v if np.any(v) else up).coeffs() for v in arrow.vector])
-        ways = {"position": arrow.at, "quaternion": turned, "scale": np.tile(scale[:, None], (1, 3))}
-        yield Track(f"{forces_path(root)}/{safe(arrow.name)}", t, ways)
+    """Create the keyframes that place, rotate and scale arrows; `size` is the mechanism's, m."""
+    z = np.array([0.0, 0.0, 1.0])
+    for arrow in arrows:
+        ratios = np.linalg.norm(arrow.vector, axis=1) / scales.get(arrow.is_torque, 1.0)
+        lengths = FULL_LENGTH * size * np.maximum(np.minimum(ratios, MAX_LENGTH_RATIO), MIN_LENGTH_RATIO)
+        rotations = np.array([pin.Quaternion.FromTwoVectors(z, v if np.any(v) else z).coeffs() for v in arrow.vector])
+        values = {"position": arrow.position, "quaternion": rotations, "scale": np.tile(lengths[:, None], (1, 3))}
+        yield Track(f"{forces_path(root)}/{escape_path(arrow.name)}", t, values)
 
 
 # --- shapes --------------------------------------------------------------------------------------
 
 
-def _straight_arrow() -> tuple[Array, IntArray]:
-    """One metre along z."""
+def _create_straight_arrow() -> tuple[Array, IntArray]:
+    """Return the surface of an arrow of one metre along z."""
     radii = np.array([0.0, 0.03, 0.03, 0.09, 0.0])
-    middles = np.outer([0.0, 0.0, 0.72, 0.72, 1.0], [0.0, 0.0, 1.0])
-    return _tube(radii, middles, np.tile([1.0, 0.0, 0.0], (5, 1)), np.tile([0.0, 1.0, 0.0], (5, 1)))
+    centres = np.outer([0.0, 0.0, 0.72, 0.72, 1.0], [0.0, 0.0, 1.0])
+    return _create_tube(radii, centres, np.tile([1.0, 0.0, 0.0], (5, 1)), np.tile([0.0, 1.0, 0.0], (5, 1)))
 
 
-def _round_arrow() -> tuple[Array, IntArray]:
-    """Three quarters of a circle round z, its radius half a metre."""
-    along = np.array([0.0, *np.linspace(0.0, 0.8, BENDS), 0.8, 1.0])
-    radii = np.array([0.0, *[0.03] * BENDS, 0.09, 0.0])
-    angles = 1.5 * np.pi * along
-    out = np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
-    return _tube(radii, 0.5 * out, np.tile([0.0, 0.0, 1.0], (len(along), 1)), out)
+def _create_round_arrow() -> tuple[Array, IntArray]:
+    """Return the surface of an arrow along three quarters of a circle around z, with a radius of half a metre."""
+    positions = np.array([0.0, *np.linspace(0.0, 0.8, ARC_POINTS), 0.8, 1.0])
+    radii = np.array([0.0, *[0.03] * ARC_POINTS, 0.09, 0.0])
+    angles = 1.5 * np.pi * positions
+    outward = np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
+    return _create_tube(radii, 0.5 * outward, np.tile([0.0, 0.0, 1.0], (len(positions), 1)), outward)
 
 
-def _tube(radii: Array, middles: Array, x: Array, y: Array) -> tuple[Array, IntArray]:
-    """Surface of circles round middles (m, 3) in planes of x and y (m, 3), each joined to the next."""
-    angles = 2 * np.pi * np.arange(CORNERS) / CORNERS
-    rings = middles[:, None] + radii[:, None, None] * (
+def _create_tube(radii: Array, centres: Array, x: Array, y: Array) -> tuple[Array, IntArray]:
+    """Return the surface through circles around centres (m, 3), in the planes of x and y (m, 3)."""
+    angles = 2 * np.pi * np.arange(CIRCUMFERENCE_POINTS) / CIRCUMFERENCE_POINTS
+    rings = centres[:, None] + radii[:, None, None] * (
         np.cos(angles)[:, None] * x[:, None] + np.sin(angles)[:, None] * y[:, None]
     )
-    here = np.arange(CORNERS)
-    after = np.roll(here, -1)
-    strip = np.vstack([np.column_stack([here, after, here + CORNERS]),
-                       np.column_stack([after, after + CORNERS, here + CORNERS])])  # fmt: skip
-    faces = np.vstack([strip + k * CORNERS for k in range(len(radii) - 1)])
+    ring = np.arange(CIRCUMFERENCE_POINTS)
+    next_ring = np.roll(ring, -1)
+    strip = np.vstack([np.column_stack([ring, next_ring, ring + CIRCUMFERENCE_POINTS]),
+                       np.column_stack([next_ring, next_ring + CIRCUMFERENCE_POINTS,
+                                        ring + CIRCUMFERENCE_POINTS])])  # fmt: skip
+    faces = np.vstack([strip + k * CIRCUMFERENCE_POINTS for k in range(len(radii) - 1)])
     return rings.reshape(-1, 3), faces

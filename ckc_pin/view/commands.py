@@ -1,7 +1,8 @@
-"""The language that meshcat's viewer speaks: drawing commands as MessagePack (meshcat's viewer/Readme.md).
+"""Drawing commands of meshcat's viewer as MessagePack (its protocol is described in meshcat's viewer/Readme.md).
 
-They are written here, not by meshcat's Python package: its import brings a ZeroMQ context, IPython and a server that
-listens on every interface, and its commands are a few dictionaries of three.js's own format.
+This module writes the commands itself instead of using meshcat's Python package. Importing that package starts a ZeroMQ
+context, IPython and a server that listens on all interfaces, whereas the commands are a few dictionaries in the format
+of three.js.
 """
 
 from __future__ import annotations
@@ -19,37 +20,42 @@ from ckc_pin.view.visuals import Colour
 __all__ = [
     "SEVERAL",
     "Command",
-    "Stage",
+    "SceneState",
     "Track",
-    "body",
+    "create_material",
     "delete",
-    "material",
-    "name_runs",
-    "polyline",
-    "say",
+    "draw_polyline",
+    "draw_primitive",
+    "draw_surface",
+    "group_commands",
     "set_animation",
     "set_property",
+    "set_runs",
+    "set_status",
     "set_transform",
-    "several",
-    "surface",
 ]
 
 Command = dict[str, Any]
 
-SEVERAL = "several"
+SEVERAL = "several"  # the type of a group of commands
 
-_UINT32, _FLOAT32 = 0x16, 0x17  # msgpack-lite's extension types of a Uint32Array and a Float32Array
-_TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # three.js's cylinders lie along y
-
-# What three.js animates, by property.
-_KINDS = {"position": "vector3", "quaternion": "quaternion", "scale": "vector3", "visible": "bool"}
+_UINT32, _FLOAT32 = 0x16, 0x17  # extension types of Uint32Array and Float32Array in msgpack-lite
+# Cylinders have their axis along y in three.js, and along z in a URDF.
+_CYLINDER_ROTATION = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_TRACK_TYPES = {"position": "vector3", "quaternion": "quaternion", "scale": "vector3", "visible": "bool"}
 
 
 @dataclass(frozen=True)
 class Track:
-    """How an object moves: at times (m,), s, the values of some of its properties.
+    """Keyframes of one object.
 
-    These are "position" and "scale" (m, 3), "quaternion" (m, 4) as x, y, z, w, and "visible" (m,) of bool.
+    Attributes
+    ----------
+    path : str
+    times : (m,) array
+        s.
+    values : mapping
+        By property: "position" and "scale" (m, 3), "quaternion" (m, 4) as x, y, z, w, "visible" (m,) of bool.
     """
 
     path: str
@@ -57,27 +63,27 @@ class Track:
     values: Mapping[str, Array | BoolArray]
 
 
-class Stage:
-    """The scene as drawn so far, in the messages that draw it again for a viewer that comes later."""
+class SceneState:
+    """The current scene as the messages that draw it from nothing, for viewers that connect later."""
 
     def __init__(self) -> None:
         self._messages: dict[tuple[str, str], bytes] = {}
         self._animation: bytes | None = None
 
     def apply(self, command: Command) -> bytes:
-        """Take a command into account; return its message."""
+        """Update the scene by a command and return the command's message."""
         message = msgspec.msgpack.encode(command)
         kind, path = command["type"], command["path"]
         if kind == "set_animation":
             self._animation = message
         elif kind == "delete":
-            self._forget(path)
+            self._remove(path)
         else:
             self._messages[f"{kind} {command.get('property', '')}", path] = message
         return message
 
-    def _forget(self, path: str) -> None:
-        """Forget what is at a path and below, the last frame, and the animation."""
+    def _remove(self, path: str) -> None:
+        """Remove the objects at a path and below it, the last live frame, and the animation."""
         self._messages = {
             key: message
             for key, message in self._messages.items()
@@ -86,26 +92,29 @@ class Stage:
         self._animation = None
 
     def messages(self) -> list[bytes]:
-        """Return the messages that draw the scene from nothing; the animation needs its objects and comes last."""
+        """Return the messages that draw the scene; the animation comes last because it refers to the objects."""
         return [*self._messages.values(), *([] if self._animation is None else [self._animation])]
 
 
-def material(colour: Colour, opacity: float = 1.0, on_top: bool = False) -> dict[str, Any]:
-    """Return a material; a translucent one lies on opaque ones at the same place, `on_top` on everything."""
+# --- objects -------------------------------------------------------------------------------------
+
+
+def create_material(colour: Colour, opacity: float = 1.0, on_top: bool = False) -> dict[str, Any]:
+    """Return a material of three.js; with `on_top` its object is drawn in front of everything else."""
     red, green, blue = (round(255 * x) for x in colour)
-    plain = {"type": "MeshPhongMaterial", "color": red << 16 | green << 8 | blue, "shininess": 20, "side": 0}
-    if opacity < 1:
-        plain |= {"transparent": True, "opacity": opacity, "depthWrite": False}
-        plain |= {"polygonOffset": True, "polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
-    return plain | ({"transparent": True, "depthTest": False} if on_top else {})
+    material = {"type": "MeshPhongMaterial", "color": red << 16 | green << 8 | blue, "shininess": 20, "side": 0}
+    if opacity < 1:  # The offset draws a translucent surface in front of an opaque one at the same place.
+        material |= {"transparent": True, "opacity": opacity, "depthWrite": False}
+        material |= {"polygonOffset": True, "polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
+    return material | ({"transparent": True, "depthTest": False} if on_top else {})
 
 
-def body(
-    path: str, shape: str, size: Iterable[float], placement: Array, look: dict[str, Any], order: int = 0
+def draw_primitive(
+    path: str, shape: str, size: Iterable[float], placement: Array, material: dict[str, Any], render_order: int = 0
 ) -> Command:
-    """Draw a box (x, y, z), a cylinder or a cone along z (radius, length) or a sphere (radius).
+    """Draw a box (x, y, z), a cylinder or a cone along z (radius, length), or a sphere (radius).
 
-    Of what is drawn on top of everything, the higher in `order` lies on the lower, whatever the side it is seen from.
+    Among objects with an `on_top` material, the one with the higher `render_order` covers the other from every side.
     """
     size = [float(x) for x in size]
     if shape == "box":
@@ -114,37 +123,53 @@ def body(
         top = size[0] if shape == "cylinder" else 0.0
         geometry = {"type": "CylinderGeometry", "radiusTop": top, "radiusBottom": size[0], "height": size[1],
                     "radialSegments": 40}  # fmt: skip
-        placement = placement @ _TURN
+        placement = placement @ _CYLINDER_ROTATION
     else:
         geometry = {"type": "SphereGeometry", "radius": size[0], "widthSegments": 24, "heightSegments": 16}
-    command = _object(path, "Mesh", geometry, look, placement)
-    if order:
-        command["object"]["object"]["renderOrder"] = order
+    command = _set_object(path, "Mesh", geometry, material, placement)
+    if render_order:
+        command["object"]["object"]["renderOrder"] = render_order
     return command
 
 
-def polyline(path: str, points: Array, colour: Colour, opacity: float = 1.0) -> Command:
+def draw_polyline(path: str, points: Array, colour: Colour, opacity: float = 1.0) -> Command:
     """Draw a line through points (m, 3)."""
-    position = {"itemSize": 3, "type": "Float32Array", "array": _floats(points), "normalized": False}
-    normal = position | {"array": _floats(np.tile([0.0, 0.0, 1.0], (len(points), 1)))}  # else the viewer makes them up
+    position = {"itemSize": 3, "type": "Float32Array", "array": _pack_floats(points), "normalized": False}
+    # Without normals the viewer would compute them.
+    normal = position | {"array": _pack_floats(np.tile([0.0, 0.0, 1.0], (len(points), 1)))}
     geometry = {"type": "BufferGeometry", "data": {"attributes": {"position": position, "normal": normal}}}
-    look = {key: x for key, x in material(colour, opacity).items() if key in ("color", "transparent", "opacity")}
-    return _object(path, "Line", geometry, {"type": "LineBasicMaterial", **look}, np.eye(4))
+    keys = ("color", "transparent", "opacity")
+    properties = {key: x for key, x in create_material(colour, opacity).items() if key in keys}
+    return _set_object(path, "Line", geometry, {"type": "LineBasicMaterial", **properties}, np.eye(4))
 
 
-def surface(path: str, corners: Array, faces: IntArray, placement: Array, look: dict[str, Any]) -> Command:
-    """Draw a triangulated surface: corners (m, 3), faces (k, 3) of their numbers; each triangle is seen as flat."""
-    position = {"itemSize": 3, "type": "Float32Array", "array": _floats(corners), "normalized": False}
-    numbers = msgspec.msgpack.Ext(_UINT32, np.ascontiguousarray(faces, dtype="<u4").tobytes())
-    data = {"attributes": {"position": position}, "index": {"type": "Uint32Array", "array": numbers}}
-    return _object(
-        path, "Mesh", {"type": "BufferGeometry", "data": data}, look | {"flatShading": True, "side": 2}, placement
-    )
+def draw_surface(path: str, corners: Array, faces: IntArray, placement: Array, material: dict[str, Any]) -> Command:
+    """Draw a triangulated surface with flat shading: corners (m, 3), and faces (k, 3) as indices of corners."""
+    position = {"itemSize": 3, "type": "Float32Array", "array": _pack_floats(corners), "normalized": False}
+    indices = msgspec.msgpack.Ext(_UINT32, np.ascontiguousarray(faces, dtype="<u4").tobytes())
+    data = {"attributes": {"position": position}, "index": {"type": "Uint32Array", "array": indices}}
+    geometry = {"type": "BufferGeometry", "data": data}
+    return _set_object(path, "Mesh", geometry, material | {"flatShading": True, "side": 2}, placement)
+
+
+def _set_object(path: str, kind: str, geometry: dict[str, Any], material: dict[str, Any], placement: Array) -> Command:
+    uuids = {part: f"{part} of {path}" for part in ("object", "geometry", "material")}  # Any unique strings will do.
+    description = {
+        "metadata": {"version": 4.5, "type": "Object"},
+        "geometries": [{"uuid": uuids["geometry"], **geometry}],
+        "materials": [{"uuid": uuids["material"], **material}],
+        "object": {"uuid": uuids["object"], "type": kind, "geometry": uuids["geometry"],
+                   "material": uuids["material"], "matrix": _list_columns(placement)},
+    }  # fmt: skip
+    return {"type": "set_object", "path": path, "object": description}
+
+
+# --- changes of the scene ------------------------------------------------------------------------
 
 
 def set_transform(path: str, matrix: Array) -> Command:
-    """Place what is at a path, and everything below it, in its parent."""
-    return {"type": "set_transform", "path": path, "matrix": _columns(matrix)}
+    """Place the object at a path, and everything below it, relative to its parent; matrix (4, 4)."""
+    return {"type": "set_transform", "path": path, "matrix": _list_columns(matrix)}
 
 
 def set_property(path: str, name: str, value: Any) -> Command:
@@ -153,74 +178,66 @@ def set_property(path: str, name: str, value: Any) -> Command:
 
 
 def delete(path: str) -> Command:
-    """Take away what is at a path, and everything below it."""
+    """Delete the object at a path and everything below it."""
     return {"type": "delete", "path": path}
 
 
-def several(these: Sequence[Command]) -> Command:
-    """Draw several things in one message, a frame that the next one replaces; our page answers when it is shown."""
-    return {"type": SEVERAL, "path": "", "commands": list(these)}
+def group_commands(commands: Sequence[Command]) -> Command:
+    """Group commands into one message, a live frame. The page answers when it has shown the frame."""
+    return {"type": SEVERAL, "path": "", "commands": list(commands)}
 
 
-def say(text: str) -> Command:
-    """Write a line of plain text below the caption; understood by our page, not by the viewer."""
+def set_status(text: str) -> Command:
+    """Set the plain text of the status line below the caption. The page handles it, not the viewer."""
     return {"type": "say", "path": "", "text": text}
 
 
-def name_runs(runs: Sequence[Mapping[str, Any]], forces: Sequence[str]) -> Command:
-    """Tell our page what there is to show and to hide.
+def set_runs(runs: Sequence[Mapping[str, Any]], forces: Sequence[str]) -> Command:
+    """Tell the page which objects can be shown and hidden.
 
     Parameters
     ----------
     runs : sequence of mappings
-        Each with its path, label, last instant `t_end`, and what is `said` from then on.
+        Each with `path`, `label`, `t_end`, and `outcome`, the text that is shown from `t_end` on.
     forces : sequence of str
-        Paths of the arrows.
+        Paths of the force arrows.
     """
     return {"type": "runs", "path": "", "runs": [dict(run) for run in runs], "forces": list(forces)}
 
 
 def set_animation(tracks: Iterable[Track], speed: float = 1.0) -> Command:
-    """Make the viewer move things by itself, once, with a time slider.
+    """Animate objects in the viewer, once, with a time slider.
 
     Parameters
     ----------
     tracks : iterable of Track
-        In the run's own time, which the slider shows.
+        In simulated time, which the slider shows.
     speed : float
-        How much of it goes by in a second: the viewer's timeScale, which our page sets.
+        Simulated seconds per second of playback.
     """
     animations = []
     for track in tracks:
         clip_tracks = [
-            {"name": f".{name}", "type": _KINDS[name], "times": _floats(track.times), "values": _values(values)}
+            {"name": f".{name}", "type": _TRACK_TYPES[name], "times": _pack_floats(track.times),
+             "values": _pack_values(values)}
             for name, values in track.values.items()
-        ]
+        ]  # fmt: skip
         animations.append({"path": track.path, "clip": {"fps": 1, "name": "run", "tracks": clip_tracks}})
     options = {"play": True, "repetitions": 1, "clampWhenFinished": True, "timeScale": speed}
     return {"type": "set_animation", "path": "", "animations": animations, "options": options}
 
 
-def _object(path: str, kind: str, geometry: dict[str, Any], look: dict[str, Any], placement: Array) -> Command:
-    names = {part: f"{part} of {path}" for part in ("object", "geometry", "material")}  # any unique strings will do
-    whole = {
-        "metadata": {"version": 4.5, "type": "Object"},
-        "geometries": [{"uuid": names["geometry"], **geometry}],
-        "materials": [{"uuid": names["material"], **look}],
-        "object": {"uuid": names["object"], "type": kind, "geometry": names["geometry"],
-                   "material": names["material"], "matrix": _columns(placement)},
-    }  # fmt: skip
-    return {"type": "set_object", "path": path, "object": whole}
+# --- encoding ------------------------------------------------------------------------------------
 
 
-def _columns(matrix: Array) -> list[float]:
+def _list_columns(matrix: Array) -> list[float]:
     columns: list[float] = matrix.T.ravel().tolist()
     return columns
 
 
-def _values(values: Array | BoolArray) -> Any:
-    return values.tolist() if values.dtype == bool else _floats(values.astype(float))
+def _pack_values(values: Array | BoolArray) -> Any:
+    return values.tolist() if values.dtype == bool else _pack_floats(values.astype(float))
 
 
-def _floats(values: Array) -> msgspec.msgpack.Ext:
+def _pack_floats(values: Array) -> msgspec.msgpack.Ext:
     return msgspec.msgpack.Ext(_FLOAT32, np.ascontiguousarray(values, dtype="<f4").tobytes())

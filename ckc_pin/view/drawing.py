@@ -1,7 +1,6 @@
-"""Runs as commands for the viewer: objects (one group for each body, named by its joint) and one animation.
+"""Drawing commands for whole runs: camera, objects of each mechanism, and one animation.
 
-The browser then plays without us, with meshcat's time slider. Keyframes are output instants of the runs, not
-interpolations.
+The browser then plays the animation by itself. Its keyframes are output times of the runs, without interpolation.
 """
 
 from __future__ import annotations
@@ -17,34 +16,49 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.view import bodies, commands
-from ckc_pin.view.arrows import arrow_scales, arrow_tracks, arrows, draw_arrows, forces_path
-from ckc_pin.view.camera import WORLD, extent_of_motions, surroundings
+from ckc_pin.view.arrows import compute_arrow_scales, compute_arrows, create_arrow_tracks, draw_arrows, forces_path
 from ckc_pin.view.commands import Command, Track
-from ckc_pin.view.desired import desired_poses
-from ckc_pin.view.gaps import gaps
-from ckc_pin.view.labels import run_labels
-from ckc_pin.view.skeleton import Placements, configurations, placements
+from ckc_pin.view.geometry import (
+    Placements,
+    compute_loop_gaps,
+    compute_placements,
+    compute_view_axes,
+    find_segments,
+    homogeneous,
+    is_planar,
+    pinocchio_configurations,
+    up_direction,
+)
+from ckc_pin.view.run_group import compute_desired_poses
+from ckc_pin.view.style import label_runs
 from ckc_pin.view.visuals import Colour
 
-__all__ = ["body_tracks", "run_path", "scene"]
+__all__ = ["WORLD", "draw_runs_3d", "estimate_reach", "motion_extent", "set_camera"]
 
-KEYFRAMES = 60  # a second of playback, as far as the run has them
-FEWEST, MOST = 2000, 20_000  # of a run: the first so that it can be slowed down, the second for the browser's sake
-TRACE: Colour = (0.25, 0.25, 0.28)
+KEYFRAMES_PER_SECOND = 60  # of playback, if the run has that many output times
+MIN_KEYFRAMES = 2000  # of a run, so that it can be played slowly
+MAX_KEYFRAMES = 20_000  # of a run, for the browser's memory
+TRACE_COLOUR: Colour = (0.25, 0.25, 0.28)
+MIN_GAP_LENGTH = 1e-9  # m; a vector of length zero has no direction
+
+WORLD = "/world"
+FIELD_OF_VIEW_DEG = 40.0
+GRID_CELL = 0.5  # m, of the viewer's own grid, which has 40 x 40 cells
+VIEW_TO_SCENE = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # right, up, towards the viewer -> x, y, z
 
 
-def scene(
+def draw_runs_3d(
     runs: Sequence[Run], *, speed: float = 1.0, gap: float = 0.0, meshes: Path | None = None, forces: bool = False
 ) -> list[Command]:
-    """Return the commands that draw and animate runs, the first one solid and the others translucent.
+    """Return the commands that draw and animate runs. The first run is opaque, the others are translucent.
 
     Parameters
     ----------
     runs : sequence of Run
     speed : float
-        Seconds of the run in a second of playback.
+        Simulated seconds per second of playback.
     gap : float
-        Above zero: how many times larger the gaps of the loops are drawn.
+        Above zero: factor by which the gaps of the loops are magnified.
     meshes : Path, optional
         Folder of the URDFs' mesh files.
     forces : bool
@@ -53,113 +67,198 @@ def scene(
     Raises
     ------
     InputError
-        A shape of a URDF that cannot be.
+        A URDF has an invalid visual.
     """
-    rows = [_keyframes(run.t, speed) for run in runs]
-    poses = [configurations(run, at) for run, at in zip(runs, rows, strict=True)]
-    motions = [placements(run.mechanism, q) for run, q in zip(runs, poses, strict=True)]
-    drawing = surroundings(runs[0].mechanism, extent_of_motions(runs[0].mechanism, motions))
+    rows = [_select_keyframes(run.t, speed) for run in runs]
+    configurations = [pinocchio_configurations(run, selected) for run, selected in zip(runs, rows, strict=True)]
+    motions = [compute_placements(run.mechanism, q) for run, q in zip(runs, configurations, strict=True)]
+    drawing = set_camera(runs[0].mechanism, motion_extent(runs[0].mechanism, motions))
     tracks: list[Track] = []
-    for k, (run, at, q, moved) in enumerate(zip(runs, rows, poses, motions, strict=True)):
-        root, look, t = run_path(runs, k), bodies.ACROSS if k else bodies.SOLID, run.t[at]
-        drawing += bodies.draw_bodies(run.mechanism, root, moved, look, meshes)
-        drawing += bodies.draw_loop_frames(run.mechanism, root, look)
-        drawing += [commands.polyline(f"{root}/trace:{bodies.safe(name)}", path, TRACE, look.opacity)
-                    for name, path in run.points.items()]  # fmt: skip
-        tracks += body_tracks(run.mechanism, root, t, moved)
+    for k, (run, selected, q, poses) in enumerate(zip(runs, rows, configurations, motions, strict=True)):
+        root, appearance, t = _run_path(runs, k), _run_appearance(k), run.t[selected]
+        drawing += bodies.draw_bodies(run.mechanism, root, poses, appearance, meshes)
+        drawing += bodies.draw_loop_frames(run.mechanism, root, appearance)
+        drawing += [
+            commands.draw_polyline(f"{root}/trace:{bodies.escape_path(name)}", path, TRACE_COLOUR, appearance.opacity)
+            for name, path in run.points.items()
+        ]
+        tracks += _create_body_tracks(run.mechanism, root, t, poses)
         if gap > 0:
-            drawing += bodies.draw_gaps(run.mechanism, root, look)
-            tracks += _gap_tracks(run.mechanism, root, t, q, moved, gap)
-    drawing, tracks = _with_ghost(runs, rows, drawing, tracks, meshes)
-    drawing, tracks = _with_forces(runs, rows, motions, drawing, tracks) if forces else (drawing, tracks)
-    names = [{"path": run_path(runs, k), "label": label, "t_end": float(run.t[-1]), "said": _ending(run)}
-             for k, (run, label) in enumerate(zip(runs, run_labels(runs), strict=True))]  # fmt: skip
-    arrows_of = [forces_path(run_path(runs, k)) for k in range(len(runs))] if forces else []
-    return [*drawing, commands.name_runs(names, arrows_of), commands.set_animation(tracks, speed)]
+            drawing += bodies.draw_gaps(run.mechanism, root, appearance)
+            tracks += _create_gap_tracks(run.mechanism, root, t, q, poses, gap)
+    _add_desired_pose(runs, rows, drawing, tracks, meshes)
+    if forces:
+        _add_forces(runs, rows, motions, drawing, tracks)
+    entries = [{"path": _run_path(runs, k), "label": label, "t_end": float(run.t[-1]), "outcome": _format_outcome(run)}
+               for k, (run, label) in enumerate(zip(runs, label_runs(runs), strict=True))]  # fmt: skip
+    force_paths = [forces_path(_run_path(runs, k)) for k in range(len(runs))] if forces else []
+    return [*drawing, commands.set_runs(entries, force_paths), commands.set_animation(tracks, speed)]
 
 
-def _ending(run: Run) -> str:
+def _format_outcome(run: Run) -> str:
     if run.status == "done":
         return ""
     return run.message if run.message.startswith(run.status) else f"{run.status} at {run.t[-1]:.4g} s: {run.message}"
 
 
-def _with_forces(
+def _run_path(runs: Sequence[Run], k: int) -> str:
+    return f"{WORLD}/{k + 1}: {bodies.escape_path(label_runs(runs)[k])}"
+
+
+def _run_appearance(k: int) -> bodies.Appearance:
+    return bodies.TRANSLUCENT if k else bodies.SOLID
+
+
+def _add_forces(
     runs: Sequence[Run], rows: Sequence[IntArray], motions: Sequence[Placements], drawing: list[Command],
     tracks: list[Track],
-) -> tuple[list[Command], list[Track]]:  # fmt: skip
-    """Add the arrows of all runs, at one scale, and say what it is."""
-    found = [arrows(run, at, moved) for run, at, moved in zip(runs, rows, motions, strict=True)]
-    scales = arrow_scales(found)
-    for k, (run, at, own) in enumerate(zip(runs, rows, found, strict=True)):
-        root, look = run_path(runs, k), bodies.ACROSS if k else bodies.SOLID
-        drawing += draw_arrows(root, own, look.opacity)
-        tracks += arrow_tracks(root, own, run.t[at], run.mechanism.size, scales)
-    sizes = [f"{scales[turns]:.3g} {'N m' if turns else 'N'}" for turns in sorted(scales)]
+) -> None:  # fmt: skip
+    """Add the force arrows of all runs at one scale, and show the scale in the status line."""
+    groups = [compute_arrows(run, selected, poses) for run, selected, poses in zip(runs, rows, motions, strict=True)]
+    scales = compute_arrow_scales(groups)
+    for k, (run, selected, arrows) in enumerate(zip(runs, rows, groups, strict=True)):
+        root = _run_path(runs, k)
+        drawing += draw_arrows(root, arrows, _run_appearance(k).opacity)
+        tracks += create_arrow_tracks(root, arrows, run.t[selected], run.mechanism.size, scales)
+    sizes = [f"{scales[is_torque]:.3g} {'N m' if is_torque else 'N'}" for is_torque in sorted(scales)]
     if sizes:
-        drawing.append(commands.say(f"long arrows: {', '.join(sizes)}"))
-    return drawing, tracks
+        drawing.append(commands.set_status(f"long arrows: {', '.join(sizes)}"))
 
 
-def run_path(runs: Sequence[Run], k: int) -> str:
-    """Return the path of a run's objects."""
-    return f"{WORLD}/{k + 1}: {bodies.safe(run_labels(runs)[k])}"
-
-
-def body_tracks(mechanism: Mechanism, root: str, t: Array, moved: Placements) -> Iterator[Track]:
-    """Yield the ways of all bodies."""
-    for joint in range(1, mechanism.tree.model.njoints):
-        turned = _quaternions(moved.rotation[:, joint])
-        ways = {"position": moved.translation[:, joint], "quaternion": turned}
-        yield Track(bodies.body_path(mechanism, root, joint), t, ways)
-
-
-def _with_ghost(
+def _add_desired_pose(
     runs: Sequence[Run], rows: Sequence[IntArray], drawing: list[Command], tracks: list[Track], meshes: Path | None
-) -> tuple[list[Command], list[Track]]:
-    """Add the pose that the first controlled run should have; it is hidden while the mechanism cannot have it."""
-    for k, (run, at) in enumerate(zip(runs, rows, strict=True)):
-        wanted = desired_poses(run, at)
-        if wanted is None:
+) -> None:
+    """Add the desired pose of the first controlled run as a ghost, hidden while that pose is unreachable."""
+    for k, (run, selected) in enumerate(zip(runs, rows, strict=True)):
+        desired = compute_desired_poses(run, selected)
+        if desired is None:
             continue
-        root, t = f"{run_path(runs, k)}/desired", run.t[at]
-        moved = placements(run.mechanism, wanted.q_tree)
-        drawing += bodies.draw_bodies(run.mechanism, root, moved, bodies.GHOST, meshes)
-        tracks += body_tracks(run.mechanism, root, t, moved)
-        if not wanted.exists.all():
-            tracks.append(Track(root, t, {"visible": wanted.exists}))
-        break
-    return drawing, tracks
+        root, t = f"{_run_path(runs, k)}/desired", run.t[selected]
+        poses = compute_placements(run.mechanism, desired.q_tree)
+        drawing += bodies.draw_bodies(run.mechanism, root, poses, bodies.GHOST, meshes)
+        tracks += _create_body_tracks(run.mechanism, root, t, poses)
+        if not desired.is_reachable.all():
+            tracks.append(Track(root, t, {"visible": desired.is_reachable}))
+        return
 
 
-def _gap_tracks(
-    mechanism: Mechanism, root: str, t: Array, q_tree: Array, moved: Placements, gap: float
+# --- animation -----------------------------------------------------------------------------------
+
+
+def _create_body_tracks(mechanism: Mechanism, root: str, t: Array, poses: Placements) -> Iterator[Track]:
+    """Yield the keyframes of all bodies."""
+    for joint in range(1, mechanism.tree.model.njoints):
+        values = {"position": poses.translation[:, joint], "quaternion": _to_quaternions(poses.rotation[:, joint])}
+        yield Track(bodies.body_path(mechanism, root, joint), t, values)
+
+
+def _create_gap_tracks(
+    mechanism: Mechanism, root: str, t: Array, q_tree: Array, poses: Placements, gap: float
 ) -> Iterator[Track]:
-    """Stretch each loop's rod from frame B over its gap, so many times larger."""
-    ends = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
-    for loop, way in gaps(mechanism, q_tree).items():
-        start, way = moved.of(ends[loop].joint, ends[loop].translation), gap * way
+    """Yield the keyframes that stretch each loop's rod from frame B over its magnified gap."""
+    frames = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
+    z = np.array([0.0, 0.0, 1.0])
+    for loop, offsets in compute_loop_gaps(mechanism, q_tree).items():
+        start = poses.point_positions(frames[loop].joint, frames[loop].translation)
+        magnified = gap * offsets
         path = bodies.gap_path(root, loop)
-        length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)  # none at all has no direction
-        stretched = np.column_stack([np.ones((len(t), 2)), length])
-        turned = np.array([pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), w).coeffs() for w in way])
-        yield Track(f"{path}/way", t, {"position": start, "quaternion": turned, "scale": stretched})
-        yield Track(f"{path}/end", t, {"position": start + way})
+        lengths = np.maximum(np.linalg.norm(magnified, axis=1), MIN_GAP_LENGTH)
+        scale = np.column_stack([np.ones((len(t), 2)), lengths])
+        rotations = np.array([pin.Quaternion.FromTwoVectors(z, vector).coeffs() for vector in magnified])
+        yield Track(f"{path}/way", t, {"position": start, "quaternion": rotations, "scale": scale})
+        yield Track(f"{path}/end", t, {"position": start + magnified})
 
 
-def _keyframes(t: Array, speed: float) -> IntArray:
-    """Output instants to show: all, or where there are very many those nearest to an even rate."""
-    wanted = np.clip(math.ceil((t[-1] - t[0]) / speed * KEYFRAMES), FEWEST, MOST)
-    if wanted >= len(t):
+def _select_keyframes(t: Array, speed: float) -> IntArray:
+    """Return the rows to show: all of them, or those nearest to a constant rate if there are very many."""
+    count = np.clip(math.ceil((t[-1] - t[0]) / speed * KEYFRAMES_PER_SECOND), MIN_KEYFRAMES, MAX_KEYFRAMES)
+    if count >= len(t):
         return np.arange(len(t))
-    instants = np.linspace(t[0], t[-1], int(wanted))
-    after = np.clip(np.searchsorted(t, instants), 1, len(t) - 1)
-    return np.unique(after - (instants - t[after - 1] < t[after] - instants))
+    times = np.linspace(t[0], t[-1], int(count))
+    upper = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+    return np.unique(upper - (times - t[upper - 1] < t[upper] - times))
 
 
-def _quaternions(rotations: Array) -> Array:
-    """Return unit quaternions x, y, z, w of rotations (m, 3, 3), without jumps of sign between instants."""
+def _to_quaternions(rotations: Array) -> Array:
+    """Return unit quaternions x, y, z, w of rotations (m, 3, 3), whose signs do not jump between rows."""
     quaternions = np.array([pin.Quaternion(rotation).coeffs() for rotation in rotations])
     jumps = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions[1:] *= np.where(np.cumsum(jumps) % 2, -1.0, 1.0)[:, None]
     return quaternions
+
+
+# --- camera --------------------------------------------------------------------------------------
+
+
+def set_camera(mechanism: Mechanism, extent: tuple[Array, Array]) -> list[Command]:
+    """Return the commands that place camera, grid and background so that a motion of some extent is in sight.
+
+    The viewer's camera always looks at the origin of its scene with z up. Therefore `WORLD` is placed: the centre of
+    the motion at the origin, up along z, the viewer's side along -y. The camera is level with a planar mechanism and
+    above any other one. The cells of the grid have a round size.
+
+    Parameters
+    ----------
+    extent : (3,) and (3,) arrays
+        Lower and upper bounds to the right, up and towards the viewer, metres.
+    """
+    low, high = extent
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    radius = max(float(half[0]), float(half[1]), 0.5 * mechanism.size)
+    distance = 1.25 * radius / math.tan(math.radians(0.5 * FIELD_OF_VIEW_DEG)) + float(half[2])
+    if is_planar(mechanism):  # The grid is a wall behind the mechanism.
+        cell = _round_down(0.3 * radius)
+        grid = homogeneous(cell / GRID_CELL * VIEW_TO_SCENE, np.array([0.0, half[2] + 0.3 * mechanism.size, 0.0]))
+    else:  # The grid is a floor, small enough that the camera does not stand on it.
+        cell = _round_down(0.15 * radius)
+        grid = homogeneous(cell / GRID_CELL * np.eye(3), np.array([0.0, 0.0, -half[1] - 0.1 * mechanism.size]))
+    axes, height = _compute_camera_axes(mechanism)
+    camera = "/Cameras/default/rotated/<object>"  # In this frame y points up and the camera looks along -z.
+    return [
+        commands.set_property("/Background", "top_color", [1.0, 1.0, 1.0]),
+        commands.set_property("/Background", "bottom_color", [0.90, 0.92, 0.95]),
+        commands.set_property("/Axes", "visible", False),
+        commands.set_property("/Grid", "color", [1.0, 1.0, 1.0, 0.25]),
+        commands.set_transform("/Grid", grid),
+        commands.set_transform(WORLD, homogeneous(VIEW_TO_SCENE @ axes, -VIEW_TO_SCENE @ centre)),
+        commands.set_property(camera, "fov", FIELD_OF_VIEW_DEG),
+        commands.set_property(camera, "near", 0.01 * distance),
+        commands.set_property(camera, "far", 100.0 * distance),
+        commands.set_property(camera, "position", [0.0, height * distance, math.sqrt(1 - height**2) * distance]),
+    ]
+
+
+def motion_extent(mechanism: Mechanism, motions: Sequence[Placements]) -> tuple[Array, Array]:
+    """Return the bounds of all segments during motions, in the viewer's axes, m."""
+    points = [
+        poses.point_positions(joint, point)
+        for poses in motions
+        for segment in find_segments(mechanism)
+        for joint, point in ((segment.joint, segment.start), (segment.end_joint, segment.end))
+    ]
+    projected = np.concatenate(points) @ _compute_camera_axes(mechanism)[0].T if points else np.zeros((1, 3))
+    return projected.min(axis=0), projected.max(axis=0)
+
+
+def estimate_reach(mechanism: Mechanism, pose: Placements) -> tuple[Array, Array]:
+    """Estimate the bounds of a future motion: the current pose, enlarged by the longest link on all sides, m."""
+    low, high = motion_extent(mechanism, [pose])
+    lengths = (np.linalg.norm(s.end - s.start) for s in find_segments(mechanism) if s.joint == s.end_joint)
+    longest = max(map(float, lengths), default=mechanism.size)
+    margin = longest * np.array([1.0, 1.0, 0.0 if is_planar(mechanism) else 1.0])
+    return low - margin, high + margin
+
+
+def _compute_camera_axes(mechanism: Mechanism) -> tuple[Array, float]:
+    """Return right, up and towards the viewer as rows, (3, 3), and the sine of the camera's elevation."""
+    view = compute_view_axes(mechanism)
+    if is_planar(mechanism):
+        return view, 0.0
+    up = up_direction(mechanism)
+    return np.array([view[0], up, np.cross(view[0], up)]), float(view[2] @ up)
+
+
+def _round_down(length: float) -> float:
+    """Round down to 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return power * max(step for step in (1, 2, 5) if step * power <= length)

@@ -1,4 +1,4 @@
-"""Playback as a GIF: lines on a plane, drawn without a browser."""
+"""Playback as an animated GIF: a line drawing, made with matplotlib and without a browser."""
 
 from __future__ import annotations
 
@@ -13,176 +13,199 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
-from ckc_pin.view.canvas import fit_legend, head, line, look
-from ckc_pin.view.desired import desired_poses
-from ckc_pin.view.labels import plain, run_labels
-from ckc_pin.view.outline import Outline, base, outline
-from ckc_pin.view.player import file_in_folder, shown_runs
-from ckc_pin.view.skeleton import Projection, configurations, is_planar, placements, planes, viewpoint
+from ckc_pin.view.geometry import (
+    Outline,
+    Projection,
+    compute_placements,
+    compute_view_axes,
+    is_planar,
+    pinocchio_configurations,
+    project_base,
+    project_outline,
+    projection_planes,
+)
+from ckc_pin.view.layout import add_header, fit_legend, legend_line
+from ckc_pin.view.player import require_parent_folder, require_playable_runs
+from ckc_pin.view.run_group import compute_desired_poses
+from ckc_pin.view.style import escape_mathtext, figure_style, label_runs
 
-__all__ = ["in_one_palette", "save_gif"]
+__all__ = ["quantize_frames", "save_gif"]
 
-RATE = 20  # frames a second; a GIF counts in hundredths
-MOST = 1200  # frames
-LAST = 1000  # ms, that the end is shown
-WIDE, LOWEST, HIGHEST = 4.8, 2.2, 6.0  # in
+FRAMES_PER_SECOND = 20  # GIF measures frame times in hundredths of a second
+MAX_FRAMES = 1200
+LAST_FRAME_MS = 1000
+WIDTH_IN, MIN_HEIGHT_IN, MAX_HEIGHT_IN = 4.8, 2.2, 6.0
 DPI = 100
-COLOURS = 64
-LOOKED_AT = 5  # frames that the colours are chosen from
+PALETTE_SIZE = 64
+PALETTE_FRAMES = 5  # frames that the palette is computed from
 
 
 def save_gif(runs: Run | Sequence[Run], path: str | Path, *, speed: float = 1.0) -> Path:
-    """Write runs as a moving picture: bars, hinges and slides on the mechanism's plane, or aslant from above.
+    """Write runs as an animated GIF that shows bars, hinges and slides.
+
+    Planar mechanisms are drawn on their plane, other mechanisms obliquely from above.
 
     Parameters
     ----------
     runs : Run or sequence of Run
-        They lie on each other; all of one mechanism. What a controller wanted is grey.
+        Runs of one mechanism, drawn on top of each other. The desired pose is grey.
     path : str or Path
     speed : float
-        Seconds of the run in a second.
+        Simulated seconds per second of playback.
 
     Raises
     ------
     InputError
-        As for `play`; a file that cannot be written; more than 1200 frames of 1/20 s; matplotlib missing.
+        As for `play_runs`; the file cannot be written; more than 1200 frames of 1/20 s; matplotlib is not installed.
     """
-    shown = shown_runs(runs, speed)
-    file = file_in_folder(path, "save_gif: path")
-    end = max(float(run.t[-1]) for run in shown)
-    count = int(np.ceil(end * RATE / speed)) + 1
-    if count > MOST:
+    ordered = require_playable_runs(runs, speed)
+    file = require_parent_folder(path, "save_gif: path")
+    t_end = max(float(run.t[-1]) for run in ordered)
+    count = int(np.ceil(t_end * FRAMES_PER_SECOND / speed)) + 1
+    if count > MAX_FRAMES:
         raise InputError(
-            f"save_gif: {end:g} s at speed {speed:g} are {count} frames, and {MOST} the most; "
-            f"speed {end * RATE / (MOST - 1):.2g} or more is short enough"
+            f"save_gif: {t_end:g} s at speed {speed:g} need {count} frames, but a GIF may have {MAX_FRAMES}; "
+            f"choose speed {t_end * FRAMES_PER_SECOND / (MAX_FRAMES - 1):.2g} or more"
         )
-    times = np.minimum(np.arange(count) * speed / RATE, end)
-    with look():
-        frames = _Frames(shown, times, speed).images()
-    durations = [1000 // RATE] * (count - 1) + [LAST]
-    with open_atomic(file) as written:
-        frames[0].save(written, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    times = np.minimum(np.arange(count) * speed / FRAMES_PER_SECOND, t_end)
+    with figure_style():
+        frames = _Animation(ordered, times, speed).render()
+    durations = [1000 // FRAMES_PER_SECOND] * (count - 1) + [LAST_FRAME_MS]
+    with open_atomic(file) as stream:
+        frames[0].save(stream, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
     return file
 
 
-def in_one_palette(drawn: Sequence[Any]) -> list[Any]:
-    """Return images in few colours, which are the same in all: what stands still is the same in the next frame."""
+def quantize_frames(images: Sequence[Any]) -> list[Any]:
+    """Reduce images to one common palette, so that GIF compresses the parts that do not change between frames."""
     from PIL import Image
 
-    some = [np.asarray(drawn[k]) for k in np.linspace(0, len(drawn) - 1, LOOKED_AT).astype(int)]
-    palette = Image.fromarray(np.vstack(some)).quantize(COLOURS)
-    made = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in drawn]
+    samples = [np.asarray(images[k]) for k in np.linspace(0, len(images) - 1, PALETTE_FRAMES).astype(int)]
+    palette = Image.fromarray(np.vstack(samples)).quantize(PALETTE_SIZE)
+    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     colours = np.array(palette.getpalette()).reshape(-1, 3)
-    colours[np.asarray(made[0])[-1, -1]] = 255  # the paper, which was averaged with what is nearly white
-    for image in made:
-        image.putpalette(colours.ravel().tolist())
-    return made
+    # The background's entry is an average of white and nearly white; make it white.
+    colours[np.asarray(frames[0])[-1, -1]] = 255
+    for frame in frames:
+        frame.putpalette(colours.ravel().tolist())
+    return frames
 
 
-class _Moving:
-    """The artists of one mechanism, which are put elsewhere for each frame."""
+class _MovingOutline:
+    """The artists of one mechanism, which are moved from frame to frame."""
 
-    def __init__(self, ax: Any, ways: list[Outline], colour: Any, **shape: Any) -> None:
+    def __init__(self, ax: Any, outlines: list[Outline], colour: Any, **properties: Any) -> None:
         from matplotlib.collections import LineCollection
         from matplotlib.patches import Polygon
 
-        self.ways = ways
-        first = ways[0]
-        self.bars = ax.add_collection(LineCollection(first.bars, colors=[colour], **shape))
-        face = {"color": colour, "markerfacecolor": "white", "markersize": 4.5, "alpha": shape.get("alpha")}
-        (self.rings,) = ax.plot(*first.rings.T, linestyle="none", marker="o", **face)
-        look = {"facecolor": "white", "edgecolor": colour, "alpha": shape.get("alpha")}
-        self.blocks = [ax.add_patch(Polygon(block, **look)) for block in first.blocks]
-        self.artists = [self.bars, *self.blocks, self.rings]  # each on those before
+        self.outlines = outlines
+        first = outlines[0]
+        self.bars = ax.add_collection(LineCollection(first.bars, colors=[colour], **properties))
+        alpha = properties.get("alpha")
+        ring_properties = {"color": colour, "markerfacecolor": "white", "markersize": 4.5, "alpha": alpha}
+        (self.rings,) = ax.plot(*first.rings.T, linestyle="none", marker="o", **ring_properties)
+        block_properties = {"facecolor": "white", "edgecolor": colour, "alpha": alpha}
+        self.blocks = [ax.add_patch(Polygon(block, **block_properties)) for block in first.blocks]
+        self.artists = [self.bars, *self.blocks, self.rings]  # in drawing order
 
-    def go(self, k: int, exists: bool = True) -> None:
-        """Stand as in frame k."""
-        way = self.ways[k]
-        self.bars.set_segments(way.bars)
-        self.rings.set_data(*way.rings.T)
-        for patch, block in zip(self.blocks, way.blocks, strict=True):
+    def move_to(self, k: int, is_visible: bool = True) -> None:
+        """Move the artists to frame k."""
+        outline = self.outlines[k]
+        self.bars.set_segments(outline.bars)
+        self.rings.set_data(*outline.rings.T)
+        for patch, block in zip(self.blocks, outline.blocks, strict=True):
             patch.set_xy(block)
         for artist in self.artists:
-            artist.set_visible(exists)
+            artist.set_visible(is_visible)
 
 
-class _Frames:
-    """A figure that is drawn once a frame."""
+class _Animation:
+    """A figure that is drawn once per frame."""
 
     def __init__(self, runs: list[Run], times: Array, speed: float) -> None:
         mechanism = runs[0].mechanism
         self.runs, self.times = runs, times
-        axes = viewpoint(mechanism)[:2]
-        self.plane = planes(mechanism)[0] if is_planar(mechanism) else Projection("", axes, ("", ""))
+        oblique = Projection("", compute_view_axes(mechanism)[:2], ("", ""))
+        self.plane = projection_planes(mechanism)[0] if is_planar(mechanism) else oblique
         rows = [np.array([run.at(t) for t in times]) for run in runs]
-        moved = [placements(run.mechanism, configurations(run, at)) for run, at in zip(runs, rows, strict=True)]
-        ways = [[outline(run.mechanism, where.row(k), self.plane) for k in range(len(times))]
-                for run, where in zip(runs, moved, strict=True)]  # fmt: skip
-        bars, rails = base(mechanism, moved[0], self.plane)
+        motions = [compute_placements(run.mechanism, pinocchio_configurations(run, selected))
+                   for run, selected in zip(runs, rows, strict=True)]  # fmt: skip
+        outlines = [
+            [project_outline(run.mechanism, motion.select_row(k), self.plane) for k in range(len(times))]
+            for run, motion in zip(runs, motions, strict=True)
+        ]
+        bars, rails = project_base(mechanism, motions[0], self.plane)
         paths = [self.plane.axes @ path.T for run in runs for path in run.points.values()]
-        moving = [x for way in ways for one in way for x in (*one.bars, one.rings, *one.blocks)]
-        self._page(np.vstack([*bars, *rails, *(path.T for path in paths), *moving]), speed)
+        moving_points = [x for frames in outlines for frame in frames
+                         for x in (*frame.bars, frame.rings, *frame.blocks)]  # fmt: skip
+        self._create_figure(np.vstack([*bars, *rails, *(path.T for path in paths), *moving_points]), speed)
         for bar in bars:
             self.ax.plot(*bar.T, color=style.GREY, linewidth=3.0, alpha=0.5 if rails else 1.0)
         for rail in rails:
             self.ax.plot(*rail.T, color="black", linewidth=1.0, marker="|", markersize=5)
         for path in paths:
             self.ax.plot(*path, color=style.GREY, linewidth=0.8, linestyle=":")
-        self.wanted, self.exists = self._wanted(rows[0])
-        looks = [{"linewidth": 2.4}] if len(runs) == 1 else style.lines(runs)
-        self.moving = [_Moving(self.ax, way, style.COLOURS[k % style.MOST], **shape)
-                       for k, (way, shape) in enumerate(zip(ways, looks, strict=True))]  # fmt: skip
-        labels = run_labels(runs) if len(runs) > 1 else []
-        handles = [line(style.COLOURS[k % style.MOST], label, **looks[k]) for k, label in enumerate(labels)]
-        fit_legend(self.figure, [*handles, *([line(style.REST, "desired")] if self.wanted else [])])
+        self.desired, self.is_reachable = self._create_desired(rows[0])
+        line_styles = [{"linewidth": 2.4}] if len(runs) == 1 else style.line_styles(runs)
+        colours = [style.COLOURS[k % style.MAX_COLOURS] for k in range(len(runs))]
+        self.outlines = [
+            _MovingOutline(self.ax, frames, colour, **line_style)
+            for frames, colour, line_style in zip(outlines, colours, line_styles, strict=True)
+        ]
+        labels = label_runs(runs) if len(runs) > 1 else []
+        handles = [legend_line(colours[k], label, **line_styles[k]) for k, label in enumerate(labels)]
+        if self.desired:
+            handles.append(legend_line(style.REST_COLOUR, "desired"))
+        fit_legend(self.figure, handles)
 
-    def _page(self, every: Array, speed: float) -> None:
+    def _create_figure(self, points: Array, speed: float) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        low, high = every.min(axis=0), every.max(axis=0)
+        low, high = points.min(axis=0), points.max(axis=0)
         low, high = low - 0.06 * (high - low).max(), high + 0.06 * (high - low).max()
-        tall = float(np.clip(WIDE * (high - low)[1] / (high - low)[0] + 0.7, LOWEST, HIGHEST))
-        self.figure = Figure(figsize=(WIDE, tall), dpi=DPI, layout="constrained")
+        height = float(np.clip(WIDTH_IN * (high - low)[1] / (high - low)[0] + 0.7, MIN_HEIGHT_IN, MAX_HEIGHT_IN))
+        self.figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI, layout="constrained")
         self.canvas: Any = FigureCanvasAgg(self.figure)
-        head(self.figure, plain(self.runs[0].scene_name), "" if speed == 1 else f"{speed:g} × real time")
+        subtitle = "" if speed == 1 else f"{speed:g} × real time"
+        add_header(self.figure, escape_mathtext(self.runs[0].scene_name), subtitle)
         self.ax: Any = self.figure.subplots()
         self.ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         self.ax.axis("off")
-        self.now = self.figure.text(0.985, 1.0 - 0.06 / tall, "", ha="right", va="top")
+        self.time_text = self.figure.text(0.985, 1.0 - 0.06 / height, "", ha="right", va="top")
 
-    def _wanted(self, rows: Any) -> tuple[_Moving | None, Any]:
-        """The pose that the first run should have; hidden while the mechanism cannot have it."""
-        wanted = desired_poses(self.runs[0], rows)
-        if wanted is None:
+    def _create_desired(self, rows: Any) -> tuple[_MovingOutline | None, Any]:
+        """Create the desired pose of the first run; it is hidden while the mechanism cannot reach it."""
+        desired = compute_desired_poses(self.runs[0], rows)
+        if desired is None:
             return None, None
         mechanism = self.runs[0].mechanism
-        moved = placements(mechanism, wanted.q_tree)
-        ways = [outline(mechanism, moved.row(k), self.plane) for k in range(len(rows))]
-        return _Moving(self.ax, ways, style.REST, linewidth=2.4), wanted.exists
+        poses = compute_placements(mechanism, desired.q_tree)
+        outlines = [project_outline(mechanism, poses.select_row(k), self.plane) for k in range(len(rows))]
+        return _MovingOutline(self.ax, outlines, style.REST_COLOUR, linewidth=2.4), desired.is_reachable
 
-    def images(self) -> list[Any]:
-        """Draw all, in one palette; what stands still is drawn once."""
+    def render(self) -> list[Any]:
+        """Draw all frames in one palette; parts that do not move are drawn once."""
         from PIL import Image
 
-        shown = ([] if self.wanted is None else [self.wanted]) + self.moving
-        artists = [artist for one in shown for artist in one.artists] + [self.now]
+        outlines = ([] if self.desired is None else [self.desired]) + self.outlines
+        artists = [artist for outline in outlines for artist in outline.artists] + [self.time_text]
         for artist in artists:
             artist.set_animated(True)
         self.canvas.draw()
-        still = self.canvas.copy_from_bbox(self.figure.bbox)
-        drawn = []
+        background = self.canvas.copy_from_bbox(self.figure.bbox)
+        images = []
         for k, t in enumerate(self.times):
-            self.canvas.restore_region(still)
-            for one in shown:
-                one.go(k, one is not self.wanted or bool(self.exists[k]))
-            self.now.set_text(self._says(float(t)))
+            self.canvas.restore_region(background)
+            for outline in outlines:
+                outline.move_to(k, outline is not self.desired or bool(self.is_reachable[k]))
+            self.time_text.set_text(self._format_time(float(t)))
             for artist in artists:
                 self.figure.draw_artist(artist)
-            drawn.append(Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy()))
-        return in_one_palette(drawn)
+            images.append(Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3].copy()))
+        return quantize_frames(images)
 
-    def _says(self, t: float) -> str:
-        """The time, and whether a run has stopped by then."""
-        stopped = any(run.status != "done" and t >= run.t[-1] for run in self.runs)
-        return f"{'stopped, ' if stopped else ''}t = {t:.2f} s"
+    def _format_time(self, t: float) -> str:
+        """Return the time, and whether a run has stopped by then."""
+        has_stopped = any(run.status != "done" and t >= run.t[-1] for run in self.runs)
+        return f"{'stopped, ' if has_stopped else ''}t = {t:.2f} s"

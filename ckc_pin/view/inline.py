@@ -1,4 +1,4 @@
-"""What figures and playback are in a notebook: values that show themselves in the page, and do nothing else."""
+"""Figures and playback as values that a notebook displays; they can also be saved."""
 
 from __future__ import annotations
 
@@ -14,47 +14,47 @@ from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
 from ckc_pin.run.run import Run
 from ckc_pin.sensitivity.sensitivities import Sensitivities
-from ckc_pin.view.figures import draw, write_figures
+from ckc_pin.view.figures import draw_runs, write_figures
 from ckc_pin.view.gif import save_gif
-from ckc_pin.view.linear_figure import draw_linear
-from ckc_pin.view.player import html, write_page
-from ckc_pin.view.sensitivity_figure import draw_sensitivities
+from ckc_pin.view.linear_figures import draw_linear
+from ckc_pin.view.player import render_html, write_page
+from ckc_pin.view.result_figures import draw_sensitivities
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["Figures", "Playback"]
 
-HEIGHT = 480  # of a playback in a page, in its pixels
-RESOLUTION = 100  # of a figure in a page
+PLAYBACK_HEIGHT_PX = 480
+FIGURE_DPI = 100
 
 
 class Figures(Mapping[str, "Figure"]):
-    """Figures by name, as `view.figures.draw` and its like draw them; shown by a notebook.
+    """Figures of runs or of another result by name. A notebook displays them, `save` writes them.
 
     Parameters
     ----------
-    shown : sequence of Run, or of one LinearModel, GainLocus or Sensitivities
+    results : sequence of Run, or of one LinearModel, GainLocus or Sensitivities
 
     Raises
     ------
     InputError
-        Nothing, something else, several linear models; matplotlib missing.
+        No result, another type, or a result that cannot be drawn together with others; matplotlib is not installed.
     """
 
-    def __init__(self, shown: Sequence[Run | LinearModel | GainLocus | Sensitivities]) -> None:
-        match shown:
-            case [LinearModel() | GainLocus() as one]:
-                self._figures = draw_linear(one)
-            case [Sensitivities() as one]:
-                self._figures = {"sensitivities": draw_sensitivities(one)}
-            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities) for x in shown):
-                raise InputError("plot: what is no run is drawn by itself; give it alone")
+    def __init__(self, results: Sequence[Run | LinearModel | GainLocus | Sensitivities]) -> None:
+        match results:
+            case [LinearModel() | GainLocus() as result]:
+                self._figures = draw_linear(result)
+            case [Sensitivities() as result]:
+                self._figures = {"sensitivities": draw_sensitivities(result)}
+            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities) for x in results):
+                raise InputError("plot: only runs can be drawn together; give each other result alone")
             case _:
-                self._figures = draw(shown)  # type: ignore[arg-type]
+                self._figures = draw_runs(results)  # type: ignore[arg-type]
 
     def __getitem__(self, name: str) -> Figure:
-        """Return matplotlib's figure, to be changed as any."""
+        """Return the matplotlib figure of a name; it can be modified."""
         return self._figures[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -67,21 +67,21 @@ class Figures(Mapping[str, "Figure"]):
         return f"Figures({', '.join(self)})"
 
     def _repr_html_(self) -> str:
-        return "\n".join(_image(name, figure) for name, figure in self._figures.items())
+        return "\n".join(_render_image(name, figure) for name, figure in self._figures.items())
 
     def save(self, out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
-        """Write the figures to a folder, which is made when missing; formats are "png", "svg" and "pdf".
+        """Write the figures to a folder, which is created if missing; formats are "png", "svg" and "pdf".
 
         Raises
         ------
         InputError
-            An unknown format, a folder that cannot be written.
+            Unknown format; the folder cannot be written.
         """
         return write_figures(self._figures, out_dir, formats)
 
 
 class Playback:
-    """Playback of runs as a page of its own; shown inline by a notebook, and kept with it.
+    """Playback of runs as a page. A notebook displays it and saves it with the cell's output.
 
     Parameters
     ----------
@@ -100,34 +100,34 @@ class Playback:
         forces: bool = False,
     ) -> None:
         self._runs, self._speed = tuple(runs), speed
-        self.html = html(self._runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
+        self.html = render_html(self._runs, speed=speed, gap=gap, meshes=meshes, forces=forces)
 
     def __repr__(self) -> str:
         names = ", ".join(run.scene_name for run in self._runs)
         return f"Playback({names}); save(FILE) writes a page that plays, or a GIF"
 
     def _repr_html_(self) -> str:
-        page = escape(self.html, quote=True)  # a page within the page; its scripts can reach nothing of ours
+        page = escape(self.html, quote=True)  # The sandbox keeps its scripts out of the notebook's page.
         return (
-            f'<iframe srcdoc="{page}" sandbox="allow-scripts" width="100%" height="{HEIGHT}" '
+            f'<iframe srcdoc="{page}" sandbox="allow-scripts" width="100%" height="{PLAYBACK_HEIGHT_PX}" '
             'style="border: 1px solid #ddd"></iframe>'
         )
 
     def save(self, path: str | Path) -> Path:
-        """Write one HTML file that plays from disk, without a network, or where its name ends in .gif a moving picture.
+        """Write an HTML file that plays from disk without a network, or a GIF if the name ends in .gif.
 
         Raises
         ------
         InputError
-            As of `save_html` and `save_gif`.
+            As for `save_html` and `save_gif`.
         """
         if str(path).lower().endswith(".gif"):
             return save_gif(self._runs, path, speed=self._speed)
         return write_page(self.html, path)
 
 
-def _image(name: str, figure: Figure) -> str:
+def _render_image(name: str, figure: Figure) -> str:
     file = BytesIO()
-    figure.savefig(file, format="png", dpi=RESOLUTION)
+    figure.savefig(file, format="png", dpi=FIGURE_DPI)
     data = b64encode(file.getvalue()).decode()
     return f'<img src="data:image/png;base64,{data}" alt="{escape(name, quote=True)}" style="max-width: 100%">'

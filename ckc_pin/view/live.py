@@ -1,7 +1,8 @@
-"""A simulation in the browser while it computes.
+"""Live view: a simulation is shown in the browser while it is computed.
 
-The integration hands over its output instants and goes on at once. A thread of its own draws the newest one a few times
-a second, and only for viewers that have shown the last one: what comes in between is dropped.
+The integration only appends its output times to a queue. A separate thread draws the newest one up to
+`MAX_FRAMES_PER_SECOND` times a second, and only for viewers that have shown the previous frame. Other output times are
+skipped.
 """
 
 from __future__ import annotations
@@ -13,9 +14,6 @@ from contextlib import contextmanager
 from threading import Event, Thread
 from time import perf_counter
 from time import sleep as pause
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
@@ -24,19 +22,14 @@ from ckc_pin.run.run import Run
 from ckc_pin.scene.parts import scene_mechanism
 from ckc_pin.scene.scene import Scene
 from ckc_pin.view import bodies, commands
-from ckc_pin.view.browser import open_in_browser
-from ckc_pin.view.camera import WORLD, extent_of_reach, surroundings
 from ckc_pin.view.commands import Command
-from ckc_pin.view.drawing import scene as drawing_of
-from ckc_pin.view.page import page
-from ckc_pin.view.skeleton import placements
-
-if TYPE_CHECKING:
-    from ckc_pin.view.server import ViewServer
+from ckc_pin.view.drawing import WORLD, draw_runs_3d, estimate_reach, set_camera
+from ckc_pin.view.geometry import compute_placements, homogeneous
+from ckc_pin.view.player import open_in_browser, start_server
 
 __all__ = ["LiveView", "live_view"]
 
-FRAMES = 30  # a second, at most
+MAX_FRAMES_PER_SECOND = 30
 ROOT = f"{WORLD}/live"
 
 
@@ -44,10 +37,10 @@ ROOT = f"{WORLD}/live"
 def live_view(
     scene: Scene, speed: float | None, port: int = 0, open_browser: bool = False
 ) -> Iterator[LiveView | None]:
-    """Show a scene's simulation for as long as the context lasts.
+    """Show a scene's simulation in the browser for the duration of a ``with`` statement.
 
-    Where that cannot be (a port in use, meshcat missing, shapes that cannot be drawn) it says so and gives None: a view
-    never keeps a run from being computed.
+    If the view cannot be started (port in use, meshcat not installed, invalid visual), the reason is printed and the
+    context's value is None. A missing view never prevents a simulation.
     """
     try:
         view = LiveView(scene, speed, port)
@@ -66,44 +59,45 @@ def live_view(
 
 
 class LiveView:
-    """Draws output instants as they come.
+    """A page in the browser that follows a running simulation. Its `on_output` is passed to `simulate`.
 
     Parameters
     ----------
     scene : Scene
     speed : float or None
-        Show so many seconds of the simulation in a second, as far as they are computed; None: the newest.
+        Simulated seconds per second, at most as fast as they are computed; None: always the newest output time.
     port : int
 
     Raises
     ------
     InputError
-        A port in use, meshcat missing, a drawing that cannot be.
+        A port in use, meshcat not installed, or an invalid visual in a URDF.
     """
 
     def __init__(self, scene: Scene, speed: float | None, port: int = 0) -> None:
-        self.mechanism = scene_mechanism(scene)  # its own: the integration's must not be used by another thread
+        # The view needs its own mechanism, because a mechanism must not be used by two threads.
+        self.mechanism = scene_mechanism(scene)
         self.t_end, self.speed = scene.spec.t_end, speed
-        drawing = _drawing(self.mechanism)
-        self.server = _serve(scene.name, port)
+        drawing = _draw_mechanism(self.mechanism)
+        self.server = start_server(scene.name, [], port)
         for command in drawing:
             self.server.send(command)
         self._frames: deque[tuple[float, Array]] = deque(maxlen=1 if speed is None else None)
-        self._last: tuple[float, Array] | None = None
-        self._began: float | None = None
-        self._ended = Event()
-        self._thread = Thread(target=self._draw, name="ckc_pin live view", daemon=True)
+        self._pending: tuple[float, Array] | None = None
+        self._start_time: float | None = None
+        self._stopped = Event()
+        self._thread = Thread(target=self._run_thread, name="ckc_pin live view", daemon=True)
         self._thread.start()
 
     def on_output(self, t: float, q_tree: Array) -> None:
-        """Take an output instant: `simulate`'s output callback. Costs next to nothing, whatever the viewers do."""
-        self._began = self._began or perf_counter()
+        """Queue an output time. This output callback of `simulate` takes microseconds, whatever the viewers do."""
+        self._start_time = self._start_time or perf_counter()
         self._frames.append((t, q_tree))
 
     def finish(self, run: Run, *, stay: bool) -> None:
-        """Wait until a slower view has come to the end; to stay is to go on with playback until Ctrl-C."""
-        if self.speed is not None and self._began is not None:
-            pause(max(0.0, self._began + float(run.t[-1]) / self.speed - perf_counter()))
+        """Wait until a view at a set speed has shown the end; with `stay`, play the run back until Ctrl-C."""
+        if self.speed is not None and self._start_time is not None:
+            pause(max(0.0, self._start_time + float(run.t[-1]) / self.speed - perf_counter()))
         self.stop()
         if stay:
             self.play_back(run)
@@ -111,72 +105,58 @@ class LiveView:
             Event().wait()
 
     def play_back(self, run: Run) -> None:
-        """Put the playback of the run in the place of its last instant."""
+        """Replace the last frame by the playback of a run."""
         self.server.send(commands.delete(WORLD))
-        self.server.send(commands.say(""))
-        for command in drawing_of([run], speed=self.speed or 1.0):
+        self.server.send(commands.set_status(""))
+        for command in draw_runs_3d([run], speed=self.speed or 1.0):
             self.server.send(command)
 
     def stop(self) -> None:
-        """Draw the last instant; nothing is drawn any more when this returns."""
-        self._ended.set()
+        """Draw the last output time and end the thread."""
+        self._stopped.set()
         self._thread.join()
 
     # --- in the view's thread --------------------------------------------------------------------
 
-    def _draw(self) -> None:
-        while not self._ended.wait(1.0 / FRAMES):
+    def _run_thread(self) -> None:
+        while not self._stopped.wait(1.0 / MAX_FRAMES_PER_SECOND):
             self._draw_newest()
         self._draw_newest()
 
     def _draw_newest(self) -> None:
-        due = self._due()
-        self._last = due or self._last
-        if self._last is not None and self.server.viewers:  # nobody there: nothing to compute
-            self.server.send(self._frame(*self._last))
-            self._last = None
+        due = self._take_due_frame()
+        self._pending = due or self._pending
+        if self._pending is not None and self.server.viewers:  # Without viewers no frame is computed.
+            self.server.send(self._create_frame(*self._pending))
+            self._pending = None
 
-    def _due(self) -> tuple[float, Array] | None:
-        """Return the newest instant whose time has come; those before it are dropped."""
+    def _take_due_frame(self) -> tuple[float, Array] | None:
+        """Return the newest output time that is due; earlier ones are dropped."""
         until = float("inf")
-        if self.speed is not None and self._began is not None:
-            until = self.speed * (perf_counter() - self._began)
-        found = None
+        if self.speed is not None and self._start_time is not None:
+            until = self.speed * (perf_counter() - self._start_time)
+        frame = None
         while self._frames and self._frames[0][0] <= until:
-            found = self._frames.popleft()
-        return found
+            frame = self._frames.popleft()
+        return frame
 
-    def _frame(self, t: float, q_tree: Array) -> Command:
+    def _create_frame(self, t: float, q_tree: Array) -> Command:
         tree = self.mechanism.tree
-        moved = placements(self.mechanism, tree.from_coordinates(q_tree)[None])
-        placed = [
+        pose = compute_placements(self.mechanism, tree.from_coordinates(q_tree)[None])
+        transforms = [
             commands.set_transform(
                 bodies.body_path(self.mechanism, ROOT, joint),
-                _matrix(moved.rotation[0, joint], moved.translation[0, joint]),
+                homogeneous(pose.rotation[0, joint], pose.translation[0, joint]),
             )
             for joint in range(1, tree.model.njoints)
         ]
-        return commands.several([*placed, commands.say(f"t = {t:.2f} of {self.t_end:g} s")])
+        return commands.group_commands([*transforms, commands.set_status(f"t = {t:.2f} of {self.t_end:g} s")])
 
 
-def _drawing(mechanism: Mechanism) -> list[Command]:
-    moved = placements(mechanism, mechanism.q_tree[None])
+def _draw_mechanism(mechanism: Mechanism) -> list[Command]:
+    pose = compute_placements(mechanism, mechanism.q_tree[None])
     return [
-        *surroundings(mechanism, extent_of_reach(mechanism, moved)),
-        *bodies.draw_bodies(mechanism, ROOT, moved, bodies.SOLID),
+        *set_camera(mechanism, estimate_reach(mechanism, pose)),
+        *bodies.draw_bodies(mechanism, ROOT, pose, bodies.SOLID),
         *bodies.draw_loop_frames(mechanism, ROOT, bodies.SOLID),
     ]
-
-
-def _serve(title: str, port: int) -> ViewServer:
-    try:
-        from ckc_pin.view.server import ViewServer
-    except ModuleNotFoundError:
-        raise InputError("playback needs meshcat and its tornado: pip install 'ckc_pin[view]'") from None
-    return ViewServer(page(title, []), port)
-
-
-def _matrix(rotation: Array, translation: Array) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix

@@ -1,7 +1,7 @@
-"""A web server for meshcat's viewer, inside this process, on 127.0.0.1 only.
+"""Web server for meshcat's viewer: runs in a thread of this process and listens on 127.0.0.1 only.
 
-Host and Origin of every request must be this very server's, or another web page could talk to it through the
-reader's browser (DNS rebinding, cross-site WebSockets).
+The Host and Origin headers of every request must name this server. Otherwise another web page could talk to it through
+the user's browser (DNS rebinding, cross-site WebSockets).
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ckc_pin.errors import InputError
-from ckc_pin.view.commands import SEVERAL, Command, Stage
-from ckc_pin.view.page import START_SCRIPT, viewer_script
+from ckc_pin.view.commands import SEVERAL, Command, SceneState
+from ckc_pin.view.page import read_live_script, read_viewer_script
 
 __all__ = ["ViewServer"]
 
 LOOPBACK = "127.0.0.1"
-MAX_INCOMING = 2**16  # bytes; viewers have little to say
-GOODBYE = 0.5  # s that a viewer has to answer a closing handshake
+MAX_MESSAGE_BYTES = 2**16  # from a viewer; they are a few bytes long
+CLOSING_TIMEOUT_S = 0.5  # for a viewer to answer the closing handshake
 
-# Nothing is loaded from, or sent to, anywhere else. dat.gui writes its own style sheet.
+# The page loads from, and sends to, this server only. Inline styles are allowed because dat.gui creates a style sheet.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self' ws://{host}; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -34,19 +34,19 @@ POLICY = (
 
 
 class ViewServer:
-    """Shows a scene to any number of browsers; one that comes later or reloads sees it as it is by then.
+    """A server that shows a scene in any number of browsers. A browser that connects later sees the current scene.
 
     Parameters
     ----------
     page : str
         The HTML at ``/``.
     port : int
-        0: any free one.
+        0: any free port.
 
     Raises
     ------
     InputError
-        No such port, or one in use; meshcat is not installed.
+        The port is invalid or in use; meshcat is not installed.
 
     Attributes
     ----------
@@ -55,47 +55,47 @@ class ViewServer:
 
     Examples
     --------
-    >>> with ViewServer(page("empty", [])) as server:  # doctest: +SKIP
+    >>> with ViewServer(render_server_page("empty", [])) as server:  # doctest: +SKIP
     ...     server.send(set_property("/Axes", "visible", False))
     """
 
     def __init__(self, page: str, port: int = 0) -> None:
         if not 0 <= port <= 65535:
             raise InputError(f"port {port}: choose one from 1 to 65535, or 0 for any free one")
-        files = {"main.min.js": ("text/javascript", viewer_script()), "start.js": ("text/javascript", START_SCRIPT)}
+        scripts = {"main.min.js": read_viewer_script(), "start.js": read_live_script()}
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
         self.url = f"http://{LOOPBACK}:{self.port}/"
         self.hosts = {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
-        self.stage = Stage()
+        self.scene_state = SceneState()
         self.viewers: set[_Viewer] = set()
         routes: list[Any] = [("/", _Viewer, {"server": self, "page": page})]
-        routes += [(f"/{name}", _File, {"server": self, "kind": kind, "content": content})
-                   for name, (kind, content) in files.items()]  # fmt: skip
+        routes += [(f"/{name}", _Script, {"server": self, "content": content}) for name, content in scripts.items()]
         self._application = Application(
             routes,
-            default_handler_class=_Nothing,
+            default_handler_class=_NotFound,
             default_handler_args={"server": self},
-            websocket_max_message_size=MAX_INCOMING,
+            websocket_max_message_size=MAX_MESSAGE_BYTES,
             log_function=lambda handler: None,
         )
-        self._drawing = Lock()
+        self._scene_lock = Lock()
         self._ready = Event()
         self._thread = Thread(target=lambda: asyncio.run(self._serve()), name="ckc_pin view", daemon=True)
         self._thread.start()
         self._ready.wait()
 
     def send(self, command: Command) -> None:
-        """Draw: for the viewers that are there, and for those to come. From any thread, which never waits.
+        """Send a drawing command to all connected viewers and keep it for later ones. Any thread may call this.
 
-        `several` things make a frame: a viewer that has not shown the last one yet misses all but the newest.
+        The call does not wait for viewers. A group of commands is a live frame: a viewer that has not yet shown the
+        previous frame skips all but the newest one.
         """
-        with self._drawing:
-            message = self.stage.apply(command)
+        with self._scene_lock:
+            message = self.scene_state.apply(command)
         self._loop.call_soon_threadsafe(self._show, message, command["type"])
 
     def stop(self) -> None:
-        """Close every connection and the port; when this returns the thread is gone."""
+        """Close all connections and the port, and wait for the thread to end."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join()
@@ -119,38 +119,39 @@ class ViewServer:
         await self._stop.wait()
         server.stop()
         await server.close_all_connections()
-        leaving = list(self.viewers)
-        for viewer in leaving:
-            if viewer.newest is not None:
-                viewer.show(viewer.newest)
+        viewers = list(self.viewers)
+        for viewer in viewers:
+            if viewer.next_frame is not None:
+                viewer.send(viewer.next_frame)
             viewer.close(1001, "stopped")
-        if leaving:
-            await asyncio.wait([asyncio.ensure_future(viewer.gone.wait()) for viewer in leaving], timeout=GOODBYE)
+        if viewers:
+            closing = [asyncio.ensure_future(viewer.closed.wait()) for viewer in viewers]
+            await asyncio.wait(closing, timeout=CLOSING_TIMEOUT_S)
         for viewer in list(self.viewers):
-            viewer.hang_up()
+            viewer.abort()
 
     def _show(self, message: bytes, kind: str) -> None:
         for viewer in list(self.viewers):
             if kind == SEVERAL:
-                viewer.show_frame(message)
+                viewer.send_frame(message)
                 continue
-            if kind == "delete":  # nor is a frame to come that would draw it again
-                viewer.newest = None
-            viewer.show(message)
+            if kind == "delete":  # A waiting frame would draw the deleted objects again.
+                viewer.next_frame = None
+            viewer.send(message)
 
-    def welcome(self, viewer: _Viewer) -> None:
-        """Draw the scene as it is for a viewer that has just come, and keep it informed."""
-        with self._drawing:
-            messages = self.stage.messages()
+    def add_viewer(self, viewer: _Viewer) -> None:
+        """Send the current scene to a new viewer, and all later commands too."""
+        with self._scene_lock:
+            messages = self.scene_state.messages()
         for message in messages:
-            viewer.show(message)
+            viewer.send(message)
         self.viewers.add(viewer)
 
 
 def _listen(port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port just left is free
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # for ports that were closed just now
         listener.bind((LOOPBACK, port))
         listener.listen(16)
     except OSError as error:
@@ -161,14 +162,14 @@ def _listen(port: int) -> socket.socket:
     return listener
 
 
-def _forget(sent: asyncio.Future[None]) -> None:
-    """A viewer that went away while it was told something is no error; `on_close` follows."""
-    if not sent.cancelled() and not isinstance(sent.exception(), WebSocketClosedError | None):
-        sent.result()
+def _ignore_closed(sending: asyncio.Future[None]) -> None:
+    """Ignore that a viewer disconnected while a message was sent; `on_close` follows. Raise any other error."""
+    if not sending.cancelled() and not isinstance(sending.exception(), WebSocketClosedError | None):
+        sending.result()
 
 
-class _OwnOnly(RequestHandler):
-    """Answers only requests that were meant for this server."""
+class _SameOriginHandler(RequestHandler):
+    """Base of all handlers: rejects requests whose Host or Origin is not this server."""
 
     def initialize(self, server: ViewServer, **rest: Any) -> None:
         self.server = server
@@ -177,11 +178,11 @@ class _OwnOnly(RequestHandler):
         origin = self.request.headers.get("Origin")
         if self.request.headers.get("Host", "") not in self.server.hosts:
             raise HTTPError(403)
-        if origin is not None and not self.own(origin):
+        if origin is not None and not self.is_same_origin(origin):
             raise HTTPError(403)
 
-    def own(self, origin: str) -> bool:
-        """Whether a page of this origin may talk to us."""
+    def is_same_origin(self, origin: str) -> bool:
+        """Return whether pages of an origin may use this server."""
         return origin.removeprefix("http://") in self.server.hosts and origin.startswith("http://")
 
     def set_default_headers(self) -> None:
@@ -190,34 +191,34 @@ class _OwnOnly(RequestHandler):
         self.set_header("X-Content-Type-Options", "nosniff")
 
     def log_exception(self, *error: Any) -> None:
-        if error[0] is None or not issubclass(error[0], HTTPError):  # a refusal is no news
+        if error[0] is None or not issubclass(error[0], HTTPError):  # rejected requests are not logged
             super().log_exception(*error)
 
 
-class _Nothing(_OwnOnly):
+class _NotFound(_SameOriginHandler):
     def get(self) -> None:
         raise HTTPError(404)
 
 
-class _File(_OwnOnly):
-    def initialize(self, server: ViewServer, kind: str = "", content: bytes | str = "", **rest: Any) -> None:
+class _Script(_SameOriginHandler):
+    def initialize(self, server: ViewServer, content: bytes | str = "", **rest: Any) -> None:
         super().initialize(server)
-        self.kind, self.content = kind, content
+        self.content = content
 
     def get(self) -> None:
-        self.set_header("Content-Type", f"{self.kind}; charset=utf-8")
+        self.set_header("Content-Type", "text/javascript; charset=utf-8")
         self.write(self.content)
 
 
-class _Viewer(_OwnOnly, WebSocketHandler):
-    """The page at ``/``, and the WebSocket that the page opens at the same place."""
+class _Viewer(_SameOriginHandler, WebSocketHandler):
+    """The page at ``/``, and the WebSocket that the page opens at the same address."""
 
     def initialize(self, server: ViewServer, page: str = "", **rest: Any) -> None:
         super().initialize(server)
         self.page = page
-        self.gone = asyncio.Event()
-        self.busy = False  # with a frame
-        self.newest: bytes | None = None  # frame that came meanwhile
+        self.closed = asyncio.Event()
+        self.is_busy = False  # has not yet answered that it has shown the last frame
+        self.next_frame: bytes | None = None  # sent after that answer
 
     async def get(self, *args: Any, **kwargs: Any) -> None:
         if self.request.headers.get("Upgrade", "").lower() == "websocket":
@@ -228,37 +229,37 @@ class _Viewer(_OwnOnly, WebSocketHandler):
         self.finish(self.page)
 
     def check_origin(self, origin: str) -> bool:
-        return self.own(origin)
+        return self.is_same_origin(origin)
 
     def open(self, *args: str, **kwargs: str) -> None:
-        self.server.welcome(self)
+        self.server.add_viewer(self)
 
-    def show(self, message: bytes) -> None:
+    def send(self, message: bytes) -> None:
         try:
-            sent = asyncio.ensure_future(self.write_message(message, binary=True))
+            sending = asyncio.ensure_future(self.write_message(message, binary=True))
         except WebSocketClosedError:
             return
-        sent.add_done_callback(_forget)
+        sending.add_done_callback(_ignore_closed)
 
-    def show_frame(self, message: bytes) -> None:
-        """Show a frame now, or when the one before has been shown and no newer one has come."""
-        if self.busy:
-            self.newest = message
+    def send_frame(self, message: bytes) -> None:
+        """Send a live frame now, or after the previous one has been shown unless a newer one replaces it."""
+        if self.is_busy:
+            self.next_frame = message
             return
-        self.busy = True
-        self.show(message)
+        self.is_busy = True
+        self.send(message)
 
     def on_message(self, message: str | bytes) -> None:
-        """Take any message for what our page says, that it has shown a frame."""
-        self.busy, newest, self.newest = False, self.newest, None
-        if newest is not None:
-            self.show_frame(newest)
+        """Send the waiting frame. The page's only message says that it has shown the previous frame."""
+        self.is_busy, next_frame, self.next_frame = False, self.next_frame, None
+        if next_frame is not None:
+            self.send_frame(next_frame)
 
     def on_close(self) -> None:
         self.server.viewers.discard(self)
-        self.gone.set()
+        self.closed.set()
 
-    def hang_up(self) -> None:
-        """Close without waiting for an answer."""
+    def abort(self) -> None:
+        """Close the connection without waiting for the viewer's answer."""
         if self.ws_connection is not None and self.ws_connection.stream is not None:
             self.ws_connection.stream.close()

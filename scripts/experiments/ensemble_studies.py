@@ -14,7 +14,7 @@ from ckc_pin.ensembles.importance import importance
 from ckc_pin.ensembles.spec import sweep_of
 from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.view.ensemble_figures import draw_basins, draw_fan, draw_importance
+from ckc_pin.view.ensemble_figures import draw_basins, draw_quantiles, draw_sobol_indices
 from scripts.experiments.certificate.certificate import certify, rest_height, sublevel_set
 from scripts.experiments.chart import shrink
 from scripts.experiments.paper.set_point_experiments import load_case
@@ -45,7 +45,7 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
     found = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, overrides=TRACKING)
     exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, overrides=TRACKING)
     change = found["error"] - exact["error"][0]
-    draw_fan(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
+    draw_quantiles(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
     lines = ["| joint | rms error, exact lengths (rad) | change by wrong lengths: 95 % stay below, the most (rad) |",
              "|---|---|---|"]  # fmt: skip
     for name in found["independent"].to_numpy():
@@ -57,7 +57,7 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
     weighed = importance(
         SweepTask(sweep_of(data, Sources("study", Path())), "study", "five_bar/tracking", None), weighed_by
     )
-    draw_importance(weighed.sel(output="late"), out / "tolerances_importance.png")
+    draw_sobol_indices(weighed.sel(output="late"), out / "tolerances_importance.png")
     lines += ["", "| length | first order | total |", "|---|---|---|"]
     for name, key in LENGTHS.items():
         one = weighed.sel(output="late", variable=key)

@@ -10,9 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import fit_legend, line
-from ckc_pin.view.labels import rate_symbol, symbol, with_unit
-from ckc_pin.view.style import WIDTH_BESIDE, colours
+from ckc_pin.view.layout import fit_legend, legend_line
+from ckc_pin.view.style import WIDE_WIDTH_IN, assign_colours, axis_label, coordinate_symbol, rate_symbol
 
 RATES = ("theta_1", "theta_3")
 IMPACT = 0.02  # s, of the run: shown by itself
@@ -24,16 +23,18 @@ def draw_friction(path: Path, dpi: float) -> None:
     """Impact at a stop, and stick-slip at the turns of a tracked swing."""
     whole = ckc_pin.simulate("five_bar/friction")
     start = ckc_pin.simulate("five_bar/friction", {"t_end": IMPACT, "solver.output_dt": IMPACT / 400})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDTH_BESIDE, 3.0), width_ratios=(1, 2))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(WIDE_WIDTH_IN, 3.0), width_ratios=(1, 2))
     shown: dict[str, Any] = {}
     for ax, run in ((left, start), (right, whole)):
-        for name, colour in colours(RATES).items():
+        for name, colour in assign_colours(RATES).items():
             (shown[name],) = ax.plot(run.t, run.v_tree[:, run.column(name)], color=colour, label=rate_symbol(name))
             for begin, end in _sticking(run, name):
-                stuck = ax.axvspan(begin, end, color=colour, alpha=0.15, linewidth=0, label=f"{symbol(name)} sticks")
+                stuck = ax.axvspan(
+                    begin, end, color=colour, alpha=0.15, linewidth=0, label=f"{coordinate_symbol(name)} sticks"
+                )
                 shown[f"{name} sticks"] = stuck
-        ax.set(xlabel=with_unit("$t$", "s"), xlim=(0, run.t[-1]))
-    left.set(ylabel=with_unit("rate", "rad/s"), title="a)  impact at a stop")
+        ax.set(xlabel=axis_label("$t$", "s"), xlim=(0, run.t[-1]))
+    left.set(ylabel=axis_label("rate", "rad/s"), title="a)  impact at a stop")
     right.set(ylim=(-1.5, 1.5), title="b)  stick-slip")
     fit_legend(figure, list(shown.values()))
     figure.savefig(path, dpi=dpi)
@@ -57,14 +58,14 @@ def draw_preload(path: Path, dpi: float) -> None:
     plain, loaded = _lift({}), _lift({"controller.allocation.preload": PRELOAD})
     if not np.abs(plain.q_tree - loaded.q_tree).max() < 1e-6:
         raise AssertionError("the preload changes the motion")
-    figure, ax = plt.subplots(figsize=(WIDTH_BESIDE, 3.4))
+    figure, ax = plt.subplots(figsize=(WIDE_WIDTH_IN, 3.4))
     shown = []
-    for name, colour in colours(SHOWN).items():
+    for name, colour in assign_colours(SHOWN).items():
         column = plain.actuated.index(name)
         shown += ax.plot(plain.t, plain.tau[:, column], color=colour, label=_words(name))
         ax.plot(loaded.t, loaded.tau[:, column], "--", color=colour)
-    preload = line("black", "with the preload", linestyle="--", linewidth=1.5)
-    ax.set(xlabel=with_unit("$t$", "s"), ylabel=with_unit(r"$\tau$", "N m"), xlim=(0, plain.t[-1]),
+    preload = legend_line("black", "with the preload", linestyle="--", linewidth=1.5)
+    ax.set(xlabel=axis_label("$t$", "s"), ylabel=axis_label(r"$\tau$", "N m"), xlim=(0, plain.t[-1]),
            title="Lift by two arms: one motion, without and with a preload of the elbows")  # fmt: skip
     fit_legend(figure, [*shown, preload])
     figure.savefig(path, dpi=dpi)

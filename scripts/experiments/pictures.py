@@ -10,10 +10,9 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
-from ckc_pin.view.canvas import look
-from ckc_pin.view.map_figure import draw_map
-from ckc_pin.view.player import play
-from ckc_pin.view.sections_figure import draw_sections
+from ckc_pin.view.map_figures import draw_map, draw_sections
+from ckc_pin.view.player import play_runs
+from ckc_pin.view.style import figure_style
 from scripts.experiments.chart import shrink
 from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
@@ -25,14 +24,14 @@ FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.ge
 
 def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> None:
     """Playback at a time of the run, without the controls."""
-    server = play(runs, block=False)
+    server = play_runs(runs, block=False)
     assert server is not None  # it does not wait
     with server:
         page.goto(server.url)
         while not page.evaluate("Boolean(window.viewer && viewer.animator.actions.length)"):
             time.sleep(0.1)
         page.evaluate("player.pause(); viewer.gui.domElement.style.display = 'none'")
-        page.evaluate(f"player.go({t}); document.getElementById('bar').style.display = 'none'; viewer.render()")
+        page.evaluate(f"player.seek({t}); document.getElementById('bar').style.display = 'none'; viewer.render()")
         time.sleep(0.5)
         page.screenshot(path=path)
 
@@ -48,7 +47,7 @@ def main(chromium: Path) -> None:
         screenshot(page, [tracking], 1.45, IMAGES / "five_bar_tracking.png")
         screenshot(page, [lift], 1.0, IMAGES / "two_ur5_lift.png")
         browser.close()
-    with look():
+    with figure_style():
         for name in ("five_bar", "five_bar_as_printed"):
             draw_map(singularity_map(name, scene="tracking")).savefig(IMAGES / f"map_{name}.png", dpi=DPI)
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 import ckc_pin
-from ckc_pin.view.canvas import look
-from ckc_pin.view.gif import in_one_palette
-from ckc_pin.view.style import COLOURS, GREY
+from ckc_pin.view.gif import quantize_frames
+from ckc_pin.view.style import COLOURS, GREY, figure_style
 from scripts.experiments.chart import shrink
 
 __all__ = ["main"]
@@ -122,7 +121,7 @@ def pipeline() -> Any:
     return figure
 
 
-@look()
+@figure_style()
 def moving(path: Path, count: int = 60) -> None:
     """The five-bar under tracking control, as it moves."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -163,7 +162,7 @@ def moving(path: Path, count: int = 60) -> None:
         now.set_xdata([run.t[instant]] * 2)
         canvas.draw()
         drawn.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    first, *others = in_one_palette(drawn)
+    first, *others = quantize_frames(drawn)
     first.save(path, save_all=True, append_images=others, duration=80, loop=0)
 
 

@@ -14,7 +14,8 @@ import ckc_pin
 from ckc_pin.mechanism.library import library
 from ckc_pin.run.recorded_joints import RecordedJoints
 from ckc_pin.view import style
-from ckc_pin.view.canvas import line, look, say
+from ckc_pin.view.layout import legend_line, set_panel_title
+from ckc_pin.view.style import figure_style
 from scripts.experiments.chart import shrink
 
 __all__ = ["error_control", "friction", "generated", "main"]
@@ -33,7 +34,7 @@ APART = np.logspace(-0.6, -6, 40)  # rad from where links 2 and 4 are in line
 def _figure(rows: int, columns: int, height: float, **grid: Any) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(style.WIDTH, height), dpi=style.DPI, layout="constrained")
+    figure = Figure(figsize=(style.WIDTH_IN, height), dpi=style.DPI, layout="constrained")
     return figure, figure.subplots(rows, columns, **grid)
 
 
@@ -65,9 +66,9 @@ def friction() -> Any:
         ax.set(xlim=TURN)
     rate.set(ylabel=r"$\dot{\theta}_1$ (rad/s)", ylim=(-0.3, 0.6))
     rate.legend()
-    say(rate, "a)  a joint turns round", "events: it rests, shaded; smoothed: it creeps")
+    set_panel_title(rate, "a)  a joint turns round", "events: it rests, shaded; smoothed: it creeps")
     force.set(xlabel="$t$ (s)", ylabel="friction over F", ylim=(-1.25, 1.25), yticks=[-1, 0, 1])
-    say(force, "b)  what friction gives", "F against the motion, and at rest what is needed, up to F")
+    set_panel_title(force, "b)  what friction gives", "F against the motion, and at rest what is needed, up to F")
     _bounces(bounce)
     return figure
 
@@ -96,7 +97,7 @@ def _bounces(ax: Any) -> None:
     ax.axvline(len(times), color=style.COLOURS[1], linewidth=1.2, label=f"contact, at {contact:.3f} s")
     ax.set(xlabel="bounce", ylabel="time to the next (s)")
     ax.legend()
-    say(ax, "c)  bounces at a stop", f"restitution {BOUNCY}: finitely many, then contact")
+    set_panel_title(ax, "c)  bounces at a stop", f"restitution {BOUNCY}: finitely many, then contact")
 
 
 # --- generated terms --------------------------------------------------------------------------------
@@ -117,16 +118,17 @@ def generated() -> Any:
             time.loglog([row[2] for row in ran], [row[column] for row in ran], marker, color=colour, markersize=4,
                         markerfacecolor=face)  # fmt: skip
         for name, x, y in ((row[0], row[1], row[2]) for row in own if label == "shipped"):
-            text.annotate(name, (x, y), (4, -7), textcoords="offset points", fontsize=style.NOTE, color=style.GREY)
+            text.annotate(name, (x, y), (4, -7), textcoords="offset points", fontsize=style.NOTE_SIZE_PT,
+                          color=style.GREY)  # fmt: skip
     text.set(xlabel="coordinates of the tree", ylabel="operations of a right-hand side")
-    text.legend(fontsize=style.NOTE)
-    say(text, "a)  how long the text is")
+    text.legend(fontsize=style.NOTE_SIZE_PT)
+    set_panel_title(text, "a)  how long the text is")
     time.set(xlabel="operations", ylabel="a right-hand side (µs)")
-    say(time, "b)  what it takes to run")
+    set_panel_title(time, "b)  what it takes to run")
     shape = {"marker": "o", "linestyle": "none", "markersize": 4}
-    time.legend(handles=[line(style.GREY, "written out", **shape),
-                         line(style.GREY, "Pinocchio's terms", markerfacecolor="white", **shape)],
-                fontsize=style.NOTE)  # fmt: skip
+    time.legend(handles=[legend_line(style.GREY, "written out", **shape),
+                         legend_line(style.GREY, "Pinocchio's terms", markerfacecolor="white", **shape)],
+                fontsize=style.NOTE_SIZE_PT)  # fmt: skip
     return figure
 
 
@@ -160,15 +162,15 @@ def error_control() -> Any:
         reached.loglog(tolerances, errors, marker + "-", color=colour, markersize=4, linewidth=1.0, label=label)
     reached.loglog(tolerances, tolerances, ":", color="black", linewidth=1.0, label="rtol")
     reached.set(xlabel="rtol", ylabel="largest error along 2 s (rad, rad/s)")
-    reached.legend(fontsize=style.NOTE)
-    say(reached, "a)  what a tolerance leads to")
+    reached.legend(fontsize=style.NOTE_SIZE_PT)
+    set_panel_title(reached, "a)  what a tolerance leads to")
     margins, of_z, of_rate = _amplified()
     steep.loglog(margins, of_rate, color=style.COLOURS[1], label=r"$\dot{z}$, with $\dot{q}$ = 1 rad/s")
     steep.loglog(margins, of_z, color=style.COLOURS[0], label="$z$")
     steep.invert_xaxis()
     steep.set(xlabel=r"$|\det\varphi_z| / (l_2 l_4)$", ylabel="its error for one of $q$")
-    steep.legend(fontsize=style.NOTE)
-    say(steep, "b)  towards the end of a chart")
+    steep.legend(fontsize=style.NOTE_SIZE_PT)
+    set_panel_title(steep, "b)  towards the end of a chart")
     return figure
 
 
@@ -197,7 +199,7 @@ def main() -> None:
     """Draw all of them."""
     for draw in (friction, generated, error_control):
         path = DOCS / "images" / "theory" / f"{draw.__name__}.png"
-        with look():
+        with figure_style():
             draw().savefig(path)
         shrink(path)
         print(f"written: {path}")

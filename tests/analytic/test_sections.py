@@ -8,7 +8,7 @@ import pytest
 import ckc_pin
 from ckc_pin.analysis.map import loci, workspace_sections
 from ckc_pin.analysis.map.sections import Stack
-from ckc_pin.view.sections_figure import draw_sections
+from ckc_pin.view.map_figures import draw_sections
 
 BASE, PLATE, ARM, ROD = 0.25, 0.04, 0.18, 0.45  # m, of the delta
 

@@ -10,7 +10,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin.view.live import live_view
-from ckc_pin.view.player import play, save_html
+from ckc_pin.view.player import play_runs, save_html
 from tests.browser.pages import browser, look_at
 from tests.contract.sketches import FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, tetrahedron, write_scene
 
@@ -41,7 +41,7 @@ def assert_elbows(visit, run: ckc_pin.Run, root: str) -> None:
 
 
 def test_the_live_page_plays_the_run(look_at, tracking):
-    with play(tracking, block=False) as server:
+    with play_runs(tracking, block=False) as server:
         visit = look_at(server.url)
         tree = visit.tree()
         root = "/world/1: reduced"
@@ -60,7 +60,7 @@ def test_the_live_page_plays_the_run(look_at, tracking):
 
 
 def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracking):
-    with play(tracking, speed=0.5, block=False) as server:
+    with play_runs(tracking, speed=0.5, block=False) as server:
         visit = look_at(server.url)
         assert visit.page.evaluate("viewer.animator.mixer.timeScale") == 0.5
         visit.until("viewer.animator.time > 0.1")
@@ -80,7 +80,7 @@ def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracki
 
 
 def test_what_is_seen_is_the_mechanism(look_at, tracking):
-    with play(tracking, block=False) as server:
+    with play_runs(tracking, block=False) as server:
         visit = look_at(server.url)
         visit.placements(np.array([1.5]), ["/world"])
         visit.page.evaluate("viewer.render()")
@@ -143,7 +143,7 @@ def test_names_from_files_are_only_text(look_at, tmp_path):
     loop = loop.replace('name = "joint"', f"name = '{PWNED}'")
     path = write_scene(tmp_path / "m", urdf, loop, f"[initial.q]\n'{PWNED}' = -0.5\n", 0.02)
     run = ckc_pin.simulate(path.rename(path.with_name(f"{PWNED}.scene.toml")))
-    with play(run, block=False) as server:
+    with play_runs(run, block=False) as server:
         pages = [server.url, save_html(run, tmp_path / "x.html").as_uri()]
         for visit in map(look_at, pages):
             assert [p for p in visit.tree() if p.endswith(f"/joint:{PWNED}")]
@@ -163,7 +163,7 @@ def test_a_simulation_is_seen_while_it_computes_and_played_back_after(look_at):
         def on_output(t: float, q_tree: np.ndarray) -> None:
             view.on_output(t, q_tree)
             if t in (0.4, 1.2):
-                visit.until(f"document.getElementById('said').textContent === 't = {t:.2f} of 2 s'")
+                visit.until(f"document.getElementById('status').textContent === 't = {t:.2f} of 2 s'")
                 shown.append(np.array(visit.tree()["/world/live/joint:theta_2"]["matrix"][12:15]))
 
         run = ckc_pin.simulate(scene, {}, on_output=on_output)
@@ -174,5 +174,5 @@ def test_a_simulation_is_seen_while_it_computes_and_played_back_after(look_at):
         visit.until("viewer.animator.actions.length")
         assert not [p for p in visit.tree() if p.startswith("/world/live")]
         assert_elbows(visit, run, "1: DAE")
-    visit.until("document.getElementById('said').textContent")
+    visit.until("document.getElementById('status').textContent")
     assert visit.caption()[-1] == "the program that sent this has ended"

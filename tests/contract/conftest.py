@@ -37,12 +37,12 @@ def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
 @pytest.fixture
 def serve() -> Iterator[Callable[..., ViewServer]]:
     """play(..., block=False), stopped at the end of the test."""
-    from ckc_pin.view.player import play
+    from ckc_pin.view.player import play_runs
 
     started: list[ViewServer] = []
 
     def start(*runs: ckc_pin.Run, **options: float) -> ViewServer:
-        server = play(runs, block=False, **options)
+        server = play_runs(runs, block=False, **options)
         assert server is not None
         started.append(server)
         return server

@@ -10,7 +10,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.view.player import html, save_html
+from ckc_pin.view.player import render_html, save_html
 from tests.contract.helpers.command import ckc
 
 SWING = "five_bar/swing"
@@ -37,7 +37,7 @@ CALLS: dict[str, Callable[[ckc_pin.Run, str], Any]] = {
     "ensemble: file": lambda run, path: ckc_pin.ensemble(SWING, {"t_end": {"file": path}}, **SWEEP),
     "torques": lambda run, path: ckc_pin.simulate(SWING, {"controller.type": "torques", "controller.file": path}),
     "save_html": save_html,
-    "html: meshes": lambda run, path: html(run, meshes=path),
+    "html: meshes": lambda run, path: render_html(run, meshes=path),
     "plot": lambda run, path: ckc_pin.plot([run], path),
 }
 

@@ -11,8 +11,8 @@ import pytest
 from matplotlib.colors import to_rgb
 
 import ckc_pin
-from ckc_pin.view.figures import draw, plot
-from ckc_pin.view.labels import run_labels, symbol
+from ckc_pin.view.figures import draw_runs, plot_runs
+from ckc_pin.view.style import coordinate_symbol, label_runs
 from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, write_scene
 
 BLUE, VERMILLION = to_rgb("#0072B2"), to_rgb("#D55E00")
@@ -31,17 +31,17 @@ def set_point(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
 
 @pytest.fixture(scope="module")
 def fig_4(tracking):
-    return draw(tracking)
+    return draw_runs(tracking)
 
 
 @pytest.fixture(scope="module")
 def fig_3(set_point):
-    return draw(set_point)
+    return draw_runs(set_point)
 
 
 @pytest.fixture(scope="module")
 def motion(swing):
-    return draw(swing)
+    return draw_runs(swing)
 
 
 def lines(ax, colour=None, style=None):
@@ -135,7 +135,7 @@ def test_trajectory_from_a_csv_is_rebuilt_from_the_saved_run_alone(tmp_path):
     )
     saved = ckc_pin.simulate(folder / "x.scene.toml").save(tmp_path / "run.npz")
     (folder / name).unlink()
-    dots_1, dots_3 = lines(draw(ckc_pin.Run.load(saved))["tracking"].axes[2], "black", "None")
+    dots_1, dots_3 = lines(draw_runs(ckc_pin.Run.load(saved))["tracking"].axes[2], "black", "None")
     np.testing.assert_allclose(dots_1[1], -1.43 + 0.1 * np.sin(dots_1[0]), atol=1e-9)
     np.testing.assert_allclose(dots_3[1], -1.70 + 0.1 * dots_3[0] ** 2, atol=1e-9)
 
@@ -216,7 +216,7 @@ def test_snapshots_are_poses_at_equal_times(swing, motion):
 
 def test_loop_forces_are_those_of_rows_that_are_lengths(tmp_path):
     run = ckc_pin.simulate("three_rrr", {"t_end": 0.02})
-    figure = draw(run)["motion_snapshots"]
+    figure = draw_runs(run)["motion_snapshots"]
     shown = [line[1] for line in lines(figure.axes[1], style="-") if len(line[1]) == len(run.t)]
     forces = run.loop_forces()
     assert len(shown) == len(forces)
@@ -237,7 +237,7 @@ offset = 0.5
 harmonics = [[0.3, 5.0, 0.0]]
 """
     run = ckc_pin.simulate(write_scene(tmp_path / "four_bar", FOUR_BAR, FOUR_BAR_LOOP, control))
-    space = draw(run)["tracking"].axes[0]
+    space = draw_runs(run)["tracking"].axes[0]
     assert "phase plane" in space.get_title(loc="left")
     assert (space.get_xlabel(), space.get_ylabel()) == (r"$\alpha$ (rad)", r"$\dot{\alpha}$ (rad/s)")
     (wanted,) = lines(space, "black", ":")
@@ -260,7 +260,7 @@ lift = 0.1
 "reach$/1" = 0.1
 """
     run = ckc_pin.simulate(write_scene(tmp_path / "arm", ARM, "", control))
-    linkage, torques, forces, angles, lengths, rates, speeds = draw(run)["set_point"].axes
+    linkage, torques, forces, angles, lengths, rates, speeds = draw_runs(run)["set_point"].axes
     assert (torques.get_ylabel(), forces.get_ylabel()) == ("$u$ (N m)", "$u$ (N)")
     assert "torques and forces" in torques.get_title(loc="left")
     assert (angles.get_ylabel(), lengths.get_ylabel()) == ("$q - q_d$ (rad)", "$q - q_d$ (m)")
@@ -270,7 +270,7 @@ lift = 0.1
     assert len(lines(linkage, VERMILLION, "-")) == 4  # a, b, c to its centre of mass, and the slide's way
     (sleeve, _) = linkage.patches  # of the initial pose and of the desired one, on a moving body
     assert np.ptp(sleeve.get_xy(), axis=0).max() > 0
-    written = plot(run, tmp_path / "out")  # the residual of no loop is zero: no logarithm
+    written = plot_runs(run, tmp_path / "out")  # the residual of no loop is zero: no logarithm
     assert {path.stem for path in written} == {"set_point", "set_point_checks", "set_point_snapshots"}
 
 
@@ -280,7 +280,7 @@ def test_a_controller_of_ones_own(tmp_path):
             return -0.2 * terms.q_dot
 
     run = ckc_pin.simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, controller=Damper())
-    figures = draw(run)
+    figures = draw_runs(run)
     assert list(figures) == ["own", "own_checks", "own_snapshots"]
     assert len(figures["own_checks"].axes) == 3  # it has no Lyapunov function
     np.testing.assert_array_equal(lines(figures["own"].axes[1], BLUE)[0][1], run.tau[:, 0])
@@ -289,15 +289,15 @@ def test_a_controller_of_ones_own(tmp_path):
 def test_runs_of_two_mechanisms_get_a_figure_each(swing, tmp_path):
     other = ckc_pin.simulate("five_bar_as_printed/swing", {"t_end": 0.1})
     stems = ["five_bar_motion", "five_bar_as_printed_motion"]
-    assert list(draw([swing, other])) == [f"{stem}{more}" for stem in stems for more in ("", "_snapshots")]
+    assert list(draw_runs([swing, other])) == [f"{stem}{more}" for stem in stems for more in ("", "_snapshots")]
 
 
 def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
     run = tracking[0]
     rows = {name: getattr(run, name)[:1] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
     stopped = replace(run, status="stopped", lyapunov=run.lyapunov[:1], **rows)
-    assert len(plot(stopped, tmp_path)) == 3
-    texts = [text.get_text() for text in draw(stopped)["tracking"].texts]
+    assert len(plot_runs(stopped, tmp_path)) == 3
+    texts = [text.get_text() for text in draw_runs(stopped)["tracking"].texts]
     assert "five_bar/tracking, Fig. 4, eq. 16, SPF, ε = 10⁻⁴ (stopped at 0 s)" in texts
 
 
@@ -312,11 +312,11 @@ def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
     ],
 )
 def test_symbols_of_the_paper_and_names_as_they_are(name, shown):
-    assert symbol(name) == shown
+    assert coordinate_symbol(name) == shown
 
 
 def test_run_labels_tell_runs_apart(tracking, swing):
     spf, reduced = tracking
-    assert run_labels([reduced, spf]) == ["reduced", "SPF, ε = 10⁻⁴"]
-    assert run_labels([reduced, swing]) == ["five_bar/tracking: reduced", "five_bar/swing: DAE"]
-    assert run_labels([reduced, reduced]) == ["1. reduced", "2. reduced"]
+    assert label_runs([reduced, spf]) == ["reduced", "SPF, ε = 10⁻⁴"]
+    assert label_runs([reduced, swing]) == ["five_bar/tracking: reduced", "five_bar/swing: DAE"]
+    assert label_runs([reduced, reduced]) == ["1. reduced", "2. reduced"]

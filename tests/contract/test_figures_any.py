@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.view.canvas import limit
-from ckc_pin.view.figures import draw
-from ckc_pin.view.skeleton import planes
-from ckc_pin.view.style import COLOURS, REST
+from ckc_pin.view.figures import draw_runs
+from ckc_pin.view.geometry import projection_planes
+from ckc_pin.view.layout import clip_end_peaks
+from ckc_pin.view.style import COLOURS, REST_COLOUR
 from tests.contract.test_figures import assert_legends_apart, lines
 
 
@@ -32,12 +32,12 @@ def stewart() -> ckc_pin.Run:
 def test_what_dampers_take_is_no_drift(overrides, title):
     """Drift is what an integrator does to an energy that should stay."""
     run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, **overrides})
-    titles = [ax.get_title("left") for ax in draw(run)["motion"].axes]
+    titles = [ax.get_title("left") for ax in draw_runs(run)["motion"].axes]
     assert [said for said in titles if "energy" in said] == [f"c)  {title}"]
 
 
 def test_six_coordinates_have_a_colour_of_their_own_and_each_a_panel(stewart):
-    figures = draw(stewart)
+    figures = draw_runs(stewart)
     assert list(figures) == ["motion", "motion_snapshots", "motion_coordinates"]
     drawn = [line.get_color() for line in figures["motion"].axes[0].get_lines()]
     assert sorted(drawn) == sorted(COLOURS)  # the legs
@@ -50,10 +50,10 @@ def test_six_coordinates_have_a_colour_of_their_own_and_each_a_panel(stewart):
 
 def test_more_motors_than_colours_lie_grey_behind_the_others():
     run = ckc_pin.simulate("two_ur5/lift", {"t_end": 0.05})
-    figures = draw(run)
+    figures = draw_runs(run)
     ax = figures["tracking"].axes[1]
     colours = [line.get_color() for line in ax.get_lines() if len(line.get_xdata()) == len(run.t)]
-    assert colours[:6] == [REST] * 6
+    assert colours[:6] == [REST_COLOUR] * 6
     assert sorted(colours[6:]) == sorted(COLOURS)
     texts = [text.get_text() for text in figures["tracking"].legends[0].get_texts()]
     assert "6 more" in texts
@@ -66,14 +66,14 @@ def test_a_spinning_crank_is_wrapped():
     run = ckc_pin.simulate("four_bar/turning", {"t_end": 1.0})
     crank = run.q_tree[:, run.column("crank")]
     assert np.ptp(crank) > 2 * np.pi
-    ax = draw(run)["motion"].axes[0]
+    ax = draw_runs(run)["motion"].axes[0]
     shown = lines(ax, COLOURS[0])[0][1]
     kept = np.isfinite(shown)
     assert np.abs(shown[kept]).max() <= np.pi
     np.testing.assert_allclose(np.exp(1j * shown[kept]), np.exp(1j * crank[kept]), atol=1e-12)
     assert 0 < np.sum(~kept) <= np.ptp(crank) / np.pi  # once a turn the pen is lifted
     assert [text.get_text() for text in ax.texts] == [r"crank, coupler: wrapped to $±π$"]
-    many = draw(replace(run, q_tree=run.q_tree * 40))["motion"].axes
+    many = draw_runs(replace(run, q_tree=run.q_tree * 40))["motion"].axes
     assert "turns" in " ".join(ax.get_ylabel() for ax in many)
 
 
@@ -86,23 +86,23 @@ def test_an_axis_is_cut_only_for_a_short_peak_at_an_end():
         peaked = calm.copy()
         peaked[at] = 50.0
         ax = Figure().add_subplot()
-        assert limit(ax, [(t, peaked)], 10.0) == said
+        assert clip_end_peaks(ax, [(t, peaked)], 10.0) == said
         assert not said or 1.0 < ax.get_ylim()[1] < 1.5
     peaked = -2.0 - calm
     peaked[0] = -1e16
     ax = Figure().add_subplot()
-    assert limit(ax, [(t, peaked)], 10.0) == "▼ -1e+16 at 0 s"
-    assert limit(ax, [(t, calm)], 10.0) == ""
-    assert limit(ax, [(t[:1], calm[:1])], 10.0) == ""
-    assert limit(ax, [(t, np.full_like(calm, np.nan))], 10.0) == ""
+    assert clip_end_peaks(ax, [(t, peaked)], 10.0) == "▼ -1e+16 at 0 s"
+    assert clip_end_peaks(ax, [(t, calm)], 10.0) == ""
+    assert clip_end_peaks(ax, [(t[:1], calm[:1])], 10.0) == ""
+    assert clip_end_peaks(ax, [(t, np.full_like(calm, np.nan))], 10.0) == ""
 
 
 def test_spatial_mechanisms_are_seen_on_coordinate_planes(stewart):
-    shown = planes(stewart.mechanism)
+    shown = projection_planes(stewart.mechanism)
     assert [(plane.title, plane.names) for plane in shown] == [
         ("front", ("$x$", "$z$")), ("side", ("$y$", "$z$")), ("top", ("$x$", "$y$")),
     ]  # fmt: skip
-    front, side, top, *_ = draw(stewart)["motion_snapshots"].axes
+    front, side, top, *_ = draw_runs(stewart)["motion_snapshots"].axes
     assert [(ax.get_xlabel(), ax.get_ylabel()) for ax in (front, side, top)] == [
         ("$x$ (m)", "$z$ (m)"), ("$y$ (m)", "$z$ (m)"), ("$x$ (m)", "$y$ (m)"),
     ]  # fmt: skip
@@ -111,7 +111,7 @@ def test_spatial_mechanisms_are_seen_on_coordinate_planes(stewart):
 
 def test_a_slider_stands_on_its_rail():
     run = ckc_pin.simulate("slider_crank", {"t_end": 0.2})
-    ax = draw(run)["motion_snapshots"].axes[0]
+    ax = draw_runs(run)["motion_snapshots"].axes[0]
     way = run.q_tree[:, run.column("slider")]
     middles = [patch.get_xy()[:4].mean(axis=0) for patch in ax.patches]
     expected = [way[run.at(float(t))] for t in np.linspace(0.0, 0.2, 5)]
@@ -122,8 +122,8 @@ def test_a_slider_stands_on_its_rail():
 
 
 def test_the_paper_is_cited_for_its_own_scenes_only(stewart):
-    own = draw(ckc_pin.simulate("five_bar/set_point", {"t_end": 0.02}))["set_point"]
+    own = draw_runs(ckc_pin.simulate("five_bar/set_point", {"t_end": 0.02}))["set_point"]
     assert "Fig. 3, eq. 14" in " ".join(text.get_text() for text in own.texts)
-    other = draw(ckc_pin.simulate("delta/circle", {"t_end": 0.02}))["tracking"]
+    other = draw_runs(ckc_pin.simulate("delta/circle", {"t_end": 0.02}))["tracking"]
     words = " ".join([*(text.get_text() for text in other.texts), *(ax.get_title(loc="left") for ax in other.axes)])
     assert not {"eq.", "paper", "Fig."} & set(words.replace(",", " ").split())

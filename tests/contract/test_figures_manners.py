@@ -9,26 +9,26 @@ import matplotlib as mpl
 import pytest
 
 from ckc_pin.errors import InputError
-from ckc_pin.view.figures import plot
+from ckc_pin.view.figures import plot_runs
 
 
 def test_files_are_the_same_whatever_the_user_has_set(swing, tmp_path):
     formats = ("png", "svg")
-    plain = [path.read_bytes() for path in plot(swing, tmp_path / "plain", formats)]
+    plain = [path.read_bytes() for path in plot_runs(swing, tmp_path / "plain", formats)]
     assert plain[0].startswith(b"\x89PNG")
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
         before = dict(mpl.rcParams)
-        styled = [path.read_bytes() for path in plot(swing, tmp_path / "styled", formats)]
+        styled = [path.read_bytes() for path in plot_runs(swing, tmp_path / "styled", formats)]
         assert dict(mpl.rcParams) == before
     assert styled == plain
 
 
 def test_pyplot_stays_out(tmp_path):
     code = (
-        "import sys, ckc_pin; from ckc_pin.view.figures import plot\n"
+        "import sys, ckc_pin; from ckc_pin.view.figures import plot_runs\n"
         "run = ckc_pin.simulate('five_bar/swing', {'t_end': 0.05})\n"
         "assert 'matplotlib' not in sys.modules\n"
-        f"plot(run, {str(tmp_path)!r}, ('png', 'svg', 'pdf'))\n"
+        f"plot_runs(run, {str(tmp_path)!r}, ('png', 'svg', 'pdf'))\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
@@ -40,10 +40,10 @@ def test_pyplot_stays_out(tmp_path):
 def test_bad_input(swing, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="no run given"):
-        plot([], tmp_path)
+        plot_runs([], tmp_path)
     with pytest.raises(InputError, match="format 'gif'; valid: png, svg, pdf"):
-        plot(swing, tmp_path, ("png", "gif"))
+        plot_runs(swing, tmp_path, ("png", "gif"))
     with pytest.raises(InputError, match="format 'missing'"):
-        plot(swing, tmp_path, ())
+        plot_runs(swing, tmp_path, ())
     with pytest.raises(InputError, match=r"file.*cannot be written"):
-        plot(swing, tmp_path / "file")
+        plot_runs(swing, tmp_path / "file")

@@ -41,7 +41,7 @@ def test_units_stand_in_brackets(place):
 def drawn(monkeypatch):
     """Figures instead of files."""
     figures = []
-    monkeypatch.setattr(ensemble_figures, "write", lambda figure, *_: [figures.append(figure)])
+    monkeypatch.setattr(ensemble_figures, "write_figure", lambda figure, *_: [figures.append(figure)])
     return figures
 
 
@@ -71,7 +71,7 @@ def test_fans_have_the_quantiles_and_the_unit(drawn):
     values = np.arange(101.0)[:, np.newaxis, np.newaxis] * np.ones((1, 2, 5))
     x = xr.DataArray(values, dims=("member", "coordinate", "time"), name="error", attrs={"units": "rad"},
                      coords={"coordinate": ["theta_1", "theta_3"], "time": np.linspace(0, 1, 5)})  # fmt: skip
-    ensemble_figures.draw_fan(x, Path("fan.png"))
+    ensemble_figures.draw_quantiles(x, Path("fan.png"))
     upper, lower = drawn[0].axes
     assert [ax.get_ylabel() for ax in (upper, lower)] == [r"$\theta_{1}$ (rad)", r"$\theta_{3}$ (rad)"]
     assert lower.get_xlabel() == "$t$ (s)"

@@ -10,9 +10,14 @@ from PIL import Image, ImageSequence
 
 import ckc_pin
 from ckc_pin import InputError, Run, load, simulate
+from ckc_pin.view.geometry import (
+    compute_placements,
+    pinocchio_configurations,
+    project_base,
+    project_outline,
+    projection_planes,
+)
 from ckc_pin.view.gif import save_gif
-from ckc_pin.view.outline import base, outline
-from ckc_pin.view.skeleton import configurations, placements, planes
 from tests.contract.helpers.command import ckc
 
 L1, L2, BASE = 0.2794, 0.3048, 0.3048  # m, of five_bar
@@ -43,33 +48,35 @@ def test_its_frames_take_as_long_as_the_run(swing: Run, tmp_path: Path) -> None:
 
 def test_a_bar_is_where_the_closed_form_has_it(swing: Run) -> None:
     """Ends of links by the angles alone; the base joins its two pins."""
-    plane = planes(swing.mechanism)[0]
+    plane = projection_planes(swing.mechanism)[0]
     rows = np.array([0, 20, 50])
-    moved = placements(swing.mechanism, configurations(swing, rows))
+    moved = compute_placements(swing.mechanism, pinocchio_configurations(swing, rows))
     for k, row in enumerate(rows):
         one, two, three, four = swing.q_tree[row]
         elbows = [L1 * np.array([np.cos(a), np.sin(a)]) + [x, 0] for a, x in ((one, 0.0), (three, BASE))]
         tips = [
             e + L2 * np.array([np.cos(a), np.sin(a)]) for e, a in zip(elbows, (one + two, three + four), strict=True)
         ]
-        drawn = outline(swing.mechanism, moved.row(k), plane)
+        drawn = project_outline(swing.mechanism, moved.select_row(k), plane)
         wanted = [[[0, 0], elbows[0]], [elbows[0], tips[0]], [[BASE, 0], elbows[1]], [elbows[1], tips[1]]]
         for bar in wanted:
             assert min(np.abs(own - np.array(bar)).max() for own in drawn.bars) < 1e-9
         for ring in (*elbows, *tips, [0, 0], [BASE, 0]):
             assert np.abs(drawn.rings - ring).max(axis=1).min() < 1e-9
         assert drawn.blocks == []
-    assert [bar.tolist() for bar in base(swing.mechanism, moved, plane)[0]] == [[[0, 0], [BASE, 0]]]
+    assert [bar.tolist() for bar in project_base(swing.mechanism, moved, plane)[0]] == [[[0, 0], [BASE, 0]]]
 
 
 def test_a_slider_goes_along_its_rail() -> None:
     mechanism = load("slider_crank")
     run = simulate("slider_crank", {"t_end": 0.3})
-    moved = placements(mechanism, configurations(run))
-    (plane,) = planes(mechanism)
-    middles = np.array([outline(mechanism, moved.row(k), plane).blocks[0].mean(axis=0) for k in range(len(run.t))])
+    moved = compute_placements(mechanism, pinocchio_configurations(run))
+    (plane,) = projection_planes(mechanism)
+    middles = np.array(
+        [project_outline(mechanism, moved.select_row(k), plane).blocks[0].mean(axis=0) for k in range(len(run.t))]
+    )
     np.testing.assert_allclose(middles, np.column_stack([run["slider"], np.zeros(len(run.t))]), atol=1e-12)
-    (rail,) = base(mechanism, moved, plane)[1]
+    (rail,) = project_base(mechanism, moved, plane)[1]
     assert rail[:, 0].min() < middles[:, 0].min() < middles[:, 0].max() < rail[:, 0].max()
 
 
@@ -79,9 +86,9 @@ def test_the_picture_moves_as_the_run_does(swing: Run, tmp_path: Path) -> None:
     blue = [np.abs(picture - BLUE).max(axis=2) < 60 for picture in pictures]
     middles = np.array([[x.mean() for x in np.nonzero(where)[::-1]] for where in blue])
     rows = [swing.at(k / 20) for k in range(11)]
-    plane = planes(swing.mechanism)[0]
-    moved = placements(swing.mechanism, configurations(swing, np.array(rows)))
-    bars = [outline(swing.mechanism, moved.row(k), plane).bars for k in range(11)]
+    plane = projection_planes(swing.mechanism)[0]
+    moved = compute_placements(swing.mechanism, pinocchio_configurations(swing, np.array(rows)))
+    bars = [project_outline(swing.mechanism, moved.select_row(k), plane).bars for k in range(11)]
     lengths = [np.linalg.norm(bar[1] - bar[0]) for bar in bars[0]]
     x, y = np.array([np.average([bar.mean(axis=0) for bar in each], axis=0, weights=lengths) for each in bars]).T
     one, none = np.ones(11), np.zeros(11)
@@ -114,7 +121,7 @@ def test_the_command_and_the_notebook_write_it(swing: Run, tmp_path: Path) -> No
     [
         (["--html", "x.html"], "--gif draws lines alone: it goes with --speed, not with --html"),
         (["--forces"], "--gif draws lines alone"),
-        (["--speed", "0.001"], "10001 frames, and 1200 the most; speed 0.0083 or more is short enough"),
+        (["--speed", "0.001"], "10001 frames, but a GIF may have 1200; choose speed 0.0083 or more"),
         (["--gif", "nowhere/x.gif"], "nowhere/x.gif: cannot be written"),
     ],
 )
@@ -128,5 +135,5 @@ def test_what_cannot_be_is_refused(options: list[str], says: str, swing: Run, tm
 
 def test_runs_of_two_mechanisms_are_refused(swing: Run, tmp_path: Path) -> None:
     other = simulate("slider_crank", {"t_end": 0.1})
-    with pytest.raises(InputError, match="only runs of one mechanism lie on each other"):
+    with pytest.raises(InputError, match="play runs of different mechanisms one by one"):
         save_gif([swing, other], tmp_path / "x.gif")

@@ -81,7 +81,7 @@ def test_a_locus_shows_itself_on_a_few_lines() -> None:
 
 def test_what_cannot_be_drawn_or_played_is_refused() -> None:
     model, scene = linearize("five_bar"), load_scene("five_bar/set_point")
-    with pytest.raises(InputError, match="give it alone"):
+    with pytest.raises(InputError, match="give each other result alone"):
         plot(model, model)
     with pytest.raises(InputError, match="a Scene is complete"):
         gain_locus(scene, overrides={"controller.K_P": 1.0})

@@ -149,7 +149,7 @@ def test_only_the_newest_instant_is_kept():
         for k in range(10_000):
             view.on_output(1e-4 * k, view.mechanism.q_tree)
         assert len(view._frames) <= 1
-        assert view._last is None or len(view._last) == 2
+        assert view._pending is None or len(view._pending) == 2
     finally:
         view.stop()
         view.server.stop()
@@ -163,12 +163,12 @@ def test_speed_says_which_instants_are_due(monkeypatch):
         view.stop()  # its thread; what follows is done by hand
         for k in range(5):
             view.on_output(0.1 * k, view.mechanism.q_tree)
-        assert view._due()[0] == 0.0
-        assert view._due() is None
+        assert view._take_due_frame()[0] == 0.0
+        assert view._take_due_frame() is None
         clock[0] = 100.5  # half a second is a quarter of a second of the motion: 0.1 is dropped
-        assert view._due()[0] == pytest.approx(0.2)
+        assert view._take_due_frame()[0] == pytest.approx(0.2)
         clock[0] = 200.0
-        assert view._due()[0] == pytest.approx(0.4)
+        assert view._take_due_frame()[0] == pytest.approx(0.4)
     finally:
         view.server.stop()
 

@@ -9,8 +9,8 @@ import pytest
 
 import ckc_pin
 from ckc_pin.errors import InputError
-from ckc_pin.view.drawing import FEWEST, scene
-from ckc_pin.view.player import play
+from ckc_pin.view.drawing import MIN_KEYFRAMES, draw_runs_3d
+from ckc_pin.view.player import play_runs
 from tests.contract.helpers.playback import floats, matrix, messages_to, objects, placed, rotated, tracks
 from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_ARM, write_scene
 
@@ -26,7 +26,7 @@ def test_page_and_viewer_are_served(serve, swing):
     assert "http" not in page.replace("http-equiv", "")  # it names no other place
     assert "default-src 'none'" in policy
     assert f"ws://127.0.0.1:{server.port}" in policy
-    for name, start in (("main.min.js", b"/*! For license"), ("start.js", b'"use strict"')):
+    for name, start in (("main.min.js", b"/*! For license"), ("start.js", b"// Controls of a playback page")):
         with urlopen(server.url + name) as answer:
             assert answer.read().startswith(start)
             assert answer.headers["Content-Type"].startswith("text/javascript")
@@ -34,7 +34,7 @@ def test_page_and_viewer_are_served(serve, swing):
 
 def test_elbows_of_the_animation_agree_with_forward_kinematics(serve, tracking):
     server = serve(tracking)
-    moved = tracks(messages_to(server, len(server.stage.messages())))
+    moved = tracks(messages_to(server, len(server.scene_state.messages())))
     for proximal, distal, foot, column in (("theta_1", "theta_2", 0.0, 0), ("theta_3", "theta_4", BASE, 2)):
         times, elbow, _ = moved[f"/world/1: reduced/joint:{distal}"]
         rows = np.searchsorted(tracking.t, times - 1e-4)
@@ -49,7 +49,7 @@ def test_elbows_of_the_animation_agree_with_forward_kinematics(serve, tracking):
 
 def test_loop_frames_meet_and_follow_the_traced_point(serve, tracking):
     server = serve(tracking)
-    drawing = messages_to(server, len(server.stage.messages()))
+    drawing = messages_to(server, len(server.scene_state.messages()))
     drawn, moved = objects(drawing), tracks(drawing)
     root = "/world/1: reduced"
     ends = {}
@@ -68,7 +68,7 @@ def test_loop_frames_meet_and_follow_the_traced_point(serve, tracking):
 
 
 def test_links_have_their_shapes_and_differ_by_colour(tracking):
-    drawn = objects(scene([tracking]))
+    drawn = objects(draw_runs_3d([tracking]))
     root = "/world/1: reduced/joint:theta_1/link:link_1"
     shapes = {path: obj["geometries"][0] for path, obj in drawn.items() if path.startswith(root)}
     box = next(g for g in shapes.values() if g["type"] == "BoxGeometry")
@@ -92,7 +92,7 @@ def opacities(drawing: list[dict]) -> dict[str, float]:
 
 
 def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
-    drawing = scene([tracking, swing])
+    drawing = draw_runs_3d([tracking, swing])
     opacity = {path: x for path, x in opacities(drawing).items() if "/desired/" not in path}
     first, second = "/world/1: five_bar%2Ftracking: reduced", "/world/2: five_bar%2Fswing: DAE"
     assert {opacity[path] for path in opacity if path.startswith(first)} == {1}
@@ -108,12 +108,12 @@ def test_the_spf_lies_translucent_on_the_reduced_model_whatever_the_order(serve,
     with urlopen(server.url) as answer:
         page = answer.read().decode()
     assert "<p>reduced</p><p>translucent: SPF, ε = 10⁻⁴</p><p>gray: desired</p>" in page
-    opacity = opacities(messages_to(server, len(server.stage.messages())))
+    opacity = opacities(messages_to(server, len(server.scene_state.messages())))
     assert {x for path, x in opacity.items() if path.startswith("/world/2: SPF")} == {0.4}
 
 
 def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
-    drawing = scene([tracking])
+    drawing = draw_runs_3d([tracking])
     root, moved = "/world/1: reduced/desired", tracks(drawing)
     assert {x for path, x in opacities(drawing).items() if path.startswith(root)} == {0.22}
     assert not [path for path in objects(drawing) if path.startswith(f"{root}/base")]
@@ -134,7 +134,7 @@ def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
 
 def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
     overrides = {"controller.desired.theta_1.harmonics": [[2.2, 10.0, 0.0]], "t_end": 0.3, "formulation": "reduced"}
-    drawing = scene([ckc_pin.simulate("five_bar/tracking", overrides)])
+    drawing = draw_runs_3d([ckc_pin.simulate("five_bar/tracking", overrides)])
     (animation,) = [c for c in drawing if c["type"] == "set_animation"]
     (hidden,) = [a for a in animation["animations"] if a["path"].endswith("/desired")]
     (track,) = hidden["clip"]["tracks"]
@@ -150,22 +150,22 @@ def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
 
 def test_all_output_instants_are_keyframes_unless_there_are_very_many(swing):
     for speed in (0.25, 1.0, 10.0):
-        drawing = scene([swing], speed=speed)
+        drawing = draw_runs_3d([swing], speed=speed)
         times = tracks(drawing)["/world/1: DAE/joint:theta_1"][0]
         np.testing.assert_allclose(times, swing.t, atol=1e-6)
         assert drawing[-1]["options"]["timeScale"] == speed
     many = ckc_pin.simulate("five_bar/swing", {"t_end": 0.5, "solver.output_dt": 1e-4})
-    times = tracks(scene([many]))["/world/1: DAE/joint:theta_1"][0]
+    times = tracks(draw_runs_3d([many]))["/world/1: DAE/joint:theta_1"][0]
     assert (times[0], times[-1]) == (0.0, 0.5)
-    assert len(times) == FEWEST
-    assert np.diff(times).max() < 2.0 * 0.5 / FEWEST
+    assert len(times) == MIN_KEYFRAMES
+    assert np.diff(times).max() < 2.0 * 0.5 / MIN_KEYFRAMES
 
 
 def test_quaternions_are_continuous(tmp_path):
     q = "[initial.q]\nalpha = -0.5\n[initial.q_dot]\nalpha = 40.0\n"  # several turns of the crank
     run = ckc_pin.simulate(write_scene(tmp_path / "m", FOUR_BAR, "gravity = [0, 0, 0]\n" + FOUR_BAR_LOOP, q, 1.0))
     assert np.ptp(run.q_tree[:, run.column("alpha")]) > 4 * np.pi
-    for _, _, quaternions in tracks(scene([run])).values():
+    for _, _, quaternions in tracks(draw_runs_3d([run])).values():
         np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1, atol=1e-6)
         assert np.sum(quaternions[1:] * quaternions[:-1], axis=1).min() > 0.8
 
@@ -175,15 +175,17 @@ def test_quaternions_are_continuous(tmp_path):
 
 def test_a_planar_mechanism_faces_the_viewer(swing, tmp_path):
     # In the viewer's scene x is right, z is up, and the camera looks along +y.
-    five_bar = placed(scene([swing]))[:3, :3]
+    five_bar = placed(draw_runs_3d([swing]))[:3, :3]
     np.testing.assert_allclose(five_bar @ np.eye(3), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-12)
     q = "[initial.q]\nalpha = -0.5\n"
     run = ckc_pin.simulate(write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, q, 0.1))
-    np.testing.assert_allclose(placed(scene([run]))[:3, :3], np.eye(3), atol=1e-12)  # x-z plane, gravity along -z
+    np.testing.assert_allclose(
+        placed(draw_runs_3d([run]))[:3, :3], np.eye(3), atol=1e-12
+    )  # x-z plane, gravity along -z
 
 
 def test_all_of_the_motion_is_in_sight(tracking):
-    drawing = scene([tracking])
+    drawing = draw_runs_3d([tracking])
     (distance,) = [c["value"][2] for c in drawing if c.get("property") == "position"]
     (angle,) = [c["value"] for c in drawing if c.get("property") == "fov"]
     world = placed(drawing)
@@ -198,7 +200,7 @@ def test_any_other_mechanism_stands_upright_below_the_camera(tmp_path):
         [("[0, 0, -9.81]", [0, 0, 1]), ("[0, -9.81, 0]", [0, 1, 0]), ("[3, 0, 4]", None)]
     ):
         run = ckc_pin.simulate(write_scene(tmp_path / f"m{k}", ARM, f"gravity = {gravity}\n", START_OF_ARM, 0.05))
-        drawing = scene([run])
+        drawing = draw_runs_3d([run])
         turn = placed(drawing)[:3, :3]
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(turn @ (up or [-0.6, 0, -0.8]), [0, 0, 1], atol=1e-12)
@@ -215,7 +217,7 @@ def test_links_without_shapes_are_drawn_as_rods(tmp_path):
     urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{mesh}')
     q = "[initial.q]\nalpha = -0.5\n"
     run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, q, 0.1))
-    drawn = objects(scene([run]))
+    drawn = objects(draw_runs_3d([run]))
     rods = {path.split("/")[3]: obj for path, obj in drawn.items() if "/rod:" in path}
     lengths = {name: obj["geometries"][0]["height"] for name, obj in rods.items()}
     assert lengths == pytest.approx({"base": 0.5, "joint:alpha": 0.2, "joint:beta": 0.5, "joint:gamma": 0.4})
@@ -227,7 +229,7 @@ def test_links_without_shapes_are_drawn_as_rods(tmp_path):
 def test_a_slide_runs_on_a_rail_as_long_as_its_way(tmp_path):
     run = ckc_pin.simulate(write_scene(tmp_path / "m", ARM, "", START_OF_ARM, 0.3))
     way = run.q_tree[:, run.column("reach$/1")]
-    ((path, rail),) = [(path, obj) for path, obj in objects(scene([run])).items() if "/rail:" in path]
+    ((path, rail),) = [(path, obj) for path, obj in objects(draw_runs_3d([run])).items() if "/rail:" in path]
     assert "/joint:lift/" in path
     placement, length = matrix(rail["object"]["matrix"]), rail["geometries"][0]["height"]
     ends = sorted((placement @ [0, side * length / 2, 0, 1])[0] for side in (-1, 1))
@@ -239,7 +241,7 @@ def test_links_of_one_colour_get_ours(tmp_path):
     ball = f'<visual><geometry><sphere radius="0.02"/></geometry>{grey}</visual>'
     urdf = ARM.replace("<inertial>", f"{ball}<inertial>")
     run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, "", START_OF_ARM, 0.05))
-    drawn = {path: obj for path, obj in objects(scene([run])).items() if "/link:" in path}
+    drawn = {path: obj for path, obj in objects(draw_runs_3d([run])).items() if "/link:" in path}
     assert {path.split("/")[3] for path in drawn} == {"joint:turn", "joint:lift", "joint:reach$%2F1"}
     assert len({obj["materials"][0]["color"] for obj in drawn.values()}) == 3
 
@@ -250,7 +252,7 @@ def test_links_of_one_colour_get_ours(tmp_path):
         ('<geometry><box size="1 2"/></geometry>', "a box needs size above zero"),
         ('<geometry><sphere radius="-1"/></geometry>', "a sphere needs radius above zero"),
         ('<geometry><cylinder radius="1"/></geometry>', "a cylinder needs radius and length above zero"),
-        ('<geometry><sphere radius="nan"/></geometry>', "radius='nan' is not made of finite numbers"),
+        ('<geometry><sphere radius="nan"/></geometry>', "radius='nan' must consist of finite numbers"),
         ('<origin xyz="0 0"/><geometry><sphere radius="1"/></geometry>', "needs three numbers in xyz and in rpy"),
         ('<geometry><sphere radius="1"/></geometry><material><color rgba="2 0 0 1"/></material>', "from 0 to 1"),
     ],
@@ -260,14 +262,14 @@ def test_a_shape_that_cannot_be_is_named(tmp_path, visual, message):
     q = "[initial.q]\nalpha = -0.5\n"
     run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, q, 0.01))
     with pytest.raises(InputError, match="link 'crank'") as error:
-        scene([run])
+        draw_runs_3d([run])
     assert message in str(error.value)
 
 
 def test_names_from_files_are_text_to_the_page(tmp_path):
     path = write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, "[initial.q]\nalpha = -0.5\n", 0.01)
     hostile = path.rename(path.with_name("<script>alert(1)<.scene.toml"))
-    with play(ckc_pin.simulate(hostile), block=False) as server, urlopen(server.url) as answer:
+    with play_runs(ckc_pin.simulate(hostile), block=False) as server, urlopen(server.url) as answer:
         page = answer.read().decode()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)&lt;" in page

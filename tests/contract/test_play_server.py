@@ -22,7 +22,7 @@ from tornado.websocket import websocket_connect
 
 from ckc_pin.errors import InputError
 from ckc_pin.view import commands
-from ckc_pin.view.player import play
+from ckc_pin.view.player import play_runs
 from ckc_pin.view.server import ViewServer
 from tests.contract.helpers.playback import leave, messages_to, objects, placed
 from tests.contract.helpers.viewer import listening, raw_viewer, vanish
@@ -30,7 +30,7 @@ from tests.contract.helpers.viewer import listening, raw_viewer, vanish
 
 def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing):
     server = serve(swing)
-    count = len(server.stage.messages())
+    count = len(server.scene_state.messages())
     first = messages_to(server, count)
     server.send(commands.set_transform("/world", 2 * np.eye(4)))
     second = messages_to(server, count)
@@ -45,7 +45,7 @@ def test_a_viewer_that_is_there_gets_it_at_once(serve, swing):
 
     async def listen() -> dict:
         connection = await websocket_connect(server.url.replace("http", "ws"), max_message_size=2**26)
-        for _ in server.stage.messages():
+        for _ in server.scene_state.messages():
             await connection.read_message()
         server.send(commands.set_property("/Axes", "visible", True))
         message = await asyncio.wait_for(connection.read_message(), 20)
@@ -82,7 +82,7 @@ def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
 
 def test_websockets_of_other_pages_are_refused(serve, swing):
     server = serve(swing)
-    count = len(server.stage.messages())
+    count = len(server.scene_state.messages())
     assert len(messages_to(server, count, Origin=f"http://localhost:{server.port}")) == count
     for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
         with pytest.raises(HTTPClientError) as refused:
@@ -107,15 +107,15 @@ def test_a_port_in_use_is_said(serve, swing):
 
 def test_bad_input(swing):
     with pytest.raises(InputError, match="no run given"):
-        play([], block=False)
+        play_runs([], block=False)
     for speed in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="speed"):
-            play(swing, speed=speed, block=False)
+            play_runs(swing, speed=speed, block=False)
 
 
 def test_nothing_is_left_after_stop(swing):
     threads, files = threading.enumerate(), len(os.listdir("/dev/fd"))
-    server = play(swing, block=False)
+    server = play_runs(swing, block=False)
     messages_to(server, 3)
     server.stop()
     server.stop()  # again is no harm
@@ -123,7 +123,7 @@ def test_nothing_is_left_after_stop(swing):
     assert len(os.listdir("/dev/fd")) == files
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", server.port)) != 0
-    with play(swing, port=server.port, block=False) as again:  # the port is free at once
+    with play_runs(swing, port=server.port, block=False) as again:  # the port is free at once
         assert again.port == server.port
 
 
@@ -131,7 +131,7 @@ def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
     server = serve(swing)
     vanish(raw_viewer(server))
     for _ in range(50):
-        server.send(commands.polyline("/world/line", np.zeros((5000, 3)), (0, 0, 0)))
+        server.send(commands.draw_polyline("/world/line", np.zeros((5000, 3)), (0, 0, 0)))
     deadline = time.monotonic() + 20
     while server.viewers and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -143,7 +143,7 @@ def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
 
 
 def test_stop_does_not_wait_for_a_viewer_that_hangs(swing):
-    server = play(swing, block=False)
+    server = play_runs(swing, block=False)
     with raw_viewer(server) as stalled:
         server.stop()
         assert not server._thread.is_alive()
@@ -172,12 +172,12 @@ def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
     saved = swing.save(tmp_path / "run.npz")
     code = (
         "import sys, ckc_pin\n"
-        "from ckc_pin.view.drawing import scene\n"
-        "from ckc_pin.view.player import play\n"
+        "from ckc_pin.view.drawing import draw_runs_3d\n"
+        "from ckc_pin.view.player import play_runs\n"
         f"run = ckc_pin.Run.load({str(saved)!r})\n"
-        "scene([run])\n"
+        "draw_runs_3d([run])\n"
         "assert not {'tornado', 'meshcat', 'matplotlib', 'yourdfpy'} & set(sys.modules)\n"
-        "play(run, block=False).stop()\n"
+        "play_runs(run, block=False).stop()\n"
         "assert not {'zmq', 'meshcat', 'IPython', 'matplotlib'} & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
@@ -188,10 +188,10 @@ def test_a_browser_that_cannot_be_opened_is_said(swing, monkeypatch, capsys):
     monkeypatch.setattr("webbrowser.open", lambda url: bool(asked.append(url)))
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with play(swing, open_browser=True, block=False) as server:
+    with play_runs(swing, open_browser=True, block=False) as server:
         assert not asked  # one for terminals would take ours
     assert f"no display here; open {server.url}" in capsys.readouterr().err
     monkeypatch.setenv("DISPLAY", ":7")
-    with play(swing, open_browser=True, block=False) as server:
+    with play_runs(swing, open_browser=True, block=False) as server:
         assert asked == [server.url]
     assert f"open {server.url} in yours" in capsys.readouterr().err

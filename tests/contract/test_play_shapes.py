@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.view.drawing import scene
-from ckc_pin.view.gaps import gaps
-from ckc_pin.view.player import play, save_html
-from ckc_pin.view.skeleton import configurations
+from ckc_pin.view.drawing import draw_runs_3d
+from ckc_pin.view.geometry import compute_loop_gaps, pinocchio_configurations
+from ckc_pin.view.player import play_runs, save_html
 from tests.contract.helpers.command import ckc
 from tests.contract.sketches import (
     ARM,
@@ -65,7 +64,7 @@ def test_a_mesh_is_drawn_where_its_link_is(tmp_path):
     run = bar(tmp_path / "m", '<mesh filename="shapes/crank.stl" scale="2 1 1"/>')
     tetrahedron(tmp_path / "m" / "shapes" / "crank.stl")
     expected = np.array([np.array(TETRAHEDRON)[list(face)] * [2, 1, 1] + [0, 0, 0.3] for face in FACES])
-    np.testing.assert_allclose(in_order(triangles(scene([run]))), in_order(expected), atol=1e-6)
+    np.testing.assert_allclose(in_order(triangles(draw_runs_3d([run]))), in_order(expected), atol=1e-6)
 
 
 def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, capsys):
@@ -74,17 +73,18 @@ def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, ca
     run = ckc_pin.Run.load(saved)
     page = save_html(run, tmp_path / "sticks.html")
     assert capsys.readouterr().err == (
-        "meshes missing, so sticks: package://mine/shapes/crank.stl; --meshes FOLDER says where they are\n"
+        "mesh files not found: package://mine/shapes/crank.stl; links are drawn as rods. "
+        "--meshes DIR names their folder\n"
     )
-    assert [path for path in objects(scene([run])) if "/joint:alpha/rod:" in path]
-    drawing = scene([run], meshes=tmp_path / "m")
+    assert [path for path in objects(draw_runs_3d([run])) if "/joint:alpha/rod:" in path]
+    drawing = draw_runs_3d([run], meshes=tmp_path / "m")
     assert not [path for path in objects(drawing) if "/joint:alpha/rod:" in path]
     expected = np.array([np.array(TETRAHEDRON)[list(face)] + [0, 0, 0.3] for face in FACES])
     np.testing.assert_allclose(in_order(triangles(drawing)), in_order(expected), atol=1e-6)
     whole = save_html(run, tmp_path / "meshes.html", meshes=tmp_path / "m")
     assert capsys.readouterr().err == ""
     assert page.read_bytes() != whole.read_bytes()
-    with pytest.raises(ckc_pin.InputError, match=r"no such folder; give the one that the mechanism\.toml is in"):
+    with pytest.raises(ckc_pin.InputError, match=r"no such folder; give the folder of the mechanism\.toml"):
         save_html(run, tmp_path / "x.html", meshes=tmp_path / "nowhere")
 
 
@@ -95,7 +95,7 @@ def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
     tetrahedron(tmp_path / "crank.stl")
     run = bar(tmp_path / "m", f'<mesh filename="{name.format(absolute=tmp_path / "crank.stl")}"/>')
     (tmp_path / "m" / "link.stl").symlink_to(tmp_path / "crank.stl")
-    drawn = objects(scene([run]))
+    drawn = objects(draw_runs_3d([run]))
     assert not [path for path in drawn if "/link:crank/" in path]
     assert [path for path in drawn if "/joint:alpha/rod:" in path]
 
@@ -104,14 +104,14 @@ def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
 def test_a_damaged_mesh_is_a_stick(tmp_path, content):
     run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
     (tmp_path / "m" / "crank.stl").write_bytes(content)
-    drawn = objects(scene([run]))
+    drawn = objects(draw_runs_3d([run]))
     assert not [path for path in drawn if "/link:crank/" in path]
     assert [path for path in drawn if "/joint:alpha/rod:" in path]
 
 
 def test_links_of_a_robot_of_meshes_have_them(tmp_path):
     run = ckc_pin.simulate("two_ur5", {"t_end": 0.01})
-    drawn = objects(scene([run]))
+    drawn = objects(draw_runs_3d([run]))
     meshes = [path for path, obj in drawn.items() if obj["geometries"][0]["type"] == "BufferGeometry"]
     assert len([path for path in meshes if "/link:" in path]) == 14  # seven links each
     assert not [path for path in drawn if "/rod:" in path]
@@ -123,7 +123,7 @@ def test_links_of_a_robot_of_meshes_have_them(tmp_path):
 def test_gaps_are_what_the_loop_holds_at_zero(run):
     off = run("five_bar/swing", formulation="spf", initial__w=[2e-3, -1e-3], t_end=0.05)
     mechanism = off.mechanism
-    found = gaps(mechanism, configurations(off))
+    found = compute_loop_gaps(mechanism, pinocchio_configurations(off))
     assert list(found) == ["elbow"]
     np.testing.assert_allclose(found["elbow"][:, :2], off.phi, atol=1e-15)  # its rows are x and y of the world
     assert np.abs(off.phi[0]).max() == pytest.approx(2e-3)
@@ -146,12 +146,12 @@ frame_b = {link = "world", xyz = [0.0, 0.6, 0.2]}
     r = tip - end
     configuration = run.mechanism.tree.from_coordinates(q[0])[None]
     expected = r * (1 - 0.55 / np.linalg.norm(r))
-    np.testing.assert_allclose(gaps(run.mechanism, configuration)["rod"][0], expected, atol=1e-14)
+    np.testing.assert_allclose(compute_loop_gaps(run.mechanism, configuration)["rod"][0], expected, atol=1e-14)
 
 
 def test_magnified_gaps_run_from_frame_b(run):
     off = run("five_bar/swing", formulation="spf", initial__w=[2e-3, -1e-3], t_end=0.05)
-    drawing = scene([off], gap=50.0)
+    drawing = draw_runs_3d([off], gap=50.0)
     root = next(path for path in objects(drawing) if "/gap:elbow" in path).rpartition("/gap")[0]
     rod = f"{root}/gap:elbow/way"
     assert objects(drawing)[f"{rod}/rod"]["geometries"][0]["height"] == 1.0
@@ -170,13 +170,13 @@ def test_magnified_gaps_run_from_frame_b(run):
     np.testing.assert_allclose(end[:, :2] - b, 50 * off.phi, atol=1e-6)
     length = values(rod, ".scale", 3)
     np.testing.assert_allclose(length[:, 2], 50 * np.linalg.norm(off.phi, axis=1), atol=1e-6)
-    assert not [path for path in objects(scene([off])) if "/gap:" in path]  # only on request
+    assert not [path for path in objects(draw_runs_3d([off])) if "/gap:" in path]  # only on request
 
 
 @pytest.mark.parametrize("gap", [-1.0, float("nan"), float("inf")])
 def test_a_gap_that_is_none(run, gap):
     with pytest.raises(ckc_pin.InputError, match="gap = "):
-        play(run("five_bar/swing"), gap=gap, block=False)
+        play_runs(run("five_bar/swing"), gap=gap, block=False)
 
 
 # --- one file ------------------------------------------------------------------------------------
@@ -200,7 +200,7 @@ def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
     arrays = several["arrays"]
     assert len({(array.code, bytes(array.data)) for array in arrays}) == len(arrays)  # each once
     found = _resolved(several["commands"], arrays)
-    assert found == msgspec.msgpack.decode(msgspec.msgpack.encode(scene([run], speed=0.5)))
+    assert found == msgspec.msgpack.decode(msgspec.msgpack.encode(draw_runs_3d([run], speed=0.5)))
 
 
 def _resolved(value, arrays):
@@ -214,7 +214,7 @@ def _resolved(value, arrays):
 def test_corners_that_nobody_can_tell_apart_are_one(tmp_path):
     run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
     tetrahedron(tmp_path / "m" / "crank.stl")  # STL has each corner once for each of its triangles
-    (drawn,) = [obj for path, obj in objects(scene([run])).items() if "/link:crank/" in path]
+    (drawn,) = [obj for path, obj in objects(draw_runs_3d([run])).items() if "/link:crank/" in path]
     position = drawn["geometries"][0]["data"]["attributes"]["position"]["array"]
     assert len(position.data) == 4 * 3 * 4
 
@@ -231,9 +231,9 @@ def test_the_command_writes_the_same_file(run, tmp_path):
     ("words", "says"),
     [
         (["--speed", "0"], "--speed 0: it must be above zero, 1 is real time"),
-        (["--gap", "-1"], "play: gap = -1.0; it says how many times larger gaps are drawn, 0 draws none"),
+        (["--gap", "-1"], "play: gap = -1.0; it must be a factor by which gaps are magnified, or 0 for no gaps"),
         (["--port", "70000"], "port 70000: choose one from 1 to 65535, or 0 for any free one"),
-        (["--meshes", "nowhere"], "play: meshes = nowhere: no such folder; give the one that the mechanism.toml is in"),
+        (["--meshes", "nowhere"], "play: meshes = nowhere: no such folder; give the folder of the mechanism.toml"),
         (["--html", "no/where.html"], "no/where.html: cannot be written: No such file or directory; choose a file in"),
     ],
 )
@@ -257,5 +257,7 @@ def test_no_two_hinges_at_one_point_of_a_body_have_balls(tmp_path: Path) -> None
     run = ckc_pin.simulate(
         write_scene(tmp_path / "m", FOUR_BAR.replace("</robot>", f"{more}</robot>"), loop, start, 0.02)
     )
-    balls = {path.split("joint:")[1].removesuffix("/ball") for path in objects(scene([run])) if path.endswith("/ball")}
+    balls = {
+        path.split("joint:")[1].removesuffix("/ball") for path in objects(draw_runs_3d([run])) if path.endswith("/ball")
+    }
     assert balls == {"alpha", "beta", "gamma", "apart"}

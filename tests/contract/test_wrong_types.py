@@ -254,5 +254,5 @@ def test_gains_of_controllers_are_taken_as_a_scene_takes_them() -> None:
 def test_runs_of_two_mechanisms_do_not_lie_on_each_other() -> None:
     runs = [simulate(name, SHORT) for name in (SWING, "four_bar")]
     for pair in (runs, runs[::-1]):
-        with pytest.raises(InputError, match="other coordinates; only runs of one mechanism lie on each other"):
+        with pytest.raises(InputError, match="other coordinates; play runs of different mechanisms one by one"):
             ckc_pin.play(*pair)

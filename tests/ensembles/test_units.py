@@ -180,9 +180,9 @@ def test_an_output_called_as_units_are_is_refused(scene: Path) -> None:
 def test_figures_have_units_on_their_axes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures: dict[str, Any] = {}
     monkeypatch.setattr(
-        ensemble_figures, "write", lambda figure, _, stem, __: [figures.__setitem__(stem, figure) or tmp_path]
+        ensemble_figures, "write_figure", lambda figure, _, stem, __: [figures.__setitem__(stem, figure) or tmp_path]
     )
-    ensemble_figures.draw(ensemble(scene), tmp_path)
+    ensemble_figures.draw_ensemble(ensemble(scene), tmp_path)
     fan, over = figures["path"], figures["way"]
     assert [ax.get_ylabel() for ax in fan.axes] == ["crank (rad/s)", "rod (rad/s)", "slider (m/s)"]
     assert [over.axes[0].get_xlabel(), over.axes[0].get_ylabel()] == [
@@ -191,6 +191,6 @@ def test_figures_have_units_on_their_axes(scene: Path, tmp_path: Path, monkeypat
     ]
     assert over.axes[1].get_ylabel() == "way (m)"
     turned = ckc_pin.ensemble(scene, dict(reversed(VARIABLES.items())), {"way": OUTPUTS["way"]}, progress=False)
-    ensemble_figures.draw(turned, tmp_path)
+    ensemble_figures.draw_ensemble(turned, tmp_path)
     assert figures["way"].axes[0].get_xlabel() == "spring.0.stiffness (N/m)", "the variable that is named first"
     assert np.all(np.isfinite(over.axes[0].collections[0].get_array()))

@@ -8,7 +8,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.sensitivity.sensitivities import sensitivities
-from ckc_pin.view.sensitivity_figure import draw_sensitivities, save_sensitivities
+from ckc_pin.view.result_figures import draw_sensitivities, save_sensitivities
 from tests.sensitivity.changed import written
 
 

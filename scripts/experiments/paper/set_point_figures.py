@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.run.run import Run
-from ckc_pin.view.labels import symbol, with_unit
+from ckc_pin.view.style import axis_label, coordinate_symbol
 from scripts.experiments.certificate.certificate import Certificate, rest_height, sublevel_set
 from scripts.experiments.certificate.gradient_bounds import Bound
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
@@ -90,7 +90,11 @@ def draw_set(case: Case, certificate: Certificate, run: Run, divisions: int, fol
     ax.plot(*path[0], "o", color=COLOURS[0])
     ax.plot(*case.controller.q_d, "*", color=BLACK, markersize=12, label="$q_d$")
     names = case.mechanism.independent
-    ax.set(xlabel=with_unit(symbol(names[0]), "rad"), ylabel=with_unit(symbol(names[1]), "rad"), aspect="equal")
+    ax.set(
+        xlabel=axis_label(coordinate_symbol(names[0]), "rad"),
+        ylabel=axis_label(coordinate_symbol(names[1]), "rad"),
+        aspect="equal",
+    )
     figure.set_size_inches(7.5, 8.8)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return save(figure, folder, "set_point_set.png")
