@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.sources import PACKAGE, resolve
+from ckc_pin.base.sources import PACKAGE, resolve_path
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.urdf import parse
@@ -171,7 +171,7 @@ def _candidate_paths(file: str, folder: Path | None) -> Iterator[Path]:
     if file.startswith(PACKAGE):
         name = file.removeprefix(PACKAGE).partition("/")[2]
         with suppress(InputError, OSError, ValueError):  # no such package, or a path that leaves it
-            yield resolve(file, Path(), "mesh")
+            yield resolve_path(file, Path(), "mesh")
     if folder is None or "://" in name or "\0" in name:
         return
     path = (folder / name).resolve()

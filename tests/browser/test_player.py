@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import ckc_pin
+from ckc_pin.view.page import STATIC
 from ckc_pin.view.player import save_html
 from tests.browser.pages import browser, look_at
 
@@ -31,7 +33,7 @@ def visit(look_at, runs, tmp_path):
         runs[1], status="stopped", message="phi_z is <singular>", **{n: getattr(runs[1], n)[rows] for n in names}
     )
     found = look_at(save_html([runs[0], short], tmp_path / "two.html", forces=True).as_uri(), offline=True)
-    found.page.evaluate("player.pause(); player.go(0)")
+    found.page.evaluate("player.pause(); player.seek(0)")
     return found
 
 
@@ -82,14 +84,14 @@ def test_arrows_step_and_change_the_speed(visit, runs):
 
 
 def test_it_ends_or_begins_again(visit):
-    visit.page.evaluate(f"player.go({END} - 0.1); player.play()")
+    visit.page.evaluate(f"player.seek({END} - 0.1); player.play()")
     visit.until("!viewer.animator.playing")
     assert time(visit) == pytest.approx(END)
     visit.page.keyboard.press("Space")  # from the start
     visit.until("viewer.animator.time > 0 && viewer.animator.time < 5")
     visit.page.keyboard.press("l")
     assert visit.page.get_attribute("#loop", "aria-pressed") == "true"
-    visit.page.evaluate(f"player.go({END} - 0.1)")
+    visit.page.evaluate(f"player.seek({END} - 0.1)")
     visit.until("viewer.animator.playing && viewer.animator.time > 0.05 && viewer.animator.time < 5")
 
 
@@ -106,9 +108,9 @@ def test_runs_are_shown_and_hidden_by_name(visit):
 def test_a_stopped_run_says_why_from_its_end_on(visit):
     line = "translucent: SPF, ε = 10⁻⁴"
     assert line in visit.caption()
-    visit.page.evaluate("player.go(3.9)")
+    visit.page.evaluate("player.seek(3.9)")
     assert line in visit.caption()
-    visit.page.evaluate("player.go(4.1)")
+    visit.page.evaluate("player.seek(4.1)")
     assert f"{line} – stopped at 4 s: phi_z is <singular>" in visit.caption()
     assert "reduced" in visit.caption()
 
@@ -139,7 +141,7 @@ def test_arrows_are_the_forces(visit, runs):
 
 def test_everything_is_on_a_small_screen(visit):
     visit.page.set_viewport_size({"width": 360, "height": 640})
-    for name in ("play", "at", "time", "speed", "loop", "forces", "record"):
+    for name in ("play", "time-slider", "time", "speed", "loop", "forces", "record"):
         box = visit.page.locator(f"#{name}").bounding_box()
         assert 0 <= box["x"] < box["x"] + box["width"] <= 360
         assert box["y"] + box["height"] <= 640
@@ -164,3 +166,25 @@ def test_the_ends_of_a_loop_lie_on_each_other_in_one_order(visit):
              viewer.scene_tree.find(["world", "1: reduced", ...path.split("/"), "<object>"]).object.renderOrder)"""
     )
     assert orders[0] > orders[1]
+
+
+def test_the_browser_accepts_every_style_rule(visit):
+    """Rules and declarations that a browser does not understand are dropped silently."""
+    css = re.sub(r"/\*.*?\*/", "", (STATIC / "player.css").read_text(encoding="utf-8"), flags=re.DOTALL)
+    kept = visit.page.evaluate(
+        """css => {
+             const sheet = new CSSStyleSheet();
+             sheet.replaceSync(css);
+             const flat = rule => rule.cssRules && rule.cssRules.length ? Array.from(rule.cssRules).flatMap(flat)
+               : [rule.selectorText];
+             return Array.from(sheet.cssRules).flatMap(flat);
+           }""",
+        css,
+    )
+    blocks = re.findall(r"[^{};]+\{[^{}]*\}", css)
+    assert len(kept) == len(blocks)
+    declarations = re.findall(r"([a-z-]+): ([^;{}]+);", css)
+    supported = visit.page.evaluate(
+        """pairs => pairs.map(([name, value]) => CSS.supports(name, value.replace(" !important", "")))""", declarations
+    )
+    assert [pair for pair, ok in zip(declarations, supported, strict=True) if not ok] == []
