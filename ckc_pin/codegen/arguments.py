@@ -9,49 +9,10 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.rows import Affine, Distance
 
-__all__ = ["Arguments", "constant", "labels", "near", "numbers", "present", "values"]
+__all__ = ["Arguments", "constant", "labels", "near", "present", "values"]
 
 NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
-
-
-def numbers(mechanism: Mechanism) -> dict[str, Array]:
-    """Return all numbers that may be arguments: of joints, of bodies, of the closure's rows, of springs.
-
-    Keys and shapes, in SI units: gravity (3); by joint, the world's first, offset and centre (joints, 3), mass
-    (joints) and inertia (joints, 3, 3); armature (n); by frame point (points, 3); by row length and affine_offset
-    (rows), affine (rows, n); by coordinate constant, joint_stiffness, joint_rest, joint_damping (n); by spring end
-    (2 springs, 3), stiffness, rest_length, damping (springs).
-    """
-    model, closure, springs, n = mechanism.tree.model, mechanism.closure, mechanism.springs, mechanism.n
-    length, affine_offset = np.zeros(closure.rows), np.zeros(closure.rows)
-    affine = np.zeros((closure.rows, n))
-    for group in closure.groups:
-        if isinstance(group, Distance):
-            length[group.out] = group.length
-        elif isinstance(group, Affine):
-            affine[group.out], affine_offset[group.out] = group.matrix, group.offset
-    return {
-        "gravity": np.array(model.gravity.linear),
-        "offset": np.array([placement.translation for placement in model.jointPlacements]),
-        "mass": np.array([inertia.mass for inertia in model.inertias]),
-        "centre": np.array([inertia.lever * (inertia.mass > 0) for inertia in model.inertias]),
-        "inertia": np.array([inertia.inertia for inertia in model.inertias]),
-        "armature": np.array(model.armature),
-        "point": np.reshape(closure.anchors.point_local, (-1, 3)),
-        "length": length,
-        "affine": affine,
-        "affine_offset": affine_offset,
-        "constant": springs.constant,
-        "joint_stiffness": springs.joint_stiffness,
-        "joint_rest": springs.joint_rest,
-        "joint_damping": springs.joint_damping,
-        "end": np.reshape(springs.anchors.point_local, (-1, 3)),
-        "stiffness": springs.stiffness,
-        "rest_length": springs.rest_length,
-        "damping": springs.damping,
-    }
 
 
 def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:

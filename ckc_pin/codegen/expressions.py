@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from ckc_pin.base.arrays import BoolArray
-from ckc_pin.codegen.arguments import Arguments, numbers, present
+from ckc_pin.codegen.arguments import Arguments, present
 from ckc_pin.codegen.bodies import ConfigurationSymbols, MovingBody, cross, dot, forward_kinematics, multiply
 from ckc_pin.codegen.branches import AxisRotations
 from ckc_pin.codegen.elimination import elimination_order
 from ckc_pin.codegen.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import model_numbers
 
 __all__ = ["TermExpressions", "kept_rows", "term_expressions"]
 
@@ -91,7 +92,7 @@ def term_expressions(
     """
     import casadi as cs
 
-    tree, arguments = mechanism.tree, Arguments(which or present(numbers(mechanism)))
+    tree, arguments = mechanism.tree, Arguments(which or present(model_numbers(mechanism)))
     configuration, v = ConfigurationSymbols(tree.nq), cs.SX.sym("v", tree.n)
     q, v_dot, zero = configuration.q, cs.SX.sym("v_dot", tree.n), cs.SX(tree.n, 1)
     rotations = AxisRotations([placement.rotation for placement in tree.model.jointPlacements], root_groups)

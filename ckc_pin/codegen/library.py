@@ -20,12 +20,13 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.atomic_files import open_atomic, temporary_folder
 from ckc_pin.base.sources import Sources
-from ckc_pin.codegen.arguments import numbers, present, values
+from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.compiler import Compiler, compile_c, find_compiler, hash_of
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.rows import RelativeLog
 
 __all__ = ["Library", "cache_folder", "compile_terms", "explain_too_large", "find_compiled_terms"]
@@ -134,7 +135,7 @@ class _Subject:
 
     @classmethod
     def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, changes: bool) -> _Subject:
-        mechanism_numbers = numbers(mechanism)
+        mechanism_numbers = model_numbers(mechanism)
         which = which or present(mechanism_numbers)
         return cls(_key(mechanism, which, changes), values(mechanism_numbers, which), which, changes)
 
@@ -247,7 +248,7 @@ def _make(
             compile_c(compiler, source, library, mechanism.name)
         except OSError as error:
             raise InputError(f"{mechanism.name}: its terms cannot be compiled: {error.strerror}") from error
-        require_equal_terms(mechanism, Library(str(library), values(numbers(mechanism), subject.which)))
+        require_equal_terms(mechanism, Library(str(library), values(model_numbers(mechanism), subject.which)))
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
         return Library(str(_store(name, content)), subject.parameters)

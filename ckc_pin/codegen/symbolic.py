@@ -11,11 +11,12 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.codegen.acceleration import ConstrainedInertia
-from ckc_pin.codegen.arguments import labels, numbers, present, values
+from ckc_pin.codegen.arguments import labels, present, values
 from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import model_numbers
 
 __all__ = ["Symbolic", "symbolic"]
 
@@ -106,7 +107,7 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
         import casadi as cs
     except ModuleNotFoundError as error:
         raise InputError("symbolic needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
-    terms, mechanism_numbers = term_expressions(mechanism), numbers(mechanism)
+    terms, mechanism_numbers = term_expressions(mechanism), model_numbers(mechanism)
     q, v, p = terms.configuration.q, terms.v, terms.arguments.vector
     u = cs.SX.sym("u", mechanism.n)
     v_dot, _ = ConstrainedInertia(terms).acceleration(u, np.zeros(mechanism.closure.rows))

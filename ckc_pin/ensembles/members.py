@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -20,11 +21,12 @@ from numpy.typing import NDArray
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.codegen.library import Library, compile_terms, explain_too_large, find_compiled_terms
-from ckc_pin.codegen.varied import Varied
+from ckc_pin.ensembles.member_numbers import MemberNumbers
 from ckc_pin.ensembles.names import check_names
 from ckc_pin.ensembles.outputs import Function, Outputs, Recorded
 from ckc_pin.ensembles.spec import OutputSpec
 from ckc_pin.errors import CkcError, InputError
+from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
@@ -32,6 +34,7 @@ from ckc_pin.run.prepare import prepare
 from ckc_pin.run.simulate import run_of, run_rows
 from ckc_pin.run.units import key_unit
 from ckc_pin.scene.initial import branch
+from ckc_pin.scene.parts import changed_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "Members"]
@@ -97,7 +100,8 @@ class Members:
         self.outputs = Outputs(outputs, self.ready)
         self._require_one_time()
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
-        self._varied = Varied(self.mechanism, [names[k] for k in self._parameters])
+        parameters = ParameterMap(self.mechanism, self.scene.spec.parameters, partial(changed_mechanism, self.scene))
+        self._numbers = MemberNumbers(parameters, [names[k] for k in self._parameters])
         self._library = self._terms(count)
         self.terms = "pinocchio" if self._library is None else "generated"
         self._overrides["solver.terms"] = self.terms
@@ -161,14 +165,14 @@ class Members:
             _, *others = self.ready.tables  # the scene's own terms may be without the numbers that vary from zero
             core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
             self._batch = _core.Batch(core, *others, self.mechanism.tolerance, self._threads)
-        found, sound = self._varied.of(values[:, self._parameters])
+        found, sound = self._numbers.evaluate(values[:, self._parameters])
         chosen = np.flatnonzero(sound)
         count = len(chosen)
         if not count:
             return 0
         varied = [(name, x[chosen].reshape(count, -1)) for name, x in found.items()]
         if found and self._library is not None:
-            varied.append(("written", self._varied.arguments(found, len(values))[chosen]))
+            varied.append(("written", self._numbers.arguments(found, len(values))[chosen]))
         q, q_dot = self._starts(values[chosen])
         out: dict[str, Any] = {name: np.zeros(count, np.int64) for name in ("why", "filled")}
         out |= {"work": np.zeros(3 * count, np.int64), "t": np.empty(count)}
@@ -286,7 +290,7 @@ class Members:
 
     def _terms(self, count: int) -> Library | None:
         """Compiled terms where they are asked for, are there, or repay compiling."""
-        wanted, which = self.scene.spec.solver.terms, self._varied.which
+        wanted, which = self.scene.spec.solver.terms, self._numbers.which
         if wanted == "pinocchio":
             return None
         if wanted == "generated":
@@ -319,7 +323,7 @@ class Members:
         known = all(name.rpartition("initial.q.")[2] in mechanism.independent for name in positions) and all(
             name.startswith(("initial.q.", "initial.q_dot.")) for name in starts
         )
-        if not known or not self._varied.possible or self.outputs.functions or not mechanism.tree.is_euclidean:
+        if not known or not self._numbers.is_batched or self.outputs.functions or not mechanism.tree.is_euclidean:
             return False
         if spec.initial.w is not None or spec.solver.max_wall_s is not None or mechanism.splits_root:
             return False

@@ -18,6 +18,7 @@ from ckc_pin.mechanism.urdf import INERTIA, LIMITS, check_inertial, check_range,
 
 __all__ = [
     "AXES",
+    "INERTIA_ENTRIES",
     "ROOTS",
     "Overrides",
     "Value",
@@ -39,6 +40,7 @@ ROOTS = ("gravity", "link", "joint", "loop", "coupling", "spring", "force", "mot
 AXES = "xyz"
 OF_JOINT = ("armature", "damping", "friction", "restitution")  # keys of [[joint]]
 OF_LINK = ("mass", "com", *(f"inertia.{entry}" for entry in INERTIA))
+INERTIA_ENTRIES = {entry: ("xyz".index(entry[1]), "xyz".index(entry[2])) for entry in INERTIA}  # rows and columns
 VECTORS = ("gravity", "com", "xyz", "rpy")  # keys of three numbers each
 UNBOUNDED = 1e300  # what the URDF's limits are where there is none
 OF_ENTRY = {

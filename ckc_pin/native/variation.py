@@ -15,8 +15,9 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, BoolArray
-from ckc_pin.codegen.arguments import numbers, present, values
+from ckc_pin.codegen.arguments import present, values
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.spec import FrameSpec
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.native.tables import core_table, packed
@@ -112,6 +113,8 @@ class SensitivityParameter:
     assembled_at : int
         Coordinate whose stop the assembled start touches, if this parameter moves that stop and the start follows it
         in one direction only; -1 otherwise.
+    slopes : mapping of str to arrays
+        Derivatives of the model's numbers (`ParameterMap.derivative`).
     """
 
     name: str
@@ -120,6 +123,7 @@ class SensitivityParameter:
     q_dot: Array | None = None
     places: tuple[Effect, ...] = ()
     assembled_at: int = -1
+    slopes: Mapping[str, Array] = field(default_factory=dict)
 
 
 # --- where terms are written out ---------------------------------------------------------------------
@@ -128,82 +132,29 @@ class SensitivityParameter:
 def directions_of(
     mechanism: Mechanism, parameters: Sequence[SensitivityParameter]
 ) -> tuple[dict[str, BoolArray], Array] | None:
-    """Return which numbers the written-out code has to take, and how they change with each parameter.
+    """Return the arguments that compiled terms need for derivatives with respect to parameters, and those directions.
 
     Returns
     -------
     dict of str to bool arrays
-        As `present` gives it, with what is zero and varies.
-    (k, parameters) array
-        By argument.
-    None where a parameter turns something: angles between joints are no arguments.
+        As `present` returns it, with numbers that are zero and vary.
+    (arguments, parameters) array
+        Derivatives of the arguments.
+    None where a parameter turns a joint or a direction, or a body has no mass: those are no arguments.
     """
-    own = numbers(mechanism)
-    changes = [_direction(own, x.effects) for x in parameters]
-    which = present(own)
-    for found in changes:
-        if found is None:
+    numbers = model_numbers(mechanism)
+    which = present(numbers)
+    for x in parameters:
+        if any(effect.lock is not None and effect.lock.turns for effect in x.effects):
             return None
-        for name, part in found.items():
-            which[name] = which[name] | (part != 0.0)
-    changed = [{name: x.get(name, np.zeros_like(own[name])) for name in own} for x in changes if x is not None]
-    columns = [values(x, which) for x in changed]
+        if any(effect.kind == "inertia" and numbers["mass"][effect.index] <= 0.0 for effect in x.effects):
+            return None
+        for key in numbers:
+            if key in x.slopes:
+                which[key] = which[key] | (x.slopes[key] != 0.0)
+    zeros = {key: np.zeros_like(x) for key, x in numbers.items()}
+    columns = [values({key: x.slopes.get(key, zeros[key]) for key in numbers}, which) for x in parameters]
     return which, np.array(columns).T
-
-
-def _direction(own: Mapping[str, Array], effects: Sequence[Effect]) -> dict[str, Array] | None:
-    found: dict[str, Array] = {}
-
-    def add(name: str, at: Any, change: Any) -> None:
-        if name not in found:
-            found[name] = np.zeros_like(own[name])
-        found[name][at] += change
-
-    for effect in effects:
-        at, x = effect.index, effect.numbers
-        match effect.kind:
-            case "placement":
-                assert effect.lock is not None
-                name = {"joint": "offset", "point": "point", "spring": "end"}.get(effect.lock.placed)
-                if name is None or effect.lock.turns:
-                    return None
-                add(name, at, _plain(x[0] * effect.lock.axis))
-            case "inertia":
-                if own["mass"][at] <= 0.0:
-                    return None
-                for name, part in _of_body(own, at, x).items():
-                    add(name, at, _plain(part))
-            case "gravity":
-                add("gravity", slice(None), x)
-            case "armature":
-                add("armature", at, x[0])
-            case "offset":
-                add("affine_offset", at, 1.0)
-            case "ratio":
-                add("affine", (at, int(x[0])), -1.0)
-            case kind if kind not in ACTING:
-                add(kind, at, 1.0)
-    return found
-
-
-def _of_body(own: Mapping[str, Array], at: int, x: Array) -> dict[str, Array]:
-    """Return a change of mass, moment and inertia about a joint's origin as one of the body's own three."""
-    m, c = own["mass"][at], own["centre"][at]
-    about = np.zeros((3, 3))
-    about[np.triu_indices(3)] = x[4:]
-    about = about + np.triu(about, 1).T
-    by_c = (x[1:4] - x[0] * c) / m
-
-    def moment(a: Array, b: Array) -> Array:
-        return np.asarray(float(a @ b) * np.eye(3) - (np.outer(a, b) + np.outer(b, a)) / 2)
-
-    return {"mass": x[0], "centre": by_c, "inertia": about - x[0] * moment(c, c) - 2 * m * moment(c, by_c)}
-
-
-def _plain(x: Any) -> Any:
-    """Without what rounding leaves of zeros."""
-    x = np.asarray(x, dtype=float)
-    return np.where(np.abs(x) > 1e-14 * np.abs(x).max(initial=0.0), x, 0.0)
 
 
 # --- in general --------------------------------------------------------------------------------------

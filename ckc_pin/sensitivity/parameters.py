@@ -6,7 +6,7 @@ controller's gains and the start are the scene's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -27,6 +27,7 @@ from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.parameters import (
     ROOTS,
     Overrides,
@@ -276,18 +277,23 @@ def find_sensitivity_parameters(
     labels = [part for name in names for part in parts_of(name, known)]
     if len(set(labels)) < len(labels):
         raise InputError(f"sensitivities: a parameter is named twice in {', '.join(names)}")
-    return [_of_mechanism(name, effects_of(mechanism, actuation, name, scene.spec.parameters, changed))
-            if is_parameter(name) else of_scene[name] for name in labels]  # fmt: skip
+    parameters = ParameterMap(mechanism, scene.spec.parameters, changed)
+    return [_of_mechanism(mechanism, actuation, name, parameters.derivative(name)) if is_parameter(name)
+            else of_scene[name] for name in labels]  # fmt: skip
 
 
-def _of_mechanism(name: str, effects: Sequence[Effect]) -> SensitivityParameter:
-    """Keep what moves nothing but a point that is reported apart from what the motion depends on."""
+def _of_mechanism(
+    mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
+) -> SensitivityParameter:
+    """Separate effects that move only reported points from those that the motion depends on."""
+    effects = effects_of(mechanism, actuation, name, slopes)
     placed = ["" if effect.lock is None else effect.lock.placed for effect in effects]
     by_place = list(zip(placed, effects, strict=True))
     return SensitivityParameter(
         name,
         tuple(effect for place, effect in by_place if place != "reported"),
         places=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
+        slopes=slopes,
     )
 
 

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.codegen.arguments import numbers, present, values
+from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.branches import find_identical_branches
 from ckc_pin.codegen.c_source import count_statements, write_c_source
 from ckc_pin.codegen.compiler import FLAGS
 from ckc_pin.codegen.derivatives import DIRECTIONS
 from ckc_pin.codegen.graph import Graph, Packing
 from ckc_pin.codegen.term_functions import TermFunctions
+from ckc_pin.mechanism.parameter_map import model_numbers
 
 TWO_BRANCHES = {"q": {k: ((0, k // 2), k % 2) for k in range(4)}}
 THREE_BRANCHES = {"q": {k: ((0, k // 2), k % 2) for k in range(6)}}  # two numbers of each of three branches
@@ -159,7 +160,7 @@ def test_an_arm_in_the_worlds_axes_is_vectorized_with_rotated_arms() -> None:
 def test_a_bodys_numbers_are_one_group_with_an_additive_derivative() -> None:
     """The group of one body takes few operations."""
     mechanism = load("five_bar")
-    mechanism_numbers = numbers(mechanism)
+    mechanism_numbers = model_numbers(mechanism)
     functions = TermFunctions.of(mechanism, changes=True).functions
     which = present(mechanism_numbers)
     parameters, random = values(mechanism_numbers, which), np.random.default_rng(0)

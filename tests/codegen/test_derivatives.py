@@ -9,13 +9,14 @@ import pytest
 
 from ckc_pin import Mechanism, load, load_scene
 from ckc_pin.codegen.acceleration import ConstrainedInertia
-from ckc_pin.codegen.arguments import numbers, present, values
+from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.mechanism.library import shipped
+from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.native.plant import Plant
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.parts import scene_mechanism
@@ -33,7 +34,7 @@ def test_derivatives_of_the_native_core_are_those_of_the_symbolic_terms(name: st
 
     mechanism, random = load(name), np.random.default_rng(0)
     tree, n, terms = mechanism.tree, mechanism.n, term_expressions(mechanism)
-    u, mechanism_numbers = cs.SX.sym("u", n), numbers(mechanism)
+    u, mechanism_numbers = cs.SX.sym("u", n), model_numbers(mechanism)
     parameters = values(mechanism_numbers, present(mechanism_numbers))
     jacobians = ConstrainedInertia(terms).derivatives(u)
     symbols = [terms.configuration.q, terms.v, u, terms.arguments.vector]

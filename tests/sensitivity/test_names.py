@@ -162,7 +162,7 @@ def test_of_a_limit_that_is_reached(tmp_path: Path) -> None:
 
 def test_a_limit_that_two_give_has_no_derivative(tmp_path: Path) -> None:
     scene = driven(tmp_path, SET_POINT + "torque_limit = 50.0\n", 50.0)
-    with pytest.raises(InputError, match="matters only one way"):
+    with pytest.raises(InputError, match="exists on one side only"):
         sensitivities(scene, ["motor.a.torque_limit"])
     found = sensitivities(scene, ["motor.a.torque_limit"], {"controller.torque_limit": 40.0, "t_end": 0.1})
     assert not found.q_tree.any()  # the other one is the smaller
