@@ -48,7 +48,7 @@ def _command(name: str) -> Iterator[str]:
         record for record in (parameter.get_help_record(context) for parameter in command.get_params(context)) if record
     ]
     if rows:
-        yield from ("| option | does |", "|---|---|")
+        yield from ("| option | meaning |", "|---|---|")
         yield from (f"| `{left.replace('|', chr(92) + '|')}` | {_text(right)} |" for left, right in rows)
         yield ""
     if command.epilog:
