@@ -25,7 +25,7 @@ def render(template: str, **content: Any) -> str:
 
 
 def said(template: str, **values: Any) -> dict[str, Any]:
-    """Fill in a template's blocks, each of which is a paragraph: its lines are joined.
+    """Fill in a template's blocks. Lines of a paragraph are joined, and blank lines separate paragraphs.
 
     Returns
     -------
@@ -34,7 +34,11 @@ def said(template: str, **values: Any) -> dict[str, Any]:
     """
     filled = environment().get_template(f"{template}.md.j2")
     context = filled.new_context(values)
-    return {name: " ".join("".join(block(context)).split()) for name, block in filled.blocks.items()}
+    return {name: _paragraphs("".join(block(context))) for name, block in filled.blocks.items()}
+
+
+def _paragraphs(text: str) -> str:
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in re.split(r"\n\s*\n", text.strip()))
 
 
 def environment() -> Environment:

@@ -14,12 +14,12 @@ __all__ = ["markdown", "names", "undocumented"]
 
 def names() -> dict[str, list[str]]:
     """Return ``ckc_pin.__all__`` by kind."""
-    found: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": []}
+    by_kind: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": []}
     for name in ckc_pin.__all__:
         value = getattr(ckc_pin, name)
         kind = "Functions" if not inspect.isclass(value) else "Errors" if issubclass(value, Exception) else "Classes"
-        found[kind].append(name)
-    return found
+        by_kind[kind].append(name)
+    return by_kind
 
 
 def markdown() -> str:
@@ -43,12 +43,12 @@ def _directive(kind: str, name: str) -> Iterator[str]:
 
 def undocumented() -> list[str]:
     """Return public names, and public members of classes, without a docstring."""
-    found = []
+    missing = []
     for name in ckc_pin.__all__:
         value = getattr(ckc_pin, name)
-        found += [name] if not inspect.getdoc(value) else []
-        found += [f"{name}.{member}" for member, of in _members(value) if not inspect.getdoc(of)]
-    return found
+        missing += [name] if not inspect.getdoc(value) else []
+        missing += [f"{name}.{member}" for member, of in _members(value) if not inspect.getdoc(of)]
+    return missing
 
 
 def _members(value: Any) -> Iterator[tuple[str, Any]]:

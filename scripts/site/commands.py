@@ -1,4 +1,4 @@
-"""The commands, their arguments and options, from click itself."""
+"""Reference of the commands with their arguments and options, generated from click."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ __all__ = ["markdown", "undocumented"]
 
 
 def markdown() -> str:
-    """Return every command's section, in MyST."""
+    """Return a section for each command, in MyST."""
     return "\n".join(line for name in COMMANDS for line in _command(name))
 
 
 def undocumented() -> list[str]:
-    """Return what has no help: commands, and their options and arguments."""
-    found = []
+    """Return commands, options and arguments without a help text."""
+    missing = []
     for name in COMMANDS:
         command, context = _click(name)
-        found += [f"ckc {name}"] if not command.help else []
+        missing += [f"ckc {name}"] if not command.help else []
         for parameter in command.get_params(context):
             if not getattr(parameter, "help", None):
-                found.append(f"ckc {name} {parameter.human_readable_name}")
-    return found
+                missing.append(f"ckc {name} {parameter.human_readable_name}")
+    return missing
 
 
 def _click(name: str) -> tuple[click.Command, click.Context]:
@@ -48,7 +48,7 @@ def _command(name: str) -> Iterator[str]:
         record for record in (parameter.get_help_record(context) for parameter in command.get_params(context)) if record
     ]
     if rows:
-        yield from ("| option | does |", "|---|---|")
+        yield from ("| option | meaning |", "|---|---|")
         yield from (f"| `{left.replace('|', chr(92) + '|')}` | {_text(right)} |" for left, right in rows)
         yield ""
     if command.epilog:
@@ -59,7 +59,7 @@ def _command(name: str) -> Iterator[str]:
 
 
 def _text(text: str) -> str:
-    """Keep what Markdown would take for its own."""
+    """Escape characters that Markdown would interpret, and join the lines."""
     for sign in "*_<[|":
         text = text.replace(sign, f"\\{sign}")
     return " ".join(text.split())

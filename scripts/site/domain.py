@@ -30,7 +30,7 @@ class KeyEntry(ObjectDescription[str]):
         for what in ("kind", "default", "unit"):
             value = self.options.get(what)
             if value:
-                text = {"needed": "needed", "absent": "absent by default"}.get(value, f"default {value}")
+                text = {"required": "required", "absent": "absent by default"}.get(value, f"default {value}")
                 shown = text if what == "default" else value
                 signode += nodes.inline("", shown, classes=["ckc-fact", f"ckc-{what}"])
         return sig
@@ -55,7 +55,7 @@ class CkcDomain(Domain):
     data_version = 1
 
     def note(self, name: str, file: str, unit: str, docname: str, anchor: str) -> None:
-        """Keep an entry; one key may stand in two structures, the first is linked to."""
+        """Add an entry. A key may occur in two structures; links lead to the first one."""
         self.data["keys"].setdefault(f"{file}:{name}", (name, unit, docname, anchor))
 
     def clear_doc(self, docname: str) -> None:

@@ -1,4 +1,4 @@
-"""The gallery: each example's first line, its picture and its text."""
+"""Gallery page: title, picture and text of each example."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PICTURES = "images/gallery"
 
 @dataclass(frozen=True)
 class Example:
-    """One file of examples/."""
+    """A file of examples/ with its title and description."""
 
     path: Path
     title: str
@@ -23,12 +23,12 @@ class Example:
 
     @property
     def name(self) -> str:
-        """What the file is called."""
+        """File name without its ending."""
         return self.path.stem
 
     @property
     def picture(self) -> Path:
-        """Where its picture is, under docs/."""
+        """Path of its picture in docs/."""
         return ROOT / "docs" / PICTURES / f"{self.name}.png"
 
 
@@ -44,24 +44,24 @@ def examples() -> list[Example]:
 def _example(path: Path) -> Example:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
-        said = ast.get_docstring(ast.parse(text)) or ""
+        text = ast.get_docstring(ast.parse(text)) or ""
     else:
-        said = "".join(json.loads(text)["cells"][0]["source"]).removeprefix("# ")
-    title, _, about = said.partition("\n")
+        text = "".join(json.loads(text)["cells"][0]["source"]).removeprefix("# ")
+    title, _, about = text.partition("\n")
     return Example(path, title.rstrip("."), about.strip())
 
 
 def markdown() -> str:
-    """Return cards that lead to sections, and a section an example, in MyST."""
-    found = examples()
-    if not found:
+    """Return a grid of links to sections, and a section for each example, in MyST."""
+    gallery = examples()
+    if not gallery:
         return ""
     lines = ["::::{grid} 2 2 3 3", ":gutter: 2", ""]
-    for example in found:
+    for example in gallery:
         lines += [f":::{{grid-item-card}} {example.title}", f":img-top: {PICTURES}/{example.name}.png"]
         lines += [f":link: example-{example.name}", ":link-type: ref", ":::", ""]
     lines += ["::::", ""]
-    for example in found:
+    for example in gallery:
         lines += [f"(example-{example.name})=", f"## {example.title}", "", example.about, ""]
         lines += [f"![{example.title}]({PICTURES}/{example.name}.png)", "", f"`examples/{example.path.name}`:", ""]
         lines += ["````python", _code(example.path), "````", ""]
@@ -71,7 +71,7 @@ def markdown() -> str:
 def _code(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
-        return text.split('"""\n', 1)[1].strip()  # what the docstring says stands above
+        return text.split('"""\n', 1)[1].strip()  # without the docstring, which is displayed above
     cells = json.loads(text)["cells"][1:]
     return "\n\n".join(
         "".join(c["source"]) if c["cell_type"] == "code" else "# " + "".join(c["source"]).replace("\n", "\n# ")

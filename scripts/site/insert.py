@@ -1,4 +1,4 @@
-"""Lines ``% insert: NAME ARGUMENT`` of a page, replaced by what the program says when the site is built."""
+"""Replace lines ``% insert: NAME ARGUMENT`` of a page by text generated from the program when the site is built."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def _file(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8").rstrip()
 
 
-def _changes(text: str) -> str:
-    """Return the change log below its title, with links as the site has them."""
+def _change_log(text: str) -> str:
+    """Return the change log without its title, with links converted to those of the site."""
     below = text.partition("\n")[2].replace("](docs/", "](/")
     return re.sub(r"\]\(examples/(\w+)\.\w+\)", lambda at: f"](/gallery.md#example-{at[1].replace('_', '-')})", below)
 
@@ -32,10 +32,10 @@ INSERTS: dict[str, Callable[..., str]] = {
     "python": lambda name: f"```python\n{_file(name)}\n```",
     "toml": lambda name: f"```toml\n{_file(name)}\n```",
     "xml": lambda name: f"```xml\n{_file(name)}\n```",
-    "changes": lambda: _changes(_file("CHANGELOG.md")),
+    "changes": lambda: _change_log(_file("CHANGELOG.md")),
 }
 
 
 def inserted(text: str) -> str:
-    """Return a page's text with its inserts."""
+    """Return a page's text with all insert lines replaced."""
     return LINE.sub(lambda match: INSERTS[match[1]](*filter(None, [match[2]])), text)

@@ -1,4 +1,4 @@
-"""The keys of a user's files, from the typed structures that the program reads them with.
+"""Reference of the keys of a user's files, generated from the typed structures that the program reads them with.
 
 Type, bounds and default are the structure's; meaning, unit and example stand in its docstring, in the form of a
 numpydoc `Attributes` section where the unit takes the place of the type, and the last line is an example.
@@ -26,15 +26,15 @@ from ckc_pin.scene.spec import SceneSpec
 __all__ = ["FILES", "Key", "Table", "markdown", "tables"]
 
 FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec, "sweep": SweepSpec}
-# Tables that a structure leaves open, since what stands in them decides how they are read.
+# Tables without a structure of their own: their contents decide which structure is read.
 OPEN = {(TrackingSpec, "desired"): (HarmonicsSpec, PointPathSpec)}
-# What the path of an open table says beside its structure's name.
+# Suffix of the path of such a table.
 PLACES: dict[Any, str] = {HarmonicsSpec: ".COORDINATE"}
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key: all that its structure says of it."""
+    """A key with its type, default, unit, meaning and example."""
 
     name: str
     kind: str
@@ -46,7 +46,7 @@ class Key:
 
     @property
     def documented(self) -> bool:
-        """Whether meaning and example are there."""
+        """Whether it has a meaning and an example."""
         return bool(self.meaning and self.example)
 
 
@@ -89,7 +89,7 @@ def _structures(kind: Any) -> tuple[Any, ...]:
     """Return the structures that a type names, at any depth."""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return (kind,)
-    return tuple(found for member in get_args(kind) for found in _structures(member))
+    return tuple(structure for member in get_args(kind) for structure in _structures(member))
 
 
 def _key(field: Any, entry: tuple[str, str, str]) -> Key:
@@ -136,16 +136,16 @@ def _nested(kind: Any) -> bool:
 
 def _default(field: Any) -> str:
     if field.required:
-        return "needed"
+        return "required"
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
     if isinstance(value, msgspec.Struct):
-        return "its keys' defaults"
+        return "defaults of its keys"
     if value is None:
         return "absent"
-    written = list(value) if isinstance(value, tuple) else value
+    literal = list(value) if isinstance(value, tuple) else value
     if isinstance(value, bool):
         return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else repr(written)
+    return f'"{value}"' if isinstance(value, str) else repr(literal)
 
 
 # --- docstrings ------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def _default(field: Any) -> str:
 
 @cache
 def described(structure: Any) -> tuple[str, dict[str, tuple[str, str, str]]]:
-    """Return what a structure's docstring says: what it is, and (unit, meaning, example) by key, bases' keys too."""
+    """Return a structure's description, and (unit, meaning, example) of each key, including keys of its bases."""
     entries: dict[str, tuple[str, str, str]] = {}
     for base in reversed(structure.__mro__):
         if issubclass(base, msgspec.Struct) and base.__dict__.get("__doc__"):
@@ -167,12 +167,12 @@ def _section(text: str) -> tuple[str, str]:
 
 
 def _entries(text: str) -> dict[str, tuple[str, str, str]]:
-    found = {}
+    entries = {}
     for match in re.finditer(r"^(\w+)(?: : (.*))?\n((?:    .*\n?)+)", text, re.MULTILINE):
         name, unit, body = match[1], match[2] or "", [line.strip() for line in match[3].strip().splitlines()]
         example = body.pop().strip("`") if re.match(rf"``{name} = .*``$", body[-1]) else ""
-        found[name] = (unit, " ".join(body), example)
-    return found
+        entries[name] = (unit, " ".join(body), example)
+    return entries
 
 
 # --- a page ----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Links of the built site: every one that stays within it leads to a page and to an anchor that are there."""
+"""Check the links of the built site: their pages and anchors must exist."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def _page(path: Path) -> _Page:
 
 
 def broken(site: Path) -> list[str]:
-    """Return links that lead nowhere, and what would be fetched from elsewhere to show a page."""
-    found = []
+    """Return links of the site whose page or anchor does not exist."""
+    faults = []
     for path in sorted(site.rglob("*.html")):
         for link in _page(path).links:
             parts = urlsplit(link)
@@ -44,17 +44,17 @@ def broken(site: Path) -> list[str]:
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.exists():
-                found.append(f"{path.relative_to(site)}: {link}: no such file")
+                faults.append(f"{path.relative_to(site)}: {link}: no such file")
             elif parts.fragment and target.suffix == ".html" and parts.fragment not in _page(target).anchors:
-                found.append(f"{path.relative_to(site)}: {link}: no such anchor")
-    return found
+                faults.append(f"{path.relative_to(site)}: {link}: no such anchor")
+    return faults
 
 
 def main() -> int:
-    """Print what is broken; return the exit code."""
-    found = broken(Path(sys.argv[1]))
-    print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
-    return 1 if found else 0
+    """Print the broken links; return the exit code."""
+    faults = broken(Path(sys.argv[1]))
+    print(*faults, sep="\n", end="\n" if faults else "", file=sys.stderr)
+    return 1 if faults else 0
 
 
 if __name__ == "__main__":

@@ -38,9 +38,9 @@ def _first_shown(example: Example) -> bytes:
     notebook = nbformat.read(example.path, as_version=4)  # type: ignore[no-untyped-call]
     NotebookClient(notebook, timeout=120).execute()
     shown = "".join(str(output.get("data", {})) for cell in notebook.cells for output in cell.get("outputs", []))
-    found = re.search(r"data:image/png;base64,([\w+/=]+)", shown)
-    assert found, "a notebook shows a figure"
-    return b64decode(found[1])
+    match = re.search(r"data:image/png;base64,([\w+/=]+)", shown)
+    assert match, "a notebook shows a figure"
+    return b64decode(match[1])
 
 
 def main() -> None:

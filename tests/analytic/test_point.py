@@ -197,7 +197,7 @@ def test_a_path_that_leaves(pair):
         ("three_rrr", {"point": "plate", "circle": {"centre": [0.01, 0.01, 0], "radius": 0.02, "frequency": 1.0}}, 9.0),
     ],
 )
-def test_interpolated_knots_are_those_of_following_the_path(name, desired, t_end):
+def test_interpolated_knots_equal_the_path(name, desired, t_end):
     """And each of them puts the point on the path, in closed form."""
     mechanism = load(name)
     follow = make_desired(desired, mechanism, Sources("test", None, {}), t_end)

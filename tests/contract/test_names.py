@@ -1,4 +1,8 @@
-"""One word for one meaning: no two public classes of one name, and none of the words that another one stands for."""
+"""One word for one meaning: unique names of public classes, and no name or phrase for which there is a better word.
+
+The vocabulary of names and phrases, the rooms that still use them and the command that lowers their bounds are in
+`language.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.contract import language
+
 ROOT = Path(__file__).resolve().parents[2]
 TOPS = ("ckc_pin", "examples", "scripts", "tests")
 
-# what to say instead of each
+# what to say instead of each word; no name may have one
 WORDS = {
     "watch": "monitor, event function, output callback",
     "guard": "monitor, event function",
@@ -35,7 +41,7 @@ WORDS = {
 FORMS = {f"{word}{end}": word for word in WORDS for end in ("", "s", "ed", "er", "es", "ing")} | {"tallies": "tally"}
 del FORMS["trailing"]  # as a newline is
 
-# classes of the experiments that are called as others are
+# classes of the experiments that have the name of another class
 TWICE = {"Approach", "Case", "Crossing", "Frame", "Locus", "Model", "Motion", "Record", "Reference", "Setting", "Steps",
          "Track", "Tree"}  # fmt: skip
 
@@ -43,8 +49,8 @@ TWICE = {"Approach", "Case", "Crossing", "Frame", "Locus", "Model", "Motion", "R
 @cache
 def files() -> tuple[str, ...]:
     """Python files of the project, as paths from its top."""
-    found = (path.relative_to(ROOT) for top in TOPS for path in (ROOT / top).rglob("*.py"))
-    return tuple(sorted(path.as_posix() for path in found))
+    paths = (path.relative_to(ROOT) for top in TOPS for path in (ROOT / top).rglob("*.py"))
+    return tuple(sorted(path.as_posix() for path in paths))
 
 
 @cache
@@ -67,9 +73,9 @@ def test_no_two_public_classes_have_one_name() -> None:
             for name in classes(tree(file)):
                 where[name].append(file)
     assert len(where) > 100
-    own = {name: sum(file.startswith("ckc_pin/") for file in found) for name, found in where.items()}
-    assert {name: where[name] for name, count in own.items() if count > 1} == {}
-    assert {name for name, found in where.items() if len(found) > 1} == TWICE
+    in_package = {name: sum(file.startswith("ckc_pin/") for file in places) for name, places in where.items()}
+    assert {name: where[name] for name, count in in_package.items() if count > 1} == {}
+    assert {name for name, places in where.items() if len(places) > 1} == TWICE
 
 
 # --- words -----------------------------------------------------------------------------------------
@@ -106,9 +112,64 @@ def test_words_of_a_name(name: str, count: int) -> None:
 
 @pytest.mark.parametrize("top", TOPS)
 def test_no_name_has_a_word_that_another_stands_for(top: str) -> None:
-    mine = [file for file in files() if file.startswith(f"{top}/")]
-    assert mine
-    found = [f"{file}: {says}" for file in mine for says in forbidden(Path(file).stem)]
-    for file in mine:
-        found += [f"{file}:{line}: {says}" for line, name in names(tree(file)) for says in forbidden(name)]
-    assert sorted(set(found)) == []
+    under_top = [file for file in files() if file.startswith(f"{top}/")]
+    assert under_top
+    faults = [f"{file}: {fault}" for file in under_top for fault in forbidden(Path(file).stem)]
+    for file in under_top:
+        faults += [f"{file}:{line}: {fault}" for line, name in names(tree(file)) for fault in forbidden(name)]
+    assert sorted(set(faults)) == []
+
+
+# --- vocabulary ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["found", "_own", "wanted_", "given2", "every", "what_acts", "joint_card", "Sway", "JointChange", "strangers",
+     "written_rates", "run_plain", "LoopWithinLimits", "test_what_is_refused"],
+)  # fmt: skip
+def test_vocabulary_rejects_names_without_a_quantity(name: str) -> None:
+    assert language.check_name(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["solution", "config", "founded", "owner", "discard", "least_squares", "joint_mode", "whatever", "settling_time",
+     "nonLinearEffects", "closest", "MAX_STEPS"],
+)  # fmt: skip
+def test_vocabulary_accepts_terms_of_the_field(name: str) -> None:
+    assert language.check_name(name, function=True) is None
+    assert language.check_name(name, constant=True) is None
+
+
+def test_vocabulary_tells_functions_and_constants_from_variables() -> None:
+    assert language.check_name("back") is None
+    assert language.check_name("back", function=True)
+    assert language.check_name("flat") is None
+    assert language.check_name("FLAT", constant=True)
+    assert language.check_name("MOST_STEPS", constant=True)
+    assert language.check_name("look", cpp=True)
+    assert language.check_name("back", cpp=True) is None  # std::vector has it
+
+
+def test_vocabulary_finds_phrases_across_lines() -> None:
+    text = "# Terms are written\n# out here, and the\n# least singular value of J."
+    assert [(line, phrase) for line, phrase, _ in language.check_prose(text)] == [
+        (0, "written out"),
+        (2, "least singular"),
+    ]
+    assert language.check_prose("Close a loop by least squares near the equilibrium.") == []
+
+
+@pytest.mark.parametrize("room", sorted(language.count().keys() | language.bounds().keys()))
+def test_room_has_exactly_the_bounded_number_of_names_and_phrases_to_avoid(room: str) -> None:
+    """A room that is not in `language_bounds.toml` has none; a bound is lowered as soon as the count is."""
+    counts = language.count().get(room, {"names": 0, "phrases": 0})
+    bounds = language.bounds().get(room, {"names": 0, "phrases": 0})
+    for kind, count in counts.items():
+        listed = "\n".join(str(hit) for hit in language.hits()[room][kind]) if room in language.hits() else ""
+        assert count <= bounds[kind], f"{room}: {count} {kind} to avoid, at most {bounds[kind]}:\n{listed}"
+        assert count == bounds[kind], (
+            f"{room}: {count} {kind} to avoid, fewer than the bound {bounds[kind]}; "
+            "lower it by `python -m tests.contract.language`"
+        )

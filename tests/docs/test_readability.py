@@ -19,7 +19,8 @@ MAX_CHARACTERS = 720  # in a paragraph as it is displayed: six lines of 120
 
 GUIDE = ["README.md", "docs/index.md", "docs/start.md", "docs/install.md", "docs/gallery.md"]
 GUIDE += [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "guide").glob("*.md"))]
-THEORY: list[str] = []  # pages of docs/theory, and docs/errors.md
+THEORY = ["docs/errors.md"]
+THEORY += [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "theory").glob("*.md"))]
 PAGES = GUIDE + THEORY
 
 

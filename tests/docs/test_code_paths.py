@@ -1,0 +1,35 @@
+"""Pages that say where code is name files and folders that exist."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from scripts.site.gallery import ROOT
+
+ROOM = re.compile(r"`((?:native/src|[a-z_]+)/[\w/]*(?:\.py|\.cpp|\.hpp)?)`")
+
+
+def test_code_of_each_equation_exists() -> None:
+    page = (ROOT / "docs" / "theory" / "pipeline.md").read_text(encoding="utf-8")
+    paths = ROOM.findall(page)
+    assert len(paths) > 15
+    assert [path for path in paths if not any((top / path).exists() for top in (ROOT / "ckc_pin", ROOT))] == []
+
+
+def test_contributing_lists_every_room_in_the_order_of_the_layers() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("### Rooms")[2].partition("\n#")[0]
+    listed = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in page.splitlines() if line.startswith("| `")]
+    layers = re.search(r"layers = \[(.*?)\]", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.DOTALL)
+    assert layers
+    rooms = [line.split(" | ") for line in re.findall(r'"([^"]+)"', layers[1]) if line != "__main__"]
+    assert listed == rooms
+
+
+@pytest.mark.parametrize("folder", ["tests", "scripts"])
+def test_contributing_names_folders_and_scripts_that_exist(folder: str) -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = re.findall(rf"`(?:\./|\.venv/bin/pytest )?({folder}/[\w./]+)", page)
+    assert paths
+    assert [path for path in paths if not (ROOT / path).exists()] == []
