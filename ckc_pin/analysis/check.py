@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
@@ -105,6 +105,16 @@ class Check(HasSummary):
     def summary(self) -> Summary:
         """Return what there is to see of it."""
         return check_summary(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the check as JSON-ready data."""
+        arrays = {
+            "q_tree": self.q_tree.tolist(),
+            "inertia": self.inertia.tolist(),
+            "branches": None if self.branches is None else self.branches.tolist(),
+            "stability": None if self.stability is None else self.stability.to_dict(),
+        }
+        return asdict(self) | arrays
 
 
 def check(

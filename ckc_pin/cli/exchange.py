@@ -11,7 +11,6 @@ import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.output import Working, errors, print_json, print_summary
 from ckc_pin.cli.signals import interrupts
-from ckc_pin.cli.tables import check_plain
 from ckc_pin.formats import exporting, importing
 
 __all__ = ["export", "import_"]
@@ -41,7 +40,7 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
     except ckc_pin.MechanismError as error:  # a finding: what was written is there to be corrected
         problem = str(error)
     if as_json:
-        result = {"status": "done", **check_plain(found)} if found else {"status": "error", "message": problem}
+        result = {"status": "done", **found.to_dict()} if found else {"status": "error", "message": problem}
         paths = [str(path) for path in written]
         said = {"left_out": draft.left_out, "guessed": draft.guessed}
         print_json({"status": "done", "written": paths, **said, "check": result})

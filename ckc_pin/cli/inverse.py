@@ -15,7 +15,7 @@ from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.cli.exits import STOPPED, interrupted
 from ckc_pin.cli.output import ProgressBar, errors, kept, make_folder, print_json, print_table
 from ckc_pin.cli.signals import interrupts
-from ckc_pin.cli.tables import inverse_plain, inverse_table
+from ckc_pin.cli.tables import inverse_table
 from ckc_pin.errors import InputError
 
 __all__ = ["inverse"]
@@ -48,7 +48,7 @@ def inverse(what: str, overrides: tuple[str, ...], out: Path | None, figures: bo
     if out is not None:
         _write(found, out, figures)
     if as_json:
-        print_json(inverse_plain(found))
+        print_json(found.to_dict())
     else:
         print_table(inverse_table(found))
         print(kept(out, "inverse.npz, for other programs"))

@@ -10,7 +10,7 @@ import ckc_pin
 from ckc_pin.cli import options
 from ckc_pin.cli.arguments import read_overrides, read_table
 from ckc_pin.cli.output import LONG, Working, errors, print_json, print_summary, print_table
-from ckc_pin.cli.tables import check_plain, terms_plain, terms_table
+from ckc_pin.cli.tables import terms_table
 
 __all__ = ["check", "compile_", "list_", "terms"]
 
@@ -57,7 +57,7 @@ def check(what: str, overrides: tuple[str, ...], branches: bool, as_json: bool) 
     with Working(f"checking {what}"):
         found = ckc_pin.check(what, read_overrides("--set", overrides), branches=branches)
     if as_json:
-        print_json(check_plain(found))
+        print_json(found.to_dict())
     else:
         print_summary(found.summary())
 
@@ -74,7 +74,7 @@ def terms(mechanism: str, q: str, v: str, as_json: bool) -> None:
     loaded = ckc_pin.load(mechanism)
     found = ckc_pin.terms(loaded, read_table("--q", q), read_table("--v", v))
     if as_json:
-        print_json(terms_plain(found))
+        print_json(found.to_dict())
     else:
         print_table(terms_table(found))
 

@@ -74,9 +74,9 @@ def map_(
                 mechanism, point=point, over=axes or ("x", "y"), count=sections, cells=cells, progress=progress
             )
     if as_json:
-        print_json(maps.map_plain(one) if sections is None else maps.sections_plain(stack))
+        print_json(one.to_dict() if sections is None else maps.sections_to_dict(stack))
     else:
-        print_table(maps.map_table(one) if sections is None else maps.sections_table(stack))
+        print_table(maps.make_map_table(one) if sections is None else maps.make_sections_table(stack))
     if out is None and not as_json:
         print("not drawn: --out DIR draws the map there")
     elif out is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,38 +14,13 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-    from ckc_pin.analysis.check import Check
     from ckc_pin.run.motion_forces import MotionForces
     from ckc_pin.run.run import Run
 
-__all__ = ["check_plain", "inverse_plain", "inverse_table", "profile_table", "terms_plain", "terms_table"]
+__all__ = ["inverse_table", "profile_table", "terms_table"]
 
 SPATIAL = (slice(0, 3), slice(3, 6))  # force and moment of a wrench
 NO_MOMENT = 1e-9  # of the force on the arm of the mechanism's size
-TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
-
-
-def check_plain(found: Check) -> dict[str, Any]:
-    """Return a check as JSON-ready data."""
-    branches = None if found.branches is None else found.branches.tolist()
-    arrays = {"q_tree": found.q_tree.tolist(), "inertia": found.inertia.tolist(), "branches": branches,
-              "stability": None if found.stability is None else found.stability.to_dict()}  # fmt: skip
-    return asdict(found) | arrays
-
-
-def terms_plain(found: Terms) -> dict[str, Any]:
-    """Return all terms at a state as JSON-ready data."""
-    mechanism = found.mechanism
-    plain: dict[str, Any] = {
-        "coordinates": mechanism.coordinates,
-        "independent": mechanism.independent,
-        "dependent": mechanism.dependent,
-        "q_tree": mechanism.tree.to_coordinates(found.q_tree).tolist(),
-        "v_tree": found.v_tree.tolist(),
-        "phi_q": found.at.phi_q.tolist(),
-        "phi_z": found.at.phi_z.tolist(),
-    }
-    return plain | {name: np.asarray(getattr(found, name)).tolist() for name in TERMS}
 
 
 def terms_table(found: Terms) -> Group:
@@ -66,30 +40,6 @@ def terms_table(found: Terms) -> Group:
         parts += [Text(name), *(Text("  " + _row(row)) for row in getattr(found, name))]
     parts += [Text("phi_q | phi_z"), *(Text(f"  {_row(a)} | {_row(b)}") for a, b in _rows_of_jacobian(found))]
     return Group(*parts)
-
-
-def inverse_plain(found: MotionForces) -> dict[str, Any]:
-    """Return what a motion needs as JSON-ready data."""
-    loops = {}
-    for loop, multipliers in found.loop_forces.items():
-        wrench = found.loop_wrenches.get(loop)
-        loops[loop] = {
-            "rows": found.rows(loop),
-            "multipliers": multipliers.tolist(),
-            "force": None if wrench is None else wrench[:, :3].tolist(),
-            "moment": None if wrench is None else wrench[:, 3:].tolist(),
-        }
-    return {
-        **{name: getattr(found, name).tolist() for name in ("t", "q_tree", "v_tree", "a_tree", "tau")},
-        "coordinates": found.coordinates,
-        "actuated": found.actuated,
-        "loop_forces": loops,
-        "joint_forces": {joint: wrench.tolist() for joint, wrench in found.joint_forces.items()},
-        "exceeded": found.exceeded,
-        "redundant": found.mechanism.redundant,
-        "status": found.status,
-        "message": found.message,
-    }
 
 
 def inverse_table(found: MotionForces) -> Group:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -24,6 +25,8 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["Terms", "terms"]
+
+SERIALIZED_TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", "C", "h", "energy")
 
 
 class Terms(HasSummary):
@@ -61,6 +64,20 @@ class Terms(HasSummary):
             ("reduced", [f"D {d, d}", f"C {d, d}", f"h ({d},)", f"rho {n, d}", f"rho_dot {n, d}"]),
         ]
         return Summary(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return state and terms as JSON-ready data; this computes all of them."""
+        mechanism = self.mechanism
+        state = {
+            "coordinates": mechanism.coordinates,
+            "independent": mechanism.independent,
+            "dependent": mechanism.dependent,
+            "q_tree": mechanism.tree.to_coordinates(self.q_tree).tolist(),
+            "v_tree": self.v_tree.tolist(),
+            "phi_q": self.at.phi_q.tolist(),
+            "phi_z": self.at.phi_z.tolist(),
+        }
+        return state | {name: np.asarray(getattr(self, name)).tolist() for name in SERIALIZED_TERMS}
 
     # --- the tree, eq. 1 -------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,6 +14,8 @@ __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "Sin
 
 Space = Literal["joint", "cartesian"]
 Kind = Literal["locked", "fold", "rank loss", "serial"]
+
+POINT_TOLERANCE = 1e-9  # rad or m; a locus of a smaller extent in the map is a point
 
 # In the paper's terms and in those of parallel robots.
 LABELS: dict[Kind, str] = {
@@ -98,6 +100,11 @@ class Locus:
     on: BoolArray
     closed: bool
     residual: float
+
+    @property
+    def is_point(self) -> bool:
+        """Whether the map shows the curve as one point, because only coordinates that are not its axes change."""
+        return bool(np.ptp(self.at, axis=0).max() < POINT_TOLERANCE)
 
 
 @dataclass(frozen=True)
@@ -203,6 +210,62 @@ class SingularityMap(HasSummary):
         rows += [("note", note) for note in self.notes]
         where = "independent coordinates" if self.point is None or self.space == "joint" else f"place of {self.point}"
         return Summary(f"Singularity map of {self.mechanism} over {where}", rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the numbers of the map as JSON-ready data, with the loci as curves over the map's axes."""
+        path = self.path
+        return {
+            "mechanism": self.mechanism,
+            "space": self.space,
+            "point": self.point,
+            "axes": [
+                {"name": a.name, "unit": a.unit, "low": a.low, "high": a.high, "cells": len(a.values)}
+                for a in self.axes
+            ],
+            "held": self.fixed,
+            "measure": self.measure,
+            "branches": [
+                {
+                    "reached": float(np.mean(aspect.reached)),
+                    "least": float(np.nanmin(aspect.det_phi_z)),
+                    "largest": float(np.nanmax(aspect.det_phi_z)),
+                }
+                for aspect in self.aspects
+            ],
+            "more_branches": self.more_branches,
+            "loci": [
+                {
+                    "kind": locus.kind,
+                    "label": LABELS[locus.kind],
+                    "closed": locus.closed,
+                    "residual": locus.residual,
+                    "branches": np.flatnonzero(np.any(locus.on, axis=1)).tolist(),
+                    "at": (locus.at[:1] if locus.is_point else locus.at).tolist(),
+                }
+                for locus in self.loci
+            ],
+            "desired": None
+            if path is None
+            else {
+                "scene": path.name,
+                "leaves_at": path.leaves_at,
+                "closest_t": path.closest_t,
+                "sigma_min": path.sigma_min,
+                "approaches": [
+                    {
+                        "locus": a.locus,
+                        "kind": self.loci[a.locus].kind,
+                        "distance": a.distance,
+                        "t": a.t,
+                        "at": a.at.tolist(),
+                        "to": a.to.tolist(),
+                    }
+                    for a in path.approaches
+                ],
+            },
+            "seconds": self.seconds,
+            "notes": list(self.notes),
+        }
 
     @property
     def counts(self) -> IntArray:

@@ -12,6 +12,10 @@ primitive       phi                                              used by
 `Affine`        A q' - c                                         couplings, mimic joints
 `RelativeLog`   log(R_A^T R_B), three rows                       prismatic, weld
 ==============  ===============================================  ==================================
+
+Rows are implemented three times on purpose: here in NumPy, as the readable reference and for many configurations at
+once; in C++ (`native/src`, rows.cpp) for runs; and as CasADi expressions (`codegen/rows.py`) for compiled terms.
+`tests/codegen/test_rows_agree.py` compares all three for every type of row.
 """
 
 from __future__ import annotations

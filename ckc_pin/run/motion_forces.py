@@ -74,6 +74,29 @@ class MotionForces(HasSummary):
         """Return what there is to see of it."""
         return forces_summary(self)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return motion and forces as JSON-ready data."""
+        loops = {}
+        for loop, multipliers in self.loop_forces.items():
+            wrench = self.loop_wrenches.get(loop)
+            loops[loop] = {
+                "rows": self.rows(loop),
+                "multipliers": multipliers.tolist(),
+                "force": None if wrench is None else wrench[:, :3].tolist(),
+                "moment": None if wrench is None else wrench[:, 3:].tolist(),
+            }
+        return {
+            **{name: getattr(self, name).tolist() for name in ("t", "q_tree", "v_tree", "a_tree", "tau")},
+            "coordinates": self.coordinates,
+            "actuated": self.actuated,
+            "loop_forces": loops,
+            "joint_forces": {joint: wrench.tolist() for joint, wrench in self.joint_forces.items()},
+            "exceeded": self.exceeded,
+            "redundant": self.mechanism.redundant,
+            "status": self.status,
+            "message": self.message,
+        }
+
     @property
     def coordinates(self) -> tuple[str, ...]:
         """Labels of the tree's coordinates."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, load
-from ckc_pin.analysis.map import map_plain, singularity_map
+from ckc_pin.analysis.map import singularity_map
 from ckc_pin.analysis.map.loci import LocusSystem
 from ckc_pin.kinematics.extended import extend_closure
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR
@@ -217,7 +217,7 @@ def test_one_freedom_and_fixed_ones():
 
 def test_numbers_of_a_map_are_plain(joint):
     found, _ = joint
-    plain = map_plain(found)
+    plain = found.to_dict()
     assert plain["axes"][0] == {"name": "theta_1", "unit": "rad", "low": -np.pi, "high": np.pi, "cells": CELLS}
     assert plain["desired"]["leaves_at"] == found.path.leaves_at
     assert [locus["kind"] for locus in plain["loci"]] == [locus.kind for locus in found.loci]

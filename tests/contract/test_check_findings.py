@@ -11,7 +11,6 @@ import pytest
 
 from ckc_pin import InputError, check, load, load_scene
 from ckc_pin.base.summary import to_json
-from ckc_pin.cli.tables import check_plain
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.library import shipped
 from tests.conftest import assert_close
@@ -55,7 +54,7 @@ def test_check_takes_overrides_as_a_run_does() -> None:
     line = [word for key, value in overrides.items() for word in ("--set", f"{key}={value}")]
     of_command = ckc("check", "five_bar/set_point", *line, "--json").json
     of_python, of_scene = check("five_bar/set_point", overrides), check(load_scene("five_bar/set_point", overrides))
-    assert of_command == json.loads(to_json(check_plain(of_python))) == json.loads(to_json(check_plain(of_scene)))
+    assert of_command == json.loads(to_json(of_python.to_dict())) == json.loads(to_json(of_scene.to_dict()))
     assert of_python.stability is not None
     assert of_python.stability.least_eigenvalue != check("five_bar/set_point").stability.least_eigenvalue  # type: ignore[union-attr]
     lighter = {"link.link_2.mass": 0.0625}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,6 +26,8 @@ from ckc_pin.mechanism.spec import (
 )
 from tests.analytic.five_bar import Array
 from tests.property.worlds import Numbers, World, random_world, rotation, slope
+
+RowsIn = Literal["a", "world"]
 
 LENGTH = 0.4  # of a distance loop
 LARGEST_RHO, LEAST_SIGMA = 10.0, 0.05  # nearer to a singular phi_z differences lose their digits
@@ -77,7 +80,13 @@ class Closed:
 
 
 def closed_mechanism(
-    kind: LoopType, seed: int, *, free: bool = True, redundant: bool = False, turn: Array | None = None
+    kind: LoopType,
+    seed: int,
+    *,
+    free: bool = True,
+    redundant: bool = False,
+    turn: Array | None = None,
+    rows_in: RowsIn = "a",
 ) -> Closed:
     """A world with a loop between the links a_3 and b_3, a coupling, springs and dampers, rotors on joints.
 
@@ -89,10 +98,12 @@ def closed_mechanism(
         Close the same loop twice.
     turn
         Rotation of everything, gravity included, about the world's origin.
+    rows_in
+        Axes in which the loop's rows are resolved: frame A's or the world's.
     """
     world = random_world(seed, free=free)
     q = world.configuration()
-    loop = _closing_loop(kind, world, q)
+    loop = _closing_loop(kind, world, q, rows_in)
     turn = np.eye(3) if turn is None else turn
     trees = [
         TreeSpec(file=prefix, prefix=prefix, root="free" if prefix == "b_" and free else "fixed",
@@ -114,7 +125,7 @@ def closed_mechanism(
     return Closed(assemble_mechanism(spec, Sources("a random world", None, texts)), world, q)
 
 
-def _closing_loop(kind: LoopType, world: World, q: Numbers) -> LoopSpec:
+def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> LoopSpec:
     """A loop whose frame B is where its frame A is at q, apart from what its type leaves free."""
     random = world.random
     inside, axis = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
@@ -126,6 +137,7 @@ def _closing_loop(kind: LoopType, world: World, q: Numbers) -> LoopSpec:
         type=kind,
         frame_a=FrameSpec(link="a_3", xyz=_triple(inside)),
         frame_b=FrameSpec(link="b_3", xyz=_triple(R_B.T @ (p_A + R_A @ (inside + apart) - p_B)), rpy=_rpy(R_B.T @ R_A)),
+        rows_in=rows_in,
         axis_a=_triple(axis),
         axis_b=_triple(across if kind == "universal" else axis),
         length=LENGTH if kind == "distance" else None,
