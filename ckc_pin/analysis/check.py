@@ -27,11 +27,10 @@ from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints, find_model_warnings
-from ckc_pin.run.runnable import require_runnable
-from ckc_pin.run.warnings import check_desired, desired_warnings, limit_warnings
+from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable
 from ckc_pin.scene.initial import Start
-from ckc_pin.scene.parts import in_samples, scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import OVERRIDES, Scene, load_scene, names_a_scene
+from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, is_scene_name, load_scene
 from ckc_pin.scene.spec import TermsOf
 
 __all__ = ["Check", "check"]
@@ -139,20 +138,20 @@ def check(
     require_type(what, (Mechanism, Scene, str, Path), "check: what", "a mechanism or a scene: itself, its name or path")
     require_flag(branches, "check: branches")
     if overrides is not None:
-        require_table(overrides, "check: overrides", OVERRIDES)
+        require_table(overrides, "check: overrides", EXPECTED_OVERRIDES)
     if isinstance(what, str | Path):
-        what = load_scene(what, overrides) if names_a_scene(str(what)) else load(what, overrides)
+        what = load_scene(what, overrides) if is_scene_name(str(what)) else load(what, overrides)
     elif overrides:
         raise InputError("check: overrides go with a name; a Scene or a Mechanism is complete")
     if isinstance(what, Mechanism):
         outside = limit_warnings(what, what.q_tree, "the assembled configuration")
         found = _mechanism_check(what, None, outside, "auto", what.name)
         return replace(found, branches=_branches(what)) if branches else found
-    mechanism = scene_mechanism(what)
-    controller, actuation = scene_controller(what, mechanism), scene_actuation(what, mechanism)
+    mechanism = load_scene_mechanism(what)
+    controller, actuation = build_scene_controller(what, mechanism), build_scene_actuation(what, mechanism)
     start: Start | None = None
     try:
-        start, refused = require_runnable(what, mechanism, in_samples(what, controller), actuation), ""
+        start, refused = require_runnable(what, mechanism, apply_sampling(what, controller), actuation), ""
     except CkcError as error:
         refused = str(error)
     desired = check_desired(controller, mechanism, what.spec.t_end, start)
@@ -184,7 +183,7 @@ def _stability(
     if desired is not None and desired.leaves_at is not None:
         return Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
     library = None if spec.solver.terms == "pinocchio" else find_compiled_terms(mechanism)
-    clocked = in_samples(scene, controller)
+    clocked = apply_sampling(scene, controller)
     found = stability(
         mechanism,
         controller,

@@ -19,9 +19,9 @@ __all__ = ["check", "compile_", "list_", "terms"]
 @options.as_json
 def list_(as_json: bool) -> None:
     """Shipped mechanisms and scenes, a line each."""
-    from ckc_pin.scene.scene import catalogue
+    from ckc_pin.scene.scene import list_catalogue
 
-    entries = catalogue()
+    entries = list_catalogue()
     if as_json:
         print_json({"mechanisms": [{"name": n, "about": about, "scenes": scenes} for n, about, scenes in entries]})
         return

@@ -63,9 +63,9 @@ def complete_mechanisms(context: click.Context, parameter: click.Parameter, inco
 def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete a shipped mechanism's or scene's name, or a path."""
     from ckc_pin.mechanism.library import shipped
-    from ckc_pin.scene.scene import scene_names
+    from ckc_pin.scene.scene import list_scene_names
 
-    return _completed([name for one in shipped() for name in (one, *_of(one, scene_names(one)))], incomplete)
+    return _completed([name for one in shipped() for name in (one, *_of(one, list_scene_names(one)))], incomplete)
 
 
 def _of(mechanism: str, scenes: list[str]) -> list[str]:

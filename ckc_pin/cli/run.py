@@ -20,7 +20,7 @@ from ckc_pin.cli.output import ProgressBar, Working, errors, kept, make_folder, 
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.cli.tables import profile_table
 from ckc_pin.errors import InputError
-from ckc_pin.run.warnings import run_warnings
+from ckc_pin.run.checks import run_warnings
 
 __all__ = ["run"]
 

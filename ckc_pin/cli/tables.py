@@ -1,4 +1,4 @@
-"""Findings as plain data (the JSON of docs/reference/json.md) and as tables for a terminal."""
+"""Tables of terms, inverse dynamics and profiles for a terminal."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from ckc_pin.ensembles.spec import read_sweep, scene_path, sweep_of
 from ckc_pin.ensembles.store import RESULTS, Store, require_libraries
 from ckc_pin.ensembles.task import SweepTask
 from ckc_pin.errors import InputError
-from ckc_pin.scene.scene import OVERRIDES, as_toml
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES, to_toml_value
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -125,12 +125,12 @@ def ensemble(
 
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
-        "scene": str(scene), "seed": as_toml(seed), "overrides": as_toml(overrides or {}),
+        "scene": str(scene), "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
         "variables": {name: _plain(x) for name, x in variables.items()},
         "outputs": {name: _plain(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
     if members is not None:
-        data["members"] = as_toml(members)
+        data["members"] = to_toml_value(members)
     spec = sweep_of(data, Sources("ensemble", Path()))
     if functions and len(functions) == len(outputs):
         spec = msgspec.structs.replace(spec, outputs={})  # a file has to name one
@@ -155,7 +155,7 @@ def _require_tables(scene: Any, variables: Any, outputs: Any, overrides: Any) ->
     require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
     require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
     if overrides is not None:
-        require_table(overrides, "ensemble: overrides", OVERRIDES)
+        require_table(overrides, "ensemble: overrides", EXPECTED_OVERRIDES)
 
 
 def _require_means(out: Any, threads: Any, workers: Any, scheduler: Any, chunk: Any, progress: Any) -> None:
@@ -274,4 +274,4 @@ def _chunk(members: Members, count: int, threads: int) -> int:
 
 
 def _plain(value: Any) -> Any:
-    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else as_toml(value)
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else to_toml_value(value)

@@ -30,11 +30,11 @@ from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
+from ckc_pin.run.columns import key_unit
 from ckc_pin.run.prepare import prepare
-from ckc_pin.run.simulate import run_of, run_rows
-from ckc_pin.run.units import key_unit
-from ckc_pin.scene.initial import branch
-from ckc_pin.scene.parts import changed_mechanism
+from ckc_pin.run.simulate import build_run, record_rows
+from ckc_pin.scene.initial import find_branch
+from ckc_pin.scene.parts import rebuild_scene_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "Members"]
@@ -100,7 +100,9 @@ class Members:
         self.outputs = Outputs(outputs, self.ready)
         self._require_one_time()
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
-        parameters = ParameterMap(self.mechanism, self.scene.spec.parameters, partial(changed_mechanism, self.scene))
+        parameters = ParameterMap(
+            self.mechanism, self.scene.spec.parameters, partial(rebuild_scene_mechanism, self.scene)
+        )
         self._numbers = MemberNumbers(parameters, [names[k] for k in self._parameters])
         self._library = self._terms(count)
         self.terms = "pinocchio" if self._library is None else "generated"
@@ -238,7 +240,7 @@ class Members:
 
         try:
             ready = prepare(load_scene(self.scene_name, self.overrides_of(values)))
-            rows, ended, message = run_rows(ready, require_not_cancelled)
+            rows, ended, message = record_rows(ready, require_not_cancelled)
         except CkcError as error:
             return FAILED, str(error), 0
         if ended == "interrupted":
@@ -251,7 +253,7 @@ class Members:
             (DONE, "" if message == "reached t_end" else message) if ended == "done" else (STOPPED, message)
         )
         if self.outputs.functions:
-            run = run_of(ready, rows, ended, message, 0.0)
+            run = build_run(ready, rows, status=ended, message=message, wall_s=0.0)
             for name, function in self.outputs.functions.items():
                 try:
                     outputs[name][k] = function(run)
@@ -274,10 +276,10 @@ class Members:
         shapes = {name: (output.dims, output.shape) for name, output in self.outputs.outputs.items()}
         if not self.outputs.functions:
             return shapes
-        rows, status, message = run_rows(self.ready)
+        rows, status, message = record_rows(self.ready)
         if status == "interrupted":
             raise interrupt_again(message)
-        run = run_of(self.ready, rows, status, message, 0.0)
+        run = build_run(self.ready, rows, status=status, message=message, wall_s=0.0)
         for name, function in self.outputs.functions.items():
             try:
                 value = np.asarray(function(run), dtype=float)
@@ -308,7 +310,7 @@ class Members:
     def work(self) -> int:
         """Right-hand sides of the scene itself."""
         try:
-            _, status, message = run_rows(self.ready)
+            _, status, message = record_rows(self.ready)
         except CkcError:
             return 0
         if status == "interrupted":
@@ -334,7 +336,7 @@ class Members:
         if not self._control_stays():
             return False
         start = self.ready.start.at
-        self._base = start.q_tree if spec.initial.at is not None else branch(mechanism, spec.initial.q).q_tree
+        self._base = start.q_tree if spec.initial.at is not None else find_branch(mechanism, spec.initial.q).q_tree
         self._q = mechanism.independent_part(start.q_tree)
         for k, name in enumerate(mechanism.independent):
             self._q[k] = spec.initial.q.get(name, self._q[k])

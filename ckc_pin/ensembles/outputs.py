@@ -14,10 +14,10 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.ensembles.spec import OutputSpec, Reduction
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.units import joined
+from ckc_pin.run.columns import integral_unit, quantity_units
 from ckc_pin.run.prepare import Prepared
 from ckc_pin.run.run import Run
-from ckc_pin.run.simulate import columns_of
-from ckc_pin.run.units import by_time, quantity_units
+from ckc_pin.run.simulate import record_columns
 
 __all__ = ["Function", "Output", "Outputs", "Recorded"]
 
@@ -89,7 +89,7 @@ class Outputs:
     """
 
     def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
-        self._ready, self._places = ready, columns_of(ready.mechanism)
+        self._ready, self._places = ready, record_columns(ready.mechanism)
         self._units = quantity_units(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
@@ -188,7 +188,7 @@ class Outputs:
         """The unit of each component; an integral's is over time."""
         index = self._ready.mechanism.tree.index
         own = [self._units["q_tree"][index[spec.of]]] if spec.of in index else self._units[spec.of]
-        return tuple(by_time(unit) if spec.reduce == "integral" else unit for unit in own)
+        return tuple(integral_unit(unit) if spec.reduce == "integral" else unit for unit in own)
 
     def _wanted(self, name: str) -> Array:
         """q_d over time, (d, instants)."""

@@ -29,13 +29,13 @@ from ckc_pin.linear.statics import balance_at_rest
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native.plant import NONE
-from ckc_pin.run.compiled_terms import library_of
-from ckc_pin.run.recorded_joints import RecordedJoints
+from ckc_pin.run.compiled_terms import select_library
+from ckc_pin.run.inverse import RecordedJoints
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import OVERRIDES, Scene, apply_overrides, load_scene, make_scene, names_a_scene
+from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, is_scene_name, load_scene, make_scene
 
 __all__ = ["At", "linearize"]
 
@@ -61,7 +61,7 @@ class _Subject:
 
     @property
     def actuation(self) -> Actuation:
-        return Actuation(self.mechanism) if self.scene is None else scene_actuation(self.scene, self.mechanism)
+        return Actuation(self.mechanism) if self.scene is None else build_scene_actuation(self.scene, self.mechanism)
 
     @property
     def smoothing(self) -> float | None:
@@ -69,7 +69,7 @@ class _Subject:
 
     @property
     def library(self) -> Library | None:
-        return library_of(self.mechanism, "auto" if self.scene is None else self.scene.spec.solver.terms)
+        return select_library(self.mechanism, "auto" if self.scene is None else self.scene.spec.solver.terms)
 
 
 def linearize(
@@ -118,7 +118,7 @@ def linearize(
     expected = "a mechanism or a scene: itself, its name or path"
     require_type(what, (Mechanism, Scene, str, Path), "linearize: what", expected)
     if overrides is not None:
-        require_table(overrides, "linearize: overrides", OVERRIDES)
+        require_table(overrides, "linearize: overrides", EXPECTED_OVERRIDES)
     with one_blas_thread():
         subject = _find_subject(what, at, overrides)
         if subject.mechanism.d == 0:
@@ -141,12 +141,12 @@ def linearize(
 def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
     if isinstance(what, str | Path):
         needs_run = not isinstance(at, Mapping | str)
-        if not (names_a_scene(str(what)) or overrides or needs_run):
+        if not (is_scene_name(str(what)) or overrides or needs_run):
             return _Subject(load(what), None)
         what = load_scene(what, overrides)
     elif overrides:
         raise InputError("linearize: overrides go with a name; a Scene or a Mechanism is complete")
-    return _Subject(scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
+    return _Subject(load_scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
 
 
 def _require_time(at: Any) -> float:
@@ -180,7 +180,7 @@ def _linearize_at_equilibrium(subject: _Subject) -> LinearModel:
 
 def _linearize_at_target(subject: _Subject) -> LinearModel:
     scene, mechanism = subject.scene, subject.mechanism
-    law = None if scene is None else scene_controller(scene, mechanism)
+    law = None if scene is None else build_scene_controller(scene, mechanism)
     if scene is None or not isinstance(law, SetPoint):
         raise InputError(
             f'at = "target": {subject.name} has no set point; give a scene whose controller is of type "set_point"'
@@ -263,7 +263,7 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
     state = _project_onto_manifold(Terms(mechanism, at, run.v_tree[k]))
     joints = RecordedJoints(run)
     locked, smoothing = joints.locked[k], subject.smoothing
-    friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sign[k]
+    friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sliding_signs[k]
     model = linear_model(
         state,
         run.tau[k],
@@ -275,7 +275,7 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
         library=subject.library,
         notes=_describe_instant(scene, run, k),
     )
-    law = scene_controller(scene, mechanism)
+    law = build_scene_controller(scene, mechanism)
     return model if law is None else _add_closed_loop(subject, model, law, t, state, friction)
 
 
@@ -335,7 +335,7 @@ def _describe_instant(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
     notes = []
     if np.any(np.abs(run.v_tree[k]) > SPEED_TOLERANCE * run.mechanism.tree.step_scale):
         notes.append("about a motion, not a state of rest: A and B are those of the instant")
-    limits = scene_actuation(scene, run.mechanism).limit
+    limits = build_scene_actuation(scene, run.mechanism).limit
     saturated = [
         name
         for name, tau, limit in zip(run.actuated, run.tau[k], limits, strict=True)

@@ -20,10 +20,10 @@ from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.linear.closed_loop import ClosedLoop
 from ckc_pin.linear.modes import ComplexArray, compute_eigenvalues
-from ckc_pin.run.compiled_terms import library_of
+from ckc_pin.run.compiled_terms import select_library
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
-from ckc_pin.scene.scene import Scene, load_scene, names_a_scene
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import Scene, is_scene_name, load_scene
 
 __all__ = ["GainLocus", "gain_locus"]
 
@@ -108,13 +108,13 @@ def gain_locus(
     """
     require_type(what, (Scene, str, Path), "gain_locus: what", "a scene: itself, its name or path")
     if not isinstance(what, Scene):
-        if not names_a_scene(str(what)):
+        if not is_scene_name(str(what)):
             return None
         what = load_scene(what, overrides)
     elif overrides:
         raise InputError("gain_locus: overrides go with a name; a Scene is complete")
-    mechanism = scene_mechanism(what)
-    law = scene_controller(what, mechanism)
+    mechanism = load_scene_mechanism(what)
+    law = build_scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):
         return None
     gains = GAINS[type(law)]
@@ -128,7 +128,8 @@ def gain_locus(
     state = Terms(mechanism, solution.at, solution.at.rho @ q_dot)
     values = []
     with one_blas_thread(with_scipy=True):
-        loop = ClosedLoop(mechanism, law, what.spec.friction_smoothing, library_of(mechanism, what.spec.solver.terms))
+        library = select_library(mechanism, what.spec.solver.terms)
+        loop = ClosedLoop(mechanism, law, what.spec.friction_smoothing, library)
         for factor in FACTORS:
             scaled = copy.copy(law)
             setattr(scaled, gain, factor * getattr(law, gain))

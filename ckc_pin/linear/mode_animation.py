@@ -135,6 +135,6 @@ def _create_run(model: LinearModel, number: int, mode: Mode, instants: Array, st
         scene_name=name,
         scene=make_scene(scene, name, mechanism.sources).to_dict(),
         texts=dict(mechanism.sources.texts),
+        built_mechanism=mechanism,
     )
-    run.__dict__["mechanism"] = mechanism
     return run

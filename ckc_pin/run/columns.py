@@ -1,7 +1,8 @@
-"""A run as other programs hold data: labelled arrays, a data frame, a CSV file; all of one table of columns."""
+"""Named columns of a run (data frame, CSV, xarray), and units of its quantities, of parameters and of scene keys."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
@@ -9,59 +10,77 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
-from ckc_pin.mechanism.units import joined
-from ckc_pin.run.units import quantity_units
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameters import is_parameter
+from ckc_pin.mechanism.units import STIFF, VISCOUS, effort, joined, motor_units, parameter_unit, row_units
 
 if TYPE_CHECKING:
     from ckc_pin.run.run import Run
 
-__all__ = ["as_csv", "as_data_frame", "as_dataset", "columns"]
+__all__ = [
+    "derivative_unit",
+    "integral_unit",
+    "key_unit",
+    "list_columns",
+    "quantity_units",
+    "to_csv_text",
+    "to_data_frame",
+    "to_dataset",
+]
 
-BY_TIME = ("energy", "lyapunov", "dissipated")
+SCALARS = ("energy", "lyapunov", "dissipated")  # quantities of a run with one value per instant, J
 AXES = ["x", "y", "z"]
+KEYS_IN_SECONDS = ("t_end", "epsilon", "max_step", "min_step", "max_wall_s", "output_dt", "sample_time", "delay",
+                   "filter")  # fmt: skip
 
 
-def columns(run: Run) -> dict[str, Array]:
-    """Return a column for each number of an instant but t: coordinates by name, the rest with a prefix.
+# --- columns ---------------------------------------------------------------------------------------
+
+
+def list_columns(run: Run) -> dict[str, Array]:
+    """Return the columns of a run's table except t, by name: coordinates, ``v.``, ``u.``, ``tau.``, ``phi.``, ``w.``.
+
+    Energies and the world coordinates of points follow.
 
     Raises
     ------
     InputError
-        A joint is called as another column is.
+        Two columns would have the same name.
     """
-    every: list[tuple[str, Array]] = [
-        *_by_name("", run.coordinates, run.q_tree),
-        *_by_name("v.", run.coordinates, run.v_tree),
-        *_by_name("u.", run.independent, run.u),
-        *_by_name("tau.", run.actuated, run.tau),
-        *_by_name("phi.", _rows(run), run.phi),
-        *_by_name("w.", _rows(run), run.w),
-        *((name, getattr(run, name)) for name in BY_TIME if getattr(run, name) is not None),
+    rows = _row_names(run)
+    columns: list[tuple[str, Array]] = [
+        *_name_columns("", run.coordinates, run.q_tree),
+        *_name_columns("v.", run.coordinates, run.v_tree),
+        *_name_columns("u.", run.independent, run.u),
+        *_name_columns("tau.", run.actuated, run.tau),
+        *_name_columns("phi.", rows, run.phi),
+        *_name_columns("w.", rows, run.w),
+        *((name, getattr(run, name)) for name in SCALARS if getattr(run, name) is not None),
     ]
     for point, path in run.points.items():
-        every += _by_name(f"{point}.", AXES, path)
-    found = dict(every)
-    if len(found) < len(every) or "t" in found:
-        names = [name for name, _ in every]
-        twice = next((name for name in names if names.count(name) > 1), "t")
-        raise InputError(f"{run.scene_name}: two columns would be called {twice!r}; give that joint another name")
-    return found
+        columns += _name_columns(f"{point}.", AXES, path)
+    by_name = dict(columns)
+    if len(by_name) < len(columns) or "t" in by_name:
+        names = [name for name, _ in columns]
+        duplicate = next((name for name in names if names.count(name) > 1), "t")
+        raise InputError(f"{run.scene_name}: two columns would be called {duplicate!r}; rename that joint")
+    return by_name
 
 
-def as_csv(run: Run) -> str:
-    """Return a run as CSV, the columns t and those of `columns`; every number as it is, to its last digit."""
+def to_csv_text(run: Run) -> str:
+    """Return a run as CSV with the columns t and those of `list_columns`. All digits of each number are written."""
     import csv
 
-    table = columns(run)
+    columns = list_columns(run)
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["t", *table])
-    writer.writerows(np.column_stack([run.t, *table.values()]).tolist())
+    writer.writerow(["t", *columns])
+    writer.writerows(np.column_stack([run.t, *columns.values()]).tolist())
     return text.getvalue()
 
 
-def as_data_frame(run: Run) -> Any:
-    """Return a run as pandas' DataFrame, its index t.
+def to_data_frame(run: Run) -> Any:
+    """Return a run as a pandas DataFrame with the index t.
 
     Raises
     ------
@@ -72,11 +91,11 @@ def as_data_frame(run: Run) -> Any:
         import pandas
     except ModuleNotFoundError:
         raise InputError("to_pandas needs pandas: pip install 'ckc_pin[data]'") from None
-    return pandas.DataFrame(columns(run), index=pandas.Index(run.t, name="t"))
+    return pandas.DataFrame(list_columns(run), index=pandas.Index(run.t, name="t"))
 
 
-def as_dataset(run: Run) -> Any:
-    """Return a run as xarray's Dataset, its dimensions named.
+def to_dataset(run: Run) -> Any:
+    """Return a run as an xarray Dataset with named dimensions and units.
 
     Raises
     ------
@@ -88,7 +107,7 @@ def as_dataset(run: Run) -> Any:
     except ModuleNotFoundError:
         raise InputError("to_xarray needs xarray: pip install 'ckc_pin[data]'") from None
     units = quantity_units(run.mechanism)
-    along = {
+    vectors = {
         "q_tree": ("coordinate", run.q_tree),
         "v_tree": ("coordinate", run.v_tree),
         "u": ("independent", run.u),
@@ -97,15 +116,16 @@ def as_dataset(run: Run) -> Any:
         "w": ("row", run.w),
     }
     data: dict[str, Any] = {
-        name: (("t", by), values, {"units": joined(units[name])}) for name, (by, values) in along.items()
+        name: (("t", dimension), values, {"units": joined(units[name])})
+        for name, (dimension, values) in vectors.items()
     }
-    data |= {name: ("t", getattr(run, name), {"units": "J"}) for name in BY_TIME if getattr(run, name) is not None}
-    places: dict[str, Any] = {
+    data |= {name: ("t", getattr(run, name), {"units": "J"}) for name in SCALARS if getattr(run, name) is not None}
+    coordinates: dict[str, Any] = {
         "t": ("t", run.t, {"units": "s"}),
         "coordinate": list(run.coordinates),
         "independent": list(run.independent),
         "motor": list(run.actuated),
-        "row": _rows(run),
+        "row": _row_names(run),
         "unit": ("coordinate", units["q_tree"]),
         "independent_unit": ("independent", units["error"]),
         "motor_unit": ("motor", units["tau"]),
@@ -113,14 +133,79 @@ def as_dataset(run: Run) -> Any:
     }
     if run.points:
         data["points"] = (("point", "t", "axis"), np.array(list(run.points.values())), {"units": "m"})
-        places |= {"point": list(run.points), "axis": AXES}
-    about = {"scene": run.scene_name, "formulation": run.scene["formulation"], "status": run.status}
-    return xarray.Dataset(data, places, {**about, "message": run.message})
+        coordinates |= {"point": list(run.points), "axis": AXES}
+    attributes = {"scene": run.scene_name, "formulation": run.scene["formulation"], "status": run.status}
+    return xarray.Dataset(data, coordinates, {**attributes, "message": run.message})
 
 
-def _rows(run: Run) -> list[str]:
+def _row_names(run: Run) -> list[str]:
     return [".".join(name) for name in run.mechanism.closure.names]
 
 
-def _by_name(prefix: str, names: Any, values: Array) -> list[tuple[str, Array]]:
+def _name_columns(prefix: str, names: Sequence[str], values: Array) -> list[tuple[str, Array]]:
     return [(f"{prefix}{name}", values[:, k]) for k, name in enumerate(names)]
+
+
+# --- units -----------------------------------------------------------------------------------------
+
+
+def quantity_units(mechanism: Mechanism) -> dict[str, list[str]]:
+    """Return the unit of each component of a run's quantities, by the quantity's name."""
+    tree, q, rows = mechanism.tree, mechanism.partition.q, row_units(mechanism)
+    independent = [tree.units()[k] for k in q]
+    return {
+        "q_tree": tree.units(), "v_tree": tree.units("/s"), "error": independent,
+        "u": [effort(unit) for unit in independent], "tau": motor_units(mechanism), "phi": rows, "w": rows,
+        "t": ["s"], "energy": ["J"], "dissipated": ["J"], "lyapunov": ["J"],
+    }  # fmt: skip
+
+
+def integral_unit(unit: str) -> str:
+    """Return the unit of a quantity's integral over time."""
+    return unit.removesuffix("/s") if unit.endswith("/s") else "s²" if unit == "s" else f"{unit} s"
+
+
+def derivative_unit(unit: str, other: str) -> str:
+    """Return the unit of the derivative of a quantity with respect to another one."""
+    return f"{unit}/({other})" if "/" in other or " " in other else f"{unit}/{other}" if other else unit
+
+
+def key_unit(mechanism: Mechanism, name: str) -> str:
+    """Return the unit of a mechanism parameter or of a scene's key; "" if it has none."""
+    if is_parameter(name):
+        return parameter_unit(mechanism, name)
+    root, _, rest = name.partition(".")
+    key, _, component = rest.partition(".")
+    if name.rpartition(".")[2] in KEYS_IN_SECONDS:
+        return "s"
+    if name == "friction_smoothing":
+        return joined(mechanism.tree.units("/s"))
+    if root == "initial":
+        return _component_unit(mechanism.coordinates, mechanism.tree.units("/s" if key == "q_dot" else ""), component)
+    if root == "controller":
+        return _controller_unit(mechanism, key, component)
+    return ""
+
+
+def _controller_unit(mechanism: Mechanism, key: str, component: str) -> str:
+    units = quantity_units(mechanism)
+    q, tau = units["error"], units["tau"]
+    if key in ("sensor", "drive", "allocation"):
+        key, _, component = component.partition(".")
+    if key == "desired":
+        component, _, key = component.rpartition(".")
+    viscous = [VISCOUS[unit] for unit in q]
+    by_coordinate = {
+        "K_P": [STIFF[unit] for unit in q], "K_V": viscous, "K_D": viscous, "Lambda": ["1/s"] * len(q), "q_d": q,
+        "offset": q, "resolution": q, "q_noise": q, "q_dot_noise": [f"{unit}/s" for unit in q],
+    }  # fmt: skip
+    by_motor = {"torque_limit": tau, "preload": tau, "torque_resolution": tau,
+                "torque_rate": [f"{unit}/s" for unit in tau]}  # fmt: skip
+    if key in by_coordinate:
+        return _component_unit(mechanism.independent, by_coordinate[key], component)
+    return _component_unit(mechanism.actuated, by_motor[key], component) if key in by_motor else ""
+
+
+def _component_unit(names: tuple[str, ...], units: list[str], name: str) -> str:
+    """Return the unit of the component called `name`, or the units of all components if there is none."""
+    return dict(zip(names, units, strict=True)).get(name) or joined(units)

@@ -1,9 +1,11 @@
-"""Events: something along a run crosses a value, located inside the step that crosses it.
+"""Events of a run: a function of the state crosses a value, and the crossing is located within the step.
 
-A crossing is a change of sign of (function - value). A run that starts on the value has not crossed
-it; touching the value and turning back is no crossing; reaching it at the very end of a run is one.
-A jump over the value at an impact is one crossing. A joint that comes to rest on the value has crossed
-it, once.
+A crossing is a change of sign of (function - value):
+
+- A run that starts on the value has not crossed it.
+- Touching the value and turning back is no crossing; reaching it at the end of the run is one.
+- A jump over the value at an impact is one crossing.
+- A joint that comes to rest on the value has crossed it once.
 """
 
 from __future__ import annotations
@@ -18,29 +20,31 @@ from ckc_pin.base.validation import require_controller_signature, require_type
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.loop_terms import event_call
+from ckc_pin.run.loop_terms import wrap_event_function
 from ckc_pin.scene.spec import EventSpec
 
-__all__ = ["Event", "EventFunction", "event_functions", "events_met"]
+__all__ = ["Event", "EventFunction", "build_event_functions", "list_occurrences"]
 
-FLOOR = 1e-12  # rad, m, rad/s, m/s: what a coordinate or a rate is on the value within
-OF = {"q": 0, "q_dot": 1, "sigma_min_phi_z": 2, "sigma_min_J": 3, "function": 4}  # as the loop numbers them
+# A coordinate or rate this close to the value counts as being on it: rad, m, rad/s, m/s.
+VALUE_TOLERANCE = 1e-12
+QUANTITIES = {"q": 0, "q_dot": 1, "sigma_min_phi_z": 2, "sigma_min_J": 3, "function": 4}  # the native loop's numbers
 
 
 @dataclass(frozen=True)
 class Event:
-    """Any function of the state, an event where it crosses zero.
+    """An event at the zero crossings of a function of the state.
 
     Parameters
     ----------
     function : callable
-        (t, terms) to a number, smooth or at least continuous in the state; `terms` are the mechanism's at that state.
+        function(t, terms) returns a number that is at least continuous in the state; `terms` are the mechanism's
+        `Terms` at that state.
     direction : -1, 0 or 1
-        1: only where it rises through zero; -1: only where it falls; 0: both.
+        1: crossings where the function rises; -1: where it falls; 0: both.
     stop : bool
-        Whether the run ends there.
+        Whether the run ends at the event.
     name : str
-        What `Run.events` calls it; the function's own name if there is none.
+        Name in `Run.events`; by default the function's name.
 
     Raises
     ------
@@ -55,10 +59,9 @@ class Event:
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise InputError(f"Event: {self.function!r:.80} is no function of (t, terms)")
-        require_controller_signature(
-            self.function, getattr(self.function, "__name__", type(self.function).__name__), "Event"
-        )
+            raise InputError(f"Event: function must be a function of (t, terms), got {self.function!r:.80}")
+        name = getattr(self.function, "__name__", type(self.function).__name__)
+        require_controller_signature(self.function, name, "Event")
         if self.direction not in (-1, 0, 1) or isinstance(self.direction, bool):
             raise InputError(f"Event: direction = {self.direction!r:.80}; valid: -1, 0, 1")
         if not isinstance(self.stop, bool):
@@ -69,14 +72,14 @@ class Event:
 
 @dataclass(frozen=True)
 class EventFunction:
-    """One function whose sign changes the loop looks for, and what a crossing of it is called.
+    """An event function of the native loop.
 
     Attributes
     ----------
     label : dict
-        name, of, coordinate, value.
+        name, of, coordinate and value of its occurrences.
     row : tuple
-        What crosses to the loop.
+        Arguments of the native event: quantity, coordinate, value, sign, direction, stop, tolerance, function.
     """
 
     label: dict[str, Any]
@@ -84,64 +87,77 @@ class EventFunction:
 
     @property
     def stop(self) -> bool:
-        """Whether a run ends where it crosses."""
+        """Whether a run ends at the event."""
         return bool(self.row[5])
 
-    def met(self, t: float, direction: int) -> dict[str, Any]:
-        """Return a crossing as `Run.events` has it."""
+    def occurrence(self, t: float, direction: int) -> dict[str, Any]:
+        """Return an entry of `Run.events`."""
         return {"t": t, **self.label, "direction": direction, "stop": self.stop}
 
 
-def event_functions(specs: Sequence[EventSpec], own: Sequence[Event], mechanism: Mechanism) -> list[EventFunction]:
-    """Return the event functions: the events of a scene, then those given in Python.
+def build_event_functions(
+    specs: Sequence[EventSpec], events: Sequence[Event], mechanism: Mechanism
+) -> list[EventFunction]:
+    """Return the event functions of a scene, followed by those of the caller.
+
+    Parameters
+    ----------
+    specs : sequence of EventSpec
+        The scene's events.
+    events : sequence of Event
+        The caller's events.
 
     Raises
     ------
     InputError
-        An unknown coordinate, one without limits, a margin that this mechanism does not have, no `Event`.
+        An unknown coordinate, a coordinate without limits, a singular value that the mechanism does not have, or an
+        object that is no `Event`.
     """
-    require_type(own, (list, tuple), "events", "a list of Event")
-    found: list[EventFunction] = []
+    require_type(events, (list, tuple), "events", "a list of Event")
+    functions: list[EventFunction] = []
     for k, spec in enumerate(specs):
-        found += _of_scene(spec, mechanism, f"event[{k}]")
-    for k, event in enumerate(own):
+        functions += _scene_event_functions(spec, mechanism, f"event[{k}]")
+    for k, event in enumerate(events):
         if not isinstance(event, Event):
             raise InputError(f"events[{k}]: {event!r:.80} is no Event; write Event(function, direction, stop, name)")
         name = event.name or getattr(event.function, "__name__", "event")
         label = {"name": name, "of": "function", "coordinate": None, "value": 0.0}
-        call = event_call(event.function, name, mechanism)
-        found.append(EventFunction(label, (OF["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)))
-    return found
+        call = wrap_event_function(event.function, name, mechanism)
+        row = (QUANTITIES["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)
+        functions.append(EventFunction(label, row))
+    return functions
 
 
-def events_met(functions: Sequence[EventFunction], mechanism: Mechanism, loop: Any) -> list[dict[str, Any]]:
-    """Return what a loop has met, in order of time: crossings, and what joints did."""
-    found = [functions[k].met(t, direction) for t, k, direction in loop.met()]
-    for t, k, what, direction in loop.joint_changes():
+def list_occurrences(functions: Sequence[EventFunction], mechanism: Mechanism, loop: Any) -> list[dict[str, Any]]:
+    """Return the entries of `Run.events` in order of time: crossings and mode transitions of joints."""
+    occurrences = [functions[k].occurrence(t, direction) for t, k, direction in loop.met()]
+    for t, k, transition, direction in loop.joint_changes():
         of, value = "friction", 0.0
-        if what not in ("sticks", "slides"):
+        if transition not in ("sticks", "slides"):
             of, value = "stop", float((mechanism.joints.lower if direction < 0 else mechanism.joints.upper)[k])
-        label = {"name": f"{mechanism.coordinates[k]} {what}", "of": of, "coordinate": mechanism.coordinates[k]}
-        found.append({"t": t, **label, "value": value, "direction": direction, "stop": False})
-    return sorted(found, key=lambda event: float(event["t"]))
+        name = mechanism.coordinates[k]
+        label = {"name": f"{name} {transition}", "of": of, "coordinate": name}
+        occurrences.append({"t": t, **label, "value": value, "direction": direction, "stop": False})
+    return sorted(occurrences, key=lambda event: float(event["t"]))
 
 
-def _of_scene(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
+def _scene_event_functions(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
     if spec.coordinate is not None:
         mechanism.tree.indices((spec.coordinate,), f"{where}.coordinate")
     if spec.of == "limit":
-        return _limits(spec, mechanism, where)
-    name, value = spec.coordinate, spec.value or 0.0
-    if name is None and mechanism.rank == 0:
+        return _limit_functions(spec, mechanism, where)
+    coordinate, value = spec.coordinate, spec.value or 0.0
+    if coordinate is None and mechanism.rank == 0:
         raise InputError(f"{where}: {mechanism.name} has no closed loop, so there is no {spec.of}")
-    says = spec.of if name is None else name if spec.of == "q" else f"{name}'s rate"
-    label = {"name": f"{says} = {value:g}", "of": spec.of, "coordinate": name, "value": value}
-    k = 0 if name is None else mechanism.tree.index[name]
-    return [EventFunction(label, (OF[spec.of], k, value, 1.0, spec.direction, spec.stop, FLOOR, None))]
+    quantity = spec.of if coordinate is None else coordinate if spec.of == "q" else f"{coordinate}'s rate"
+    label = {"name": f"{quantity} = {value:g}", "of": spec.of, "coordinate": coordinate, "value": value}
+    k = 0 if coordinate is None else mechanism.tree.index[coordinate]
+    row = (QUANTITIES[spec.of], k, value, 1.0, spec.direction, spec.stop, VALUE_TOLERANCE, None)
+    return [EventFunction(label, row)]
 
 
-def _limits(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
-    """Return how far beyond its limits a coordinate is: rising is leaving, falling is coming back."""
+def _limit_functions(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
+    """Return functions that rise through zero where a coordinate leaves its limits, one for each limit."""
     tree = mechanism.tree
     lower, upper = tree.limits()
     limited = [name for k, name in enumerate(tree.coordinates) if np.isfinite(lower[k]) or np.isfinite(upper[k])]
@@ -149,13 +165,12 @@ def _limits(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunc
         raise InputError(f"{where}: no joint of {mechanism.name} has limits in its URDF")
     if spec.coordinate is not None and spec.coordinate not in limited:
         raise InputError(f"{where}: {spec.coordinate} has no limits in its URDF; {', '.join(limited)} have")
-    found = []
+    functions = []
     for name in limited if spec.coordinate is None else [spec.coordinate]:
         k = tree.index[name]
-        for side, limit, outwards in (("lower", float(lower[k]), -1.0), ("upper", float(upper[k]), 1.0)):
+        for side, limit, sign in (("lower", float(lower[k]), -1.0), ("upper", float(upper[k]), 1.0)):
             if np.isfinite(limit):
                 label = {"name": f"{name} at its {side} limit", "of": "limit", "coordinate": name, "value": limit}
-                found.append(
-                    EventFunction(label, (OF["q"], k, limit, outwards, spec.direction, spec.stop, FLOOR, None))
-                )
-    return found
+                row = (QUANTITIES["q"], k, limit, sign, spec.direction, spec.stop, VALUE_TOLERANCE, None)
+                functions.append(EventFunction(label, row))
+    return functions

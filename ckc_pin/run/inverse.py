@@ -1,8 +1,8 @@
-"""Inverse dynamics: what motors, loops and joints must bear along a prescribed motion, or bore along a recorded one.
+"""Inverse dynamics: motor torques, loop forces and joint forces along a prescribed or a recorded motion.
 
-Of a recorded run the accelerations are those of eq. 1 with the efforts that it recorded, instant by instant, so that
-these come back, with their share within the mechanism, and nothing is lost between output instants. What joints that
-slide, stick and touch did there, its events tell.
+For a recorded run, eq. 1 gives the accelerations from the recorded motor torques at each output instant. The result
+therefore contains these torques, and nothing is interpolated between output instants. The run's events tell which
+joints slid, stuck and touched stops.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import acknowledge
-from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.linear_algebra import Factorization, one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
@@ -30,30 +30,46 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.motion_forces import MotionForces, collected
-from ckc_pin.run.recorded_joints import RecordedJoints
+from ckc_pin.run.motion_forces import MotionForces, collect_forces
 from ckc_pin.run.run import Run, Status
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.output_instants import output_instants
-from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
-from ckc_pin.scene.scene import OVERRIDES, Scene, apply_overrides, as_scene, make_scene
+from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, as_scene, make_scene
 
-__all__ = ["inverse_dynamics"]
+__all__ = ["RecordedJoints", "compute_loop_forces", "inverse_dynamics"]
 
-LEFT_OVER = 1e-7  # of the forces along a freedom: rounding, which no actuator needs to produce
-ROUNDING = 1e-4  # of that along the others: a freedom that no force acts along has nothing of its own
-DEAD = 1e-7  # of a motion: what an actuator moves by where it is at a dead centre
+# Below this, relative to the forces along a freedom, a missing generalized force is rounding.
+FORCE_TOLERANCE = 1e-7
+# The same relative to the tolerance of the freedom with the largest forces, for freedoms along which no force acts.
+CROSS_TOLERANCE = 1e-4
+# A motor at a dead centre moves by less than this, relative to the motion of the freedom.
+DEAD_CENTRE_TOLERANCE = 1e-7
+# Singular values below this, relative to the largest, belong to joints whose holding forces depend on those of others.
+HOLDING_RANK_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class _Instant:
-    """One instant of a motion: what the loops allow, the efforts nearest to it, what friction and stops do."""
+    """One instant of a motion.
+
+    Attributes
+    ----------
+    t : float
+        s.
+    terms : Terms
+    acceleration : (n,) array
+        Acceleration of the tree.
+    tau : (motors,) array
+        Recorded torques or preload; inverse dynamics adds the minimum-norm torques that are missing.
+    joint_force : (n,) array
+        Generalized force of friction and stops.
+    """
 
     t: float
     terms: Terms
     acceleration: Array
     tau: Array
-    of_joints: Array
+    joint_force: Array
 
 
 def inverse_dynamics(
@@ -62,86 +78,90 @@ def inverse_dynamics(
     *,
     progress: Callable[[float, float], None] | None = None,
 ) -> MotionForces:
-    """Find the efforts, loop forces and joint forces of a motion.
+    """Compute motor torques, loop forces and joint forces along a motion.
 
     Parameters
     ----------
     what : Scene, Run, str or Path
-        A scene, its shipped name or its path: the motion is what its controller wants (``controller.desired``,
-        of coordinates or of a point; of a set point, to rest there), on the assembly branch of its start. Or a run,
-        its file or its folder: the motion is the recorded one.
+        A scene, its shipped name or its path: the motion is its controller's desired motion, of coordinates or of a
+        point, or rest at the target of a set point, on the assembly branch of the scene's start. Or a run, its file or
+        its folder: the motion is the recorded one.
     overrides : mapping, optional
-        Values of the scene, of a run's scene too, by dotted key, e.g. ``{"controller.torque_limit": 3.0}``.
+        Values of the scene, or of a run's scene, by dotted key, e.g. ``{"controller.torque_limit": 3.0}``.
     progress : callable, optional
         Called as progress(t, t_end).
 
     Returns
     -------
     MotionForces
-        With status "stopped" or "interrupted" everything up to there.
+        If its status is "stopped" or "interrupted", it contains all instants up to that time.
 
     Raises
     ------
     InputError, MechanismError
-        No motion is prescribed, it starts out of reach, no actuator holds one of the freedoms, or the run is of
-        another mechanism.
+        No motion is prescribed, it starts out of reach, no motor moves one of the freedoms, or the run is of another
+        mechanism.
     NumericalError
         The motion starts at a singular configuration.
 
     Notes
     -----
-    Of more motors than freedoms tau is the least, or nearest to the preload, as a run's is within limits; of redundant
-    rows the multipliers are the least.
-    Friction of a joint is -friction sign(v'), zero where a prescribed motion rests; along a run what it was, in joints
-    that stick the least that holds them.
+    With more motors than freedoms, tau is the minimum-norm solution, or the one nearest to the preload, as in a run
+    within limits. With redundant rows the multipliers have minimum norm.
+
+    Friction of a joint is -friction sign(v'), and zero where a prescribed motion is at rest. Along a run it is the
+    friction of the run. Joints that stick have the minimum-norm friction forces that hold them.
     """
-    if isinstance(what, str | Path) and _names_a_run(str(what)):
+    if isinstance(what, str | Path) and _is_run_name(str(what)):
         what = Run.load(what)
     if not isinstance(what, Run):
         what = as_scene(what, overrides, "inverse_dynamics")
     elif overrides is not None:
-        require_table(overrides, "inverse_dynamics: overrides", OVERRIDES)
+        require_table(overrides, "inverse_dynamics: overrides", EXPECTED_OVERRIDES)
     require_callable(progress, "inverse_dynamics: progress", "a function of (t, t_end)")
     with one_blas_thread():
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
-            actuation = scene_actuation(scene, mechanism)
-            motion, t_end = _recorded(what, mechanism), float(what.t[-1])
+            actuation = build_scene_actuation(scene, mechanism)
+            motion, t_end = _recorded_motion(what, mechanism), float(what.t[-1])
         else:
             scene = what
-            mechanism, t_end = scene_mechanism(scene), scene.spec.t_end
-            actuation = scene_actuation(scene, mechanism)
-            motion = _prescribed(scene, mechanism, actuation)
-        return _along(motion, mechanism, actuation, scene.name, progress or (lambda t, t_end: None), t_end)
+            mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end
+            actuation = build_scene_actuation(scene, mechanism)
+            motion = _prescribed_motion(scene, mechanism, actuation)
+        return _collect_motion(motion, mechanism, actuation, scene.name, t_end, progress)
 
 
-def _names_a_run(name: str) -> bool:
+def _is_run_name(name: str) -> bool:
+    """Whether a name denotes a run file or a folder with one, and not a scene."""
     return name.endswith(".npz") or isfile(Path(name) / "run.npz")
 
 
 def _scene_of(run: Run, overrides: Mapping[str, Any]) -> Scene:
-    """Return the scene of a run, with its motor limits or others."""
+    """Return the scene of a run with overrides, for example of motor limits."""
     if any(key.partition(".")[0] == "mechanism" for key in overrides):
-        raise InputError("mechanism: the motion of a run is its own mechanism's; give a scene to take another")
+        raise InputError("mechanism: a run belongs to its mechanism; give a scene to use another mechanism")
     sources = Sources(run.scene_name, None, run.texts)
     return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources)
 
 
-def _along(
+def _collect_motion(
     motion: Iterator[_Instant],
     mechanism: Mechanism,
     actuation: Actuation,
     name: str,
-    progress: Callable[[float, float], None],
     t_end: float,
+    progress: Callable[[float, float], None] | None,
 ) -> MotionForces:
+    """Compute the forces at all instants of a motion, until it ends, fails or is interrupted."""
     rows: list[dict[str, Any]] = []
     status: Status = "done"
     message = "reached the end of the motion"
     try:
         for instant in motion:
-            rows.append(_forces(instant, mechanism, actuation))
-            progress(instant.t, t_end)
+            rows.append(_compute_forces(instant, mechanism, actuation))
+            if progress is not None:
+                progress(instant.t, t_end)
     except NumericalError as error:
         if not rows:
             raise
@@ -150,22 +170,23 @@ def _along(
         if not rows:
             raise
         status, message = "interrupted", f"interrupted at t = {rows[-1]['t']:.6g} s{acknowledge(signal)}"
-    return collected(rows, mechanism, actuation.limit, name, status, message)
+    return collect_forces(rows, mechanism, actuation.limit, name=name, status=status, message=message)
 
 
-def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
-    """Solve eq. 1 at one instant for tau and the multipliers; what each joint transmits follows."""
+def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
+    """Solve eq. 1 at one instant for tau and the multipliers, and compute the joint wrenches that follow."""
     terms, acceleration, t = instant.terms, instant.acceleration, instant.t
-    needed = tree_force(terms, acceleration) - instant.of_joints
-    if not np.all(np.isfinite(needed)):
+    required = tree_force(terms, acceleration) - instant.joint_force
+    if not np.all(np.isfinite(required)):
         raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
     u_tree = mechanism.motors.force(instant.tau)
-    lacking, enough = tangent.T @ (needed - u_tree), LEFT_OVER * np.abs(tangent.T) @ (np.abs(needed) + np.abs(u_tree))
-    if np.any(np.abs(lacking) > enough + ROUNDING * enough.max(initial=0.0)):
-        _require_grip(mechanism, tangent, actuation, t)
-    tau = instant.tau + actuation.minimum_norm_torques(tangent, lacking)
-    forces = multipliers(terms, mechanism.motors.force(tau) + instant.of_joints, acceleration)
+    missing = tangent.T @ (required - u_tree)
+    tolerance = FORCE_TOLERANCE * np.abs(tangent.T) @ (np.abs(required) + np.abs(u_tree))
+    if np.any(np.abs(missing) > tolerance + CROSS_TOLERANCE * tolerance.max(initial=0.0)):
+        _require_actuated(mechanism, tangent, t)
+    tau = instant.tau + actuation.minimum_norm_torques(tangent, missing)
+    forces = multipliers(terms, mechanism.motors.force(tau) + instant.joint_force, acceleration)
     return {
         "t": t,
         "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
@@ -178,63 +199,137 @@ def _forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> di
     }
 
 
-def _require_grip(mechanism: Mechanism, tangent: Array, actuation: Actuation, t: float) -> None:
-    """Refuse a configuration where some freedom is held by no actuator, as at a rocker's dead centre."""
-    motions = tangent / mechanism.tree.step_scale[:, None]
-    motions, _ = np.linalg.qr(motions)  # of one size, in radians or the mechanism's size
-    grip = mechanism.motors.transmission @ motions
-    values, directions = np.linalg.eigh(grip.T @ grip)
-    if values[0] <= DEAD**2:
-        loose = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
-        raise NumericalError(f"the motion along {loose} is held by no actuator at t = {t:.6g} s", t=t)
+def _require_actuated(mechanism: Mechanism, tangent: Array, t: float) -> None:
+    """Raise NumericalError where no motor moves some freedom, for example at a rocker's dead centre."""
+    # Orthonormal motions, where lengths are relative to the mechanism's size.
+    motions, _ = np.linalg.qr(tangent / mechanism.tree.step_scale[:, None])
+    motor_motions = mechanism.motors.transmission @ motions
+    values, directions = np.linalg.eigh(motor_motions.T @ motor_motions)
+    if values[0] <= DEAD_CENTRE_TOLERANCE**2:
+        coordinate = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
+        raise NumericalError(f"the motion along {coordinate} is held by no actuator at t = {t:.6g} s", t=t)
 
 
 # --- motions -------------------------------------------------------------------------------------
 
 
-def _prescribed(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
-    """What the controller of a scene wants, from sigma: v' = rho q_dot, its rate rho q_ddot + rho_dot q_dot."""
-    controller = scene_controller(scene, mechanism)
+def _prescribed_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+    """Yield the desired motion of a scene's controller, with v' = rho q_dot and its rate rho q_ddot + rho_dot q_dot."""
+    controller = build_scene_controller(scene, mechanism)
     if controller is None or isinstance(controller, RecordedTorques):
-        lacks = "no [controller]" if controller is None else 'the controller\'s type is "torques"'
+        reason = "no [controller]" if controller is None else 'the controller\'s type is "torques"'
         raise InputError(
-            f"{scene.name}: {lacks}, so no motion is prescribed; give controller.desired, or a run of the scene"
+            f"{scene.name}: {reason}, so no motion is prescribed; give controller.desired, or a run of the scene"
         )
     at = find_start(mechanism, scene).at
-    desired = controller.desired if isinstance(controller, Tracking) else _rest(controller.q_d)
-    before: float | None = None
-    for t in output_instants(scene).tolist():
+    desired = controller.desired if isinstance(controller, Tracking) else _rest_at(controller.q_d)
+    previous_t: float | None = None
+    for t in scene.output_instants().tolist():
         q_d, q_d_dot, q_d_ddot = desired(t)
-        found = sigma(mechanism, q_d, at)
-        if found.verdict != "converged" and before is not None:
-            end = find_workspace_exit(mechanism, desired, at, before, t).leaves_at
-            raise NumericalError(f"the motion cannot be followed beyond t = {end:.5f} s: {found.reason}", t=end)
-        if found.verdict != "converged":
-            kind = NumericalError if found.verdict == "singular" else InputError
-            raise kind(f"{scene.name}: the motion cannot be started: q_d(0) is {found.verdict}: {found.reason}")
-        if before is None:
-            actuation.require_driven_freedoms(found.at)
-        at, before = found.at, t
+        solution = sigma(mechanism, q_d, at)
+        if solution.verdict != "converged" and previous_t is not None:
+            end = find_workspace_exit(mechanism, desired, at, previous_t, t).leaves_at
+            raise NumericalError(f"the motion cannot be followed beyond t = {end:.5f} s: {solution.reason}", t=end)
+        if solution.verdict != "converged":
+            error = NumericalError if solution.verdict == "singular" else InputError
+            raise error(f"{scene.name}: the motion cannot be started: q_d(0) is {solution.verdict}: {solution.reason}")
+        if previous_t is None:
+            actuation.require_driven_freedoms(solution.at)
+        at, previous_t = solution.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
         friction = friction_force(mechanism, terms.v_tree)
         yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload, friction)
 
 
-def _rest(q_d: Array) -> Desired:
+def _rest_at(q_d: Array) -> Desired:
     """Return the motion that stays at q_d."""
-    none = np.zeros_like(q_d)
-    return lambda t: (q_d, none, none)
+    zero = np.zeros_like(q_d)
+    return lambda t: (q_d, zero, zero)
 
 
-def _recorded(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
-    """What a run recorded."""
+def _recorded_motion(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
+    """Yield the motion that a run recorded."""
     if np.any(run.w[0]):
         raise InputError(
-            f"{run.scene_name}: the run starts off phi = 0, with open loops: no forces in a closed mechanism move it so"
+            f"{run.scene_name}: the run starts off phi = 0, with open loops; no forces in a closed mechanism produce "
+            "its motion"
         )
-    of_joints = RecordedJoints(run)
+    recorded_joints = RecordedJoints(run)
     for k, (t, numbers) in enumerate(zip(run.t.tolist(), run.q_tree, strict=True)):
         terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(numbers)), run.v_tree[k])
         u_tree = mechanism.motors.force(run.tau[k])
-        force = of_joints(k, terms, u_tree)
+        force = recorded_joints.force(k, terms, u_tree)
         yield _Instant(t, terms, dae_acceleration(terms, u_tree + force), run.tau[k], force)
+
+
+# --- joints of recorded runs ---------------------------------------------------------------------
+
+
+class RecordedJoints:
+    """Generalized forces of dry friction and stops along a run, reconstructed from the run's events.
+
+    Parameters
+    ----------
+    run : Run
+    """
+
+    def __init__(self, run: Run) -> None:
+        mechanism = self.mechanism = run.mechanism
+        self.smoothing = run.scene.get("friction_smoothing")
+        sign, locked = np.zeros(mechanism.n), np.zeros(mechanism.n, dtype=bool)
+        transitions = [event for event in run.events if event["of"] in ("friction", "stop")]
+        self.sliding_signs: list[Array] = []
+        self.locked: list[IntArray] = []
+        for t in run.t:
+            while transitions and transitions[0]["t"] <= t:
+                event = transitions.pop(0)
+                k, transition = mechanism.tree.index[event["coordinate"]], event["name"].rpartition(" ")[2]
+                locked[k] = transition in ("sticks", "touches")
+                sign[k] = event["direction"] if transition == "slides" else 0.0 if locked[k] else sign[k]
+            self.sliding_signs.append(sign.copy())
+            self.locked.append(np.flatnonzero(locked))
+
+    def force(self, k: int, terms: Terms, u_tree: Array) -> Array:
+        """Return the force of friction and stops on the tree at output instant k, shape (n,), N or N m.
+
+        Joints that stick or touch a stop have the minimum-norm forces that keep them at rest.
+
+        Parameters
+        ----------
+        k : int
+        terms : Terms
+            At the instant.
+        u_tree : (n,) array
+            All other applied forces u'.
+        """
+        joints = self.mechanism.joints
+        if self.smoothing is not None:
+            return joints.smooth_friction(terms.v_tree, self.smoothing)
+        force = -joints.friction * self.sliding_signs[k]
+        locked = self.locked[k]
+        if not len(locked):
+            return force
+        tangent, _ = tangent_basis(terms, np.zeros(self.mechanism.closure.rows))
+        inertia = Factorization(tangent.T @ terms.D_tree @ tangent)
+        locked_tangent = tangent[locked]
+        responses = locked_tangent @ np.column_stack([inertia.solve(row) for row in locked_tangent])
+        acceleration = dae_acceleration(terms, u_tree + force)[locked]
+        force[locked] -= np.linalg.lstsq(responses, acceleration, rcond=HOLDING_RANK_TOLERANCE)[0]
+        return force
+
+
+def compute_loop_forces(run: Run) -> dict[str, Array]:
+    """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
+    mechanism, recorded_joints = run.mechanism, RecordedJoints(run)
+    forces = np.empty_like(run.phi)
+    for k, numbers in enumerate(run.q_tree):
+        at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
+        terms = Terms(mechanism, at, run.v_tree[k])
+        u_tree = mechanism.motors.force(run.tau[k])
+        try:
+            u_tree += recorded_joints.force(k, terms, u_tree)
+            forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
+        except NumericalError:
+            forces[k] = np.nan
+    loops = [loop for loop, _ in mechanism.closure.names]
+    return {loop: forces[:, [name == loop for name in loops]] for loop in dict.fromkeys(loops)}

@@ -1,16 +1,17 @@
-"""The three formulations as y' = f(t, y) in NumPy: the readable reference, for SciPy's solvers or any other.
+"""The formulations as initial value problems y' = f(t, y) in NumPy, for SciPy's or other solvers.
 
 ============ ==================== =====================================================
 class        y                    equations
 ============ ==================== =====================================================
-`LevelSet`   q, q_dot             eq. 6 on the level set phi = w(0) exp(-t / epsilon): with
-                                  w(0) = 0 the reduced model, else the SPF in eq. 17's
-                                  coordinates, whose w is known in closed form
+`LevelSet`   q, q_dot             eq. 6 on the level set phi = w(0) exp(-t / epsilon). With
+                                  w(0) = 0 it is the reduced model, otherwise the SPF in
+                                  the coordinates of eq. 17, whose w is known exactly
 `PrintedSpf` q, q_dot, z          eq. 8 as printed
-`Dae`        q', v'               eq. 1, its closure differentiated twice; nothing is projected
+`Dae`        q', v'               eq. 1 with the closure differentiated twice and without
+                                  projection
 ============ ==================== =====================================================
 
-The step loop has the same in C++, and nothing of this.
+This is the readable reference. Runs do not use it: the native loop has its own implementation.
 """
 
 from __future__ import annotations
@@ -42,26 +43,26 @@ from ckc_pin.kinematics.sigma import follow_sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, as_scene
 
-__all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "force_of"]
+__all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "make_force"]
 
 Force = Callable[[float, Terms], Array]  # u' on the tree at (t, terms)
 
 
 class Ivp(Protocol):
-    """An initial value problem and what reads its states.
+    """An initial value problem y' = f(t, y), and the terms and velocities of its states.
 
     Attributes
     ----------
     mechanism : Mechanism
     y0 : array
-        At t = 0.
+        State at t = 0.
     t_span : (0, t_end)
-        s.
+        Times, s.
     counts : dict of str to int
-        "newton": corrections of sigma so far.
+        "newton": number of Newton corrections of sigma.
     """
 
     mechanism: Mechanism
@@ -70,13 +71,13 @@ class Ivp(Protocol):
     counts: dict[str, int]
 
     def f(self, t: float, y: Array) -> Array:
-        """y' at (t, y); NaN where it does not exist, on which solvers shorten their steps."""
+        """Return y' at (t, y), or NaN where it does not exist, so that solvers shorten their steps."""
 
     def terms(self, t: float, y: Array) -> Terms:
-        """Terms at a state; NumericalError where they do not exist."""
+        """Return the terms at a state (NumericalError where they do not exist)."""
 
     def velocity(self, t: float, y: Array) -> Array:
-        """The velocity of the tree, shape (n,); off the manifold the SPF's z_dot differs from rho_z q_dot."""
+        """Return the velocity of the tree, shape (n,). Off the manifold the SPF's z_dot differs from rho_z q_dot."""
 
 
 def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None) -> Ivp:
@@ -85,16 +86,16 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
     Parameters
     ----------
     scene : Scene, str or Path
-        A scene, its shipped name or its path; its solver and its events have no meaning here.
+        A scene, its shipped name or its path. Its solver and its events are not used.
     overrides : mapping, optional
         Values by dotted key.
 
     Raises
     ------
     InputError, MechanismError
-        The scene cannot be run as written, its controller is sampled, or its joints stick or stop.
+        The scene cannot be run as written, its controller is sampled, or its joints stick or have stops.
     NumericalError
-        Its start is singular.
+        The start is singular.
 
     Examples
     --------
@@ -104,17 +105,17 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
     >>> problem.terms(2.0, solution.y[:, -1]).q_tree
     """
     scene = as_scene(scene, overrides, "as_ivp")
-    spec, mechanism = scene.spec, scene_mechanism(scene)
+    spec, mechanism = scene.spec, load_scene_mechanism(scene)
     if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
-        raise InputError("as_ivp: controller.sample_time: what is sampled and held is no function of t and y")
+        raise InputError("as_ivp: controller.sample_time: a sampled u is not a function of t and y; remove sample_time")
     smoothing = spec.friction_smoothing
     if mechanism.joints.has_events(smoothing):
         raise InputError(
-            f"as_ivp: joints of {mechanism.name} stick or stop, which is no function of t and y; without stops give "
-            "friction_smoothing"
+            f"as_ivp: joints of {mechanism.name} stick or have stops, whose forces are not a function of t and y; "
+            "without stops set friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    force = force_of(scene_controller(scene, mechanism), scene_actuation(scene, mechanism))
+    force = make_force(build_scene_controller(scene, mechanism), build_scene_actuation(scene, mechanism))
     if smoothing is not None:
         force = _with_friction(force, mechanism, smoothing)
     span = (0.0, spec.t_end)
@@ -122,14 +123,14 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
         return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, span)
     if spec.formulation == "reduced":
         return LevelSet(mechanism, start.at, start.q_dot, force, span)
-    how = (spec.epsilon, start.w, spec.coriolis_velocity)
-    if spec.spf_coordinates == "z":
-        return PrintedSpf(mechanism, start.at, start.q_dot, force, span, *how)
-    return LevelSet(mechanism, start.at, start.q_dot, force, span, *how)
+    problem = PrintedSpf if spec.spf_coordinates == "z" else LevelSet
+    return problem(
+        mechanism, start.at, start.q_dot, force, span, spec.epsilon, start.w, convention=spec.coriolis_velocity
+    )
 
 
-def force_of(controller: Controller | TorqueController | None, actuation: Actuation) -> Force:
-    """Return u' on the tree as a function of (t, terms)."""
+def make_force(controller: Controller | TorqueController | None, actuation: Actuation) -> Force:
+    """Return the function (t, terms) of the force u' on the tree that a controller applies through the motors."""
     if controller is None:
         return lambda t, terms: actuation.zero.u_tree
     torques = is_torque_controller(controller)
@@ -146,7 +147,7 @@ def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Forc
 class LevelSet:
     """The reduced model (w0 = 0), or the SPF in the coordinates of eq. 17 (w0 = phi at the start).
 
-    z is found on the level set from the state evaluated last, along the straight line in q.
+    z is computed by following the level set from the state of the last evaluation, along a straight line in q.
     """
 
     mechanism: Mechanism
@@ -166,36 +167,36 @@ class LevelSet:
         self.y0 = np.concatenate([self._chart.numbers(self.initial.q_tree), self.q_dot])
 
     def w(self, t: float) -> Array:
-        """Eq. 17's second line, exact, shape (rows,)."""
+        """Return the exact w(t) of eq. 17's second line, shape (rows,)."""
         w0 = np.zeros(self.mechanism.closure.rows) if self.w0 is None else self.w0
         return w0 * np.exp(-t / self.epsilon)
 
     def close(self, t: float, numbers: Array) -> Kinematics:
         """Return the configuration at q on the level set phi(q, z) = w(t)."""
         step = self._chart.step(self._last.q_tree, numbers)
-        found = follow_sigma(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
-        self.counts["newton"] += found.iterations
-        if found.verdict != "converged":
+        solution = follow_sigma(self._last, step, self.w(t), self.mechanism.tolerance, anywhere=False)
+        self.counts["newton"] += solution.iterations
+        if solution.verdict != "converged":
             tree = self.mechanism.tree
-            where = tree.named(tree.to_coordinates(found.at.q_tree))
-            raise NumericalError(f"follow_sigma(q) is {found.verdict}: {found.reason}", t=t, q_tree=where)
-        self._last = found.at
-        return found.at
+            where = tree.named(tree.to_coordinates(solution.at.q_tree))
+            raise NumericalError(f"sigma(q) is {solution.verdict}: {solution.reason}", t=t, q_tree=where)
+        self._last = solution.at
+        return solution.at
 
     def terms(self, t: float, y: Array) -> Terms:
-        y = _state(t, y, self.y0)
+        y = _require_state(t, y, self.y0)
         at, q_dot = self.close(t, y[: self._d]), y[self._d :]
         if self._off:
             return spf_terms(self.mechanism, at, q_dot, self.epsilon, self.w(t), self.convention)
         return Terms(self.mechanism, at, at.rho @ q_dot)
 
     def velocity(self, t: float, y: Array) -> Array:
-        y = _state(t, y, self.y0)
+        y = _require_state(t, y, self.y0)
         terms = self.terms(t, y)
         return _spf_velocity(terms, y[self._d :], self.epsilon, self.w(t)) if self._off else terms.v_tree
 
     def f(self, t: float, y: Array) -> Array:
-        y = _state(t, y, self.y0)
+        y = _require_state(t, y, self.y0)
         try:
             terms, q_dot = self.terms(t, y), y[self._d :]
             actual = self._off and self.convention == "actual"
@@ -207,7 +208,7 @@ class LevelSet:
 
 @dataclass
 class PrintedSpf:
-    """Eq. 8 as printed: y = (q, q_dot, z), with phi = w0 at the start. No free root: its rotation is no number."""
+    """Eq. 8 as printed: y = (q, q_dot, z), with phi = w0 at the start, for mechanisms without free roots."""
 
     mechanism: Mechanism
     initial: Kinematics
@@ -225,19 +226,19 @@ class PrintedSpf:
         self.y0 = np.concatenate([self.initial.q_tree[self._q], self.q_dot, self.initial.q_tree[self._z]])
 
     def terms(self, t: float, y: Array) -> Terms:
-        y, d, q_tree = _state(t, y, self.y0), self._d, np.empty(self.mechanism.tree.nq)
+        y, d, q_tree = _require_state(t, y, self.y0), self._d, np.empty(self.mechanism.tree.nq)
         q_tree[self._q], q_tree[self._z] = y[:d], y[2 * d :]
         at = self.mechanism.kinematics(q_tree)
         return spf_terms(self.mechanism, at, y[d : 2 * d], self.epsilon, at.phi, self.convention)
 
     def velocity(self, t: float, y: Array) -> Array:
-        y = _state(t, y, self.y0)
-        # with the exact w: what a tolerance leaves phi off by would be divided by epsilon
+        y = _require_state(t, y, self.y0)
+        # The exact w is used because the rounding of phi would be divided by epsilon.
         w = self.w0 * np.exp(-t / self.epsilon)
         return _spf_velocity(self.terms(t, y), y[self._d : 2 * self._d], self.epsilon, w)
 
     def f(self, t: float, y: Array) -> Array:
-        y = _state(t, y, self.y0)
+        y = _require_state(t, y, self.y0)
         if not np.all(np.isfinite(y)):
             return np.full_like(y, np.nan)
         terms, q_dot = self.terms(t, y), y[self._d : 2 * self._d]
@@ -251,7 +252,7 @@ class PrintedSpf:
 
 @dataclass
 class Dae:
-    """Eq. 1: y = (q', v'). What is off the closure stays, and grows with time squared."""
+    """Eq. 1: y = (q', v'). An error of the constraints is not corrected and grows with the square of time."""
 
     mechanism: Mechanism
     initial: Kinematics
@@ -264,15 +265,15 @@ class Dae:
         self.y0 = np.concatenate([self.initial.q_tree, self.v_tree])
 
     def terms(self, t: float, y: Array) -> Terms:
-        y, tree = _state(t, y, self.y0), self.mechanism.tree
+        y, tree = _require_state(t, y, self.y0), self.mechanism.tree
         q_tree = y[: tree.nq] if tree.is_euclidean else pin.normalize(tree.model, y[: tree.nq])
         return Terms(self.mechanism, self.mechanism.kinematics(q_tree), y[tree.nq :])
 
     def velocity(self, t: float, y: Array) -> Array:
-        return _state(t, y, self.y0)[self.mechanism.tree.nq :]
+        return _require_state(t, y, self.y0)[self.mechanism.tree.nq :]
 
     def f(self, t: float, y: Array) -> Array:
-        y = _state(t, y, self.y0)
+        y = _require_state(t, y, self.y0)
         if not np.all(np.isfinite(y)):
             return np.full_like(y, np.nan)
         terms = self.terms(t, y)
@@ -283,17 +284,17 @@ class Dae:
         return np.concatenate([self.mechanism.tree.configuration_rate(terms.q_tree, terms.v_tree), acceleration])
 
 
-def _state(t: Any, y: Any, y0: Array) -> Array:
-    """Return a state as numbers (InputError where it, or t, is none)."""
+def _require_state(t: Any, y: Any, y0: Array) -> Array:
+    """Return a state as an array of floats (InputError if t or y has another type, or y another shape than y0)."""
     if not is_number(t):
         raise InputError(f"as_ivp: t: expected a number, s, got {describe_value(t)}")
     try:
-        found = np.asarray(y, dtype=float)
+        state = np.asarray(y, dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"as_ivp: y: expected {len(y0)} numbers, as y0 has, got {describe_value(y)}") from None
-    if found.shape != y0.shape:
-        raise InputError(f"as_ivp: y: expected {len(y0)} numbers, as y0 has, got shape {found.shape}")
-    return found
+    if state.shape != y0.shape:
+        raise InputError(f"as_ivp: y: expected {len(y0)} numbers, as y0 has, got shape {state.shape}")
+    return state
 
 
 def _spf_velocity(terms: Terms, q_dot: Array, epsilon: float, w: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The terms of the state that the loop is at, for a caller's controller or event: as the loop has computed them."""
+"""Wrap a caller's controller or event function for the native loop, with terms that the loop has already computed."""
 
 from __future__ import annotations
 
@@ -15,127 +15,143 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["LoopTerms", "controller_call", "event_call", "require_number"]
+__all__ = ["LoopTerms", "require_number", "wrap_controller", "wrap_event_function"]
 
-NATIVE = ("D_tree", "C_tree", "h_tree", "bias_tree", "potential_energy", "D", "C", "h", "rho_dot")
+
+class _LoopTerm(lazy[Any]):
+    """A term of `Terms` that is taken from the loop if the loop has computed it, and else computed in NumPy."""
+
+    def __init__(self, name: str) -> None:
+        reference: lazy[Any] = Terms.__dict__[name]
+
+        def compute(terms: LoopTerms) -> Any:
+            value = terms._read_from_loop(name)
+            return reference.compute(terms) if value is None else value
+
+        super().__init__(compute)
+        self.name, self.__doc__ = name, reference.__doc__
 
 
 class LoopTerms(Terms):
-    """Terms at the loop's state; what it does not have, and what is asked for later, NumPy computes.
+    """Terms at the loop's state, passed to a caller's controller or event function.
+
+    Terms that the loop has not computed, and terms that are used after the call, are computed in NumPy.
 
     Parameters
     ----------
     mechanism : Mechanism
-    given : tuple
-        What the loop calls with: a view of it for as long as the call lasts, the call's number, t (s), an array of q',
-        v', q and q_dot one after the other, which the next call overwrites, and the places of q and z.
+    call : tuple
+        Arguments of the native call: a view of the loop that is valid during the call, the call's number, t (s), an
+        array of q', v', q and q_dot one after the other, which the next call overwrites, and the indices of q and z.
     """
 
-    def __init__(self, mechanism: Mechanism, given: tuple[Any, ...]) -> None:
-        self.mechanism, self._given, self.t = mechanism, given, given[2]
-        self._numbers = own = given[3].copy()
-        d = mechanism.d
-        self.q, self.q_dot = own[-2 * d : -d], own[-d:]  # at once: hardly a controller does without
+    D_tree = _LoopTerm("D_tree")
+    C_tree = _LoopTerm("C_tree")
+    h_tree = _LoopTerm("h_tree")
+    bias_tree = _LoopTerm("bias_tree")
+    potential_energy = _LoopTerm("potential_energy")
+    D = _LoopTerm("D")
+    C = _LoopTerm("C")
+    h = _LoopTerm("h")
+    rho_dot = _LoopTerm("rho_dot")
 
-    def _term(self, name: str) -> Any:
-        """A term that the loop may have, or None, as when the call is over."""
-        view, stamp, *_ = self._given
+    def __init__(self, mechanism: Mechanism, call: tuple[Any, ...]) -> None:
+        self.mechanism, self._call, self.t = mechanism, call, call[2]
+        self._packed = packed = call[3].copy()
+        d = mechanism.d
+        self.q, self.q_dot = packed[-2 * d : -d], packed[-d:]  # almost every controller reads them
+
+    def _read_from_loop(self, name: str) -> Any:
+        """Return a term of the loop. It is None if the loop has not computed it, or if the call is over."""
+        view, stamp, *_ = self._call
         return view.term(stamp, name)
 
     @lazy
     def q_tree(self) -> Array:
         """The tree's configuration, shape (nq,)."""
-        return self._numbers[: self.mechanism.tree.nq]
+        return self._packed[: self.mechanism.tree.nq]
 
     @lazy
     def v_tree(self) -> Array:
         """The tree's velocity, shape (n,)."""
         nq = self.mechanism.tree.nq
-        return self._numbers[nq : nq + self.mechanism.n]
+        return self._packed[nq : nq + self.mechanism.n]
 
     @lazy
     def at(self) -> Kinematics:
         """The closure's terms at q'."""
-        self._term("at")  # which it has not: it is told that terms are looked at
-        q, z = (np.array(part, np.intp) for part in self._given[4:])
+        self._read_from_loop("at")  # The loop has no such term. The call tells it that terms of the closure are used.
+        q, z = (np.array(indices, np.intp) for indices in self._call[4:])
         return Kinematics(self.mechanism.tree, self.mechanism.closure, Partition(q, z), self.q_tree)
 
     @lazy
     def phi(self) -> Array:
         """Residual of the closure, shape (rows,)."""
-        found = self._term("phi")
-        return self.at.phi if found is None else found
+        phi = self._read_from_loop("phi")
+        return self.at.phi if phi is None else phi
 
     @lazy
     def rho(self) -> Array:
         """Rho of eq. 5, shape (n, d)."""
-        found = self._term("rho")
-        return self.at.rho if found is None else found
+        rho = self._read_from_loop("rho")
+        return self.at.rho if rho is None else rho
 
     def C_times(self, x: Array) -> Array:
         """Return C x, shape (d,)."""
         return self.C @ x
 
 
-def _native(name: str) -> lazy[Any]:
-    """Return a term that the loop may have."""
-    reference: lazy[Any] = Terms.__dict__[name]
+def wrap_controller(controller: Controller | TorqueController, mechanism: Mechanism) -> Callable[..., Any]:
+    """Return the function that the loop calls for a controller written in Python.
 
-    def compute(terms: LoopTerms) -> Any:
-        found = terms._term(name)
-        return reference.compute(terms) if found is None else found
-
-    compute.__name__, compute.__doc__ = name, reference.__doc__
-    return lazy(compute)
-
-
-for _name in NATIVE:
-    setattr(LoopTerms, _name, _native(_name))
-
-
-def controller_call(controller: Controller | TorqueController, mechanism: Mechanism) -> Callable[..., Any]:
-    """Return what the loop calls for a controller that only Python knows: (view) to u or tau, or why there is none."""
+    It returns u or tau, or the text of a NumericalError, at which the run stops.
+    """
     torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Any] = getattr(controller, "tau" if torques else "u")
     require = require_tau if torques else require_u
 
-    def call(*given: Any) -> Any:
+    def call(*arguments: Any) -> Any:
         try:
-            return require(law(given[2], LoopTerms(mechanism, given)), mechanism)
+            return require(law(arguments[2], LoopTerms(mechanism, arguments)), mechanism)
         except NumericalError as error:
             return str(error)
 
     return call
 
 
-def event_call(function: Callable[[float, Terms], Any], name: str, mechanism: Mechanism) -> Callable[..., Any]:
-    """Return what the loop calls for an event's function: (view) to a number, or why there is none."""
+def wrap_event_function(function: Callable[[float, Terms], Any], name: str, mechanism: Mechanism) -> Callable[..., Any]:
+    """Return the function that the loop calls for an event function written in Python.
 
-    def call(*given: Any) -> Any:
+    It returns a number, or the text of a NumericalError, at which the run stops.
+    """
+
+    def call(*arguments: Any) -> Any:
         try:
-            value = function(given[2], LoopTerms(mechanism, given))
+            value = function(arguments[2], LoopTerms(mechanism, arguments))
         except NumericalError as error:
             return str(error)
         if isinstance(value, bool | np.bool_):
-            says = "a number that changes sign where it happens is needed, as t - 0.5 is one for t > 0.5"
-            raise InputError(f"the event {name!r} gave {bool(value)}; {says}")
+            raise InputError(
+                f"the event {name!r} gave {bool(value)}; a number that changes sign at the event is needed, "
+                "for example t - 0.5 instead of t > 0.5"
+            )
         return require_number(value, f"the event {name!r}")
 
     return call
 
 
-def require_number(value: Any, what: str) -> float:
-    """Return what a caller's function gave as a float.
+def require_number(value: Any, source: str) -> float:
+    """Return a caller's result as a float.
 
     Raises
     ------
     InputError
-        It is no real number, or too large for one.
+        It is not a real number, or too large for a float.
     """
     number = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
     if isinstance(number, bool) or not isinstance(number, int | float):
-        raise InputError(f"{what} gave {value!r:.80}; a number is needed")
+        raise InputError(f"{source} gave {value!r:.80}; a number is needed")
     try:
         return float(number)
     except OverflowError:
-        raise InputError(f"{what} gave an integer too large for a number") from None
+        raise InputError(f"{source} gave an integer that is too large for a float") from None

@@ -1,4 +1,4 @@
-"""What inverse dynamics finds, as one value: to look at, to print, to save."""
+"""Motor, loop and joint forces of a motion: the result of inverse dynamics."""
 
 from __future__ import annotations
 
@@ -12,47 +12,45 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic
-from ckc_pin.base.summary import HasSummary, Summary
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Status
-from ckc_pin.run.summary import forces_summary
 
-__all__ = ["MotionForces", "collected"]
+__all__ = ["MotionForces", "collect_forces"]
 
-BEYOND = 1e-9  # of a limit: what was cut off there stands at it, but for rounding
+LIMIT_TOLERANCE = 1e-9  # relative to a limit: a torque clipped at its limit may exceed it by rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionForces(HasSummary):
-    """What acts in a mechanism along a motion; a row of each array is an instant.
+    """Forces in a mechanism along a motion. Arrays have a row for each instant.
 
     Attributes
     ----------
     status : "done", "stopped" or "interrupted"
     message : str
-        Why, in one sentence, and what of the forces is not unique.
+        Reason of the status, in one sentence, and forces that are not unique.
     name : str
-        The scene's.
+        Name of the scene.
     mechanism : Mechanism
     t : (m,) array
-        s.
+        Times, s.
     q_tree, v_tree, a_tree : (m, n) arrays
         Configuration, velocity and acceleration by coordinate, in the order of `coordinates`.
     tau : (m, actuators) array
-        In the order of `actuated`, N m or N; not cut at the limits.
+        Motor torques in the order of `actuated`, N m or N; not clipped at the limits.
     limit : (motors,) array
-        Of |tau|, infinite where there is none.
+        Limits of |tau|; infinite for motors without one.
     loop_forces : dict of str to (m, rows of the loop) array
-        Multipliers of eq. 1, N or N m, couplings among them.
+        Multipliers of eq. 1 by loop and coupling, N or N m.
     loop_wrenches : dict of str to (m, 6) array
-        What each loop does to the body of its frame A, at that frame's origin, in world axes: force, N, and moment,
+        Wrench of each loop on the body of its frame A, at that frame's origin, in world axes: force, N, and moment,
         N m. Couplings have none.
     joint_forces : dict of str to (m, 6) array
-        What each joint transmits to the body that it carries, at the joint's origin: force and moment in world axes,
-        those along its axis included. Free roots have none.
+        Wrench that each joint transmits to its child body, at the joint's origin, in world axes: force, N, and moment,
+        N m, including those along the joint's axis. Free roots have none.
     exceeded : list of dict
-        Motors that are asked for more than their limit: motor, limit, t (the first instant), most (the largest |tau|),
-        t_most.
+        Motors whose limit is exceeded: motor, limit, t (the first instant), most (the largest |tau|), t_most.
     """
 
     status: Status
@@ -71,11 +69,20 @@ class MotionForces(HasSummary):
     exceeded: list[dict[str, Any]]
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
-        return forces_summary(self)
+        """Return a one-screen summary: largest motor torques, names of loops and joints, exceeded limits."""
+        rows: list[Row] = [
+            ("instants", f"{len(self.t)}, from t = {self.t[0]:g} to {self.t[-1]:g} s"),
+            ("largest |tau|", format_quantities(self.actuated, np.abs(self.tau).max(axis=0))),
+            ("loop_forces", list(self.loop_forces)),
+            ("joint_forces", list(self.joint_forces)),
+        ]
+        for x in self.exceeded:
+            peak = f"{x['motor']}: {x['most']:.4g} at t = {x['t_most']:.4g} s"
+            rows.append(("exceeded", f"{peak}, its limit is {x['limit']:.4g}"))
+        return Summary(f"MotionForces of {self.name}, {self.status}: {self.message}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return motion and forces as JSON-ready data."""
+        """Return the JSON of `ckc inverse` (docs/reference/json.md): all arrays as lists, forces by name."""
         loops = {}
         for loop, multipliers in self.loop_forces.items():
             wrench = self.loop_wrenches.get(loop)
@@ -99,27 +106,27 @@ class MotionForces(HasSummary):
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Labels of the tree's coordinates."""
+        """Names of the tree's coordinates."""
         return self.mechanism.coordinates
 
     @property
     def actuated(self) -> tuple[str, ...]:
-        """Names of the actuators."""
+        """Names of the motors."""
         return self.mechanism.actuated
 
     def rows(self, loop: str) -> list[str]:
-        """Return what the multipliers of a loop belong to: the labels of its rows."""
+        """Return the names of a loop's constraint rows, in the order of its multipliers."""
         return [row for name, row in self.mechanism.closure.names if name == loop]
 
     def save(self, path: Path) -> Path:
-        """Write it to a file, NumPy's npz without pickle (docs/reference/run_file.md): whole or not at all.
+        """Write all values to a NumPy npz file without pickle (docs/reference/run_file.md), atomically.
 
         Raises
         ------
         InputError
-            It cannot be written.
+            The file cannot be written.
         """
-        about = {"status": self.status, "message": self.message, "name": self.name, "exceeded": self.exceeded}
+        meta = {"status": self.status, "message": self.message, "name": self.name, "exceeded": self.exceeded}
         arrays = {
             **{name: getattr(self, name) for name in ("t", "q_tree", "v_tree", "a_tree", "tau")},
             "coordinates": np.array(self.coordinates, dtype=str),
@@ -127,36 +134,40 @@ class MotionForces(HasSummary):
             "rows": np.array([".".join(name) for name in self.mechanism.closure.names], dtype=str),
             "multipliers": np.hstack([np.zeros((len(self.t), 0)), *self.loop_forces.values()]),
             "loops": np.array(list(self.loop_wrenches), dtype=str),
-            "loop_wrenches": _stacked(self.loop_wrenches, len(self.t)),
+            "loop_wrenches": _stack_wrenches(self.loop_wrenches, len(self.t)),
             "joints": np.array(list(self.joint_forces), dtype=str),
-            "joint_forces": _stacked(self.joint_forces, len(self.t)),
-            "meta": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
+            "joint_forces": _stack_wrenches(self.joint_forces, len(self.t)),
+            "meta": np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8),
         }
         with open_atomic(path) as file:
             np.savez_compressed(file, **arrays)
         return path
 
 
-def collected(
+def collect_forces(
     rows: Sequence[dict[str, Any]],
     mechanism: Mechanism,
     limit: Array,
+    *,
     name: str,
     status: Status,
     message: str,
 ) -> MotionForces:
-    """Put instants, one after the other, into one value; see there.
+    """Return the `MotionForces` of a sequence of instants.
 
     Parameters
     ----------
     rows : sequence of dict
-        At least one: t, q_tree, v_tree, a_tree, tau, multipliers, and loop_wrenches and joint_forces by name.
+        One dict for each instant, at least one: t, q_tree, v_tree, a_tree, tau, multipliers, and by name
+        loop_wrenches and joint_forces.
+    mechanism, limit, name, status, message
+        As in `MotionForces`.
     """
     arrays = {key: np.array([row[key] for row in rows]) for key in ("t", "q_tree", "v_tree", "a_tree", "tau")}
     forces, loops = np.array([row["multipliers"] for row in rows]), [loop for loop, _ in mechanism.closure.names]
     if mechanism.redundant:
         names = ", ".join(mechanism.redundant)
-        message += f"; rows that others imply ({names}) leave loop and joint forces open: those of least multipliers"
+        message += f"; rows {names} are redundant, so loop and joint forces are those with minimum-norm multipliers"
     return MotionForces(
         status=status,
         message=message,
@@ -166,23 +177,23 @@ def collected(
         loop_forces={loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)},
         loop_wrenches={x: np.array([row["loop_wrenches"][x] for row in rows]) for x in rows[0]["loop_wrenches"]},
         joint_forces={x: np.array([row["joint_forces"][x] for row in rows]) for x in rows[0]["joint_forces"]},
-        exceeded=_exceeded(arrays["t"], arrays["tau"], limit, mechanism.actuated),
+        exceeded=_find_exceeded_limits(arrays["t"], arrays["tau"], limit, mechanism.actuated),
         **arrays,
     )
 
 
-def _exceeded(t: Array, tau: Array, limit: Array, motors: Sequence[str]) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
+def _find_exceeded_limits(t: Array, tau: Array, limit: Array, motors: Sequence[str]) -> list[dict[str, Any]]:
+    exceeded: list[dict[str, Any]] = []
     for k, motor in enumerate(motors):
-        size, most = np.abs(tau[:, k]), float(limit[k])
-        beyond = np.flatnonzero(size > most * (1 + BEYOND))
+        size, maximum = np.abs(tau[:, k]), float(limit[k])
+        beyond = np.flatnonzero(size > maximum * (1 + LIMIT_TOLERANCE))
         if len(beyond):
             peak = int(np.argmax(size))
-            found.append({"motor": motor, "limit": most, "t": float(t[beyond[0]]), "most": float(size[peak]),
-                          "t_most": float(t[peak])})  # fmt: skip
-    return found
+            exceeded.append({"motor": motor, "limit": maximum, "t": float(t[beyond[0]]), "most": float(size[peak]),
+                             "t_most": float(t[peak])})  # fmt: skip
+    return exceeded
 
 
-def _stacked(wrenches: dict[str, Array], count: int) -> Array:
-    """Wrenches by name as one array (m, names, 6)."""
+def _stack_wrenches(wrenches: dict[str, Array], count: int) -> Array:
+    """Return wrenches by name as one array, shape (m, names, 6)."""
     return np.stack(list(wrenches.values()), axis=1) if wrenches else np.zeros((count, 0, 6))

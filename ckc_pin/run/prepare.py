@@ -1,7 +1,8 @@
-"""From a scene to a loop that can be started: mechanism, controller, start, formulation, solver."""
+"""Prepare a scene for a run: load the mechanism, build controller, events and start, and make the native loop."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,48 +22,54 @@ from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
 from ckc_pin.native.tables import core_table
 from ckc_pin.native.variation import SensitivityParameter
-from ckc_pin.run.compiled_terms import library_of
-from ckc_pin.run.events import Event, EventFunction, event_functions
-from ckc_pin.run.loop_tables import formulation_table, solver_table
-from ckc_pin.run.loop_terms import controller_call
-from ckc_pin.run.runnable import require_runnable
+from ckc_pin.run.checks import require_runnable
+from ckc_pin.run.compiled_terms import NEVER, select_library
+from ckc_pin.run.events import Event, EventFunction, build_event_functions
+from ckc_pin.run.loop_terms import wrap_controller
 from ckc_pin.scene.initial import Start
-from ckc_pin.scene.output_instants import output_instants
 from ckc_pin.scene.parts import (
-    in_samples,
-    scene_actuation,
-    scene_controller,
-    scene_mechanism,
+    apply_sampling,
+    build_scene_actuation,
+    build_scene_controller,
+    load_scene_mechanism,
 )
 from ckc_pin.scene.scene import Scene
+from ckc_pin.scene.spec import SceneSpec
 
 __all__ = ["DerivativeSetup", "ParameterDerivatives", "Prepared", "prepare"]
+
+# A right-hand side is evaluated this close to the constraint manifold, relative to rtol and the mechanism's size.
+CLOSURE_TOLERANCE = 3e-3
+# From this ratio of inertias on, heavy links turn an open closure into accelerations of light links.
+MAX_INERTIA_RATIO = 1e4
+# A collocation step keeps the loops closed to this, relative to the mechanism's size. Otherwise its branches would not
+# meet at a loss of rank.
+COLLOCATION_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class ParameterDerivatives:
-    """What the native loop needs to integrate the derivatives of a motion with respect to parameters.
+    """Tables for the native loop to integrate derivatives of a motion with respect to parameters.
 
     Attributes
     ----------
     sensitivity_parameters : tuple of SensitivityParameter
-        The parameters.
     table : dict
-        The formulation's entry for them.
-    library : Library or None
+        The entry "variation" of the formulation's table.
+    parameter_library : Library or None
         Compiled terms that have these derivatives.
     missing_arguments : dict of str to bool arrays, or None
-        Arguments that a library would need to have these derivatives; None where there is one, or none can.
+        Arguments that a library needs for these derivatives. None if there is such a library, or if there can be none.
     """
 
     sensitivity_parameters: tuple[SensitivityParameter, ...]
     table: dict[str, Any]
-    library: Library | None
+    parameter_library: Library | None
     missing_arguments: dict[str, BoolArray] | None
 
 
 class DerivativeSetup(Protocol):
-    """Build the parameter derivatives of a scene that is being prepared."""
+    """Builds the parameter derivatives of a scene that is being prepared."""
 
     def __call__(
         self,
@@ -72,32 +79,32 @@ class DerivativeSetup(Protocol):
         actuation: Actuation,
         start: Start,
     ) -> ParameterDerivatives:
-        """Return them (InputError: the motion has no known derivatives)."""
+        """Return the parameter derivatives (InputError: the motion has no known derivatives)."""
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A scene ready to be run, again and again.
+    """A scene that is ready to run. It can be run several times.
 
     Attributes
     ----------
     scene : Scene
     mechanism : Mechanism
     controller : Controller, TorqueController, Sampled or None
-        What acts, beside a u that is held.
+        None if the caller gives u.
     actuation : Actuation
     events : list of EventFunction
     instants : (m,) array
-        Output instants, s; empty where the caller steps.
+        Output instants, s; empty if the caller steps.
     start : Start
     texts : dict of str to str
-        The files of mechanism, scene and controller.
+        Files of mechanism, scene and controller, by name.
     tables : tuple
-        What the loop is made of: core, formulation, control, solver, events.
+        Arguments of the native loop: core, formulation, control, solver, events.
     loop : native Loop
     derivatives : ParameterDerivatives or None
-        Set where derivatives of the motion are integrated beside it.
+        Set if derivatives of the motion are integrated with it.
     """
 
     scene: Scene
@@ -114,17 +121,23 @@ class Prepared:
 
     @property
     def missing_arguments(self) -> dict[str, BoolArray] | None:
-        """Arguments that a library of compiled terms would need to have the parameter derivatives."""
+        """Arguments that a library of compiled terms needs for the parameter derivatives, if there is none yet."""
         return self.derivatives.missing_arguments if self.derivatives else None
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
-        """Put the loop to a start, as if nothing had been before."""
+        """Set the loop to a start at time t (s), by default the scene's, and discard its history.
+
+        Raises
+        ------
+        InputError
+            The velocity is not finite.
+        """
         start = start or self.start
         with np.errstate(over="ignore"):
             v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         if not np.all(np.isfinite(v_tree)):
             raise InputError(
-                f"initial.q_dot = {start.q_dot.tolist()}: the other coordinates' rates are not finite then"
+                f"initial.q_dot = {start.q_dot.tolist()}: the rates of the dependent coordinates are not finite"
             )
         self.loop.start(t, start.at.q_tree, v_tree, start.w)
 
@@ -143,18 +156,19 @@ def prepare(
 
     Parameters
     ----------
+    scene : Scene
     controller : Controller, TorqueController, Sampled or function u(t, terms), optional
-        Takes the place of the scene's.
+        Replaces the scene's controller.
     events : sequence of Event
-        Beside those of the scene.
+        Events in addition to the scene's.
     free : bool
-        No controller at all: the caller says what acts.
+        Use no controller; the caller gives u step by step.
     profile : bool
-        Count which terms are evaluated.
+        Count the terms that are evaluated.
     library : Library, optional
-        The mechanism's terms, compiled, in the place of those that the scene's solver.terms says.
+        Compiled terms to use instead of those that solver.terms selects.
     derivatives : DerivativeSetup, optional
-        Builds the parameter derivatives that are integrated beside the motion.
+        Builds the parameter derivatives that are integrated with the motion.
 
     Raises
     ------
@@ -163,46 +177,108 @@ def prepare(
     NumericalError
         Its start is singular.
     """
-    instants = np.zeros(0) if free else output_instants(scene)  # refused before anything is loaded
-    mechanism = scene_mechanism(scene)
+    # Too many output instants are refused before anything is loaded.
+    instants = np.zeros(0) if free else scene.output_instants()
+    mechanism = load_scene_mechanism(scene)
     texts: dict[str, str] = {}
     if controller is None and not free:
-        controller = in_samples(scene, scene_controller(scene, mechanism, texts))
+        controller = apply_sampling(scene, build_scene_controller(scene, mechanism, texts))
     elif controller is not None and not isinstance(controller, Sampled):
         controller = as_controller(controller)
-    actuation = scene_actuation(scene, mechanism)
-    functions = event_functions(scene.spec.event, events, mechanism)
+    actuation = build_scene_actuation(scene, mechanism)
+    functions = build_event_functions(scene.spec.event, events, mechanism)
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
-    formulation = formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
-    terms = scene.spec.solver.terms
-    setup = None if derivatives is None else derivatives(scene, mechanism, controller, actuation, start)
-    if setup is not None:
-        library = setup.library
-        formulation["variation"] = setup.table
+    formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
+    parameter_derivatives = None
+    if derivatives is not None:
+        parameter_derivatives = derivatives(scene, mechanism, controller, actuation, start)
+        library = parameter_derivatives.parameter_library
+        formulation["variation"] = parameter_derivatives.table
     with scene.sources.prefix_errors():
         control = control_table(
-            controller, actuation, partial(controller_call, mechanism=mechanism), differs=setup is not None
+            controller,
+            actuation,
+            partial(wrap_controller, mechanism=mechanism),
+            differs=parameter_derivatives is not None,
         )
+    library = library or select_library(mechanism, scene.spec.solver.terms)
     tables = (
-        core_table(mechanism, library or library_of(mechanism, terms), scene.spec.friction_smoothing or 0.0),
+        core_table(mechanism, library, scene.spec.friction_smoothing or 0.0),
         formulation,
         control,
-        solver_table(mechanism, scene.spec, profile),
-        [event.row for event in functions],
+        _solver_table(mechanism, scene.spec, profile=profile),
+        [function.row for function in functions],
     )
-    loop = _core.Loop(*tables)
-    texts = {**mechanism.sources.texts, **scene.sources.texts, **texts}
     return Prepared(
-        scene,
-        mechanism,
-        controller,
-        actuation,
-        functions,
-        instants,
-        start,
-        texts,
-        tables,
-        loop,
-        setup,
+        scene=scene,
+        mechanism=mechanism,
+        controller=controller,
+        actuation=actuation,
+        events=functions,
+        instants=instants,
+        start=start,
+        texts={**mechanism.sources.texts, **scene.sources.texts, **texts},
+        tables=tables,
+        loop=_core.Loop(*tables),
+        derivatives=parameter_derivatives,
     )
+
+
+def _formulation_table(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarray[Any, Any]) -> dict[str, Any]:
+    """Return the native loop's table of a formulation and its tolerances.
+
+    Parameters
+    ----------
+    inertias : (n,) array
+        Diagonal of D' at the start.
+
+    Raises
+    ------
+    InputError
+        The mechanism cannot be integrated in the scene's spf_coordinates, or off phi = 0.
+    """
+    if spec.formulation == "dae":
+        alpha, beta = spec.solver.baumgarte or (0.0, 0.0)
+        return {"kind": "dae", "tolerance": mechanism.tolerance, "projects": spec.solver.projection,
+                "alpha": alpha, "beta": beta}  # fmt: skip
+    table = {
+        "tolerance": mechanism.tolerance,
+        "epsilon": spec.epsilon if spec.formulation == "spf" else 1.0,
+        "actual": spec.formulation == "spf" and spec.coriolis_velocity == "actual",
+    }
+    has_joint_events = mechanism.joints.has_events(spec.friction_smoothing)
+    if spec.formulation == "spf" and spec.spf_coordinates == "z":
+        if mechanism.tree.free_roots:
+            raise InputError(
+                'spf_coordinates = "z": eq. 8 as printed integrates q and z as numbers, and the rotation of a free '
+                'root has no such numbers; use "w"'
+            )
+        if has_joint_events:
+            raise InputError(
+                f'{mechanism.name}: spf_coordinates = "z" does not close the loops exactly, so joints cannot stick or '
+                'rest at stops; use "w"'
+            )
+        return {"kind": "printed", **table}
+    if has_joint_events and spec.initial.w is not None and any(spec.initial.w):
+        raise InputError(
+            f"initial.w: joints of {mechanism.name} that stick or rest at stops cannot be held off phi = 0; remove it"
+        )
+    evenness = min(1.0, MAX_INERTIA_RATIO * float(inertias.min()) / float(inertias.max()))
+    return {"kind": "level_set", **table, "slack": CLOSURE_TOLERANCE * spec.solver.rtol * mechanism.size * evenness}
+
+
+def _solver_table(mechanism: Mechanism, spec: SceneSpec, *, profile: bool) -> dict[str, Any]:
+    """Return the native loop's table of method, tolerances and budgets; `profile` counts the evaluated terms."""
+    solver = spec.solver
+    is_printed_spf = spec.formulation == "spf" and spec.spf_coordinates == "z"
+    return {
+        "method": "Radau" if solver.method == "auto" and is_printed_spf else solver.method,
+        "rtol": solver.rtol,
+        "atol": solver.rtol / 100 if solver.atol is None else solver.atol,
+        "max_step": solver.max_step or math.inf,
+        "min_step": solver.min_step,
+        "max_rhs": solver.max_rhs or NEVER,
+        "closed": max(COLLOCATION_TOLERANCE * mechanism.size, 10 * mechanism.tolerance),
+        "profile": profile,
+    }

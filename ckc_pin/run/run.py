@@ -1,8 +1,8 @@
-"""The `Run`: what a simulation gives, as one value that can be saved, loaded and replayed anywhere."""
+"""The `Run`: results of a simulation as one value that can be indexed, plotted, exported, saved and loaded."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 from functools import cached_property
 from os.path import isdir, isfile
 from pathlib import Path
@@ -13,18 +13,19 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.summary import HasSummary, Summary
+from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import describe_value, is_number, require_path
-from ckc_pin.errors import InputError
+from ckc_pin.codegen.library import explain_too_large
+from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import plain_values
-from ckc_pin.run.columns import as_csv, as_data_frame, as_dataset
-from ckc_pin.run.instants import part_of, state_of
+from ckc_pin.mechanism.units import joined
+from ckc_pin.run.columns import quantity_units, to_csv_text, to_data_frame, to_dataset
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
-from ckc_pin.run.state import State
-from ckc_pin.run.summary import run_summary
+from ckc_pin.run.state import State, recorded_state
+from ckc_pin.scene.scene import describe_formulation
 
 if TYPE_CHECKING:
     import pandas
@@ -33,57 +34,59 @@ if TYPE_CHECKING:
     from ckc_pin.view.inline import Figures, Playback
     from ckc_pin.view.server import ViewServer
 
-__all__ = ["Run", "Status"]
+__all__ = ["Run", "Status", "format_work"]
 
 Status = Literal["done", "stopped", "interrupted"]
 
 META = tuple(name for name in RunMeta.__struct_fields__ if name not in ("format", "hashes"))
+MAX_EVENTS_SHOWN = 10
+LONG_RUN_S = 10.0  # compiling the terms of a mechanism usually takes less, s
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run(HasSummary):
-    """A simulated motion; a row of each array is an output instant.
+    """Results of a simulation. Arrays have a row for each output instant.
 
-    ``run["theta_1"]`` is a coordinate along the motion, ``run.sel(t=0.5)`` the state at an instant, ``run.plot()`` and
-    ``run.play()`` show it, `to_xarray`, `to_pandas` and `to_csv` hand it over.
+    ``run["theta_1"]`` is a coordinate along the motion and ``run.sel(t=0.5)`` the state at an instant. ``run.plot()``
+    draws figures and ``run.play()`` plays the motion. `to_xarray`, `to_pandas` and `to_csv` export it.
 
     Attributes
     ----------
     status : "done", "stopped" or "interrupted"
     message : str
-        Why, in one sentence.
+        Reason of the status, in one sentence.
     t : (m,) array
         Output instants, s.
     q_tree, v_tree : (m, n) arrays
-        By coordinate, in the order of `coordinates`.
+        Values and rates by coordinate, in the order of `coordinates`.
     u, tau : (m, d) and (m, actuators) arrays
-        Eq. 6's force in the order of `independent`; the motors' torques in the order of `actuated`. Where torques act
-        and phi_z is singular, there is no u: not finite.
+        Eq. 6's force in the order of `independent`; motor torques in the order of `actuated`. With torque controllers u
+        is not finite where phi_z is singular.
     phi, w : (m, rows) arrays
-        The closure's residual, and what it should be (zero but for the SPF started off its manifold).
+        Constraint residual and its exact value, which is zero except for the SPF started off its manifold.
     energy : (m,) array
         Kinetic and potential energy, J.
     lyapunov : (m,) array or None
         The controller's Lyapunov function.
     dissipated : (m,) array or None
-        Energy that dry friction and impacts have taken since the start, J. None where there are neither, and with
-        `friction_smoothing`, where friction is a force like a damper's whose work is not counted.
+        Energy dissipated by dry friction and impacts since the start, J. None without them, and with
+        `friction_smoothing`, where the work of friction is not recorded.
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict
-        Events that were met, in order of time: t, name, of, coordinate, value, direction (1 rising, -1 falling; of
-        "limit" 1 is leaving, -1 coming back), stop. Beside a scene's: where a joint sticks or slides (of "friction"),
-        touches a stop, leaves it or bounces off it (of "stop").
+        Events in order of time: t, name, of, coordinate, value, direction (1 rising, -1 falling; for "limit" 1 leaving,
+        -1 coming back), stop. They include the mode transitions of joints: sticking and sliding (of "friction"),
+        touching a stop, leaving it and bouncing off it (of "stop").
     stats : dict
-        rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (of a
-        caller's controller and events), terms (at the end), rhs_by_terms ("pinocchio", "generated", or
-        "general": compiled terms, but the general elimination because theirs rounds too much), wall_s.
+        rhs, steps, rejected, newton, factorizations, jacobians, switches, method, steps_by_method, python_calls (calls
+        of a controller and of event functions in Python), terms (at the end), rhs_by_terms ("pinocchio", "generated",
+        or "general": compiled terms with the general elimination, used where theirs is inaccurate), wall_s.
     scene : dict
-        The scene as resolved.
+        The scene with all defaults filled in.
     texts : dict of str to str
         The mechanism file and every file that it or the scene names.
     profile : dict
-        Terms evaluated, how often and for how long, when asked for.
+        Evaluated terms with their number of calls and their time, if requested.
     """
 
     status: Status
@@ -109,30 +112,88 @@ class Run(HasSummary):
     scene: dict[str, Any]
     texts: dict[str, str]
     profile: dict[str, Any] = field(default_factory=dict)
+    built_mechanism: InitVar[Mechanism | None] = (
+        None  # the simulated mechanism, so that `mechanism` need not rebuild it
+    )
+
+    def __post_init__(self, built_mechanism: Mechanism | None) -> None:
+        object.__setattr__(self, "_built_mechanism", built_mechanism)
 
     @cached_property
     def mechanism(self) -> Mechanism:
-        """The mechanism, built again from the run's own texts.
+        """The run's mechanism. For a run from a file it is rebuilt from the run's texts.
 
-        InputError: it is not the one that the numbers are of.
+        Raises
+        ------
+        InputError
+            The run's columns do not fit the mechanism.
         """
+        simulated: Mechanism | None = self._built_mechanism  # type: ignore[attr-defined]
+        if simulated is not None:
+            return simulated
         overrides = plain_values(self.scene.get("parameters", {}))
         mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), overrides)
-        for what in ("coordinates", "independent", "actuated"):
-            own, theirs = getattr(self, what), getattr(mechanism, what)
-            if own != theirs:
-                says = f"{', '.join(own)}, its mechanism's {', '.join(theirs)}"
-                raise InputError(f"{self.scene_name}: damaged: the run's {what} are {says}")
+        for attribute in ("coordinates", "independent", "actuated"):
+            names, expected = getattr(self, attribute), getattr(mechanism, attribute)
+            if names != expected:
+                raise InputError(
+                    f"{self.scene_name}: damaged: the run's {attribute} are {', '.join(names)}, its mechanism's "
+                    f"{', '.join(expected)}"
+                )
         if self.phi.shape[1] != mechanism.closure.rows:
-            rows = f"{self.phi.shape[1]} columns, its mechanism {mechanism.closure.rows} rows"
-            raise InputError(f"{self.scene_name}: damaged: the run's phi has {rows}")
+            raise InputError(
+                f"{self.scene_name}: damaged: the run's phi has {self.phi.shape[1]} columns, its mechanism "
+                f"{mechanism.closure.rows} rows"
+            )
         return mechanism
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
-        return run_summary(self)
+        """Return a one-screen summary: final state, largest forces, energy, residual, work and events."""
+        mechanism = self._mechanism_or_none()
+        units = ([], []) if mechanism is None else (mechanism.tree.units(), mechanism.tree.units("/s"))
+        rows: list[Row] = [
+            ("formulation", describe_formulation(self.scene, exact=not self.w[0].any())),
+            ("instants", f"{len(self.t)}, from t = {self.t[0]:g} to {self.t[-1]:g} s"),
+            ("q_tree at the end", format_quantities(self.coordinates, self.q_tree[-1], units[0], 9)),
+            ("v_tree at the end", format_quantities(self.coordinates, self.v_tree[-1], units[1])),
+        ]
+        if np.any(self.u) or np.any(self.tau) or "controller" in self.scene:
+            u_unit = tau_unit = ""
+            if mechanism is not None:
+                by_quantity = quantity_units(mechanism)
+                u_unit, tau_unit = f" {joined(by_quantity['u'])}", f" {joined(by_quantity['tau'])}"
+            u, tau = _largest_finite(self.u), _largest_finite(self.tau)
+            rows.append(("largest |u|, |tau|", f"{u:.4g}{u_unit}, {tau:.4g}{tau_unit}"))
+        for name, rate in ({} if mechanism is None else self.too_fast()).items():
+            limit = self.mechanism.motors.speed_limit[self.actuated.index(name)]
+            rows.append(("warning", f"{name} turns at {rate:.4g}, its speed_limit is {limit:.4g}"))
+        rows.append(("energy start, end", f"{self.energy[0]:.9g}, {self.energy[-1]:.9g} J"))
+        if self.dissipated is not None:
+            rows.append(("friction, impacts took", f"{self.dissipated[-1]:.9g} J"))
+        rows.append(("largest |phi - w|", f"{self.max_phi:.2g} (its rate {self.max_phi_dot:.2g})"))
+        rows += format_work(self.stats, self._suggest_compiling(mechanism))
+        rows += [("event", f"t = {event['t']:.9g} s: {event['name']}") for event in self.events[:MAX_EVENTS_SHOWN]]
+        if len(self.events) > MAX_EVENTS_SHOWN:
+            rows.append(("", f"and {len(self.events) - MAX_EVENTS_SHOWN} more events"))
+        outcome = self.message if self.message.startswith(self.status) else f"{self.status}: {self.message}"
+        return Summary(f"Run of {self.scene_name}, {outcome}", rows)
 
-    # --- by name, by time ------------------------------------------------------------------------
+    def _mechanism_or_none(self) -> Mechanism | None:
+        """Return the mechanism, or None if the run's texts are damaged: a summary is printed all the same."""
+        try:
+            return self.mechanism
+        except CkcError:
+            return None
+
+    def _suggest_compiling(self, mechanism: Mechanism | None) -> str:
+        """Return a hint for a long run that compiled terms would have made faster, or an empty text."""
+        if self.stats.get("terms", "pinocchio") != "pinocchio" or self.stats["wall_s"] < LONG_RUN_S:
+            return ""
+        if mechanism is None or explain_too_large(mechanism):
+            return ""
+        return "; compiled ones are several times faster: ckc compile"
+
+    # --- access by name and by time --------------------------------------------------------------
 
     def __getitem__(self, name: str) -> Array:
         """Return a coordinate along the run, shape (m,), or an array by its name, as ``run["energy"]``.
@@ -140,15 +201,15 @@ class Run(HasSummary):
         Raises
         ------
         InputError
-            Neither; names those there are.
+            There is no such coordinate or array; the message lists the existing ones.
         """
         if name in self.coordinates:
             return self.q_tree[:, self.coordinates.index(name)]
-        others = [other for other in (*ARRAYS, *OPTIONAL) if getattr(self, other) is not None]
-        if name not in others:
-            own = ", ".join(self.coordinates)
+        arrays = [array for array in (*ARRAYS, *OPTIONAL) if getattr(self, array) is not None]
+        if name not in arrays:
             raise InputError(
-                f"run[{describe_value(name)}]: there are the coordinates {own}, and the arrays {', '.join(others)}"
+                f"run[{describe_value(name)}]: no such coordinate or array; there are the coordinates "
+                f"{', '.join(self.coordinates)}, and the arrays {', '.join(arrays)}"
             )
         return np.asarray(getattr(self, name))
 
@@ -159,41 +220,63 @@ class Run(HasSummary):
     def sel(self, *, t: slice) -> Run: ...
 
     def sel(self, *, t: float | slice) -> State | Run:
-        """Return the run at an instant, or from one time to another.
+        """Return the state at an instant, or the part of the run between two times.
 
         Parameters
         ----------
         t : float or slice
-            s. A number: the state at the output instant nearest to it, whose own t says which that is. A slice: the
-            run's instants from its start to its stop, both included.
+            s. A number selects the state at the nearest output instant, whose time is `State.t`. A slice selects the
+            instants from its start to its stop, both included.
 
         Returns
         -------
         State or Run
-            Of a part of a run `stats`, `max_phi` and `max_phi_dot` are those of the whole.
+            A part of a run keeps `stats`, `max_phi` and `max_phi_dot` of the whole run.
 
         Raises
         ------
         InputError
-            A time before the run's start or after its end, or none between the two.
+            A time outside the run, or a slice without output instants.
         """
         first, last = float(self.t[0]), float(self.t[-1])
         if isinstance(t, slice):
-            return part_of(self, first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
+            return self._part(first if t.start is None else t.start, last if t.stop is None else t.stop, t.step)
         if not is_number(t):
             raise InputError(f"Run.sel: t: expected a time, s, or slice(start, stop), got {describe_value(t)}")
         if not first <= t <= last:
             raise InputError(f"Run.sel: t = {t:g} s; the run is from {first:g} to {last:g} s")
-        return state_of(self, self.at(t))
+        return recorded_state(self, self.at(t))
+
+    def _part(self, start: Any, stop: Any, step: Any) -> Run:
+        """Return the run's instants from start to stop (s) with the events between them."""
+        if step is not None or not (is_number(start) and is_number(stop)):
+            raise InputError(
+                f"Run.sel: t: expected a slice of two times, s, without a step, got slice({start!r:.40}, {stop!r:.40})"
+            )
+        rows = (start <= self.t) & (self.t <= stop)
+        if not rows.any():
+            raise InputError(
+                f"Run.sel: no output instant from {start:g} to {stop:g} s; the run is from {self.t[0]:g} to "
+                f"{self.t[-1]:g} s"
+            )
+        arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
+        selected: dict[str, Any] = {name: x if x is None else x[rows] for name, x in arrays.items()}
+        return replace(self, events=[event for event in self.events if start <= event["t"] <= stop], **selected)
 
     def column(self, coordinate: str) -> int:
-        """Return the column of a coordinate; InputError names the valid ones."""
+        """Return the column of a coordinate.
+
+        Raises
+        ------
+        InputError
+            There is no such coordinate; the message lists the existing ones.
+        """
         if coordinate not in self.coordinates:
             raise InputError(f"no coordinate {coordinate!r} in this run; there are {', '.join(self.coordinates)}")
         return self.coordinates.index(coordinate)
 
     def at(self, t: float) -> int:
-        """Return the row of the output instant nearest to t, s."""
+        """Return the row of the output instant nearest to t (s)."""
         if not is_number(t):
             raise InputError(f"Run.at: expected a time, s, got {describe_value(t)}")
         return int(np.argmin(np.abs(self.t - t)))
@@ -210,29 +293,28 @@ class Run(HasSummary):
 
     @cached_property
     def motor_rates(self) -> Array:
-        """Rates of the motors themselves, before their gears, along the run, shape (m, motors), rad/s or m/s."""
+        """Rates of the motor shafts, before the gears, along the run, shape (m, motors), rad/s or m/s."""
         return self.v_tree @ self.mechanism.motors.transmission.T
 
     def too_fast(self) -> dict[str, float]:
-        """Return the largest rate of each motor that is above its speed limit at some output instant."""
+        """Return the largest rate of each motor that exceeds its speed limit at some output instant, rad/s or m/s."""
         motors = self.mechanism.motors
         largest = np.abs(self.motor_rates).max(axis=0, initial=0.0)
-        every = zip(motors.names, largest, motors.speed_limit, strict=True)
-        return {name: float(rate) for name, rate, limit in every if rate > limit}
+        rates = zip(motors.names, largest, motors.speed_limit, strict=True)
+        return {name: float(rate) for name, rate, limit in rates if rate > limit}
 
     def loop_forces(self) -> dict[str, Array]:
-        """Multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
+        """Return the multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
 
-        For a point row: the force that the loop exerts on frame A, along the row's axis. NaN where J has lost rank, so
-        that nothing determines them.
+        The multiplier of a point row is the force that the loop exerts on frame A along the row's axis. NaN is returned
+        where J has lost rank, because the multipliers are not determined there.
         """
-        from ckc_pin.run.recorded_joints import loop_forces
+        from ckc_pin.run.inverse import compute_loop_forces
 
-        return loop_forces(self)
+        return compute_loop_forces(self)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `ckc run --json` prints (docs/reference/json.md): scalars, and the last instant by name."""
-        last = {name: path[-1].tolist() for name, path in self.points.items()}
+        """Return the JSON of `ckc run` (docs/reference/json.md): scalars, and the state at the end."""
         return {
             "status": self.status,
             "message": self.message,
@@ -242,7 +324,7 @@ class Run(HasSummary):
             "v_tree": self.v_tree[-1].tolist(),
             "u": self.u[-1].tolist(),
             "tau": self.tau[-1].tolist(),
-            "points": last,
+            "points": {name: path[-1].tolist() for name, path in self.points.items()},
             "max_abs_u": float(np.abs(self.u).max(initial=0.0)),
             "max_abs_tau": float(np.abs(self.tau).max(initial=0.0)),
             "too_fast": self.too_fast(),
@@ -257,10 +339,10 @@ class Run(HasSummary):
             "stats": self.stats,
         }
 
-    # --- to look at, to hand over -------------------------------------------------------------------
+    # --- figures, playback, export ---------------------------------------------------------------
 
     def plot(self) -> Figures:
-        """Draw the run: figures that a notebook shows and `save(folder)` writes; see `ckc_pin.plot`."""
+        """Draw figures of the run. A notebook shows them and `save(folder)` writes them; see `ckc_pin.plot`."""
         import ckc_pin
 
         return ckc_pin.plot(self)
@@ -274,42 +356,42 @@ class Run(HasSummary):
         forces: bool = False,
         inline: bool | None = None,
     ) -> Playback | ViewServer | None:
-        """Play the run: in a notebook below the cell, elsewhere in the browser until Ctrl-C; see `ckc_pin.play`."""
+        """Play the run in the notebook or, outside a notebook, in the browser until Ctrl-C; see `ckc_pin.play`."""
         import ckc_pin
 
         return ckc_pin.play(self, speed=speed, gap=gap, meshes=meshes, forces=forces, inline=inline)
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return the run as xarray's Dataset, by t, coordinate, independent, motor, row and point (extra `data`)."""
-        return as_dataset(self)
+        """Return an xarray Dataset by t, coordinate, independent, motor, row and point (needs the extra `data`)."""
+        return to_dataset(self)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return the run as pandas' DataFrame by t, with the columns of `to_csv` (extra `data`)."""
-        return as_data_frame(self)
+        """Return a pandas DataFrame by t with the columns of `to_csv` (needs the extra `data`)."""
+        return to_data_frame(self)
 
     def to_csv(self, path: str | Path) -> Path:
         """Write the run as CSV: t, each coordinate by its name, v.NAME, u.NAME, tau.MOTOR, phi.ROW, w.ROW, energy.
 
-        Points are POINT.x, .y, .z. Every number is written to its last digit.
+        Points are POINT.x, POINT.y, POINT.z. All digits of each number are written.
 
         Raises
         ------
         InputError
-            It cannot be written; a joint is called as another column is.
+            The file cannot be written, or a joint has the name of another column.
         """
         require_path(path, "Run.to_csv: path")
-        write_atomic(Path(path), as_csv(self))
+        write_atomic(Path(path), to_csv_text(self))
         return Path(path)
 
     # --- files -----------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:
-        """Write the run to a file: whole or not at all, also when the machine goes down meanwhile.
+        """Write the run to a file atomically, so that an interruption or a power failure leaves no partial file.
 
         Raises
         ------
         InputError
-            It cannot be written; what was there is still there.
+            It cannot be written. An existing file is kept.
         """
         require_path(path, "Run.save: path")
         path = Path(path)
@@ -319,21 +401,21 @@ class Run(HasSummary):
 
     @classmethod
     def load(cls, path: str | Path) -> Run:
-        """Read a run file, or the run.npz of a folder.
+        """Read a run file, or the run.npz in a folder.
 
         Raises
         ------
         InputError
-            No such file, not a run file, damaged, too large, or of another version.
+            The file is missing, no run file, damaged, too large, or of another version.
         """
         require_path(path, "Run.load: path", "the path of a run file, or of a folder that holds a run.npz")
         path = Path(path)
         if isdir(path):
             path = path / "run.npz"
         if not isfile(path):
-            mode = path.parent / "mode_1.npz"  # a linear model's folder has one for each
-            where = f"; there is {mode}" if isfile(mode) else ""
-            raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one{where}")
+            mode = path.parent / "mode_1.npz"  # The folder of a linear model has a file for each mode.
+            hint = f"; there is {mode}" if isfile(mode) else ""
+            raise InputError(f"{path}: no such run file; ckc run SCENE --out DIR writes one{hint}")
         try:
             coordinates, arrays, meta = read_run(path)
         except InputError as error:
@@ -345,3 +427,23 @@ class Run(HasSummary):
 
     def _meta(self) -> RunMeta:
         return RunMeta(**{name: getattr(self, name) for name in META})
+
+
+def format_work(stats: dict[str, Any], hint: str = "") -> list[Row]:
+    """Return rows of a summary for the work of a run or simulator; `hint` is appended to the row of the terms."""
+    steps = ", ".join(f"{name} {count} steps" for name, count in stats["steps_by_method"].items())
+    calls = f", {stats['python_calls']} calls of your functions" if stats["python_calls"] else ""
+    seconds = f", {stats['wall_s']:.2g} s" if "wall_s" in stats else ""
+    terms = stats.get("terms", "pinocchio")  # Old run files have no such key.
+    before = stats.get("rhs_by_terms", {}).get("pinocchio", 0)
+    late = f", compiled after {before} right-hand sides" if terms == "generated" and before else ""
+    work = f"{stats['rhs']} right-hand sides, {stats['newton']} Newton iterations"
+    return [
+        ("method", f"{steps or stats['method']}, {stats['rejected']} rejected"),
+        ("terms", terms + late + hint),
+        ("work", f"{work}, {stats['factorizations']} factorizations{calls}{seconds}"),
+    ]
+
+
+def _largest_finite(values: Array) -> float:
+    return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""Run files: NumPy's npz without pickle, written whole or not at all, and read as if a stranger had made them."""
+"""Read and write run files: NumPy npz without pickle, written atomically and read as untrusted input."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from ckc_pin.mechanism.spec import Vector3
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "hashes_of", "read_run", "write_run"]
 
 FORMAT = 1
-MAX_BYTES = 2**31  # of a run, expanded
-MAX_META = 2**27  # of what it holds beside its arrays: as Python's objects that takes many times as much
-MAX_HEADER = 10_000  # of an array's header; NumPy's own limit
+MAX_BYTES = 2**31  # of an uncompressed run
+MAX_META_BYTES = 2**27  # of the JSON beside the arrays, which takes many times as much memory when it is parsed
+MAX_HEADER_BYTES = 10_000  # of an array's header; NumPy's own limit
 ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
 OPTIONAL = ("lyapunov", "dissipated")
 OTHERS = ("coordinates", "meta")
 
 
 class RunMeta(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """What a run file holds beside its arrays, as JSON; a number that is not finite is null."""
+    """Content of a run file beside its arrays, stored as JSON. Numbers that are not finite are null."""
 
     format: int = FORMAT
     hashes: dict[str, str] = {}
@@ -67,7 +67,7 @@ class _Stats(msgspec.Struct):
     steps_by_method: dict[str, int]
     python_calls: int
     wall_s: float
-    terms: Literal["pinocchio", "generated"] = "pinocchio"  # of files from before there were others
+    terms: Literal["pinocchio", "generated"] = "pinocchio"  # old files have no such key
     rhs_by_terms: dict[str, int] = {}
 
 
@@ -88,12 +88,12 @@ class _Cost(msgspec.Struct):
     seconds: float
 
 
-# what tables and figures read of them; the rest of a scene is checked where it is used
-READ = {"events": list[_Event], "stats": _Stats, "scene": _Scene, "profile": dict[str, _Cost]}
+# Parts that tables and figures read without further checks. The rest of a scene is checked where it is used.
+CHECKED_TYPES = {"events": list[_Event], "stats": _Stats, "scene": _Scene, "profile": dict[str, _Cost]}
 
 
 def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array], meta: RunMeta) -> None:
-    """Write a run's file (InputError where that cannot be)."""
+    """Write a run file (InputError if it cannot be written)."""
     meta.hashes = hashes_of(meta)
     content = {
         **arrays,
@@ -105,31 +105,37 @@ def write_run(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array]
 
 
 def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
-    """Read coordinates, arrays and the rest.
+    """Read a run file.
+
+    Returns
+    -------
+    coordinates : tuple of str
+    arrays : dict of str to array
+    meta : RunMeta
 
     Raises
     ------
     InputError
-        Not a run file, damaged, too large, or of another version.
+        The file is no run file, damaged, too large, or of another version.
     """
     try:
-        content = _arrays(path)
-        rest = content.pop("meta").tobytes()
-        version = msgspec.json.decode(rest, type=dict[str, Any]).get("format")
+        content = _read_arrays(path)
+        encoded = content.pop("meta").tobytes()
+        version = msgspec.json.decode(encoded, type=dict[str, Any]).get("format")
         if version != FORMAT:
             raise InputError(f"{path}: a run of format {version}; this program reads format {FORMAT}")
-        meta = msgspec.json.decode(rest, type=RunMeta)
-        named = content.pop("coordinates")
-        if named.ndim != 1 or named.dtype.kind != "U":
-            raise InputError(f"{path}: damaged: coordinates is {named.shape} {named.dtype}, not names")
-        coordinates = tuple(str(name) for name in named)
+        meta = msgspec.json.decode(encoded, type=RunMeta)
+        names = content.pop("coordinates")
+        if names.ndim != 1 or names.dtype.kind != "U":
+            raise InputError(f"{path}: damaged: coordinates is {names.shape} {names.dtype}, not names")
+        coordinates = tuple(str(name) for name in names)
     except InputError:
         raise
-    except Exception as error:  # whatever a damaged archive makes NumPy, zlib or msgspec raise
+    except Exception as error:  # NumPy, zlib and msgspec raise various errors for a damaged archive.
         raise InputError(f"{path}: not a run file, or damaged ({type(error).__name__}: {error})") from None
     if MECHANISM_FILE not in meta.texts or meta.hashes != hashes_of(meta):
         raise InputError(f"{path}: damaged: its texts do not match their hashes")
-    for name, kind in READ.items():
+    for name, kind in CHECKED_TYPES.items():
         try:
             msgspec.convert(getattr(meta, name), kind)
         except msgspec.ValidationError as error:
@@ -138,60 +144,63 @@ def read_run(path: Path) -> tuple[tuple[str, ...], dict[str, Array], RunMeta]:
     return coordinates, content, meta
 
 
-def _arrays(path: Path) -> dict[str, Any]:
-    """Read the arrays, after everything that the file declares about them has been found harmless."""
+def _read_arrays(path: Path) -> dict[str, Any]:
+    """Read the arrays, after checking the names, sizes and types that the file declares."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"{path}: a file of {path.stat().st_size} bytes; a run has at most {MAX_BYTES}")
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         names = sorted(entry.filename for entry in entries)
         allowed = {f"{name}.npy" for name in (*ARRAYS, *OPTIONAL, *OTHERS)}
-        needed = {f"{name}.npy" for name in (*ARRAYS, *OTHERS)}
-        if len(set(names)) != len(names) or not needed <= set(names) <= allowed:
+        required = {f"{name}.npy" for name in (*ARRAYS, *OTHERS)}
+        if len(set(names)) != len(names) or not required <= set(names) <= allowed:
             arrays = ", ".join(name.removesuffix(".npy") for name in names[:20])
-            raise InputError(f"{path}: not a run file: it holds {arrays or 'nothing'}")
+            raise InputError(f"{path}: not a run file: it contains {arrays or 'nothing'}")
         total = 0
         for entry in entries:
-            size = _declared(path, archive, entry)
+            size = _declared_bytes(path, archive, entry)
             total += size
-            most = MAX_META if entry.filename == "meta.npy" else MAX_BYTES
-            if size > most:
-                raise InputError(f"{path}: an array of {size} bytes; a run has at most {most}")
+            limit = MAX_META_BYTES if entry.filename == "meta.npy" else MAX_BYTES
+            if size > limit:
+                raise InputError(f"{path}: an array of {size} bytes; a run has at most {limit}")
         if total > MAX_BYTES:
             raise InputError(f"{path}: {total} bytes when expanded; a run has at most {MAX_BYTES}")
     with np.load(path, allow_pickle=False) as data:
         return {name: data[name] for name in data.files}
 
 
-def _declared(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
-    """Bytes that an entry says it has, which is what would be allocated: by the archive and by the array's header."""
+def _declared_bytes(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
+    """Return the bytes that reading an entry would allocate, by the archive and by the array's header."""
     with archive.open(entry) as file:
-        if np.lib.format.read_magic(file) != (1, 0):  # a later version's header may itself be of 4 GiB
-            raise InputError(f"{path}: damaged: {entry.filename} has a header that a run does not need")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER)
+        if np.lib.format.read_magic(file) != (1, 0):  # Headers of later versions may have up to 4 GiB.
+            raise InputError(f"{path}: damaged: {entry.filename} has an array header of an unsupported version")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER_BYTES)
     if dtype.hasobject:
-        raise InputError(f"{path}: damaged: {entry.filename} holds Python objects")
+        raise InputError(f"{path}: damaged: {entry.filename} contains Python objects")
     return max(dtype.itemsize * math.prod(shape), entry.file_size)
 
 
 def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Array], meta: RunMeta) -> None:
+    """Raise InputError for shapes, types or times that no run has."""
     rows = len(arrays["t"]) if arrays["t"].ndim == 1 else 0
     closure = arrays["phi"].shape[1:]
     n = (len(coordinates),)
-    wanted = {"t": (), "energy": (), "lyapunov": (), "dissipated": (), "phi": closure, "w": closure, "q_tree": n,
+    shapes = {"t": (), "energy": (), "lyapunov": (), "dissipated": (), "phi": closure, "w": closure, "q_tree": n,
               "v_tree": n, "u": (len(meta.independent),), "tau": (len(meta.actuated),)}  # fmt: skip
     for name, array in arrays.items():
-        if array.shape != (rows, *wanted[name]) or array.dtype != np.float64 or not rows:
-            raise InputError(f"{path}: damaged: {name} is {array.shape} {array.dtype}, which does not fit the rest")
+        if array.shape != (rows, *shapes[name]) or array.dtype != np.float64 or not rows:
+            raise InputError(
+                f"{path}: damaged: {name} is {array.shape} {array.dtype}, which does not fit the other arrays"
+            )
     for name in ("t", "q_tree"):
         if not np.all(np.isfinite(arrays[name])):
-            raise InputError(f"{path}: damaged: {name} holds numbers that are not finite")
+            raise InputError(f"{path}: damaged: {name} contains numbers that are not finite")
     if not np.all(np.diff(arrays["t"]) > 0):
         raise InputError(f"{path}: damaged: t does not increase")
 
 
 def hashes_of(meta: RunMeta) -> dict[str, str]:
-    """SHA-256 of every text, and of the scene as resolved."""
+    """Return the SHA-256 of every text and of the scene."""
     scene = msgspec.json.encode(meta.scene, order="sorted")
     return {
         "scene": sha256(scene).hexdigest(),

@@ -1,9 +1,8 @@
-"""From a scene to a `Run`."""
+"""Run a scene from start to end and return a `Run`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,30 +12,26 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.validation import require_callable, require_flag
-from ckc_pin.codegen.library import compile_terms
 from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.events import Event, events_met
+from ckc_pin.run.compiled_terms import COMPILE_AFTER_RHS, NEVER, compile_during_run
+from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.loop_terms import require_number
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
-from ckc_pin.run.stop_reasons import PAUSE, Stop, explain
+from ckc_pin.run.stop_reasons import PAUSE_S, Stop, describe_stop
 from ckc_pin.scene.scene import Scene, as_scene
 
-__all__ = ["OnOutput", "Progress", "columns_of", "run_of", "run_prepared", "run_rows", "simulate"]
+__all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
 
 Progress = Callable[[float, float], None]  # (t, t_end)
 OnOutput = Callable[[float, Array], None]  # (t, q_tree), q_tree by coordinate
 
-# Right-hand sides that cost what writing terms out and compiling them does, of whatever mechanism but one of a single
-# long branch, which is up to 2.5 times as many (docs/theory/generated.md); a run with as many still ahead takes them
-# then, wherever it runs.
-REPAYS, NEVER = 2_000_000, 2**62
-SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")
+SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")  # quantities of one column
 
 
 def simulate(
@@ -49,7 +44,7 @@ def simulate(
     on_output: OnOutput | None = None,
     profile: bool = False,
 ) -> Run:
-    """Run a scene.
+    """Simulate a scene.
 
     Parameters
     ----------
@@ -58,31 +53,31 @@ def simulate(
     overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     controller : Controller, TorqueController, Sampled or function, optional
-        An object with a method u(t, terms) or tau(t, terms), or a plain function u(t, terms), whose u is eq. 6's force
-        on the independent coordinates. Takes the place of the scene's, its sample time, delay, sensor and drive
-        included; `Sampled` gives it its own.
+        An object with a method u(t, terms) or tau(t, terms), or a function u(t, terms). u is eq. 6's force on the
+        independent coordinates. It replaces the scene's controller with its sample time, delay, sensors and drives;
+        `Sampled` adds others.
     events : sequence of Event, optional
-        Event functions of the state, beside the scene's events.
+        Event functions of the state, in addition to the scene's events.
     progress : callable, optional
-        Called as progress(t, t_end), every 0.05 s or so.
+        Called as progress(t, t_end), about every 0.05 s.
     on_output : callable, optional
         Called as on_output(t, q_tree) for each output instant, q_tree by coordinate, shape (n,).
     profile : bool
-        Count the terms evaluated in `Run.profile`.
+        Count the terms that are evaluated in `Run.profile`.
 
     Returns
     -------
     Run
-        With status "done", or "stopped" or "interrupted" with the reason and everything up to there.
+        Its status is "done", or "stopped" or "interrupted" with the reason and all results up to that time.
 
     Raises
     ------
     InputError, MechanismError
-        The scene cannot be run as written; known before the first step.
+        The scene cannot be run as written. This is known before the first step.
     NumericalError
-        It cannot even start, because its initial state is singular.
+        The initial state is singular.
     KeyboardInterrupt
-        It was interrupted before the first output instant was recorded.
+        The run was interrupted before the first output instant was recorded.
     """
     scene = as_scene(scene, overrides, "simulate")
     require_callable(progress, "simulate: progress", "a function of (t, t_end)")
@@ -90,129 +85,129 @@ def simulate(
     require_flag(profile, "simulate: profile")
     run = run_prepared(prepare(scene, controller, events, profile=profile), progress, on_output)
     if controller is not None:
-        run.scene.pop("controller", None)  # the caller's took its place
+        run.scene.pop("controller", None)  # The caller's controller replaced it.
     return run
 
 
-def run_prepared(ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
-    """Run what was prepared, from its start; errors are those of `simulate`."""
-    started = perf_counter()  # loading and assembling are not the run's work
-    rows, status, message = run_rows(ready, progress, on_output)
-    return run_of(ready, rows, status, message, perf_counter() - started)
+def run_prepared(prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
+    """Run a prepared scene from its start; errors as of `simulate`."""
+    started = perf_counter()  # Loading and assembling do not count as time of the run.
+    rows, status, message = record_rows(prepared, progress, on_output)
+    return build_run(prepared, rows, status=status, message=message, wall_s=perf_counter() - started)
 
 
-def run_rows(
-    ready: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None
+def record_rows(
+    prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None
 ) -> tuple[Array, Status, str]:
-    """Run what was prepared, and return what the loop has recorded, how it ended and why."""
-    loop, times = ready.loop, ready.instants
+    """Run a prepared scene and return the recorded rows, the status and the message of the run.
+
+    Returns
+    -------
+    rows : (m, width) array
+        A row for each output instant, with the columns of `record_columns`.
+    status, message : str
+    """
+    loop, times = prepared.loop, prepared.instants
     rows = np.empty((len(times) + 1, loop.width))
     if rows.nbytes > MAX_BYTES:
         raise InputError(
             f"solver.output_dt: {len(times)} output instants of {loop.width - 4} numbers each; a run has at most "
             f"{MAX_BYTES // 2**20} MiB"
         )
-    ready.begin()
+    prepared.begin()
     loop.record(times, rows)
-    status, message, filled = _drive(ready, rows, progress, on_output)
+    status, message, filled = _advance_to_end(prepared, rows, progress, on_output)
     return rows[:filled], status, message
 
 
-def run_of(ready: Prepared, rows: Array, status: Status, message: str, wall_s: float) -> Run:
-    """Make a `Run` of what was recorded."""
-    scene, mechanism, loop = ready.scene, ready.mechanism, ready.loop
-    parts = _parts(ready, rows)
+def build_run(prepared: Prepared, rows: Array, *, status: Status, message: str, wall_s: float) -> Run:
+    """Return the `Run` of recorded rows; `wall_s` is the time that it took, s."""
+    scene, mechanism, loop = prepared.scene, prepared.mechanism, prepared.loop
+    parts = _split_rows(prepared, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
     joints, smoothing = mechanism.joints, scene.spec.friction_smoothing
-    accounted = joints.has_events(smoothing) and not joints.has_smooth_friction(smoothing)
+    is_dissipation_known = joints.has_events(smoothing) and not joints.has_smooth_friction(smoothing)
     run = Run(
         status=status,
         message=message,
         coordinates=mechanism.coordinates,
         independent=mechanism.independent,
         actuated=mechanism.actuated,
-        lyapunov=_lyapunov(ready, lyapunov, parts),
-        dissipated=dissipated if accounted else None,
+        lyapunov=_evaluate_lyapunov(prepared, lyapunov, parts),
+        dissipated=dissipated if is_dissipation_known else None,
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
-        events=events_met(ready.events, mechanism, loop),
+        events=list_occurrences(prepared.events, mechanism, loop),
         stats={**loop.stats(), "wall_s": wall_s},
         scene_name=scene.name,
         scene=scene.to_dict(),
-        texts=ready.texts,
-        profile={name: {"calls": calls, "seconds": spent} for name, (calls, spent) in loop.profile().items()},
+        texts=prepared.texts,
+        profile={name: {"calls": calls, "seconds": seconds} for name, (calls, seconds) in loop.profile().items()},
+        built_mechanism=mechanism,
         **parts,
     )
-    run.__dict__["mechanism"] = mechanism
     return run
 
 
-def _drive(
-    ready: Prepared, rows: Array, progress: Progress | None, on_output: OnOutput | None
+def _advance_to_end(
+    prepared: Prepared, rows: Array, progress: Progress | None, on_output: OnOutput | None
 ) -> tuple[Status, str, int]:
-    """Advance to the end; say how it ended and how many rows there are."""
-    loop, solver, t_end = ready.loop, ready.scene.spec.solver, ready.scene.spec.t_end
+    """Advance the loop to t_end and return status, message and the number of recorded rows."""
+    loop, solver, t_end = prepared.loop, prepared.scene.spec.solver, prepared.scene.spec.t_end
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
-    n, shown, filled = ready.mechanism.n, 0, 0
+    n, shown, filled = prepared.mechanism.n, 0, 0
     may_compile = solver.terms == "auto" and (
-        loop.stats()["terms"] == "pinocchio" or ready.missing_arguments is not None
+        loop.stats()["terms"] == "pinocchio" or prepared.missing_arguments is not None
     )
-    loop.pause_at(REPAYS if may_compile else NEVER)
+    loop.pause_at(COMPILE_AFTER_RHS if may_compile else NEVER)
     try:
         while True:
-            stop = Stop(*loop.advance(t_end, True, PAUSE, deadline - perf_counter()))
-            if may_compile and stop.why == "pause" and loop.stats()["rhs"] >= REPAYS:
+            stop = Stop(*loop.advance(until=t_end, final=True, pause=PAUSE_S, budget=deadline - perf_counter()))
+            if may_compile and stop.why == "pause" and loop.stats()["rhs"] >= COMPILE_AFTER_RHS:
                 may_compile = False
                 loop.pause_at(NEVER)
                 if loop.t <= t_end / 2:
-                    _compile(ready)
+                    compile_during_run(prepared.mechanism, loop, prepared.missing_arguments)
             filled = stop.filled
             if on_output is not None:
                 for row in rows[shown:filled]:
-                    on_output(float(row[0]), row[1 : 1 + n].copy())  # theirs, to change as they like
+                    on_output(float(row[0]), row[1 : 1 + n].copy())  # The caller may write to its copy.
                 shown = filled
             if progress is not None:
                 progress(loop.t, t_end)
             if stop.why == "end":
                 return "done", "reached t_end", filled
             if stop.why == "event":
-                name = next(ready.events[k] for _, k, _ in reversed(loop.met()) if ready.events[k].stop).label["name"]
+                events = prepared.events
+                name = next(events[k].label["name"] for _, k, _ in reversed(loop.met()) if events[k].stop)
                 return "done", f"stopped by the event at t = {stop.t:.9g} s: {name}", filled
             if stop.why != "pause":
                 break
     except KeyboardInterrupt as signal:
-        if not loop.filled:  # not even a first row: in the first call of a caller's controller, say
+        if not loop.filled:  # For example in the first call of the caller's controller.
             raise
         status: Status = "interrupted"
         message = f"interrupted at t = {loop.t:.6g} s{acknowledge(signal)}"
     else:
-        error = explain(stop, loop, ready.mechanism, solver, ready.events)
-        if not filled:  # not even a first row
+        error = describe_stop(stop, loop, prepared.mechanism, solver, prepared.events)
+        if not filled:
             raise error
-        status, message = "stopped", _sentence(error, loop.t)
-    loop.record_now()  # where not even that state has terms, the last output instant is the end
+        status, message = "stopped", _describe_error(error, loop.t)
+    loop.record_now()  # If the terms of this state cannot be evaluated, the last output instant is the end.
     return status, message, loop.filled
 
 
-def _compile(ready: Prepared) -> None:
-    """Give the loop terms that are written out, where they can be."""
-    with suppress(InputError):  # too many coordinates, no CasADi, no compiler: it goes on as it is
-        missing = ready.missing_arguments
-        library = compile_terms(ready.mechanism, missing, changes=missing is not None)
-        ready.loop.write((library.path, library.parameters))
-
-
-def _parts(ready: Prepared, rows: Array) -> dict[str, Array]:
-    """Split what the loop has recorded, a row an instant."""
+def _split_rows(prepared: Prepared, rows: Array) -> dict[str, Array]:
+    """Return the recorded quantities by name, a row for each instant."""
     parts: dict[str, Array] = {}
-    for name, at in columns_of(ready.mechanism).items():
-        part = rows[:, at].copy()
+    for name, columns in record_columns(prepared.mechanism).items():
+        part = rows[:, columns].copy()
         parts[name] = part[:, 0] if name in SCALARS else part
     return parts
 
 
-def columns_of(mechanism: Mechanism) -> dict[str, slice]:
-    """Return where what the loop records stands in a row (`Recorder` in recorder.hpp)."""
+def record_columns(mechanism: Mechanism) -> dict[str, slice]:
+    """Return the columns of each quantity in a row that the native loop records (`Recorder` in recorder.hpp)."""
     n, m = mechanism.n, mechanism.closure.rows
     widths = {"t": 1, "q_tree": n, "v_tree": n, "u": mechanism.d, "tau": len(mechanism.actuated), "phi": m, "w": m,
               "energy": 1, "dissipated": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
@@ -220,23 +215,27 @@ def columns_of(mechanism: Mechanism) -> dict[str, slice]:
     return {name: slice(ends[k], ends[k + 1]) for k, name in enumerate(widths)}
 
 
-def _lyapunov(ready: Prepared, found: Array, parts: dict[str, Array]) -> Array | None:
-    """Return the controller's Lyapunov function, of a caller's own evaluated here."""
-    law = ready.controller.controller if isinstance(ready.controller, Sampled) else ready.controller
+def _evaluate_lyapunov(prepared: Prepared, recorded: Array, parts: dict[str, Array]) -> Array | None:
+    """Return the controller's Lyapunov function along the run, shape (m,), or None if it has none.
+
+    The native loop records it for the controllers of scenes. A caller's function is evaluated here.
+    """
+    law = prepared.controller.controller if isinstance(prepared.controller, Sampled) else prepared.controller
     function = getattr(law, "lyapunov", None)
-    t, q_tree, v_tree, phi = (parts[name] for name in ("t", "q_tree", "v_tree", "phi"))
     if function is None:
         return None
-    if not np.isnan(found).any():
-        return found
-    mechanism = ready.mechanism
-    kinematics = [mechanism.kinematics(mechanism.tree.from_coordinates(numbers)) for numbers in q_tree]
-    every = zip(t, kinematics, v_tree, phi, strict=True)
-    values = [(float(at_t), function(float(at_t), Terms(mechanism, at, v), w)) for at_t, at, v, w in every]
-    return np.array([require_number(value, f"controller: lyapunov at t = {at_t:.9g}") for at_t, value in values])
+    if not np.isnan(recorded).any():
+        return recorded
+    mechanism = prepared.mechanism
+    values = []
+    for t, q_tree, v_tree, phi in zip(*(parts[name] for name in ("t", "q_tree", "v_tree", "phi")), strict=True):
+        at = mechanism.kinematics(mechanism.tree.from_coordinates(q_tree))
+        value = function(float(t), Terms(mechanism, at, v_tree), phi)
+        values.append(require_number(value, f"controller: lyapunov at t = {float(t):.9g}"))
+    return np.array(values)
 
 
-def _sentence(error: NumericalError, t: float) -> str:
+def _describe_error(error: NumericalError, t: float) -> str:
     where = ""
     if error.q_tree:
         where = " near " + ", ".join(f"{name} = {x:.6g}" for name, x in error.q_tree.items())

@@ -1,60 +1,61 @@
-"""Step by step: a scene whose loop the caller closes, for model predictive control, learning, or a bench."""
+"""Step a scene under the caller's control: for model predictive control, reinforcement learning, or a test bench."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.summary import HasSummary, Summary
+from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.validation import is_number
 from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.errors import InputError
 from ckc_pin.native import _core
-from ckc_pin.run.events import Event, events_met
+from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.prepare import prepare
+from ckc_pin.run.run import format_work
 from ckc_pin.run.state import State
-from ckc_pin.run.stop_reasons import PAUSE, Stop, explain
-from ckc_pin.run.summary import simulator_summary
+from ckc_pin.run.stop_reasons import PAUSE_S, Stop, describe_stop
 from ckc_pin.scene.initial import Start, find_start
-from ckc_pin.scene.parts import scene_controller
-from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
+from ckc_pin.scene.parts import build_scene_controller
+from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, describe_formulation, make_scene
 
 __all__ = ["Simulator"]
 
-AT_WORK = "this simulator is at work on another call; it takes one at a time, and none from an event's function"
+BUSY = "this simulator is executing another call; call it from one thread at a time, and not from an event function"
 
 
 class Simulator(HasSummary):
-    """A scene that is stepped by its caller, who gives u; as accurate as `simulate`, and it stops for the same reasons.
+    """A scene that its caller steps with u or motor torques, as accurate as `simulate`.
 
     Parameters
     ----------
     scene : Scene, str or Path
-        A scene, its shipped name, or its path. Its t_end and output_dt have no meaning here, and its
-        controller does not act; of that table the torque limit holds.
+        A scene, its shipped name, or its path. t_end and output_dt are not used. Of the scene's controller only the
+        torque limit and the allocation are used.
     overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
     events : sequence of Event, optional
-        Event functions of the state, beside the scene's events.
+        Event functions of the state, in addition to the scene's events.
 
     Attributes
     ----------
     scene : Scene
     mechanism : Mechanism
     controller : Controller, TorqueController or None
-        The scene's own, for who wants to call it: ``controller.u(state.t, state.terms)``.
+        The scene's controller, which the caller may evaluate: ``controller.u(state.t, state.terms)``.
     state : State
-        Where it is.
+        The present state.
     events : list of dict
-        Events met since the last reset, as in `Run.events`. One that stops ends the step it happens in early.
+        Events since the last reset, as in `Run.events`. An event with ``stop`` ends its step early.
     stats : dict
-        What was evaluated since the last reset: `Run.stats` but for the time.
+        Evaluations since the last reset, as in `Run.stats` without wall_s.
 
     Raises
     ------
@@ -65,16 +66,20 @@ class Simulator(HasSummary):
 
     Notes
     -----
-    solver.max_rhs counts from each reset; solver.max_wall_s does not apply, the time between steps is the caller's.
-    While u stays as it is, a step of the method may reach beyond the caller's, and states within it are read off it, as
-    accurate as the outputs of a run; a change of u goes on from the state that was read. Events keep steps from that.
+    solver.max_rhs counts from each reset. solver.max_wall_s is not used.
 
-    It is not copied or pickled: after ``other.reset(this.state)`` another one of the scene goes on from where this one
-    is, as accurate, but not by the same steps.
+    While u stays the same, a step of the integration method may be longer than the caller's. States within it are
+    interpolated, as accurate as the outputs of a run. A new u continues from the interpolated state. Events prevent
+    longer steps.
 
-    It takes one call at a time: an InputError refuses one from another thread, or from an event's function, while it is
-    at work. Simulators of their own in several threads do not wait for each other.
+    A simulator cannot be copied or pickled. After ``other.reset(this.state)`` another simulator of the scene continues
+    from this one's state, equally accurate, but with other steps.
 
+    A simulator executes one call at a time. Calls from another thread or from an event function in the meantime raise
+    InputError. Several simulators in several threads do not wait for each other.
+
+    Examples
+    --------
     >>> simulator = Simulator("five_bar/set_point", {"formulation": "reduced"})
     >>> for _ in range(10):
     ...     state = simulator.step(-2.0 * simulator.state.q_dot, 0.002)
@@ -89,54 +94,62 @@ class Simulator(HasSummary):
     ) -> None:
         scene = as_scene(scene, overrides, "Simulator")
         self.scene = scene
-        self._ready = prepare(scene, events=events, free=True)
-        self._loop = self._ready.loop
-        self.mechanism = self._ready.mechanism
-        self.controller: Controller | TorqueController | None = scene_controller(scene, self.mechanism)
-        self._no_u = self._ready.actuation.explain_undriven_freedoms(self._ready.start.at)
-        self._none = np.zeros(self.mechanism.d)
-        gate = _core.Gate(InputError)  # the loop has one state
+        self._prepared = prepare(scene, events=events, free=True)
+        self._loop = self._prepared.loop
+        self.mechanism = self._prepared.mechanism
+        self.controller: Controller | TorqueController | None = build_scene_controller(scene, self.mechanism)
+        self._u_refusal = self._prepared.actuation.explain_undriven_freedoms(self._prepared.start.at)
+        self._zero_u = np.zeros(self.mechanism.d)
+        gate = _core.Gate(InputError)  # One call at a time, because the loop has one state.
         self._step, self._reset, self._events, self._stats = (
-            gate.turn(f"{what}: {AT_WORK}") for what in ("step", "reset", "events", "stats")
+            gate.turn(f"{name}: {BUSY}") for name in ("step", "reset", "events", "stats")
         )
         self.reset()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse copies, shallow, deep or pickled: steps beyond the present state are known to one loop alone."""
+        """Refuse copies and pickles: the native loop holds steps beyond the present state, which cannot be copied."""
         raise InputError(
-            "Simulator: one cannot be copied or pickled; make another of the same scene, and take it to where this one "
-            "is with other.reset(simulator.state)"
+            "Simulator: it cannot be copied or pickled; make another simulator of the same scene and call "
+            "other.reset(simulator.state)"
         )
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
-        return simulator_summary(self)
+        """Return a one-screen summary: formulation, present state, motors and work."""
+        rows: list[Row] = [
+            ("formulation", describe_formulation(self.scene.to_dict(), exact=not np.any(self.state.w))),
+            *self.state.summary().rows,
+            ("motors", ", ".join(self.mechanism.actuated) or "none"),
+        ]
+        with suppress(InputError):  # Within a step, for example from an event function, the counts are not available.
+            stats = self.stats
+            rows += format_work(stats) if stats["rhs"] else []
+        return Summary(f"Simulator of {self.scene.name} at t = {self.state.t:g} s", rows)
 
     @property
     def state(self) -> State:
-        """Where it is."""
+        """The present state."""
         return self._state
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """Events met since the last reset."""
+        """Events since the last reset."""
         with self._events:
-            return events_met(self._ready.events, self._ready.mechanism, self._loop)
+            return list_occurrences(self._prepared.events, self.mechanism, self._loop)
 
     @property
     def stats(self) -> dict[str, Any]:
-        """What was evaluated since the last reset, by the names of `Run.stats`."""
+        """Evaluations since the last reset, by the names of `Run.stats`."""
         with self._stats:
             return dict(self._loop.stats())
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
-        """Go to a state; what was before has no influence on what follows.
+        """Go to a state. Earlier steps have no influence on the following ones.
 
         Parameters
         ----------
         state : State, mapping or None
-            A state that this or another simulator of the mechanism has been in, with its time; a table as a
-            scene's [initial], e.g. ``{"q": {...}, "q_dot": {...}}``, at t = 0; or None, the scene's start.
+            A state of this or another simulator of the mechanism, with its time; or a table as a scene's [initial],
+            e.g. ``{"q": {...}, "q_dot": {...}}``, at t = 0; or None for the scene's start.
 
         Returns
         -------
@@ -145,88 +158,93 @@ class Simulator(HasSummary):
         Raises
         ------
         InputError, NumericalError
-            A state of another mechanism, out of reach or singular; a step is under way.
+            The state is of another mechanism, out of reach or singular, or a step is being executed.
         """
         with self._reset:
             if isinstance(state, State):
-                self._ready.begin(self._start(state), state.t)
-                self._state = State(self.mechanism, state.t, state._numbers, state._q, state._z)
+                self._prepared.begin(self._start_of(state), state.t)
+                self._state = state.with_mechanism(self.mechanism)
             else:
-                self._ready.begin(None if state is None else self._initial(state))
-                self._state = self._present()
+                self._prepared.begin(None if state is None else self._start_of_table(state))
+                self._state = self._read_state()
             return self._state
 
     def step(self, u: Any = None, dt: Any = None, *, tau: Any = None) -> State:
-        """Hold u, or the motors' torques, for dt seconds.
+        """Advance by dt with constant u or constant motor torques.
 
         Parameters
         ----------
         u : (d,) array or None
-            Eq. 6's force on the independent coordinates, N m or N; None: no force.
+            Eq. 6's force on the independent coordinates, N m or N; None for no force.
         dt : float
-            s, greater than 0.
+            Duration, s, greater than 0.
         tau : (motors,) array or {motor: number}, optional
-            In the place of u, the motors' own torques, N m or N; motors not in a table have none.
+            Instead of u: motor torques, N m or N. Motors that a table does not name have none.
 
         Returns
         -------
         State
-            At t + dt, or where an event stopped.
+            State at t + dt, or at an event with ``stop``.
 
         Raises
         ------
         InputError
-            u or tau of the wrong shape or not finite, both of them, a u that the motors cannot produce, dt not
-            positive, another step is under way; nothing has moved.
+            u or tau has the wrong shape or is not finite, both are given, the motors cannot produce u, dt is not
+            positive, or another step is being executed. The state has not changed.
         NumericalError
-            The numerics stopped within the step; `state` is the last one that was reached.
+            The integration stopped within the step. `state` is the last one that was reached.
         """
         if tau is not None:
             if u is not None:
                 raise InputError("step: give either u or tau, not both")
-            applied = require_tau(tau, self.mechanism, "tau")
+            effort = require_tau(tau, self.mechanism, "tau")
         else:
-            applied = self._none if u is None else require_u(u, self.mechanism, "u")
-            if self._no_u and applied.any():
-                raise InputError(f"u: {self._no_u}; give tau by motor instead")
+            effort = self._zero_u if u is None else require_u(u, self.mechanism, "u")
+            if self._u_refusal and effort.any():
+                raise InputError(f"u: {self._u_refusal}; give tau by motor instead")
         dt = self._require_dt(dt)
         with self._step:
-            return self._go(applied, tau is not None, self._state.t + dt)
+            return self._advance(effort, until=self._state.t + dt, of_motors=tau is not None)
 
-    def _go(self, applied: Array, of_motors: bool, until: float) -> State:
+    def _advance(self, effort: Array, *, until: float, of_motors: bool) -> State:
+        """Advance to a time (s) with a constant effort: u or, with `of_motors`, tau."""
         try:
-            while (found := self._loop.step(applied, of_motors, until, PAUSE)) is not None and found[0][0] == "pause":
-                pass
-        except BaseException:  # a caller's function may raise, and Ctrl-C
-            self._state = self._present()
+            while True:
+                result = self._loop.step(effort, of_motors=of_motors, until=until, pause=PAUSE_S)
+                if result is None or result[0][0] != "pause":
+                    break
+        except BaseException:  # An event function may raise, and so does Ctrl-C.
+            self._state = self._read_state()
             raise
-        if found is None:
-            raise InputError(f"{'tau' if of_motors else 'u'} is not finite: {applied.tolist()}")
-        stop, reached = found
+        if result is None:
+            raise InputError(f"{'tau' if of_motors else 'u'} is not finite: {effort.tolist()}")
+        stop, reached = result
         if reached is not None:
             self._state = State(self.mechanism, *reached)
         if stop[0] not in ("end", "event"):
-            loop, solver = self._loop, self._ready.scene.spec.solver
-            raise explain(Stop(*stop), loop, self.mechanism, solver, self._ready.events)
+            solver = self._prepared.scene.spec.solver
+            raise describe_stop(Stop(*stop), self._loop, self.mechanism, solver, self._prepared.events)
         return self._state
 
-    def _present(self) -> State:
+    def _read_state(self) -> State:
+        """Return the loop's state, or the last one if the terms of the loop's state cannot be evaluated."""
         reached = self._loop.state()
         return self._state if reached is None else State(self.mechanism, *reached)
 
-    def _start(self, state: State) -> Start:
-        theirs = state.mechanism
-        if theirs.coordinates != self.mechanism.coordinates or len(state.w) != self.mechanism.closure.rows:
-            raise InputError(f"reset: a state of {theirs.name}, this is {self.mechanism.name}")
-        if np.any(state.w) and self._ready.scene.spec.formulation != "spf":
-            raise InputError("reset: a state off phi = 0, which only the SPF can be in")
-        return Start(self.mechanism.kinematics(state._q_tree), state.q_dot, state.w, state.v_tree)
+    def _start_of(self, state: State) -> Start:
+        """Return a start at a state of this mechanism, possibly of another simulator."""
+        other = state.mechanism
+        if other.coordinates != self.mechanism.coordinates or len(state.w) != self.mechanism.closure.rows:
+            raise InputError(f"reset: the state is of {other.name}; this simulator is of {self.mechanism.name}")
+        if np.any(state.w) and self._prepared.scene.spec.formulation != "spf":
+            raise InputError("reset: the state is off phi = 0; only the SPF can start there")
+        return Start(self.mechanism.kinematics(state.terms.q_tree), state.q_dot, state.w, state.v_tree)
 
-    def _initial(self, table: Mapping[str, Any]) -> Start:
-        """Return the start that a table as a scene's [initial] gives."""
+    def _start_of_table(self, table: Mapping[str, Any]) -> Start:
+        """Return the start that a table as a scene's [initial] describes."""
         if not isinstance(table, Mapping):
-            raise InputError(f"reset: {table!r:.80} is no State and no table as a scene's [initial]")
-        scene = self._ready.scene
+            raise InputError(f"reset: expected a State or a table as a scene's [initial], got {table!r:.80}")
+        scene = self._prepared.scene
         data = apply_overrides(scene.to_dict(), {"initial": table})
         return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
 

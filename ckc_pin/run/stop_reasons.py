@@ -1,4 +1,4 @@
-"""Why the loop stopped, in words."""
+"""Messages for the reasons at which the native loop stops."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.events import EventFunction
 from ckc_pin.scene.spec import SolverSpec
 
-__all__ = ["PAUSE", "Stop", "explain", "why_not_q"]
+__all__ = ["PAUSE_S", "Stop", "describe_singular_phi_z", "describe_stop"]
 
-PAUSE = 0.05  # s: how long the interpreter, and with it Ctrl-C, may be kept waiting
-INSTANT = 1e-8  # of the time, or s: changes of modes so close to each other are at one instant
-SMOOTHER = "a scene with friction_smoothing has no sticking, and a smaller solver.rtol may tell the joints apart"
-NEARLY = 1e-3  # of |J|: phi_z's least singular value below which a step that cannot be made is put down to it
+PAUSE_S = 0.05  # longest time that the native loop keeps the interpreter, and with it Ctrl-C, waiting, s
+SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one instant; relative to t, or s
+# Below this smallest singular value of phi_z, relative to |J|, a step that fails is blamed on phi_z.
+NEARLY_SINGULAR = 1e-3
+FRICTION_REMEDY = "a scene with friction_smoothing has no sticking, and a smaller solver.rtol may tell the joints apart"
 
-TROUBLES = {
-    "none": "the step became so short that t does not change any more",
+# By the native loop's name of the failure.
+STEP_FAILURES = {
+    "none": "the step size became so small that t does not change any more",
     "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
     "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
-    "vague": "phi_z is so nearly singular that the other coordinates are not known as exactly as solver.rtol asks",
-    "pole": "what is wanted of the motors passes through infinity, and they jump from limit to limit: how the "
-    "parameters move that instant is not known",
-    "shares": "motors at their limits do not reach what is wanted of them together, and how they share what they do "
-    "has no known derivative",
+    "vague": "phi_z is so nearly singular that the dependent coordinates are less accurate than solver.rtol asks",
+    "pole": "the required motor torque passes through infinity and jumps from one limit to the other: the parameter "
+    "derivative of that instant is unknown",
+    "shares": "motors at their torque limits cannot produce u together, and the parameter derivative of the torque "
+    "allocation is unknown",
     "infinite": "its state or its right-hand side is not finite",
 }
 
 
 class Stop(NamedTuple):
-    """How the loop came back: why, when, a number that goes with it, which event, and how many rows are recorded."""
+    """Return value of the native loop: why it stopped, t (s), a value and an index for the reason, recorded rows."""
 
     why: str
     t: float
@@ -42,11 +44,11 @@ class Stop(NamedTuple):
     filled: int
 
 
-def explain(
+def describe_stop(
     stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, events: list[EventFunction]
 ) -> NumericalError:
-    """Return the error that a stop is, with the configuration where that matters."""
-    why, says, u, sigma_min, margin, q_tree, q, z = loop.trouble()
+    """Return the error for a stop, with the configuration where it matters."""
+    failure, says, u, sigma_min, margin, q_tree, q, z = loop.trouble()
     where = mechanism.tree.named(mechanism.tree.to_coordinates(q_tree))
     match stop.why:
         case "rhs_budget":
@@ -54,21 +56,23 @@ def explain(
         case "wall_budget":
             return NumericalError(f"the budget of max_wall_s = {solver.max_wall_s:g} s is used up", t=loop.t)
         case "pace":
-            return NumericalError(f"{_fastest(loop, mechanism)}; {_rest(stop.value)}", t=loop.t)
+            return NumericalError(
+                f"{_describe_fastest(loop, mechanism)}; {_describe_remaining_work(stop.value)}", t=loop.t
+            )
         case "rank":
             return NumericalError(
-                f"J loses rank at t = {stop.t:.6g} s (least singular value {stop.value:.1g}): branches of the motion "
-                "meet there, and the loops do not say which one it takes",
+                f"J loses rank at t = {stop.t:.6g} s (smallest singular value {stop.value:.1g}): branches of the "
+                "motion meet there, and the loops do not determine one",
                 t=loop.t,
                 q_tree=where,
             )
         case "chart" if not math.isfinite(sigma_min):
-            return NumericalError(f"the motion runs away: {TROUBLES['infinite']}", t=loop.t)
+            return NumericalError(f"the motion runs away: {STEP_FAILURES['infinite']}", t=loop.t)
         case "chart":
-            return NumericalError(why_not_q(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
+            return NumericalError(describe_singular_phi_z(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
         case "energy":
             return NumericalError(
-                f"nothing acts, but a step changes the energy by {stop.value:.2g} J however short it is",
+                f"no force acts, but a step changes the energy by {stop.value:.2g} J at every step size",
                 t=loop.t,
                 q_tree=where,
             )
@@ -76,44 +80,44 @@ def explain(
             return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
         case "chatter":
             return NumericalError(
-                f"{_changing(loop, mechanism)} change between sticking, sliding and touching again and again at this "
-                f"instant{_holding_forces(loop, mechanism)}; {SMOOTHER}",
+                f"{_list_last_transitions(loop, mechanism)} change between sticking, sliding and touching again and "
+                f"again at this instant{_describe_holding_forces(loop, mechanism)}; {FRICTION_REMEDY}",
                 t=loop.t,
                 q_tree=where,
             )
         case "contact":
             return NumericalError(
                 "no forces are found that hold the joints at their stops or at rest here"
-                f"{_holding_forces(loop, mechanism)}; {SMOOTHER}",
+                f"{_describe_holding_forces(loop, mechanism)}; {FRICTION_REMEDY}",
                 t=loop.t,
                 q_tree=where,
             )
         case "beyond_stop":
             name = mechanism.coordinates[stop.event]
             return NumericalError(
-                f"{name} has passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
+                f"{name} passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
                 "beyond the stop finds the impact",
                 t=loop.t,
                 q_tree=where,
             )
         case "function":
             return NumericalError(f"the event {events[stop.event].label['name']!r} is {stop.value}", t=loop.t)
-    small = f"the step fell below min_step = {solver.min_step:g} s"
-    reason = small if stop.why == "min_step" else TROUBLES[why]
-    if not margin <= NEARLY:
+    below_minimum = f"the step size fell below min_step = {solver.min_step:g} s"
+    reason = below_minimum if stop.why == "min_step" else STEP_FAILURES[failure]
+    if not margin <= NEARLY_SINGULAR:
         return NumericalError(reason, t=loop.t)
-    return NumericalError(f"{why_not_q(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
+    return NumericalError(f"{describe_singular_phi_z(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
 
 
-def _changing(loop: Any, mechanism: Mechanism) -> str:
-    """Name the joints whose mode changed last, at one instant."""
-    changes = loop.joint_changes()
-    names = [mechanism.coordinates[k] for t, k, *_ in changes if loop.t - t <= INSTANT * max(1.0, abs(loop.t))]
+def _list_last_transitions(loop: Any, mechanism: Mechanism) -> str:
+    """Name the joints whose mode changed at the present instant."""
+    tolerance = SAME_INSTANT_TOLERANCE * max(1.0, abs(loop.t))
+    names = [mechanism.coordinates[k] for t, k, *_ in loop.joint_changes() if loop.t - t <= tolerance]
     return ", ".join(dict.fromkeys(names)) or "joints"
 
 
-def _holding_forces(loop: Any, mechanism: Mechanism) -> str:
-    """Say which joints are held, with which force, and between which bounds that has to be."""
+def _describe_holding_forces(loop: Any, mechanism: Mechanism) -> str:
+    """List the joints at rest with the forces that hold them and the bounds of these forces."""
     forces = [
         f"{mechanism.coordinates[k]} {force:.6g} {'N' if mechanism.tree.in_metres[k] else 'N m'}, "
         f"{low:.6g} to {high:.6g} being possible"
@@ -122,26 +126,28 @@ def _holding_forces(loop: Any, mechanism: Mechanism) -> str:
     return f" (forces on the joints at rest: {'; '.join(forces)})" if forces else ""
 
 
-def _rest(rhs: float) -> str:
-    much = f"{rhs:.0e}" if math.isfinite(rhs) else "far more than 1e9"
-    return f"the rest would take {much} right-hand sides: the motion runs away or is stiff (solver.max_rhs = N goes on)"
+def _describe_remaining_work(rhs: float) -> str:
+    count = f"{rhs:.0e}" if math.isfinite(rhs) else "far more than 1e9"
+    return (
+        f"the rest would take {count} right-hand sides: the motion runs away or is stiff (solver.max_rhs = N goes on)"
+    )
 
 
-def _fastest(loop: Any, mechanism: Mechanism) -> str:
-    """Say which coordinate moves fastest, radians and the mechanism's size being alike."""
+def _describe_fastest(loop: Any, mechanism: Mechanism) -> str:
+    """Name the fastest coordinate, where lengths are compared relative to the mechanism's size."""
     tree = mechanism.tree
-    at = loop.state()
-    if at is None:
+    state = loop.state()
+    if state is None:
         return "steps are very short"
-    v = at[1][tree.nq : tree.nq + tree.n]
-    k = int(np.argmax(np.abs(v) / tree.step_scale))
-    return f"steps are very short ({mechanism.coordinates[k]} moves at {v[k]:.2g} {tree.units('/s')[k]})"
+    v_tree = state[1][tree.nq : tree.nq + tree.n]
+    k = int(np.argmax(np.abs(v_tree) / tree.step_scale))
+    return f"steps are very short ({mechanism.coordinates[k]} moves at {v_tree[k]:.2g} {tree.units('/s')[k]})"
 
 
-def why_not_q(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:
-    """Say that phi_z is singular, so that q has stopped to be coordinates."""
+def describe_singular_phi_z(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:
+    """Say that phi_z is singular, so that the independent coordinates do not determine the dependent ones."""
     names = mechanism.coordinates
     return (
-        f"phi_z is singular (its least singular value is {sigma_min:.2g}): "
+        f"phi_z is singular (its smallest singular value is {sigma_min:.2g}): "
         f"{', '.join(names[k] for k in q)} do not determine {', '.join(names[k] for k in z)} here"
     )

@@ -1,4 +1,4 @@
-"""What a scene names: a mechanism, a controller, the clock that it is on, and how it moves the motors."""
+"""Load and build what a scene names: its mechanism, its controller with sampling, and its actuation."""
 
 from __future__ import annotations
 
@@ -14,37 +14,59 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
-from ckc_pin.scene.initial import branch, is_chart
+from ckc_pin.scene.initial import find_branch, is_chart
 from ckc_pin.scene.scene import Scene
 
-__all__ = ["changed_mechanism", "in_samples", "scene_actuation", "scene_controller", "scene_mechanism"]
+__all__ = [
+    "apply_sampling",
+    "build_scene_actuation",
+    "build_scene_controller",
+    "load_scene_mechanism",
+    "rebuild_scene_mechanism",
+]
 
 
-def scene_mechanism(scene: Scene) -> Mechanism:
-    """Load the mechanism that a scene names, relative to its own folder or by shipped name, or has made by rule."""
-    return changed_mechanism(scene, scene.spec.parameters)
+def load_scene_mechanism(scene: Scene) -> Mechanism:
+    """Load a scene's mechanism with the scene's parameters: a file beside the scene, a shipped one, or a generated one.
+
+    Raises
+    ------
+    InputError, MechanismError
+    """
+    return rebuild_scene_mechanism(scene, scene.spec.parameters)
 
 
-def changed_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
-    """Load the mechanism that a scene names with these parameters in the place of the scene's own."""
+def rebuild_scene_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
+    """Load a scene's mechanism with other parameters than the scene's."""
     mechanism = scene.spec.mechanism
-    return load(_beside(scene, mechanism) if isinstance(mechanism, str) else mechanism, overrides)
+    return load(_resolve_path(scene, mechanism) if isinstance(mechanism, str) else mechanism, overrides)
 
 
-def _beside(scene: Scene, name: str) -> str | Path:
+def _resolve_path(scene: Scene, name: str) -> str | Path:
+    """Return the path of a mechanism relative to the scene's folder, or its shipped name."""
     folder = scene.sources.folder
     if folder is not None and (name.endswith(".toml") or exists(folder / name)):
         return mechanism_file(folder / name)
     return name
 
 
-def scene_controller(
+def build_scene_controller(
     scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
 ) -> SetPoint | Tracking | RecordedTorques | None:
-    """Build a scene's controller; the texts of its own model are added to `texts`."""
+    """Build a scene's controller.
+
+    Parameters
+    ----------
+    texts : dict of str to str, optional
+        Receives the files of the controller's own model, by name.
+
+    Raises
+    ------
+    InputError, MechanismError
+    """
 
     def load_model(name: str) -> Mechanism:
-        model = load(_beside(scene, name))
+        model = load(_resolve_path(scene, name))
         if texts is not None:
             texts.update({f"model/{file}": text for file, text in model.sources.texts.items()})
         return model
@@ -52,27 +74,28 @@ def scene_controller(
     spec = scene.spec
     if spec.controller is None:
         return None
-    of = spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources
     with scene.sources.prefix_errors():
-        start = {name: x for name, x in spec.initial.q.items() if name in mechanism.coordinates}
-        near = branch(mechanism, start)
-        if not is_chart(near):  # between branches; the start itself is refused
+        q = {name: x for name, x in spec.initial.q.items() if name in mechanism.coordinates}
+        near = find_branch(mechanism, q)
+        if not is_chart(near):  # The start itself is refused later, with a better message.
             near = mechanism.assembled
-        return make_controller(*of, near, load_model)
+        return make_controller(
+            spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, near, load_model
+        )
 
 
-def scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
-    """Return how a scene's controller, or who stands in for it, moves the motors."""
+def build_scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
+    """Return how motors with a scene's torque limits and allocation produce u."""
     spec = scene.spec.controller
     allocation = spec.allocation if isinstance(spec, FeedbackSpec) else None
     with scene.sources.prefix_errors():
         return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
 
 
-def in_samples(
+def apply_sampling(
     scene: Scene, controller: SetPoint | Tracking | RecordedTorques | None
 ) -> SetPoint | Tracking | RecordedTorques | Sampled | None:
-    """Return a scene's controller on the clock that the scene gives it, if it does."""
+    """Return a scene's controller with the scene's sample time, delay, sensors and drives, if it is sampled."""
     spec = scene.spec.controller
     if controller is None or not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
         return controller

@@ -1,4 +1,4 @@
-"""The scene file, `NAME.scene.toml`, as a typed structure; its `[controller]` is in `control.spec`."""
+"""Typed structures of a scene file, `NAME.scene.toml`; its table `[controller]` is in `control.spec`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ckc_pin.base.toml import FileStruct
 from ckc_pin.control.spec import ControllerSpec
 from ckc_pin.mechanism.library import GeneratorSpec
 from ckc_pin.mechanism.spec import Vector3
@@ -14,32 +15,29 @@ __all__ = ["EventSpec", "InitialSpec", "Method", "SceneSpec", "SolverSpec", "Ter
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers replace anything finer
+Tolerance = Annotated[float, msgspec.Meta(ge=2.3e-14, lt=1)]  # SciPy's solvers raise smaller values to about this
 
 Method = Literal["auto", "DOP853", "RK45", "Radau"]
 TermsOf = Literal["auto", "pinocchio", "generated"]
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class InitialSpec(_Spec, frozen=True):
-    """Where a run starts: at q, at the stable equilibrium reached from q_guess, or as assembled from q_guess.
+class InitialSpec(FileStruct, frozen=True):
+    """Initial state of a run: at q, at the stable equilibrium reached from q_guess, or as assembled from q_guess.
 
     Attributes
     ----------
     at
-        In the place of ``q``: the stable equilibrium reached from ``q_guess``, or as assembled from it.
+        Instead of ``q``: ``"equilibrium"``, the stable equilibrium reached from ``q_guess``, or ``"assembled"``, the
+        configuration assembled from ``q_guess``.
         ``at = "equilibrium"``
     q : rad, m
-        The independent coordinates; dependent ones may be added to pick the branch.
+        Values of the independent coordinates. Dependent ones may be added to select the assembly branch.
         ``q = {theta_1 = -1.2, theta_3 = -1.9}``
     q_dot : rad/s, m/s
-        The independent rates; 0 for what is not named. Of a free root velocity and angular velocity in its own axes.
+        Rates of the independent coordinates; default 0. A free root has velocity and angular velocity in its own axes.
         ``q_dot = {theta_1 = 0.4}``
     w : m, rad
-        φ at the start, of the SPF alone; absent: 0.
+        Initial residual φ of the loop closures, by row; SPF only; default 0.
         ``w = [0.01, -0.006]``
     """
 
@@ -49,45 +47,45 @@ class InitialSpec(_Spec, frozen=True):
     w: list[float] | None = None
 
 
-class SolverSpec(_Spec, frozen=True):
-    """How a run is integrated.
+class SolverSpec(FileStruct, frozen=True):
+    """Integration method, tolerances, budgets and output of a run.
 
     Attributes
     ----------
     method
-        ``auto``: DOP853, RK45 for segments that are short for it, Radau IIA where the motion is stiff.
+        Integration method. ``auto`` selects DOP853, RK45 for short segments, and Radau IIA where the motion is stiff.
         ``method = "Radau"``
     rtol
         Relative tolerance of a step (see "how errors are controlled").
         ``rtol = 1e-10``
     atol
-        Absolute tolerance; absent: rtol / 100.
+        Absolute tolerance; default rtol / 100.
         ``atol = 1e-12``
     max_step : s
-        No longer steps.
+        Largest step size; default unlimited.
         ``max_step = 0.01``
     min_step : s
-        A step below it stops the run, exit code 3.
+        The run stops with exit code 3 if a step becomes smaller.
         ``min_step = 1e-9``
     max_rhs
-        So many right-hand sides, then the run stops; absent: where the rest would take more than 1e9.
+        The run stops after this many right-hand sides. By default it stops if the rest would take more than 1e9.
         ``max_rhs = 100000``
     max_wall_s : s
-        So much time of the clock, then the run stops.
+        The run stops after this much wall-clock time; default unlimited.
         ``max_wall_s = 60.0``
     output_dt : s
-        Between output instants; absent: 501 instants, both ends among them.
+        Interval between output instants; by default there are 501 instants including both ends.
         ``output_dt = 0.01``
     projection
-        Of the DAE: back onto φ = 0 and φ̇ = 0 after each step.
+        Project the DAE's state onto φ = 0 and φ̇ = 0 after each step.
         ``projection = false``
     terms
-        Whose D', C', h', φ, J: Pinocchio's, or those written out and compiled for the mechanism; ``auto``
-        takes the latter where ``ckc compile`` has left them, and compiles them itself once a run has evaluated
-        2,000,000 right-hand sides with half of its time or more still ahead: a short run never waits.
+        Source of D', C', h', φ and J: Pinocchio, or terms compiled for the mechanism. ``auto`` uses compiled terms if
+        ``ckc compile`` has made them. It compiles them itself after 2,000,000 right-hand sides if half of the run or
+        more remains, so short runs never wait.
         ``terms = "pinocchio"``
     baumgarte : 1/s
-        α and β, of a DAE with ``projection = false``.
+        Baumgarte gains α and β of a DAE with ``projection = false``.
         ``baumgarte = [50.0, 50.0]``
     """
 
@@ -104,25 +102,26 @@ class SolverSpec(_Spec, frozen=True):
     baumgarte: tuple[NonNegative, NonNegative] | None = None
 
 
-class EventSpec(_Spec, frozen=True):
-    """A coordinate or its rate crossing a value, a joint limit passed, or a singularity margin crossing a value.
+class EventSpec(FileStruct, frozen=True):
+    """An event: a coordinate, its rate or a smallest singular value crosses a value, or a joint passes its limit.
 
     Attributes
     ----------
     coordinate
-        Whose; a margin has none, and a limit without it means every coordinate's.
+        The coordinate. With ``of = "limit"``, all coordinates by default. Singular values have none.
         ``coordinate = "theta_1"``
     of
-        A coordinate, its rate, its limits in the URDF, or how near φ_z or J is to singular.
+        The monitored quantity: a coordinate, its rate, its limits in the URDF, or the smallest singular value of φ_z
+        or J.
         ``of = "q_dot"``
-    value : of what crosses
-        Absent: 0; a margin needs one greater than 0, a limit has none.
+    value : unit of the quantity
+        The value to cross; default 0. Singular values need one greater than 0; limits have none.
         ``value = 0.5``
     direction
-        -1 falling, 1 rising, 0 both.
+        1: rising only; -1: falling only; 0: both.
         ``direction = -1``
     stop
-        End the run there.
+        Whether the event ends the run.
         ``stop = true``
     """
 
@@ -133,47 +132,47 @@ class EventSpec(_Spec, frozen=True):
     stop: bool = False
 
 
-class SceneSpec(_Spec, frozen=True):
-    """The whole file.
+class SceneSpec(FileStruct, frozen=True):
+    """A scene file: mechanism, formulation, start, solver, controller and events of a run.
 
     Attributes
     ----------
     mechanism
-        The mechanism's file, beside the scene; or a table ``{generator, N}``.
+        The mechanism's file, relative to the scene, or a table ``{generator, N}``.
         ``mechanism = "mechanism.toml"``
     formulation
         ``dae``: eq. 1, projected; ``reduced``: eq. 6; ``spf``: the singular perturbation formulation, eqs. 8 and 17.
         ``formulation = "reduced"``
     t_end : s
-        How long.
+        End time.
         ``t_end = 9.5``
     epsilon : s
         ε of the SPF.
         ``epsilon = 1e-4``
     spf_coordinates
-        Eq. 17, exact in w, or eq. 8 as printed, in z.
+        Coordinates of the SPF: eq. 17, exact in w, or eq. 8 as printed, in z.
         ``spf_coordinates = "z"``
     coriolis_velocity
-        The velocity in C off the manifold: ρ q̇ (eq. 8) or the actual one (eq. 16), for plant and
-        controller.
+        Velocity in C off the manifold, for plant and controller: ρ q̇ (eq. 8) or the actual velocity (eq. 16).
         ``coriolis_velocity = "actual"``
     friction_smoothing : rad/s, m/s
-        Dry friction grows as tanh over such a rate, instead of joints that stick; its work is not in `dissipated`.
+        Smooth dry friction, friction * tanh(rate / friction_smoothing), instead of joints that stick. Its work is not
+        in `dissipated`.
         ``friction_smoothing = 1e-3``
     parameters : as in the files
-        Numbers of the mechanism that are other ones, by name (see "parameters").
+        Other values of the mechanism's parameters, by name (see "parameters").
         ``parameters = {"link.link_2.mass" = 0.3}``
     initial
-        Where it starts.
+        Initial state.
         ``initial = {at = "equilibrium"}``
     solver
-        How it is integrated.
+        Integration method, tolerances, budgets and output.
         ``solver = {rtol = 1e-10}``
     controller
-        Absent: u = 0.
+        Controller; default u = 0.
         ``controller = {type = "torques", file = "torques.csv"}``
     event
-        What is recorded, or ends the run, where it crosses a value.
+        Events that are recorded, or that end the run.
         ``event = [{of = "limit", stop = true}]``
     """
 

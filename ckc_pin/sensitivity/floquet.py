@@ -24,7 +24,7 @@ from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import Progress, simulate
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
 from ckc_pin.sensitivity.parameters import derivatives_of
 from ckc_pin.sensitivity.sensitivities import sensitivities
@@ -162,7 +162,7 @@ def floquet(
     period = _require_period(period)
     base = as_scene(scene, overrides, "floquet")
     scene = make_scene(apply_overrides(base.to_dict(), {"t_end": period}), base.name, base.sources)
-    mechanism = scene_mechanism(scene)
+    mechanism = load_scene_mechanism(scene)
     if root := mechanism.independent_root_coordinates:
         raise InputError(
             f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, whose rotation has no "
@@ -170,7 +170,7 @@ def floquet(
         )
     if isinstance(scene.spec.controller, FeedbackSpec) and scene.spec.controller.sample_time is not None:
         _require_whole_samples(scene.spec.controller, scene.spec.controller.sample_time, period, scene.name)
-    if (drive := _find_drive(scene_controller(scene, mechanism), mechanism)) is not None:
+    if (drive := _find_drive(build_scene_controller(scene, mechanism), mechanism)) is not None:
         _require_periodic_drive(drive, period)
     if scene.spec.initial.at is not None:
         scene = _start_from_coordinates(scene, mechanism)

@@ -40,10 +40,10 @@ from ckc_pin.mechanism.parameters import (
     with_components,
 )
 from ckc_pin.native.variation import Effect, SensitivityParameter, directions_of, variation_table
-from ckc_pin.run.compiled_terms import changing_library
+from ckc_pin.run.compiled_terms import select_derivative_library
 from ckc_pin.run.prepare import DerivativeSetup, ParameterDerivatives
 from ckc_pin.scene.initial import Start
-from ckc_pin.scene.parts import changed_mechanism
+from ckc_pin.scene.parts import rebuild_scene_mechanism
 from ckc_pin.scene.scene import Scene
 from ckc_pin.sensitivity.effects import effects_of
 
@@ -65,7 +65,7 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
         actuation: Actuation,
         start: Start,
     ) -> ParameterDerivatives:
-        given, changed = scene.spec.parameters, partial(changed_mechanism, scene)
+        given, changed = scene.spec.parameters, partial(rebuild_scene_mechanism, scene)
         law = controller.controller if isinstance(controller, Sampled) else controller
         parameters = find_sensitivity_parameters(mechanism, scene, law, actuation, names, changed, start.at.q_tree)
         require_known_motion(mechanism, scene, controller, parameters)
@@ -73,7 +73,7 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
         if scene.spec.initial.at == "assembled":
             parameters = [at_assembled_stop(mechanism, given, x, changed) for x in parameters]
         arguments, directions = directions_of(mechanism, parameters) or (None, None)
-        library = changing_library(mechanism, scene.spec.solver.terms, arguments)
+        library = select_derivative_library(mechanism, scene.spec.solver.terms, arguments)
         table = variation_table(
             mechanism, parameters, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=compensated_at(mechanism, law), controlled=controller is not None,

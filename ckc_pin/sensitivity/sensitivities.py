@@ -19,11 +19,11 @@ from ckc_pin.control.controllers import ControlLaw, Controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.native.variation import SensitivityParameter
+from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.events import Event
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run
-from ckc_pin.run.simulate import Progress, run_of, run_rows
-from ckc_pin.run.units import key_unit, per
+from ckc_pin.run.simulate import Progress, build_run, record_rows
 from ckc_pin.scene.scene import Scene, as_scene
 from ckc_pin.sensitivity.moved_points import moved_points
 from ckc_pin.sensitivity.parameters import derivatives_of
@@ -212,14 +212,14 @@ def sensitivities(
     ready = prepare(scene, controller, events, derivatives=derivatives_of(tuple(parameters)))
     started = perf_counter()
     try:
-        rows, status, message = run_rows(ready, progress)
+        rows, status, message = record_rows(ready, progress)
     except NumericalError as error:
         if (apart := _apart(ready)) is None:
             raise
         raise NumericalError(f"sensitivities: {apart}", t=0.0) from error
     message = _apart(ready) or message
     _refuse_terms(ready)
-    run = run_of(ready, rows, status, message, perf_counter() - started)
+    run = build_run(ready, rows, status=status, message=message, wall_s=perf_counter() - started)
     run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
     q_tree, v_tree, u, tau = _parts(ready, rows)
     if np.isnan(q_tree[0]).any():
@@ -334,9 +334,11 @@ def sensitivities_summary(found: Sensitivities) -> Summary:
         unit = key_unit(run.mechanism, name)
         most = [np.abs(found.q_tree[:, j, k]).max() for j in at]
         most += [np.linalg.norm(moved[:, :, k], axis=1).max() for moved in found.points.values()]
-        rows.append((f"by {name}", format_quantities(names, np.array(most), [per(one, unit) for one in units], 4)))
+        rows.append(
+            (f"by {name}", format_quantities(names, np.array(most), [derivative_unit(one, unit) for one in units], 4))
+        )
     if found.end_time is not None:
-        shown = [f"{x:.4g} {per('s', key_unit(run.mechanism, name))}" for name, x in
+        shown = [f"{x:.4g} {derivative_unit('s', key_unit(run.mechanism, name))}" for name, x in
                  zip(found.parameters, found.end_time.tolist(), strict=True)]  # fmt: skip
         rows.append(("the end comes later by", shown))
     said = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"

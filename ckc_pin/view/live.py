@@ -19,7 +19,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import Scene
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.commands import Command
@@ -76,7 +76,7 @@ class LiveView:
 
     def __init__(self, scene: Scene, speed: float | None, port: int = 0) -> None:
         # The view needs its own mechanism, because a mechanism must not be used by two threads.
-        self.mechanism = scene_mechanism(scene)
+        self.mechanism = load_scene_mechanism(scene)
         self.t_end, self.speed = scene.spec.t_end, speed
         drawing = _draw_mechanism(self.mechanism)
         self.server = start_server(scene.name, [], port)

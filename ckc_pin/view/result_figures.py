@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.mechanism.units import joined, motor_units
+from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.motion_forces import MotionForces
-from ckc_pin.run.units import key_unit, per
 from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view import style
 from ckc_pin.view.layout import add_note, create_page, fit_legend, legend_line, write_figure
@@ -149,7 +149,7 @@ def draw_sensitivities(sensitivities: Sensitivities) -> Figure:
                         label=coordinate_symbol(name))  # fmt: skip
             ax.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
             parameter_unit = key_unit(run.mechanism, parameter)
-            unit = joined(per(run.mechanism.tree.units()[k], parameter_unit) for k in columns)
+            unit = joined(derivative_unit(run.mechanism.tree.units()[k], parameter_unit) for k in columns)
             ax.set(title=f"by {escape_mathtext(parameter)}", ylabel=axis_label(r"$\partial q / \partial p$", unit))
         if len(run.independent) <= MAX_LEGEND_CURVES:
             fit_legend(figure, axes[0].get_legend_handles_labels()[0])

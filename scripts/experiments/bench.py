@@ -21,8 +21,8 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.simulate import run_prepared
-from ckc_pin.scene.parts import scene_controller
-from ckc_pin.scene.scene import catalogue
+from ckc_pin.scene.parts import build_scene_controller
+from ckc_pin.scene.scene import list_catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 INERT = [{"coordinate": "theta_1", "value": 50.0}]
@@ -52,7 +52,7 @@ def run_seconds(scene: str, overrides: dict[str, Any] | None = None, times: int 
 def python_calls() -> float:
     """Of all shipped scenes in all their formulations, those that start."""
     total = 0
-    for name, _, scenes in catalogue():
+    for name, _, scenes in list_catalogue():
         for scene in scenes:
             for formulation in FORMULATIONS:
                 run = simulate(f"{name}/{scene}", {"formulation": formulation, "t_end": 0.05})
@@ -70,7 +70,7 @@ class Own:
     """Eq. 14 as a caller would write it, its gains numbers."""
 
     def __init__(self, scene: str) -> None:
-        inner = scene_controller(load_scene(scene), ready(scene).mechanism)
+        inner = build_scene_controller(load_scene(scene), ready(scene).mechanism)
         assert isinstance(inner, SetPoint)
         self.q_d, self.K_P, self.K_V, self.h_d = inner.q_d, inner.K_P[0, 0], inner.K_V[0, 0], inner.target.h
 

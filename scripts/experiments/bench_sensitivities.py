@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from time import process_time
 
-from ckc_pin.run.simulate import run_rows
+from ckc_pin.run.simulate import record_rows
 from ckc_pin.sensitivity.parameters import derivatives_of
 from scripts.experiments.bench import ready
 
@@ -32,7 +32,7 @@ def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[
     for _ in range(TIMES):
         for run, found in zip(runs, seconds, strict=True):
             began = process_time()
-            run_rows(run)
+            record_rows(run)
             found.append(process_time() - began)
     least, rhs = [min(found) for found in seconds], [run.loop.stats()["rhs"] for run in runs]
     return [(a / least[0], b / rhs[0]) for a, b in zip(least[1:], rhs[1:], strict=True)]

@@ -21,7 +21,7 @@ from ckc_pin.codegen.library import Library, compile_terms
 from ckc_pin.codegen.term_functions import TermFunctions
 from ckc_pin.errors import InputError
 from ckc_pin.run.prepare import prepare
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, written
 
@@ -94,7 +94,7 @@ def measure(name: str) -> Size:
     """Write, compile and time one mechanism: a shipped name, a number of squares, or ring_n."""
     with tempfile.TemporaryDirectory() as folder, empty_cache(Path(folder) / "cache"):
         scene = _scene(name, Path(folder))
-        mechanism = scene_mechanism(load_scene(scene))
+        mechanism = load_scene_mechanism(load_scene(scene))
         began = _spent()
         found = TermFunctions.of(mechanism)
         text = found.c_source()

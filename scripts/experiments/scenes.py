@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from ckc_pin import InputError, as_ivp, load, simulate
 from ckc_pin.analysis.precision.motion import FORMULATIONS
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.scene.scene import catalogue
+from ckc_pin.scene.scene import list_catalogue
 
 TIGHT = 1e-11
 ALLOWED = 100  # tolerances of a step: what a run adds up to
@@ -42,7 +42,7 @@ def main() -> int:
     print("| scene | " + " | ".join(FORMULATIONS) + " |\n|---|" + "---|" * len(FORMULATIONS))
     bad = 0
     with one_blas_thread():
-        for name, _, scenes in catalogue():
+        for name, _, scenes in list_catalogue():
             for scene in scenes:
                 cells = []
                 smooth = {"friction_smoothing": SMOOTH} if load(name).joints.friction.any() else {}

@@ -12,7 +12,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.mechanism.library import library
-from ckc_pin.run.recorded_joints import RecordedJoints
+from ckc_pin.run.inverse import RecordedJoints
 from ckc_pin.view import style
 from ckc_pin.view.layout import legend_line, set_panel_title
 from ckc_pin.view.style import figure_style
@@ -55,7 +55,7 @@ def friction() -> Any:
         for row in np.flatnonzero(here):
             terms = run.sel(t=float(run.t[row])).terms
             torques = run.mechanism.motors.transmission.T @ run.tau[row]
-            forces.append(joints(int(row), terms, torques)[k] / max_friction)
+            forces.append(joints.force(int(row), terms, torques)[k] / max_friction)
         label = "events" if smooth is None else f"smoothed over {smooth:g} rad/s"
         rate.plot(run.t[here], run.v_tree[here, k], color=colour, linestyle=dashes, label=label)
         force.plot(run.t[here], forces, color=colour, linestyle=dashes)

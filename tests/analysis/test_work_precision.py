@@ -22,7 +22,7 @@ from ckc_pin.analysis.precision.mujoco import load_model
 from ckc_pin.analysis.precision.reference import Reference, find_confirmed_span, find_reference
 from ckc_pin.cli.arguments import read_overrides
 from ckc_pin.formats.exporting import export
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from tests.analysis.swing_table import START, pendulum, write_table
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
@@ -49,7 +49,7 @@ def reference_of(result: WorkPrecision) -> Reference:
 
 def find_scene_reference(scene: str | Path, overrides: dict[str, Any] | None = None, seconds: float = 3.0) -> Reference:
     loaded = load_scene(scene, overrides)
-    reference = find_reference(loaded, scene_mechanism(loaded), seconds)
+    reference = find_reference(loaded, load_scene_mechanism(loaded), seconds)
     assert isinstance(reference, Reference), reference
     return reference
 

@@ -28,7 +28,7 @@ from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import mechanism_file
-from ckc_pin.scene.parts import scene_actuation, scene_controller
+from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller
 from tests.analytic.five_bar import Array
 
 TARGET = {"theta_1": -1.2, "theta_3": -1.9}
@@ -74,7 +74,7 @@ def scene_of(folder: Path, controller: dict[str, Any], **keys: Any) -> Scene:
 
 
 def set_point(scene: Scene, mechanism: Mechanism) -> SetPoint:
-    law = scene_controller(scene, mechanism)
+    law = build_scene_controller(scene, mechanism)
     assert isinstance(law, SetPoint)
     return law
 
@@ -114,7 +114,7 @@ def test_closed_loop_includes_friction_of_sliding_joints(tmp_path: Path) -> None
     mechanism = five_bar_with(tmp_path, SLIDES)
     scene = scene_of(tmp_path, SET_POINT)
     model = linearize(scene, 0.13)
-    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    controller, actuation = set_point(scene, mechanism), build_scene_actuation(scene, mechanism)
     friction = mechanism.joints.friction
     assert not model.locked
     agree(model.closed_loop, closed_by_differences(model, controller, actuation, lambda v: -friction * np.sign(v)))
@@ -125,7 +125,7 @@ def test_a_motor_at_its_limit_does_not_respond(t: float) -> None:
     scene = load_scene("five_bar/set_point", {"controller.torque_limit": {"theta_1": 0.2}})
     mechanism = load("five_bar")
     model = linearize(scene, t)
-    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    controller, actuation = set_point(scene, mechanism), build_scene_actuation(scene, mechanism)
     assert abs(model.tau[0]) == 0.2
     agree(model.closed_loop, closed_by_differences(model, controller, actuation))
 
@@ -133,7 +133,7 @@ def test_a_motor_at_its_limit_does_not_respond(t: float) -> None:
 def test_a_motor_on_several_joints_at_its_limit_does_not_respond(tmp_path: Path) -> None:
     mechanism = five_bar_with(tmp_path, GEARED, motors=True)
     scene = scene_of(tmp_path, SET_POINT)
-    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    controller, actuation = set_point(scene, mechanism), build_scene_actuation(scene, mechanism)
     is_saturated = []
     for t in (0.0, 0.1, 0.3, 0.6):
         model = linearize(scene, t)
@@ -180,7 +180,7 @@ def test_a_note_says_that_limited_motors_cannot_hold_the_target() -> None:
     scene = load_scene("five_bar/set_point", {"controller.torque_limit": {"theta_1": needed / 2}})
     model, mechanism = linearize(scene, "target"), load("five_bar")
     assert any("not in equilibrium" in note for note in model.notes)
-    controller, actuation = set_point(scene, mechanism), scene_actuation(scene, mechanism)
+    controller, actuation = set_point(scene, mechanism), build_scene_actuation(scene, mechanism)
     agree(model.closed_loop, closed_by_differences(model, controller, actuation))
 
 

@@ -15,8 +15,8 @@ from ckc_pin.linear.closed_loop import ClosedLoop
 from ckc_pin.linear.stability import stability
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
-from ckc_pin.scene.scene import scene_names
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import list_scene_names
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step, set_point
 
 TRACKING = ["five_bar/tracking", "stewart/wave", "delta/circle", "two_ur5/lift", "three_rrr/circle"]
@@ -24,7 +24,7 @@ LEAVES = {"five_bar_as_printed/tracking"}  # erratum 3: the motion leaves the wo
 CONTROLLED = [
     name
     for mechanism in shipped()
-    for scene in scene_names(mechanism)
+    for scene in list_scene_names(mechanism)
     if load_scene(name := f"{mechanism}/{scene}").spec.controller is not None and name not in LEAVES
 ]
 MIN_TIME_CONSTANTS = 4  # duration of a shipped scene, in time constants of the slowest decay: errors fall to 2 %
@@ -32,8 +32,8 @@ MIN_TIME_CONSTANTS = 4  # duration of a shipped scene, in time constants of the 
 
 def load_controlled(name: str, overrides: dict[str, Any] | None = None) -> tuple[Mechanism, Any]:
     scene = load_scene(name, overrides)
-    mechanism = scene_mechanism(scene)
-    return mechanism, scene_controller(scene, mechanism)
+    mechanism = load_scene_mechanism(scene)
+    return mechanism, build_scene_controller(scene, mechanism)
 
 
 def state_of(mechanism: Mechanism, law: Tracking, t: float, off: float) -> Terms:
@@ -233,8 +233,8 @@ def test_check_reports_the_least_gain_of_an_unstable_set_point() -> None:
 def test_a_set_point_with_another_model_is_stable_off_its_target(tmp_path: Any) -> None:
     """The model's gravity is not the plant's. The loop is linearized about its position of rest, not its target."""
     scene = load_scene("five_bar/set_point", {"controller.model": "five_bar_as_printed"})
-    mechanism = scene_mechanism(scene)
-    law = scene_controller(scene, mechanism)
+    mechanism = load_scene_mechanism(scene)
+    law = build_scene_controller(scene, mechanism)
     assert isinstance(law, SetPoint)
     result = stability(mechanism, law, 5.0)
     assert result.stable

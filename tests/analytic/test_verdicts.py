@@ -14,7 +14,7 @@ from ckc_pin.control.controllers import Tracking
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import assembly_branches, sigma
 from ckc_pin.mechanism.library import library
-from ckc_pin.scene.parts import scene_controller
+from ckc_pin.scene.parts import build_scene_controller
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.analytic.test_stability import waves
 from tests.analytic.test_workspace import EDGE
@@ -72,7 +72,7 @@ def test_tracking_is_linearized_on_the_assembly_branch_of_the_start() -> None:
     mechanism = load("five_bar")
     other = mechanism.tree.named(mechanism.tree.to_coordinates(assembly_branches(mechanism)[1].q_tree))
     scene = load_scene("five_bar/tracking", waves(2.0) | {"initial": {"q": other}, "controller.K_D": 0.1})
-    law = scene_controller(scene, mechanism)
+    law = build_scene_controller(scene, mechanism)
     assert isinstance(law, Tracking)
     q_d, q_d_dot, _ = law.desired(0.0)
     there = mechanism.kinematics(mechanism.tree.from_coordinates(np.array([other[x] for x in mechanism.coordinates])))
@@ -185,7 +185,7 @@ def test_stability_of_a_scene_that_cannot_run_is_unknown(tmp_path: Path) -> None
 def start_on_motion(overrides: dict[str, Any], t_end: float) -> tuple[dict[str, Any], Tracking]:
     """Tracking of the five-bar that starts on its desired motion."""
     scene = load_scene("five_bar/tracking", overrides)
-    law = scene_controller(scene, load("five_bar"))
+    law = build_scene_controller(scene, load("five_bar"))
     assert isinstance(law, Tracking)
     q, q_dot, _ = (dict(zip(NAMES, x.tolist(), strict=True)) for x in law.desired(0.0))
     exact = {"formulation": "reduced", "solver.rtol": 1e-10, "t_end": t_end}

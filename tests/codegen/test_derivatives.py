@@ -19,7 +19,7 @@ from ckc_pin.mechanism.library import shipped
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.native.plant import Plant
 from ckc_pin.run.prepare import prepare
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 
 TOLERANCE = 1e-11  # relative
@@ -79,7 +79,7 @@ def test_baumgartes_terms_enter_the_jacobian_on_the_manifold(speed: float) -> No
     overrides = {"formulation": "dae", "solver.baumgarte": [5.0, 0.0], "solver.projection": False}
     scene = load_scene("five_bar/swing", {**overrides, "solver.terms": "pinocchio"})
     jacobians = []
-    for library in (compile_terms(scene_mechanism(scene)), None):
+    for library in (compile_terms(load_scene_mechanism(scene)), None):
         ready = prepare(scene, library=library)
         ready.begin()
         y = ready.loop.y.copy()

@@ -15,7 +15,7 @@ from ckc_pin import InputError, check, load, load_scene, simulate
 from ckc_pin.codegen import library
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.simulate import run_prepared
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from scripts.experiments.benchmark.growth import Case, written
 from scripts.experiments.generated_sizes import ring
 from tests.contract.helpers.command import ckc
@@ -197,7 +197,7 @@ def test_size_limit_depends_on_the_lengths_of_branches(folder: Path, tmp_path: P
     with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
         library.compile_terms(ring_41)
     squares = load_scene("n_four_bar", {"mechanism.N": 64})
-    assert not library.explain_too_large(scene_mechanism(squares))  # 129 coordinates
+    assert not library.explain_too_large(load_scene_mechanism(squares))  # 129 coordinates
     with pytest.raises(InputError, match="41 coordinates, which move 861 joints"):
         simulate(tmp_path / "ring.scene.toml", {"solver.terms": "generated", "t_end": 0.01})
 

@@ -45,7 +45,7 @@ CASES = [
     Bad(
         "folder without scene",
         ["run", "empty"],
-        ["empty: no scene, *.scene.toml, says what to run"],
+        ["empty: it contains no scene, *.scene.toml"],
         files=EMPTY,
     ),
     Bad(
@@ -57,7 +57,7 @@ CASES = [
     Bad(
         "folder as scene file",
         ["run", "own.scene.toml"],
-        ["own.scene.toml: no scene, "],
+        ["own.scene.toml: it contains no scene, "],
         files={"own.scene.toml/x": ""},
     ),
     Bad("URDF as scene", ["run", "bar/five_bar.urdf"], ["malformed TOML", "line 1", "named in a mechanism.toml"]),
@@ -115,7 +115,7 @@ CASES = [
         [
             "singular: theta_1, theta_3 do not determine theta_2, theta_4",
             "start elsewhere",
-            "theta_3, theta_4 would do",
+            "for example theta_3, theta_4",
         ],
         code=STOPPED,
     ),

@@ -92,7 +92,9 @@ START = [
     _value("initial.w=[0.1, 0.1]", "initial.w: only the SPF can start off phi = 0, not 'dae'"),
     Bad("w of the reduced", _set("initial.w=[0.1, 0.1]", "formulation=reduced"), ["initial.w", "not 'reduced'"]),
     Bad(
-        "w too short", _set("initial.w=[0.1]", "formulation=spf"), ["initial.w: 1 numbers", "2 rows: elbow.x, elbow.y"]
+        "w too short",
+        _set("initial.w=[0.1]", "formulation=spf"),
+        ["initial.w: got 1 numbers", "2 rows: elbow.x, elbow.y"],
     ),
     Bad("w that is a number", _set("initial.w=0.1", "formulation=spf"), ["initial.w = 0.1: expected a list"]),
     Bad("w with nan", _set("initial.w=[nan, 0.1]", "formulation=spf"), [f"initial.w[0] = nan: {FINITE}"]),

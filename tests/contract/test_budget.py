@@ -15,7 +15,7 @@ import pytest
 
 from ckc_pin import InputError, Run, Terms, load_scene, simulate
 from ckc_pin.cli.signals import Interrupts
-from ckc_pin.run.run_file import MAX_BYTES, MAX_META
+from ckc_pin.run.run_file import MAX_BYTES, MAX_META_BYTES
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 from tests.contract.helpers.under_way import under_way
@@ -55,7 +55,7 @@ def test_min_step_ends_a_run_that_needs_shorter_ones() -> None:
     overrides = {"formulation": "reduced", "solver.min_step": 1e-4}
     run = simulate("five_bar/swing", overrides, controller=Push())
     assert run.status == "stopped"
-    assert "the step fell below min_step = 0.0001 s" in run.message
+    assert "the step size fell below min_step = 0.0001 s" in run.message
     assert 0.2 < run.t[-1] < 0.25
 
 
@@ -193,11 +193,11 @@ BOMBS: dict[str, tuple[dict[str, bytes], str]] = {
         {name: _header(GIGABYTE) for name in ("u", "tau", "w", "phi")},
         "bytes when expanded; a run has at",
     ),
-    "zeros that deflate well": ({"meta": bytes(MAX_META + 1)}, "damaged"),
-    "a long meta": ({"meta": _header((MAX_META + 1,), "|u1")}, f"a run has at most {MAX_META}"),
+    "zeros that deflate well": ({"meta": bytes(MAX_META_BYTES + 1)}, "damaged"),
+    "a long meta": ({"meta": _header((MAX_META_BYTES + 1,), "|u1")}, f"a run has at most {MAX_META_BYTES}"),
     "long names": ({"coordinates": _header((10**6,), "<U10000")}, "bytes; a run has at most"),
-    "a later header": ({"t": _header((11,), version=2)}, "t.npy has a header that a run does not need"),
-    "Python objects": ({"t": _header((11,), "|O")}, "t.npy holds Python objects"),
+    "a later header": ({"t": _header((11,), version=2)}, "t.npy has an array header of an unsupported version"),
+    "Python objects": ({"t": _header((11,), "|O")}, "t.npy contains Python objects"),
 }
 
 
@@ -232,14 +232,14 @@ def test_bombs_are_not_expanded(
 def test_an_entry_twice_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="Duplicate name"):
         path = _zip(tmp_path / "run.npz", [*whole.items(), ("t.npy", whole["t.npy"])])
-    with pytest.raises(InputError, match="not a run file: it holds"):
+    with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 
 def test_an_entry_that_is_no_array_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
     rename: Callable[[str], str] = lambda name: "t" if name == "t.npy" else name  # noqa: E731
     path = _zip(tmp_path / "run.npz", [(rename(name), data) for name, data in whole.items()])
-    with pytest.raises(InputError, match="not a run file: it holds"):
+    with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 

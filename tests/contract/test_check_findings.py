@@ -220,7 +220,7 @@ def test_a_start_outside_joint_limits_is_named(bar: Path) -> None:
     assert warnings("bar") == []
     assert warnings("bar/swing.scene.toml") == [
         "bar/swing.scene.toml: initial: theta_1 = -0.934309 is beyond its stops, -1.5 to -1.2; give another initial.q, "
-        "or a q_guess within them"
+        "or a q_guess within the stops"
     ]
     edit(bar / "five_bar.urdf", ('lower="-1.5" upper="-1.2"', 'lower="-1" upper="-0.5"'))
     edit(bar / "mechanism.toml", ("stops = true", "stops = false"))  # limits alone do not say where it is assembled

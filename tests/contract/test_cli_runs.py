@@ -228,7 +228,7 @@ def test_numpy_values_change_a_scene_like_pythons() -> None:
 def test_a_scene_is_complete() -> None:
     scene = load_scene("five_bar/swing", {"t_end": 0.01})
     assert simulate(scene).t[-1] == 0.01
-    with pytest.raises(InputError, match="overrides go with the name of a scene"):
+    with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):
         simulate(scene, {"t_end": 1.0})
 
 

@@ -15,7 +15,7 @@ from tests.contract.helpers.bad import Bad, expect
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ((3,), "Event: 3 is no function"),
+        ((3,), "Event: function must be a function"),
         ((max, 2), "direction = 2; valid: -1, 0, 1"),
         ((max, True), "direction = True"),
         ((max, 0, 1), "stop = 1: expected True or False"),
@@ -62,9 +62,12 @@ SCENE = ("run", "bar/swing.scene.toml", "--set")
 BAD = [
     ("{}", "event[0]: the key 'coordinate' is missing; of = 'q' needs one"),
     ('{of="q_dot"}', "event[0]: the key 'coordinate' is missing; of = 'q_dot' needs one"),
-    ('{of="limit", value=1.0}', "event[0]: of = 'limit' has no key 'value'; the limits are those of the URDF"),
+    ('{of="limit", value=1.0}', "event[0]: of = 'limit' takes the limits of the URDF; remove the key 'value'"),
     ('{of="limit"}', "event[0]: no joint of five_bar has limits in its URDF"),
-    ('{of="sigma_min_J", coordinate="theta_1", value=1.0}', "event[0]: of = 'sigma_min_J' has no key 'coordinate'"),
+    (
+        '{of="sigma_min_J", coordinate="theta_1", value=1.0}',
+        "event[0]: of = 'sigma_min_J' belongs to the whole",
+    ),
     ('{of="sigma_min_phi_z"}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
     ('{of="sigma_min_phi_z", value=-1.0}', "event[0]: of = 'sigma_min_phi_z' needs a value greater than 0"),
     ('{coordinate="x", of="limit"}', "event[0].coordinate: no coordinate 'x'; there are theta_1, theta_2"),

@@ -168,7 +168,7 @@ def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> No
     answer = ckc("run", "mine/own", "--set", f"initial.q.{other}=1.2")
     assert answer.code == 2
     assert answer.err.startswith(f"error: mine/own: initial.q: {chosen} missing; expected {chosen}, which were chosen")
-    assert "because mine/mechanism.toml does not: independent = [...] there says" in answer.err
+    assert "because mine/mechanism.toml has no key independent; set independent = [...] there" in answer.err
 
 
 def test_what_comes_next_can_be_typed_as_it_stands(tmp_path: Path) -> None:
@@ -202,9 +202,9 @@ def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch)
     (mine / "drop.scene.toml").unlink()
     none = ckc("run", "mine")
     assert none.code == 2
-    assert "mine: no scene, *.scene.toml, says what to run; ckc new NAME makes a folder with one" in none.err
+    assert "mine: it contains no scene, *.scene.toml; ckc new NAME makes a folder with an example" in none.err
     simulate("five_bar/swing", {"t_end": 0.01}).save(mine / "run.npz")
-    assert "mine: the folder of a run, which is over; ckc play, plot and inverse take it" in ckc("run", "mine").err
+    assert "mine: a finished run, not a scene; ckc play, plot and inverse accept this folder" in ckc("run", "mine").err
 
 
 # --- what is drawn, what is kept ---------------------------------------------------------------------

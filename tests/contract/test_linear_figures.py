@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, Mechanism, Tracking, gain_locus, linearize, load, load_scene, plot, terms
-from ckc_pin.scene.parts import scene_controller
+from ckc_pin.scene.parts import build_scene_controller
 
 
 def test_a_locus_without_imaginary_parts_shows_no_rounding() -> None:
@@ -31,7 +31,7 @@ def _by_hand() -> np.ndarray:
     """Eigenvalues of tracking at its start: those of D r_dot = -(C + K_D) r and of e_dot = r - Lambda e."""
     scene = load_scene("five_bar/tracking")
     mechanism = load("five_bar")
-    law = scene_controller(scene, mechanism)
+    law = build_scene_controller(scene, mechanism)
     assert isinstance(law, Tracking)
     q, q_dot, _ = law.desired(0.0)
     at = terms(mechanism, dict(zip(mechanism.independent, q, strict=True)),

@@ -96,9 +96,12 @@ def test_names_are_never_broken_and_have_units(monkeypatch: pytest.MonkeyPatch) 
 def test_a_coordinate_and_an_array_by_name(swing: Run) -> None:
     assert np.array_equal(swing["theta_3"], swing.q_tree[:, 2])
     assert swing["energy"] is swing.energy
-    with pytest.raises(InputError, match=r"run\['theta_9'\]: there are the coordinates theta_1, .*, and the arrays t"):
+    with pytest.raises(
+        InputError,
+        match=r"run\['theta_9'\]: no such .* the coordinates theta_1, .*, and the arrays t",
+    ):
         swing["theta_9"]
-    with pytest.raises(InputError, match=r"run\[3\]: there are"):
+    with pytest.raises(InputError, match=r"run\[3\]: no such coordinate"):
         swing[3]  # type: ignore[index]
 
 

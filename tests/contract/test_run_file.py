@@ -222,9 +222,9 @@ TAMPERED: dict[str, tuple[Callable[[Contents], None], str]] = {
     "wrong type": (_meta(stats=3), "damaged"),
     "unknown status": (_meta(status="fine"), "damaged"),
     "meta that is not JSON": (_array("meta", np.zeros(8, dtype=np.uint8)), "damaged"),
-    "missing array": (_without("q_tree"), "not a run file: it holds coordinates, energy"),
-    "unknown array": (_array("extra", np.zeros(3)), "not a run file: it holds"),
-    "too few rows": (_array("u", np.zeros((3, 2))), "u is (3, 2) float64, which does not fit the rest"),
+    "missing array": (_without("q_tree"), "not a run file: it contains coordinates, energy"),
+    "unknown array": (_array("extra", np.zeros(3)), "not a run file: it contains"),
+    "too few rows": (_array("u", np.zeros((3, 2))), "u is (3, 2) float64, which does not fit the other arrays"),
     "too many columns": (_array("q_tree", np.zeros((11, 5))), "q_tree is (11, 5)"),
     "complex": (_array("energy", np.zeros(11, dtype=complex)), "energy is (11,) complex128"),
     "no rows": (_array("t", np.zeros(0)), "damaged"),
@@ -232,9 +232,9 @@ TAMPERED: dict[str, tuple[Callable[[Contents], None], str]] = {
     "time that stands still": (_array("t", np.zeros(11)), "t does not increase"),
     "a configuration that is no number": (
         _array("q_tree", np.full((11, 4), np.nan)),
-        "q_tree holds numbers that are not",
+        "q_tree contains numbers that are not",
     ),
-    "an endless time": (_array("t", np.append(np.arange(10.0), np.inf)), "t holds numbers that are not finite"),
+    "an endless time": (_array("t", np.append(np.arange(10.0), np.inf)), "t contains numbers that are not finite"),
     "a pickle": (_array("energy", np.array([Payload()] * 11, dtype=object)), "damaged"),
 }
 

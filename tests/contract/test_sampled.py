@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, NumericalError, Sampled, Terms, simulate
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Controller, Q, set_point, tracking
 from tests.conftest import assert_close
@@ -107,7 +107,7 @@ def test_the_continuous_controller_in_the_limit(scene: str) -> None:
 def test_a_sampled_controller_from_python() -> None:
     overrides = {"formulation": "reduced", "t_end": 0.01}
     scene = load_scene("five_bar/tracking")
-    inner = scene_controller(scene, scene_mechanism(scene))
+    inner = build_scene_controller(scene, load_scene_mechanism(scene))
     assert inner is not None
     own = Sampled(inner, 5e-4, 2e-4)
     shipped = simulate("five_bar/tracking", {**overrides, "controller.sample_time": 5e-4, "controller.delay": 2e-4})

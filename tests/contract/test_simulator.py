@@ -205,7 +205,7 @@ def test_steps_over_positions_where_j_loses_rank(dt: float, changing: bool) -> N
         if changing and k % 20 == 0:
             u = 1e-9 * random.standard_normal(1)
         state = simulator.step(u if changing else None, dt)
-    place = simulator.mechanism.point_positions(state._q_tree)["B0"]
+    place = simulator.mechanism.point_positions(state.terms.q_tree)["B0"]
     assert_close(place[:2], np.array(first_top_pin(7, state.t)), 2e-6)
     if not changing:
         plain = simulate("n_four_bar", {"mechanism.N": 7, "formulation": "dae", "t_end": 3.0})
@@ -283,7 +283,7 @@ def test_reset_to_a_table() -> None:
         ({"q": {"theta_9": 1.0}}, "no coordinate 'theta_9'|theta_9"),
         ({"q": {"theta_1": 3.1, "theta_3": 0.0}}, "out of reach"),
         ({"w": [0.1, 0.1], "at": "assembled"}, "only the SPF can start off phi = 0"),
-        (3, "no State and no table"),
+        (3, "expected a State or a table"),
     ],
 )
 def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> None:
@@ -292,7 +292,7 @@ def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> No
     with pytest.raises(InputError, match=says):
         simulator.reset(state)
     assert_same(simulator.state, before)
-    with pytest.raises(InputError, match="reset: a state of four_bar, this is five_bar"):
+    with pytest.raises(InputError, match="reset: the state is of four_bar; this simulator is of five_bar"):
         simulator.reset(Simulator("four_bar").state)
 
 
@@ -325,7 +325,7 @@ def test_a_copy_is_refused_and_what_does_the_same_is_named(copied: Callable[[Sim
     """A copy would share the loop: what one steps, the other would too."""
     simulator, other = Simulator("five_bar/swing", TIGHT), Simulator("five_bar/swing", TIGHT)
     _push_on(simulator, np.array([0.1, 0.2]), 10)
-    with pytest.raises(InputError, match=r"make another of the same scene, .* other\.reset\(simulator\.state\)"):
+    with pytest.raises(InputError, match=r"make another simulator .* other\.reset\(simulator\.state\)"):
         copied(simulator)
     other.reset(simulator.state)
     _push_on(other, np.array([3.0, -3.0]), 3)
@@ -343,5 +343,5 @@ def test_limits_of_torque_hold() -> None:
 def test_a_scene_is_complete() -> None:
     scene = load_scene("five_bar/swing")
     assert Simulator(scene).step(None, 0.01).t == 0.01
-    with pytest.raises(InputError, match="overrides go with the name of a scene"):
+    with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):
         Simulator(scene, {"formulation": "dae"})

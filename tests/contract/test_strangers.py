@@ -113,7 +113,7 @@ def test_one_simulator_in_threads_steps_or_refuses(restless: Any) -> None:
 
     with ThreadPoolExecutor(4) as pool:
         said = list(pool.map(step, range(200)))
-    assert all(text.startswith("step: this simulator is at work") for text in said if text)
+    assert all(text.startswith("step: this simulator is executing another call") for text in said if text)
     assert simulator.state.t == pytest.approx(1e-3 * said.count(""), abs=1e-12)
     simulator.reset()
     assert simulator.step(None, 1e-3).t == 1e-3
@@ -148,7 +148,7 @@ def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
 
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"}, events=[Event(function)])
     armed = True
-    with pytest.raises(InputError, match=f"{what}: this simulator is at work"):
+    with pytest.raises(InputError, match=f"{what}: this simulator is executing another call"):
         simulator.step(None, 1e-3)
     armed = False
     assert simulator.step(None, 1e-3).t > 0
@@ -180,7 +180,7 @@ def test_what_numpy_would_take_for_numbers_is_no_u(u: Any) -> None:
 
 
 def test_an_event_too_large_for_a_number_is_refused() -> None:
-    with pytest.raises(InputError, match=r"the event 'big' gave an integer too large"):
+    with pytest.raises(InputError, match=r"the event 'big' gave an integer that is too large"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: 10**400, name="big")])
 
 

@@ -65,7 +65,7 @@ def set_point() -> SetPoint:
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "simulate a mechanism": (
         lambda: simulate(five_bar()),
-        "a Mechanism was given, .*five_bar/default, five_bar/friction, five_bar/set",
+        "got a Mechanism, .*five_bar/default, five_bar/friction, five_bar/set",
     ),
     "simulate a number": (lambda: simulate(3), "simulate: scene: expected a scene.*, got 3"),
     "simulate a run": (lambda: simulate(run()), "simulate: scene: expected .*, got a Run"),
@@ -170,7 +170,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "over": (lambda: ckc_pin.singularity_map("five_bar", over="theta_1"), r"expected .*\['theta_1'\].*, got 'theta_1'"),
     "a map's scene": (lambda: ckc_pin.singularity_map("five_bar", scene=3), "singularity_map: scene: expected .*got 3"),
     "symbolic": (lambda: ckc_pin.symbolic(3), "symbolic: mechanism: expected .*, got 3"),
-    "as_ivp": (lambda: ckc_pin.as_ivp(five_bar()), "as_ivp: a Mechanism was given"),
+    "as_ivp": (lambda: ckc_pin.as_ivp(five_bar()), "as_ivp: expected a scene.*got a Mechanism"),
     "inverse dynamics": (lambda: ckc_pin.inverse_dynamics(3), "inverse_dynamics: scene: expected .*, got 3"),
     "linearize": (lambda: ckc_pin.linearize(3), "linearize: what: expected a mechanism or a scene.*, got 3"),
     "linearize with words": (lambda: ckc_pin.linearize(SWING, 0.1, "t_end=1"), "linearize: overrides: expected .*"),

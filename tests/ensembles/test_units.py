@@ -12,7 +12,7 @@ import xarray as xr
 
 import ckc_pin
 from ckc_pin.mechanism.parameters import values_of, with_components
-from ckc_pin.run.units import key_unit
+from ckc_pin.run.columns import key_unit
 from ckc_pin.view import ensemble_figures
 from scripts.site import keys
 from tests.ensembles.test_damaged_results import convert_to_format_1

@@ -13,11 +13,11 @@ from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.plant import Plant
-from ckc_pin.scene.scene import catalogue
+from ckc_pin.scene.scene import list_catalogue
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.native.loops import started
 
-SHIPPED = [name for name, *_ in catalogue()]
+SHIPPED = [name for name, *_ in list_catalogue()]
 CLOSED = 1e-6  # of the largest: differences next to a loss of rank say nothing
 
 

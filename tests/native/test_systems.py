@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from ckc_pin.dynamics import Terms, dae_acceleration
-from ckc_pin.scene.parts import scene_mechanism
-from ckc_pin.scene.scene import catalogue, load_scene
+from ckc_pin.scene.parts import load_scene_mechanism
+from ckc_pin.scene.scene import list_catalogue, load_scene
 from tests.native.loops import both, started
 
 FORMULATIONS = [{"formulation": "dae"}, {"formulation": "reduced"}, {"formulation": "spf"}]
 
 
 def _joints(scene):
-    return scene_mechanism(load_scene(scene)).joints
+    return load_scene_mechanism(load_scene(scene)).joints
 
 
-EVERY = [f"{name}/{scene}" for name, _, scenes in catalogue() for scene in scenes]
+EVERY = [f"{name}/{scene}" for name, _, scenes in list_catalogue() for scene in scenes]
 SCENES = [scene for scene in EVERY if not _joints(scene).has_events(0.1)]  # a stop is no function of t and y
 OFF = {"formulation": "spf", "initial.w": [0.01, -0.02], "epsilon": 1e-2}
 SPREAD = 0.02  # rad or m, and their rates, around the start

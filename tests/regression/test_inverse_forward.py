@@ -12,8 +12,8 @@ import ckc_pin
 from ckc_pin import InputError, Mechanism, MotionForces, Terms, inverse_dynamics
 from ckc_pin.control.desired import Table
 from ckc_pin.mechanism.library import shipped
-from ckc_pin.scene.parts import scene_mechanism
-from ckc_pin.scene.scene import scene_names
+from ckc_pin.scene.parts import load_scene_mechanism
+from ckc_pin.scene.scene import list_scene_names
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
@@ -21,7 +21,7 @@ from tests.conftest import assert_close
 CONTROLLED = [
     f"{mechanism}/{scene}"
     for mechanism in shipped()
-    for scene in scene_names(mechanism)
+    for scene in list_scene_names(mechanism)
     if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
 ]
 T_END = {"andrews": 0.01}  # s; open loop, what is off grows by e in 2 ms there, and rounding differs by machine
@@ -106,7 +106,7 @@ def test_shipped_scenes_at_each_instant(scene: str) -> None:
 
 @pytest.mark.parametrize("name", shipped())
 def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
-    overrides = waves(scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
+    overrides = waves(load_scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
     found = inverse_dynamics(name, overrides)
     assert found.status == "done"
     assert_gives_back(found)
@@ -117,7 +117,7 @@ def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
 def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> None:
     """A free root that the loops leave free is held by no motor: refused, by name."""
     scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
-    mechanism = scene_mechanism(ckc_pin.load_scene(scene))
+    mechanism = load_scene_mechanism(ckc_pin.load_scene(scene))
     overrides = waves(mechanism, 0.1)
     if mechanism.splits_root or mechanism.independent_root_coordinates:
         says = (

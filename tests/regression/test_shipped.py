@@ -12,7 +12,7 @@ import pytest
 from ckc_pin import InputError, Mechanism, Run, check, load, simulate
 from ckc_pin.dynamics import Terms, h_gradient, stable_equilibrium
 from ckc_pin.mechanism.library import library, shipped
-from ckc_pin.scene.scene import catalogue, scene_names
+from ckc_pin.scene.scene import list_catalogue, list_scene_names
 
 # coordinates, freedoms, closure rows, rank: what the literature, or counting, says
 MOBILITY = {
@@ -46,7 +46,7 @@ FREE = {
 }
 SLIDER_CRANK = library() / "slider_crank"
 OF_OTHERS = ("talos", "two_ur5")  # links drawn by the robots' own meshes
-SCENES = [f"{name}/{scene}" for name in shipped() for scene in scene_names(name)]
+SCENES = [f"{name}/{scene}" for name in shipped() for scene in list_scene_names(name)]
 
 
 @cache
@@ -74,7 +74,7 @@ def test_nothing_to_warn_about(name: str) -> None:
 
 
 def test_each_says_what_it_is() -> None:
-    for name, about, scenes in catalogue():
+    for name, about, scenes in list_catalogue():
         assert len(about.split()) > 5, name
         assert "default" in scenes, name
         assert all(scenes.values()), name

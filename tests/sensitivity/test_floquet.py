@@ -16,7 +16,7 @@ from scipy.special import mathieu_a
 
 from ckc_pin import InputError, load_scene
 from ckc_pin.control.controllers import Tracking
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.sensitivity.floquet import floquet
 from tests.sensitivity.sliders import sliders
 
@@ -132,7 +132,7 @@ def test_stability_of_a_conservative_motion_is_undecided(rtol: float, late: floa
 def start_on_motion(overrides: dict[str, Any]) -> dict[str, Any]:
     """Tracking of the five-bar that starts on its desired motion."""
     scene = load_scene("five_bar/tracking", overrides)
-    law = scene_controller(scene, scene_mechanism(scene))
+    law = build_scene_controller(scene, load_scene_mechanism(scene))
     assert isinstance(law, Tracking)
     q, q_dot, _ = (dict(zip(("theta_1", "theta_3"), x.tolist(), strict=True)) for x in law.desired(0.0))
     return {**overrides, "initial": {"q": q, "q_dot": q_dot}, "formulation": "reduced", "solver.rtol": 1e-10}

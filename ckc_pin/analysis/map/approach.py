@@ -21,7 +21,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.batch import evaluate_closure
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene
 
 __all__ = ["Wanted", "add_path", "read_wanted"]
@@ -52,10 +52,10 @@ def read_wanted(scene: Scene, mechanism: Mechanism) -> Wanted:
     InputError
         The scene has another mechanism, or no desired trajectory.
     """
-    own = scene_mechanism(scene)
+    own = load_scene_mechanism(scene)
     if own.coordinates != mechanism.coordinates or own.independent != mechanism.independent:
         raise InputError(f"--scene {scene.name}: it is of {own.name}, the map of {mechanism.name}")
-    controller = scene_controller(scene, mechanism)
+    controller = build_scene_controller(scene, mechanism)
     if isinstance(controller, SetPoint):
         target, still = controller.target.q, np.zeros(mechanism.d)
         check = DesiredCheck(None, 0.0, controller.target.at.sigma_min())

@@ -22,7 +22,7 @@ from ckc_pin.kinematics.mapped import Aspect, Axis, Locus, Path, SingularityMap,
 from ckc_pin.kinematics.nodes import find_solutions, nodes_at
 from ckc_pin.mechanism.batch import ManyPoses
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.scene.scene import TAKES, Scene, load_scene
+from ckc_pin.scene.scene import EXPECTED_SCENE, Scene, load_scene
 
 __all__ = ["located", "map_value", "name_of", "singularity_map"]
 
@@ -72,7 +72,7 @@ def singularity_map(
     """
     found = as_mechanism(mechanism, "singularity_map")
     if scene is not None:
-        require_type(scene, (Scene, str, FilePath), "singularity_map: scene", TAKES)
+        require_type(scene, (Scene, str, FilePath), "singularity_map: scene", EXPECTED_SCENE)
     require_type(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
         raise InputError(f"singularity_map: over: expected one or two names, as [{over!r}], got {over!r}")

@@ -27,7 +27,7 @@ from ckc_pin.errors import CkcError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.run.ivp import Ivp, as_ivp
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.scene import Scene, catalogue, load_scene
+from ckc_pin.scene.scene import Scene, list_catalogue, load_scene
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 
@@ -129,7 +129,7 @@ class LeftOut:
 
 def every_scene() -> list[str]:
     """Names of all shipped scenes."""
-    return [f"{name}/{scene}" for name, _, scenes in catalogue() for scene in scenes]
+    return [f"{name}/{scene}" for name, _, scenes in list_catalogue() for scene in scenes]
 
 
 def module_costs(repeats: int = REPEATS, modules: Modules = MODULES) -> Iterator[LeftOut]:

@@ -15,7 +15,7 @@ from joblib import Memory
 
 from ckc_pin.analysis.precision.motion import motion_without_data
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.benchmark import analysis, growth, left_out, ours
 from scripts.experiments.benchmark.figure import draw, draw_growth, draw_main
@@ -205,7 +205,7 @@ def _left_out(works: list[Work], quick: bool, memory: Memory) -> list[LeftOut]:
     for name in scenes:
         try:
             scene = load_scene(name)
-            content = [scene.to_dict(), {**scene_mechanism(scene).sources.texts, **scene.sources.texts}]
+            content = [scene.to_dict(), {**load_scene_mechanism(scene).sources.texts, **scene.sources.texts}]
         except CkcError as error:  # robots that are not installed
             found.append(LeftOut(scene=name, what=left_out.MISSING, reason=str(error)))
         else:

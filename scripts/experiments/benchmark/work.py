@@ -13,7 +13,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.scene.parts import scene_mechanism
+from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["WORKS", "Budget", "Work"]
@@ -70,7 +70,7 @@ class Work:
     @cached_property
     def mechanism(self) -> Mechanism:
         """The mechanism, loaded once."""
-        return scene_mechanism(self.load())
+        return load_scene_mechanism(self.load())
 
     @cached_property
     def terms(self) -> str:

@@ -18,7 +18,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
 from scripts.experiments.pages import said
@@ -128,8 +128,8 @@ def _beyond(excess: Callable[[float], float], inside: float, t_end: float) -> tu
 def tracking(name: str) -> tuple[Mechanism, Desired, float]:
     """Return mechanism, desired trajectory and t_end of a mechanism's tracking scene."""
     scene = load_scene(f"{name}/tracking")
-    mechanism = scene_mechanism(scene)
-    controller = scene_controller(scene, mechanism)
+    mechanism = load_scene_mechanism(scene)
+    controller = build_scene_controller(scene, mechanism)
     if not isinstance(controller, Tracking):
         raise InputError(f"{scene.name}: it has no tracking controller")
     return mechanism, controller.desired, scene.spec.t_end

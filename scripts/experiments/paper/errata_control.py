@@ -14,7 +14,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.run.ivp import LevelSet
-from ckc_pin.scene.parts import scene_controller
+from ckc_pin.scene.parts import build_scene_controller
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.pages import said
 from scripts.experiments.paper.erratum import Erratum
@@ -164,7 +164,7 @@ def _tracking() -> tuple[Problem, Tracking]:
 def _scene(name: str) -> tuple[Problem, object]:
     scene = load_scene(f"{FIVE_BAR}/{name}")
     problem = Problem.of_scene(scene)
-    return problem, scene_controller(scene, problem.mechanism)
+    return problem, build_scene_controller(scene, problem.mechanism)
 
 
 def _reported(reduced: LevelSet, controller: Tracking) -> Callable[[float, Array], float]:

@@ -22,9 +22,9 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, force_of
+from ckc_pin.run.ivp import Dae, Force, Ivp, LevelSet, PrintedSpf, make_force
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import scene_actuation, scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene
 
 __all__ = [
@@ -75,9 +75,9 @@ class Problem:
     @classmethod
     def of_scene(cls, scene: Scene) -> Problem:
         """Take a scene's start and controller; its formulation, solver and w are left aside."""
-        mechanism = scene_mechanism(scene)
+        mechanism = load_scene_mechanism(scene)
         start = find_start(mechanism, scene)
-        force = force_of(scene_controller(scene, mechanism), scene_actuation(scene, mechanism))
+        force = make_force(build_scene_controller(scene, mechanism), build_scene_actuation(scene, mechanism))
         return cls(mechanism, start.at, start.q_dot, force)
 
     def dae(self) -> Dae:

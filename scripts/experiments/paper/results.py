@@ -20,7 +20,7 @@ from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.run.ivp import LevelSet, force_of
+from ckc_pin.run.ivp import LevelSet, make_force
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.pages import said
@@ -82,7 +82,7 @@ def error_law(name: str, own: Mechanism, believed: Mechanism | None = None, rtol
     model = ControllerModel(believed, own, "rho") if believed else None
     controller = Tracking(np.eye(2), 10.0 * np.eye(2), desired, model)
     start = own.kinematics(stable_equilibrium(load(FIVE_BAR)).q_tree)
-    reduced = LevelSet(own, start, np.zeros(2), force_of(controller, Actuation(own)), (0.0, AT))
+    reduced = LevelSet(own, start, np.zeros(2), make_force(controller, Actuation(own)), (0.0, AT))
     u = [0.0]
 
     def note(solver: Any) -> None:

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import Start, find_start
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.certificate.branch_walk import follow, margin
 from scripts.experiments.certificate.certificate import Certificate, certify, level_of, sublevel_set
@@ -79,8 +79,8 @@ def load_case(overrides: Mapping[str, Any] | None = None, scene: str | Path = SC
         The scene has no set-point controller.
     """
     loaded = load_scene(scene, overrides)
-    mechanism = scene_mechanism(loaded)
-    controller = scene_controller(loaded, mechanism)
+    mechanism = load_scene_mechanism(loaded)
+    controller = build_scene_controller(loaded, mechanism)
     if not isinstance(controller, SetPoint):
         raise InputError(f"{loaded.name}: not a scene with set-point control (eq. 14)")
     return Case(mechanism, controller, find_start(mechanism, loaded))

@@ -13,7 +13,7 @@ from ckc_pin.control.controllers import Tracking
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
 from scripts.experiments.paper.deviations import Deviation, Setting, Track, deviation, instants, track
 from scripts.experiments.paper.lyapunov import Record, record
@@ -94,7 +94,7 @@ def _since(run: Run, since: float) -> Run:
 
 
 def _tracking(scene: Scene) -> Tracking:
-    controller = scene_controller(scene, scene_mechanism(scene))
+    controller = build_scene_controller(scene, load_scene_mechanism(scene))
     if not isinstance(controller, Tracking):
         raise InputError(f"{scene.name}: not a scene with tracking control (eq. 16)")
     return controller

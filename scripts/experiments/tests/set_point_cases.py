@@ -14,7 +14,7 @@ from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.scene.initial import Start, find_start
-from ckc_pin.scene.parts import scene_controller, scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array
 
@@ -33,8 +33,8 @@ class Given(NamedTuple):
 def given(overrides: Mapping[str, Any] | None = None) -> Given:
     """The five-bar's set-point scene with values replaced by dotted key."""
     loaded = load_scene("five_bar/set_point", overrides)
-    mechanism = scene_mechanism(loaded)
-    controller = scene_controller(loaded, mechanism)
+    mechanism = load_scene_mechanism(loaded)
+    controller = build_scene_controller(loaded, mechanism)
     assert isinstance(controller, SetPoint)
     return Given(mechanism, controller, find_start(mechanism, loaded))
 
