@@ -1,4 +1,4 @@
-"""How a run changes with parameters, to first order, by the variational equations in the loop."""
+"""Derivatives of a run with respect to parameters, by the variational equations in the step loop."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from ckc_pin.base.validation import require_callable, require_path, require_type
 from ckc_pin.control.controllers import ControlLaw, Controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.pose import Pose
 from ckc_pin.native.variation import SensitivityParameter
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.events import Event
@@ -25,34 +27,33 @@ from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import Progress, build_run, record_rows
 from ckc_pin.scene.scene import Scene, as_scene
-from ckc_pin.sensitivity.moved_points import moved_points
 from ckc_pin.sensitivity.parameters import derivatives_of
 
-__all__ = ["Sensitivities", "sensitivities"]
+__all__ = ["Sensitivities", "compute_point_sensitivities", "sensitivities"]
 
-NAMES = 'a list of names, as ["link.link_2.mass"]'
-RATES = ("q", "q_dot")  # of which an event's time is known to change
+EXPECTED_NAMES = 'a list of names, as ["link.link_2.mass"]'
+DIFFERENTIABLE_EVENTS = ("q", "q_dot")  # quantities whose events have times with a derivative
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities(HasSummary):
-    """A run with its derivatives by parameters, at fixed times.
+    """A run with its derivatives with respect to parameters, at fixed times.
 
     Attributes
     ----------
     run : Run
     parameters : tuple of str
-        Columns; a vector's three components are three.
+        The columns. A vector has three of them.
     q_tree, v_tree : (m, n, p) arrays
-        By output instant, coordinate and parameter: rad, m, rad/s and m/s for the parameter's unit. Of a free root
-        the twist in its own axes, and how the twist's rate changes.
+        By output instant, coordinate and parameter: rad, m, rad/s or m/s for the parameter's unit. A free root has the
+        twist in its own axes, and the derivative of the twist's rate.
     u, tau : (m, d, p) and (m, motors, p) arrays
-        How eq. 6's force and the motors' torques change, as `Run.u` and `Run.tau` have them; NaN where motors that are
-        more than freedoms share a force. Zero without a controller.
+        Derivatives of `Run.u` and `Run.tau`; zero without a controller. `tau` is NaN if the mechanism has more motors
+        than freedoms.
     end_time : (p,) array or None
-        How the time of the event that ended the run changes, s; None where it ended at `t_end`.
+        Derivative of the time of the event that ended the run, s; None if no such event did.
     sensitivity_parameters : tuple of SensitivityParameter
-        What the parameters do.
+        The effects of the parameters.
     """
 
     run: Run
@@ -64,10 +65,6 @@ class Sensitivities(HasSummary):
     end_time: Array | None
     sensitivity_parameters: tuple[SensitivityParameter, ...]
 
-    def summary(self) -> Summary:
-        """Return what there is to see of it."""
-        return sensitivities_summary(self)
-
     @property
     def t(self) -> Array:
         """Output instants, s."""
@@ -75,23 +72,25 @@ class Sensitivities(HasSummary):
 
     @lazy
     def points(self) -> dict[str, Array]:
-        """How the mechanism's points move, (m, 3, p) in world axes: with the coordinates, and with what places them."""
-        return moved_points(self.run.mechanism, self.sensitivity_parameters, self.run.q_tree, self.q_tree)
+        """Derivatives of the positions of the mechanism's points, (m, 3, p) each, in world axes."""
+        mechanism = self.run.mechanism
+        return compute_point_sensitivities(mechanism, self.sensitivity_parameters, self.run.q_tree, self.q_tree)
 
     def of(self, name: str, parameter: str) -> Array:
-        """Return how a quantity changes with a parameter along the run, shape (m,).
+        """Return the derivative of a quantity with respect to a parameter along the run, shape (m,).
 
         Parameters
         ----------
         name : str
-            A coordinate, ``theta_1``; with ``v.`` before it its rate; ``u.`` and an independent coordinate, ``tau.``
-            and a motor, or a point's, ``point:tip.x``.
+            A coordinate, ``theta_1``, or its rate, ``v.theta_1``; a force on an independent coordinate, ``u.theta_1``;
+            a motor torque, ``tau.MOTOR``; a coordinate of a point, ``point:tip.x``.
         parameter : str
+            One of `parameters`.
 
         Raises
         ------
         InputError
-            No such quantity or parameter; the message lists those there are.
+            Unknown quantity or parameter. The message lists the valid ones.
         """
         if parameter not in self.parameters:
             raise InputError(f"no parameter {parameter!r} among these; there are {', '.join(self.parameters)}")
@@ -101,18 +100,42 @@ class Sensitivities(HasSummary):
         return np.array(curves[name][:, self.parameters.index(parameter)], dtype=float)
 
     def _curves(self) -> dict[str, Array]:
-        """By name, (m, p)."""
-        run, found = self.run, dict[str, Array]()
+        """Return the derivatives of every quantity, (m, p), by name."""
+        run, curves = self.run, dict[str, Array]()
         parts = {"": (run.coordinates, self.q_tree), "v.": (run.coordinates, self.v_tree),
                  "u.": (run.independent, self.u), "tau.": (run.actuated, self.tau)}  # fmt: skip
         for prefix, (names, array) in parts.items():
-            found |= {prefix + name: array[:, k] for k, name in enumerate(names)}
-        for name, moved in self.points.items():
-            found |= {f"point:{name}.{axis}": moved[:, k] for k, axis in enumerate("xyz")}
-        return found
+            curves |= {prefix + name: array[:, k] for k, name in enumerate(names)}
+        for name, array in self.points.items():
+            curves |= {f"point:{name}.{axis}": array[:, k] for k, axis in enumerate("xyz")}
+        return curves
+
+    def summary(self) -> Summary:
+        """Return the largest derivatives of independent coordinates and points, as `repr` and a notebook show them."""
+        run = self.run
+        tree, indices = run.mechanism.tree, [run.coordinates.index(name) for name in run.independent]
+        names = [*run.independent, *self.points]
+        units = [*(tree.units()[k] for k in indices), *("m" for _ in self.points)]
+        rows: list[Row] = [
+            ("instants", f"{len(self.t)}, from t = {self.t[0]:g} to {self.t[-1]:g} s"),
+            ("largest along it", ""),
+        ]
+        for k, name in enumerate(self.parameters):
+            unit = key_unit(run.mechanism, name)
+            largest = [np.abs(self.q_tree[:, j, k]).max() for j in indices]
+            largest += [np.linalg.norm(array[:, :, k], axis=1).max() for array in self.points.values()]
+            quantity_units = [derivative_unit(quantity_unit, unit) for quantity_unit in units]
+            rows.append((f"by {name}", format_quantities(names, np.array(largest), quantity_units, 4)))
+        if self.end_time is not None:
+            delays = zip(self.parameters, self.end_time.tolist(), strict=True)
+            rows.append(
+                ("end time", [f"{x:.4g} {derivative_unit('s', key_unit(run.mechanism, name))}" for name, x in delays])
+            )
+        outcome = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"
+        return Summary(f"Sensitivities of {run.scene_name}, {outcome}", rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return them as JSON has them; a row of each list an instant, by coordinate and parameter."""
+        """Return the derivatives as JSON-ready data; lists are by instant, coordinate and parameter."""
         run = self.run
         names = {"coordinates": run.coordinates, "independent": run.independent, "actuated": run.actuated}
         arrays = {name: getattr(self, name).tolist() for name in ("t", "q_tree", "v_tree", "u", "tau")}
@@ -125,25 +148,27 @@ class Sensitivities(HasSummary):
         }  # fmt: skip
 
     def save(self, path: str | Path) -> Path:
-        """Write them to a file, NumPy's npz without pickle (docs/reference/run_file.md): whole or not at all.
+        """Write the derivatives to a file, NumPy's npz without pickle (docs/reference/run_file.md).
+
+        The file is written completely or not at all.
 
         Raises
         ------
         InputError
-            It cannot be written.
+            The file cannot be written.
         """
         require_path(path, "Sensitivities.save: path")
         run, path = self.run, Path(path)
-        about = {"name": run.scene_name, "status": run.status, "message": run.message}
+        meta = {"name": run.scene_name, "status": run.status, "message": run.message}
         names = {"parameters": self.parameters, "coordinates": run.coordinates, "independent": run.independent,
                  "actuated": run.actuated, "points": tuple(self.points)}  # fmt: skip
-        none = np.zeros((len(self.t), 0, 3, len(self.parameters)))
+        no_points = np.zeros((len(self.t), 0, 3, len(self.parameters)))
         arrays = {
             **{name: getattr(self, name) for name in ("t", "q_tree", "v_tree", "u", "tau")},
             **{key: np.array(x, dtype=str) for key, x in names.items()},
-            "point_moved": np.stack(list(self.points.values()), axis=1) if self.points else none,
+            "point_moved": np.stack(list(self.points.values()), axis=1) if self.points else no_points,
             "end_time": np.full(len(self.parameters), np.nan) if self.end_time is None else self.end_time,
-            "meta": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
+            "meta": np.frombuffer(json.dumps(meta).encode(), dtype=np.uint8),
         }
         with open_atomic(path) as file:
             np.savez_compressed(file, **arrays)
@@ -159,32 +184,32 @@ def sensitivities(
     controller: Controller | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
 ) -> Sensitivities:
-    """Run a scene together with how its motion changes with parameters, to first order.
+    """Run a scene and compute the derivatives of its motion with respect to parameters.
 
-    What is integrated beside eq. 1 are its variational equations, S' = f_y S + f_p, with S under the same tolerances as
-    the motion. They hold through changes of coordinates; where a joint sticks, slides, touches or bounces, S jumps as
-    the motion's kink or jump does (saltation). The derivatives are exact; none are differences but those of a caller's
-    own controller.
+    The variational equations S' = f_y S + f_p are integrated together with eq. 1, under the same tolerances. They are
+    independent of the choice of coordinates. S jumps where a joint sticks, slides, touches a stop or bounces
+    (saltation). The derivatives are exact, except that a caller's controller is differentiated by finite differences.
 
     Parameters
     ----------
     scene : Scene, str or Path
     parameters : sequence of str
-        Every number of the mechanism that has a name (docs/reference/parameters.md), as ``link.NAME.mass`` (the same
-        body of another density), ``joint.NAME.xyz``, ``spring.K.stiffness``, ``motor.NAME.ratio``, ``gravity``; K
-        counts from 0. Of eq. 14 ``controller.K_P``, ``controller.K_P.NAME``, ``controller.K_V``; of the start
-        ``initial.q.NAME``, ``initial.q_dot.NAME``. A vector stands for its components, which have ``.x``, ``.y`` and
-        ``.z`` behind.
-        A controller with a `model` keeps it; eq. 14 without one compensates what the changed mechanism needs.
+        Any named parameter of the mechanism (docs/reference/parameters.md): ``link.NAME.mass`` (the same body with
+        another density), ``joint.NAME.xyz``, ``spring.K.stiffness``, ``motor.NAME.ratio``, ``gravity`` and others; K
+        counts from 0. Of the controller ``controller.K_P``, ``controller.K_P.NAME``, ``controller.K_V`` and others. Of
+        the start ``initial.q.NAME`` and ``initial.q_dot.NAME``. The name of a vector stands for its components, which
+        end in ``.x``, ``.y`` and ``.z``.
+        The `model` of a controller does not depend on the parameters. Eq. 14 without a model compensates the gravity
+        of the mechanism with its parameters.
     overrides : mapping, optional
-        As of `simulate`.
+        As in `simulate`.
     progress : callable, optional
-        As of `simulate`.
+        As in `simulate`.
     controller : Controller, Sampled or function, optional
-        As of `simulate`, giving u. How u changes with the state is found by central differences, 4 n calls a
-        right-hand side or a sample.
+        As in `simulate`; it must give u. It is differentiated by central differences, with 4 n calls for each
+        right-hand side or sample.
     events : sequence of Event, optional
-        As of `simulate`.
+        As in `simulate`.
 
     Returns
     -------
@@ -193,20 +218,19 @@ def sensitivities(
     Raises
     ------
     InputError
-        An unknown parameter, or a scene whose motion has no known derivatives: with a sensor or a drive, an SPF off
-        phi = 0, a caller's controller that looks at terms which change with the parameters; a stop that holds a start
-        `at = "assembled"` back from q_guess.
+        Unknown parameter, or unsupported scene: a sensor or drive, an SPF off phi = 0, a caller's controller that reads
+        terms which depend on the parameters, or a start with `at = "assembled"` whose q_guess is beyond a stop.
     NumericalError
-        A start that is singular; two joints that change what they do at the same instant.
+        The start is singular, or the motion has no derivative there.
     MechanismError
-        As `simulate`.
+        As in `simulate`.
     """
     scene = as_scene(scene, overrides, "sensitivities")
     require_callable(progress, "sensitivities: progress", "a function of (t, t_end)")
     parameters = [parameters] if isinstance(parameters, str | bytes) else parameters
-    require_type(parameters, Sequence, "sensitivities: parameters", NAMES)
+    require_type(parameters, Sequence, "sensitivities: parameters", EXPECTED_NAMES)
     for name in parameters:
-        require_type(name, str, "sensitivities: parameters", NAMES)
+        require_type(name, str, "sensitivities: parameters", EXPECTED_NAMES)
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, controller, events, derivatives=derivatives_of(tuple(parameters)))
@@ -214,132 +238,156 @@ def sensitivities(
     try:
         rows, status, message = record_rows(ready, progress)
     except NumericalError as error:
-        if (apart := _apart(ready)) is None:
+        if (reason := _explain_missing_derivative(ready)) is None:
             raise
-        raise NumericalError(f"sensitivities: {apart}", t=0.0) from error
-    message = _apart(ready) or message
-    _refuse_terms(ready)
+        raise NumericalError(f"sensitivities: {reason}", t=0.0) from error
+    message = _explain_missing_derivative(ready) or message
+    _require_independent_terms(ready)
     run = build_run(ready, rows, status=status, message=message, wall_s=perf_counter() - started)
     run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
-    q_tree, v_tree, u, tau = _parts(ready, rows)
+    q_tree, v_tree, u, tau = _split_rows(ready, rows)
     if np.isnan(q_tree[0]).any():
-        raise NumericalError(f"sensitivities: {_start(ready)}", t=0.0)
+        raise NumericalError(f"sensitivities: {_explain_start(ready)}", t=0.0)
     sensitivity_parameters = _sensitivity_parameters(ready)
     names = tuple(x.name for x in sensitivity_parameters)
-    return Sensitivities(run, names, q_tree, v_tree, u, tau, _end_time(ready), sensitivity_parameters)
+    return Sensitivities(run, names, q_tree, v_tree, u, tau, _compute_end_time(ready), sensitivity_parameters)
 
 
 def _sensitivity_parameters(ready: Prepared) -> tuple[SensitivityParameter, ...]:
     return ready.derivatives.sensitivity_parameters if ready.derivatives else ()
 
 
-def _apart(ready: Prepared) -> str | None:
-    """Say where a joint has no one time to change what it does."""
-    found = ready.loop.apart()
-    if found is None:
+# --- motions without a derivative ----------------------------------------------------------------
+
+
+def _explain_missing_derivative(ready: Prepared) -> str | None:
+    """Return why the motion is not differentiable where the run stopped, or None."""
+    event = ready.loop.apart()
+    if event is None:
         return None
-    coordinate, of_rate, parameter, reason = found
-    joint, name, t = (
-        ready.mechanism.coordinates[coordinate],
-        _sensitivity_parameters(ready)[parameter].name,
-        float(ready.loop.t),
-    )
+    coordinate, at_rest, k, reason = event
+    joint, parameter = ready.mechanism.coordinates[coordinate], _sensitivity_parameters(ready)[k]
+    t, name = float(ready.loop.t), parameter.name
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
-    if t == 0.0 and _sensitivity_parameters(ready)[parameter].assembled_at == coordinate:
-        return (
-            f"stopped {where}: {joint} is assembled at its stop, and with another {name} it starts elsewhere one way "
-            "only, so that the motion has no derivative"
+    if t == 0.0 and parameter.assembled_at == coordinate:
+        cause = f"{joint} is assembled at its stop, and a step in {name} moves its start for one sign only"
+    elif reason == "let_go":
+        cause = f"the holding force of {joint} is at its limit, and one sign of a step in {name} releases {joint}"
+    elif reason == "restitution":
+        cause = (
+            f"{joint} and joints that move only with it hit their stops at the same instant, and a step in {name} "
+            "changes which of their restitutions counts"
         )
-    if reason == "let_go":
-        return (
-            f"stopped {where}: the force that holds {joint} is at its limit, and with another {name} {joint} is let go "
-            "one way only, so that the motion has no derivative"
-        )
-    if reason == "restitution":
-        return (
-            f"stopped {where}: {joint} and joints that move only with it are thrown back by their stops at once, and "
-            f"with another {name} by one of them alone: either way the motion goes on differently, so that it has no "
-            "derivative"
-        )
-    what = f"{joint} begins to move from rest" if of_rate else f"{joint} comes to its stop"
-    there = "at rest" if of_rate else "there"
-    return (
-        f"stopped {where}: {what}, and with another {name} it is not {there} just then: either way the motion goes on "
-        "differently, so that it has no derivative"
-    )
+    elif at_rest:
+        cause = f"{joint} begins to move from rest, and after a step in {name} it is not at rest at this instant"
+    else:
+        cause = f"{joint} comes to its stop, and after a step in {name} it is not at its stop at this instant"
+    return f"stopped {where}: {cause}; the one-sided derivatives differ, so the motion has no derivative"
 
 
-def _refuse_terms(ready: Prepared) -> None:
-    """Refuse what a caller's controller makes of terms that are other ones with other parameters."""
-    name = next((x.name for x in _sensitivity_parameters(ready) if any(effect.is_term for effect in x.effects)), None)
+def _require_independent_terms(ready: Prepared) -> None:
+    """Refuse a caller's controller that has read terms which depend on the parameters (InputError)."""
+    parameters = _sensitivity_parameters(ready)
+    name = next((x.name for x in parameters if any(effect.is_term for effect in x.effects)), None)
     if name is not None and ready.loop.asked():
         raise InputError(
-            f"sensitivities: {name}: the controller looks at terms of the mechanism, which change with it in a way "
-            "that it alone knows; let it take q, q_dot, q_tree and v_tree, and terms of a mechanism of its own"
+            f"sensitivities: {name}: the controller reads terms whose parameter dependence is unknown; "
+            "use q, q_dot, q_tree and v_tree, and the terms of a separate mechanism"
         )
 
 
-def _start(ready: Prepared) -> str:
-    """Say why how the start changes is not known."""
+def _explain_start(ready: Prepared) -> str:
+    """Return why the derivatives of the start are unknown."""
     mechanism = ready.mechanism
+    names = ", ".join(mechanism.independent)
     if ready.scene.spec.initial.at == "equilibrium":
         return (
-            "the start is an equilibrium beside which there are others, or where "
-            f"{', '.join(mechanism.independent)} are no coordinates: which one it is with other parameters is not known"
+            "the derivatives of the start are unknown: the equilibrium is not isolated, or "
+            f"{names} do not determine the configuration there"
         )
-    names = mechanism.independent
+    verb = "does" if len(mechanism.independent) == 1 else "do"
     return (
-        f"at the start phi_z is singular: {', '.join(names)} {'does' if len(names) == 1 else 'do'} not determine the "
-        "others, so that how they change is not known; other independent coordinates would"
+        f"at the start phi_z is singular: {names} {verb} not determine the other coordinates; choose other independent "
+        "coordinates"
     )
 
 
-def _parts(ready: Prepared, rows: Array) -> list[Array]:
-    """Split what the loop has recorded behind the motion: by parameter q' and v' together, then u, then tau."""
+# --- results ---------------------------------------------------------------------------------------
+
+
+def _split_rows(ready: Prepared, rows: Array) -> list[Array]:
+    """Return the derivatives of q', v', u and tau, (m, size, p) each, from the columns that follow the motion's."""
     mechanism, p = ready.mechanism, len(_sensitivity_parameters(ready))
     sizes = [2 * mechanism.n, mechanism.d, len(mechanism.actuated)]
     end = rows.shape[1] - p * sum(sizes)
-    found = []
+    arrays = []
     for size in sizes:
-        part = rows[:, end : end + p * size].reshape(len(rows), p, size).transpose(0, 2, 1)
-        found.append(np.array(part, dtype=float))
+        columns = rows[:, end : end + p * size].reshape(len(rows), p, size).transpose(0, 2, 1)
+        arrays.append(np.array(columns, dtype=float))
         end += p * size
-    q_and_v, u, tau = found
+    q_and_v, u, tau = arrays
     return [q_and_v[:, : mechanism.n], q_and_v[:, mechanism.n :], u, tau]
 
 
-def _end_time(ready: Prepared) -> Array | None:
-    """How much later the event that ended a run comes with each parameter."""
+def _compute_end_time(ready: Prepared) -> Array | None:
+    """Return the derivative of the time of the event that ended a run, (p,) in s."""
     last = [event for _, k, _ in ready.loop.met() if (event := ready.events[k]).stop]
     if not last:
         return None
-    of, coordinate = last[-1].row[:2]
-    if of >= len(RATES):
+    quantity, coordinate = last[-1].row[:2]
+    if quantity >= len(DIFFERENTIABLE_EVENTS):
         return None
-    found: Array | None = ready.loop.delays(coordinate, RATES[of] == "q_dot")
-    return found
+    end_time: Array | None = ready.loop.delays(coordinate, DIFFERENTIABLE_EVENTS[quantity] == "q_dot")
+    return end_time
 
 
-def sensitivities_summary(found: Sensitivities) -> Summary:
-    """Return how far each parameter moves the independent coordinates, and the points, at most along the run."""
-    run = found.run
-    tree, at = run.mechanism.tree, [run.coordinates.index(name) for name in run.independent]
-    names = [*run.independent, *found.points]
-    units = [*(tree.units()[k] for k in at), *("m" for _ in found.points)]
-    rows: list[Row] = [
-        ("instants", f"{len(found.t)}, from t = {found.t[0]:g} to {found.t[-1]:g} s"),
-        ("largest along it", ""),
-    ]
-    for k, name in enumerate(found.parameters):
-        unit = key_unit(run.mechanism, name)
-        most = [np.abs(found.q_tree[:, j, k]).max() for j in at]
-        most += [np.linalg.norm(moved[:, :, k], axis=1).max() for moved in found.points.values()]
-        rows.append(
-            (f"by {name}", format_quantities(names, np.array(most), [derivative_unit(one, unit) for one in units], 4))
-        )
-    if found.end_time is not None:
-        shown = [f"{x:.4g} {derivative_unit('s', key_unit(run.mechanism, name))}" for name, x in
-                 zip(found.parameters, found.end_time.tolist(), strict=True)]  # fmt: skip
-        rows.append(("the end comes later by", shown))
-    said = run.message if run.message.startswith(run.status) else f"{run.status}: {run.message}"
-    return Summary(f"Sensitivities of {run.scene_name}, {said}", rows)
+def compute_point_sensitivities(
+    mechanism: Mechanism, parameters: Sequence[SensitivityParameter], q_tree: Array, by_parameter: Array
+) -> dict[str, Array]:
+    """Return the derivatives of the positions of a mechanism's points.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    parameters : sequence of SensitivityParameter
+    q_tree : (m, n) array
+        Coordinates by instant.
+    by_parameter : (m, n, p) array
+        Their derivatives; of a free root as a twist in its own axes.
+
+    Returns
+    -------
+    dict of str to (m, 3, p) arrays
+        In world axes, m for the parameter's unit.
+    """
+    positions = {name: np.zeros((len(q_tree), 3, len(parameters))) for name in mechanism.points}
+    if not positions:
+        return positions
+    placing = [(k, parameter) for k, parameter in enumerate(parameters) if parameter.places]
+    for row, (coordinates, derivative) in enumerate(zip(q_tree, by_parameter, strict=True)):
+        q = mechanism.tree.from_coordinates(coordinates)
+        for name, jacobian in mechanism.point_jacobians(q).items():
+            positions[name][row] = jacobian @ derivative
+        if not placing:
+            continue
+        pose = Pose(mechanism.tree, mechanism.closure.anchors, q)
+        for number, (name, position) in enumerate(mechanism.point_positions(q).items()):
+            carriers = set(mechanism.tree.model.supports[mechanism.points[name].joint])
+            for k, parameter in placing:
+                positions[name][row, :, k] += _displace_by_placement(parameter, number, carriers, position, pose)
+    return positions
+
+
+def _displace_by_placement(
+    parameter: SensitivityParameter, number: int, carriers: set[int], position: Array, pose: Pose
+) -> Array:
+    """Return the derivative of a point's position by its own placement and by that of the joints that carry it."""
+    total = np.zeros(3)
+    for effect in parameter.places:
+        assert effect.lock is not None
+        placed, index = effect.lock.placed, effect.index
+        if (placed == "joint" and index in carriers) or (placed == "reported" and index == number):
+            axis = pose.rotation[effect.lock.carrier] @ effect.lock.axis
+            arm = position - pose.translation[effect.lock.carrier]
+            total += effect.numbers[0] * (np.cross(axis, arm) if effect.lock.turns else axis)
+    return total

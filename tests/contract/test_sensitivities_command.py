@@ -57,7 +57,7 @@ def test_a_motion_without_a_derivative_keeps_what_it_has(tmp_path: Path) -> None
         "--set", "joint.theta_1.friction=1e-3", "--out", str(tmp_path),
     )  # fmt: skip
     assert answer.code == 3
-    assert "theta_1 begins to move from rest, and with another initial.q_dot.theta_1" in answer.err
+    assert "theta_1 begins to move from rest, and after a step in initial.q_dot.theta_1" in answer.err
     assert (tmp_path / "sensitivities.npz").is_file()
 
 
@@ -76,7 +76,7 @@ BAD = [
             "--set",
             "controller.drive.torque_resolution=0.1",
         ],
-        ["controller.drive", "leave it out"],
+        ["controller.drive", "remove the table"],
     ),
 ]
 

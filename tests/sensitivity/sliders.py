@@ -1,4 +1,4 @@
-"""Two sliders on a line, beside each other or the second on the first: motions that are known in closed form."""
+"""Two sliders on a line, side by side or the second on the first, whose motions have a closed form."""
 
 from __future__ import annotations
 
@@ -10,10 +10,18 @@ JOINT = """<joint name="{name}" type="prismatic"><parent link="{on}"/><child lin
 <limit lower="-9" upper="{upper!r}" effort="1" velocity="1"/></joint>"""
 
 
-def sliders(folder: Path, more: str, *, q: tuple[float, float] = (0.0, 0.0), q_dot: tuple[float, float] = (0.0, 0.0),
-            masses: tuple[float, float] = (1.3, 0.7), upper: float = 9.0, on: str = "ground",
-            scene: str = "") -> str:  # fmt: skip
-    """Write the files, `more` being what the mechanism has beside the tree; return the scene's path."""
+def write_sliders(
+    folder: Path,
+    more: str,
+    *,
+    q: tuple[float, float] = (0.0, 0.0),
+    q_dot: tuple[float, float] = (0.0, 0.0),
+    masses: tuple[float, float] = (1.3, 0.7),
+    upper: float = 9.0,
+    on: str = "ground",
+    scene: str = "",
+) -> str:
+    """Write the files, with `more` appended to the mechanism's; return the scene's path."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = [LINK.format(name=name, mass=mass) for name, mass in zip(("one", "two"), masses, strict=True)]
     parts += [JOINT.format(name="x", on="ground", link="one", upper=upper)]

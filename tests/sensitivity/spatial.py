@@ -1,4 +1,4 @@
-"""Two arms in space whose tips a loop of any type joins, with a gear, a fixed joint and motors, in files of its own."""
+"""Two spatial arms that a loop of any type connects, with a gear and fixed joints, and a body on a spring."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ solver.output_dt = 0.1
 """
 
 Q = {"la": 0.3, "lb": -0.4, "lc": 0.5, "ld": 0.2, "ra": 0.6, "rb": -0.3, "rc": -0.2, "rd": 0.4}
-FREE = {  # coordinates that stay independent, by type of loop
+INDEPENDENT = {  # independent coordinates by type of loop
     "weld": ["lb", "lc"],
     "prismatic": ["ra", "rb", "la"],
     "hinge": ["ra", "rb", "la"],
@@ -77,12 +77,12 @@ FREE = {  # coordinates that stay independent, by type of loop
 }
 
 
-def text_of(numbers: object) -> str:
+def format_list(numbers: object) -> str:
     return str([float(x) for x in numbers])  # type: ignore[attr-defined]
 
 
-def arms(folder: Path, kind: str, formulation: str = "dae", more: str = "") -> str:
-    """Write the files, the loop closed at Q; return the scene's path."""
+def write_arms(folder: Path, kind: str, formulation: str = "dae", more: str = "") -> str:
+    """Write the files of two arms whose loop is closed at Q; return the scene's path."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = "".join(ARM.format(s=s, x=x, body=BODY) for s, x in (("l", -0.3), ("r", 0.3)))
     urdf = f'<robot name="arms"><link name="base"/>{parts}{WHEEL.format(body=BODY)}</robot>'.replace(
@@ -100,11 +100,11 @@ def arms(folder: Path, kind: str, formulation: str = "dae", more: str = "") -> s
     )
     other = data.oMf[model.getFrameId("rtip")].actInv(tip)
     axis = np.array([0.0, 0.6, 0.8]) if kind != "universal" else np.array([1.0, 0.0, 0.0])
-    names = FREE[kind]
+    names = INDEPENDENT[kind]
     (folder / "arms.toml").write_text(
         MECHANISM.format(
-            type=kind, xyz=text_of(other.translation), rpy=text_of(pin.rpy.matrixToRpy(other.rotation)),
-            axis_b=text_of(axis), independent=", ".join(f'"{x}"' for x in names),
+            type=kind, xyz=format_list(other.translation), rpy=format_list(pin.rpy.matrixToRpy(other.rotation)),
+            axis_b=format_list(axis), independent=", ".join(f'"{x}"' for x in names),
             guess=", ".join(f"{k} = {x}" for k, x in Q.items()),
         ) + more,
         encoding="utf-8",
@@ -114,8 +114,8 @@ def arms(folder: Path, kind: str, formulation: str = "dae", more: str = "") -> s
     return str(folder / "arms.scene.toml")
 
 
-def tethered(folder: Path) -> str:
-    """Write a body without joints that a spring holds; return the scene's path."""
+def write_tethered_body(folder: Path) -> str:
+    """Write the files of a free body on a spring; return the scene's path."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "body.urdf").write_text(f'<robot name="body"><link name="body">{BODY}</link></robot>', encoding="utf-8")
     (folder / "body.toml").write_text(TETHERED, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Of controllers: gains, targets, starts with free roots; against extrapolated differences of tight runs."""
+"""Sensitivities with controllers against extrapolated differences: gains, targets, limits, samples, functions."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ import ckc_pin
 from ckc_pin import InputError, simulate
 from ckc_pin.mechanism.parameters import values_of, with_components
 from ckc_pin.sensitivity.sensitivities import sensitivities
-from tests.sensitivity.changed import TIGHT
+from tests.sensitivity.four_bar import TIGHT
 
-CLOSE = 1e-8  # of the largest
+TOLERANCE = 1e-8  # relative to the largest
 
 
 def agree(scene: str, values: dict[str, float], overrides: dict[str, Any]) -> None:
-    """In the coordinates of joints, their rates, u and tau; `values`: of the parameters."""
-    found = sensitivities(scene, list(values), overrides)
-    assert found.run.status == "done"
-    run = found.run
+    """Compare joint coordinates, rates, u and tau; `values` are those of the parameters."""
+    result = sensitivities(scene, list(values), overrides)
+    assert result.run.status == "done"
+    run = result.run
     free = run.mechanism.tree.free_coordinates
-    kept = [k for k, name in enumerate(run.coordinates) if name not in free]
+    joints = [k for k, name in enumerate(run.coordinates) if name not in free]
     parts = {
-        "q": (found.q_tree[:, kept], lambda x: x.q_tree[:, kept]),
-        "v": (found.v_tree[:, kept], lambda x: x.v_tree[:, kept]),
-        "u": (found.u, lambda x: x.u),
-        "tau": (found.tau, lambda x: x.tau),
+        "q": (result.q_tree[:, joints], lambda x: x.q_tree[:, joints]),
+        "v": (result.v_tree[:, joints], lambda x: x.v_tree[:, joints]),
+        "u": (result.u, lambda x: x.u),
+        "tau": (result.tau, lambda x: x.tau),
     }
     for k, (name, value) in enumerate(values.items()):
         h = 1e-2 * max(1.0, abs(value))
@@ -41,17 +41,17 @@ def agree(scene: str, values: dict[str, float], overrides: dict[str, Any]) -> No
             one, two, four = (
                 (read(more) - read(less)) / (2 * h / s) for (more, less), s in zip(runs, (1, 2, 4), strict=True)
             )
-            wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
-            assert np.abs(wanted).max() > 1e-6, name  # it matters
-            assert np.abs(ours[:, :, k] - wanted).max() <= CLOSE * np.abs(wanted).max(), name
+            expected = (16 * (4 * four - two) - (4 * two - one)) / 45
+            assert np.abs(expected).max() > 1e-6, name  # it matters
+            assert np.abs(ours[:, :, k] - expected).max() <= TOLERANCE * np.abs(expected).max(), name
 
 
 @pytest.mark.parametrize(
     ("terms", "formulation", "each"),
     [("pinocchio", "dae", False), ("pinocchio", "reduced", True), ("generated", "dae", True)],
 )
-def test_of_tracking_controls_gains(terms: str, formulation: str, each: bool) -> None:
-    """Numbers for all, or by coordinate."""
+def test_gains_of_tracking(terms: str, formulation: str, each: bool) -> None:
+    """As one number, or by coordinate."""
     gains = {"controller.Lambda": 1.0, "controller.K_D": 10.0}
     spec = ckc_pin.load_scene("five_bar/tracking").spec.controller
     assert (spec.Lambda, spec.K_D) == tuple(gains.values())
@@ -63,15 +63,15 @@ def test_of_tracking_controls_gains(terms: str, formulation: str, each: bool) ->
 
 
 @pytest.mark.parametrize("terms", ["pinocchio", "generated"])
-def test_of_a_set_points_target(terms: str) -> None:
-    """Where what it compensates moves with it."""
+def test_target_of_a_set_point(terms: str) -> None:
+    """The compensated gravity depends on the target."""
     q_d = dict(ckc_pin.load_scene("five_bar/set_point").spec.controller.q_d)
     overrides = {**TIGHT, "formulation": "reduced", "t_end": 0.3, "solver.output_dt": 0.1, "solver.terms": terms}
     agree("five_bar/set_point", {f"controller.q_d.{name}": value for name, value in q_d.items()}, overrides)
 
 
 @pytest.mark.parametrize("scene", ["delta/circle", "stewart/wave", "two_ur5/lift"])
-def test_of_tracking_with_a_free_root(scene: str) -> None:
+def test_tracking_with_a_free_root(scene: str) -> None:
     ready = ckc_pin.load_scene(scene)
     name = ckc_pin.load(scene.split("/")[0]).independent[1]
     start = (ready.spec.initial.q_dot or {}).get(name, 0.0)
@@ -101,27 +101,27 @@ def with_three_motors(folder: Path, limit: str = "") -> str:
     return str(folder / "set_point.scene.toml")
 
 
-def test_of_a_limit_that_other_motors_make_up_for(tmp_path: Path) -> None:
-    """They do the rest of u, so that the motion stays what it is."""
+def test_a_torque_limit_that_other_motors_compensate(tmp_path: Path) -> None:
+    """The other motors give the rest of u, so the motion does not depend on the limit."""
     names = ["motor.theta_2.torque_limit", "motor.theta_2.ratio", "controller.K_P"]
-    found = sensitivities(with_three_motors(tmp_path / "x"), names, {"t_end": 0.3, "solver.output_dt": 0.05})
-    assert np.abs(found.run.tau[:, 1]).max() == 0.5
-    assert not found.q_tree[:, :, :2].any()
-    assert not found.u[:, :, :2].any()
-    assert np.abs(found.q_tree[-1, :, 2]).max() > 1e-3
+    result = sensitivities(with_three_motors(tmp_path / "x"), names, {"t_end": 0.3, "solver.output_dt": 0.05})
+    assert np.abs(result.run.tau[:, 1]).max() == 0.5
+    assert not result.q_tree[:, :, :2].any()
+    assert not result.u[:, :, :2].any()
+    assert np.abs(result.q_tree[-1, :, 2]).max() > 1e-3
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])
-def test_redundant_motors_that_do_not_reach_u_stop_it(method: str, formulation: str, tmp_path: Path) -> None:
+def test_redundant_motors_that_cannot_give_u_stop_the_run(method: str, formulation: str, tmp_path: Path) -> None:
     overrides = {"t_end": 0.3, "solver.method": method, "formulation": formulation}
-    found = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], overrides)
-    assert found.run.status == "stopped"
-    assert "motors at their limits do not reach what is wanted of them together" in found.run.message
+    result = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], overrides)
+    assert result.run.status == "stopped"
+    assert "motors at their limits do not reach what is wanted of them together" in result.run.message
 
 
-def test_lengths_are_refused_where_a_point_follows_a_path(tmp_path: Path) -> None:
-    """Even with a model: q_d is where the mechanism's own lengths bring the point."""
+def test_lengths_are_rejected_if_a_point_follows_a_path(tmp_path: Path) -> None:
+    """Even with a model, q_d depends on the mechanism's lengths."""
     shutil.copytree("urdf/five_bar", tmp_path / "x")
     scene = tmp_path / "x" / "tracking.scene.toml"
     x, y, _ = simulate("five_bar/swing", {"t_end": 1e-3}).points["tip"][0]
@@ -134,7 +134,7 @@ def test_lengths_are_refused_where_a_point_follows_a_path(tmp_path: Path) -> Non
         "frequency = 1.0 }\n",
         encoding="utf-8",
     )
-    with pytest.raises(InputError, match=r"joint\.theta_2\.xyz\.x: q_d is where the mechanism's own lengths bring"):
+    with pytest.raises(InputError, match=r"joint\.theta_2\.xyz\.x: .* q_d depends on the mechanism's lengths"):
         sensitivities(str(scene), ["joint.theta_2.xyz.x"])
 
 
@@ -148,8 +148,8 @@ OF_SET_POINT = {"controller.K_P": 10.0, "controller.K_V": 1.0, "initial.q_dot.th
     ("formulation", "terms"),
     [("dae", "pinocchio"), ("reduced", "pinocchio"), ("spf", "pinocchio"), ("dae", "generated")],
 )
-def test_of_sampled_controllers(formulation: str, terms: str) -> None:
-    """Between samples what was found is held, and so is how it changes; delayed by more than a period."""
+def test_sampled_controllers(formulation: str, terms: str) -> None:
+    """Output and derivatives are held between samples, with a delay longer than a period."""
     settings = {**TIGHT, **CLOCK, "formulation": formulation, "solver.terms": terms}
     agree("five_bar/set_point", OF_SET_POINT, {**settings, "t_end": 0.1, "solver.output_dt": 0.025})
     names = {"initial.q_dot.theta_1": 0.0} | ({"controller.Lambda": 1.0} if terms == "pinocchio" else {})
@@ -157,8 +157,8 @@ def test_of_sampled_controllers(formulation: str, terms: str) -> None:
     agree("five_bar/tracking", names, {**settings, **quick})
 
 
-def test_of_samples_that_ask_for_more_than_there_is() -> None:
-    """A torque at its limit does not answer until the sample that brings it back."""
+def test_sampled_torques_beyond_their_limit() -> None:
+    """A torque at its limit has zero derivatives until a sample brings it back."""
     limited = {"controller.torque_limit": 2.0, "controller.sample_time": 0.01}
     overrides = {**TIGHT, **limited, "formulation": "reduced", "t_end": 0.5, "solver.output_dt": 0.1}
     run = simulate("five_bar/set_point", overrides)
@@ -166,11 +166,11 @@ def test_of_samples_that_ask_for_more_than_there_is() -> None:
     agree("five_bar/set_point", OF_SET_POINT, overrides)
 
 
-# --- a caller's own --------------------------------------------------------------------------------
+# --- caller's controller -----------------------------------------------------------------------------
 
 
 class Spring:
-    """Nonlinear in q, with a dependent coordinate and the tree's rates in it, and in t."""
+    """A nonlinear law of independent and dependent coordinates, rates and time."""
 
     def u(self, t: float, terms: ckc_pin.Terms) -> list[float]:
         q, v = terms.q_tree, terms.v_tree
@@ -180,7 +180,7 @@ class Spring:
 @pytest.mark.parametrize(
     ("formulation", "sampled"), [("dae", False), ("reduced", False), ("spf", False), ("dae", True)]
 )
-def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
+def test_a_callers_controller(formulation: str, sampled: bool) -> None:
     overrides = {
         **TIGHT,
         "formulation": formulation,
@@ -190,11 +190,11 @@ def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
     }
     values = {"link.link_2.mass": 0.1, "joint.theta_2.xyz.x": 0.2794, "gravity.y": -9.81, "initial.q_dot.theta_1": 0.0}
     loaded = ckc_pin.load("five_bar")
-    own = with_components(values_of(loaded.spec, loaded.urdf))
-    values |= {name: own[name] for name in values if name in own}
+    present = with_components(values_of(loaded.spec, loaded.urdf))
+    values |= {name: present[name] for name in values if name in present}
     law = ckc_pin.Sampled(Spring(), 0.01) if sampled else Spring()
-    found = ckc_pin.sensitivities("five_bar/swing", list(values), overrides, controller=law)
-    assert found.run.status == "done"
+    result = ckc_pin.sensitivities("five_bar/swing", list(values), overrides, controller=law)
+    assert result.run.status == "done"
     for k, (name, value) in enumerate(values.items()):
         h = 2e-3 * max(0.3, abs(value))
         runs = [
@@ -206,31 +206,34 @@ def test_of_a_callers_own_controller(formulation: str, sampled: bool) -> None:
                 (getattr(more, part) - getattr(less, part)) / (2 * h / s)
                 for (more, less), s in zip(runs, (1, 2, 4), strict=True)
             )
-            wanted = (16 * (4 * four - two) - (4 * two - one)) / 45
-            assert np.abs(getattr(found, part)[:, :, k] - wanted).max() <= 1e-7 * np.abs(wanted).max(), (name, part)
+            expected = (16 * (4 * four - two) - (4 * two - one)) / 45
+            assert np.abs(getattr(result, part)[:, :, k] - expected).max() <= 1e-7 * np.abs(expected).max(), (
+                name,
+                part,
+            )
 
 
-def test_a_callers_controller_that_looks_at_terms() -> None:
-    """Which are others with other masses; with another start they are not."""
+def test_a_callers_controller_that_reads_terms_is_rejected() -> None:
+    """Terms depend on masses, but not on the start."""
 
     def compensated(t: float, terms: ckc_pin.Terms) -> np.ndarray:
         return terms.h - 2.0 * terms.q_dot
 
     overrides = {**TIGHT, "t_end": 0.2}
-    with pytest.raises(InputError, match=r"link\.link_2\.mass: the controller looks at terms of the mechanism"):
+    with pytest.raises(InputError, match=r"link\.link_2\.mass: the controller reads terms whose parameter dependence"):
         ckc_pin.sensitivities("five_bar/swing", ["link.link_2.mass"], overrides, controller=compensated)
     name = "initial.q_dot.theta_3"
-    found = ckc_pin.sensitivities("five_bar/swing", [name], overrides, controller=compensated)
+    result = ckc_pin.sensitivities("five_bar/swing", [name], overrides, controller=compensated)
     one, two = (
         simulate("five_bar/swing", {**overrides, name: x}, controller=compensated).q_tree for x in (1e-4, -1e-4)
     )
-    assert np.abs(found.q_tree[:, :, 0] - (one - two) / 2e-4).max() <= 1e-6 * np.abs(one - two).max() / 2e-4
+    assert np.abs(result.q_tree[:, :, 0] - (one - two) / 2e-4).max() <= 1e-6 * np.abs(one - two).max() / 2e-4
 
 
-def test_what_a_caller_gives_in_the_place_of_a_controller_is_refused() -> None:
+def test_a_callers_controller_must_give_u() -> None:
     class Motors:
         def tau(self, t: float, terms: ckc_pin.Terms) -> list[float]:
             return [0.0, 0.0]
 
-    with pytest.raises(InputError, match="Motors: how torques that a function gives change is not known"):
+    with pytest.raises(InputError, match="Motors gives tau, whose derivatives are unknown"):
         ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], controller=Motors())  # type: ignore[arg-type]

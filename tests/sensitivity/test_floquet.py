@@ -18,7 +18,7 @@ from ckc_pin import InputError, load_scene
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.sensitivity.floquet import floquet
-from tests.sensitivity.sliders import sliders
+from tests.sensitivity.sliders import write_sliders
 
 M, m, L, g, w = 3.0, 0.7, 0.5, 9.81, 6.0
 PERIOD = 2 * np.pi / w
@@ -171,7 +171,7 @@ def test_multipliers_of_a_sampled_loop_at_rest_match_the_closed_form(
     """Two masses with separate loops, whose zero-order-hold discretization is known, stable and unstable."""
     (mass, other), (K_P, K_V), T = (1.3, 0.7), (11.0, 3.0), 0.05 if stable else 0.9
     controller = f'[controller]\ntype = "set_point"\nK_P = {K_P!r}\nK_V = {K_V!r}\nsample_time = {T!r}\n'
-    scene = sliders(tmp_path, "", masses=(mass, other), scene=f"{controller}q_d = {{ x = 0.2, y = -0.1 }}\n",
+    scene = write_sliders(tmp_path, "", masses=(mass, other), scene=f"{controller}q_d = {{ x = 0.2, y = -0.1 }}\n",
                     q=(0.2, -0.1))  # fmt: skip
     result = floquet(scene, samples * T, TIGHT)
     expected = np.zeros((4, 4))
@@ -183,20 +183,20 @@ def test_multipliers_of_a_sampled_loop_at_rest_match_the_closed_form(
 
 
 @pytest.mark.parametrize(
-    ("overrides", "says"),
+    ("overrides", "message"),
     [
         ({"sample_time": 1e-3}, r"controller\.sample_time: period = 6\.28318531 s is 6283\.18531 samples; it must be"),
         ({"sample_time": 10.0}, r"controller\.sample_time: period = 6\.28318531 s is 0\.628318531 samples"),
         ({"sample_time": np.pi / 500, "delay": 1e-3}, r"controller\.delay: floquet does not support delayed outputs"),
     ],
 )
-def test_delays_and_periods_of_fractional_samples_are_rejected(overrides: dict[str, float], says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_delays_and_periods_of_fractional_samples_are_rejected(overrides: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         floquet("five_bar/tracking", 2 * np.pi, {f"controller.{name}": x for name, x in overrides.items()})
 
 
 def test_unsupported_scenes_are_rejected_before_anything_is_run() -> None:
-    with pytest.raises(InputError, match=r'^floquet: spf_coordinates = "z": eq. 8 as printed is another motion'):
+    with pytest.raises(InputError, match=r'^floquet: sensitivities support spf_coordinates = "w" only'):
         floquet("five_bar/swing", 1.0, {"formulation": "spf", "spf_coordinates": "z"})
 
 

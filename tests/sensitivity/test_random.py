@@ -1,4 +1,4 @@
-"""Random sensitivities through impacts, stops and friction, against one-sided differences from both sides."""
+"""Random sensitivities through impacts, stops and friction, against one-sided differences on both sides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A four-bar whose files are written from numbers, and what runs with other numbers say of a derivative."""
+"""A four-bar whose files are written from parameter values, and finite differences of its runs."""
 
 from __future__ import annotations
 
@@ -94,11 +94,19 @@ solver.terms = "pinocchio"
 """
 
 
-def written(folder: Path, overrides: dict[str, float] | None = None, *, stop: bool = False, controlled: bool = False,
-            formulation: str = "dae", t_end: float = 1.0, more: str = "") -> str:  # fmt: skip
-    """Write the files; return the scene's path."""
+def write_four_bar(
+    folder: Path,
+    overrides: dict[str, float] | None = None,
+    *,
+    stop: bool = False,
+    controlled: bool = False,
+    formulation: str = "dae",
+    t_end: float = 1.0,
+    more: str = "",
+) -> str:
+    """Write the files for some parameter values; return the scene's path."""
     x = {**NUMBERS, **(overrides or {})}
-    mass, inertia = x["link.crank.mass"], 0.03 * x["link.crank.mass"] / NUMBERS["link.crank.mass"]  # one density
+    mass, inertia = x["link.crank.mass"], 0.03 * x["link.crank.mass"] / NUMBERS["link.crank.mass"]  # a constant density
     links = [
         LINK.format(name="crank", x=0.2, y=0.01, mass=mass, i=inertia),
         LINK.format(name="coupler", x=x["link.coupler.com.x"], y=x["link.coupler.com.y"], mass=0.9, i=0.07),
@@ -108,12 +116,12 @@ def written(folder: Path, overrides: dict[str, float] | None = None, *, stop: bo
         links="\n  ".join(links), bx=x["joint.b.xyz.x"], cx=x["joint.c.xyz.x"], cy=x["joint.c.xyz.y"],
         damping=x["joint.b.damping"], lower=x["joint.c.lower"], upper=x["joint.c.upper"],
     )  # fmt: skip
-    wall = f'[[joint]]\nname = "c"\nstops = true\nrestitution = {x["joint.c.restitution"]!r}' if stop else ""
+    stop_table = f'[[joint]]\nname = "c"\nstops = true\nrestitution = {x["joint.c.restitution"]!r}' if stop else ""
     mechanism = MECHANISM.format(
         gravity=x["gravity.y"], ax=x["loop.knee.frame_a.xyz.x"], bx=x["loop.knee.frame_b.xyz.x"],
         end=x["spring.0.frame_b.xyz.y"], stiffness=x["spring.0.stiffness"], rest_length=x["spring.0.rest_length"],
         damping=x["spring.0.damping"], joint_stiffness=x["spring.1.stiffness"], rest=x["spring.1.rest"],
-        force=x["force.0.value"], friction=x["joint.a.friction"], stop=wall,
+        force=x["force.0.value"], friction=x["joint.a.friction"], stop=stop_table,
     )  # fmt: skip
     if controlled:
         more += f'\n[controller]\ntype = "set_point"\nK_P = {x["controller.K_P"]!r}\nK_V = {x["controller.K_V"]!r}\n'
@@ -133,11 +141,11 @@ def written(folder: Path, overrides: dict[str, float] | None = None, *, stop: bo
     return str(folder / "bars.scene.toml")
 
 
-def differentiated(folder: Path, name: str, h: float, read: Any = None, **kind: Any) -> Any:
-    """The derivative of runs by one number, by Richardson's extrapolation of central differences."""
+def finite_difference(folder: Path, name: str, h: float, read: Any = None, **kind: Any) -> Any:
+    """Derivative of runs with respect to one parameter, by Richardson extrapolation of central differences."""
 
     def value(x: float) -> Any:
-        run = simulate(written(folder, {**kind.get("overrides", {}), name: x}, **rest), TIGHT)
+        run = simulate(write_four_bar(folder, {**kind.get("overrides", {}), name: x}, **rest), TIGHT)
         return np.stack([run.q_tree, run.v_tree]) if read is None else read(run)
 
     rest = {key: x for key, x in kind.items() if key != "overrides"}

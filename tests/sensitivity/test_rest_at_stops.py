@@ -1,4 +1,4 @@
-"""Of a joint that its stop holds to the end: whether it does is of the motion alone, not of how that changes."""
+"""Sensitivities of a joint that comes to rest on its stop."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ solver.output_dt = 0.5
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-11])
-def test_a_joint_rests_whatever_the_changes_are(formulation: str, rtol: float, tmp_path: Path) -> None:
-    """The loop has one freedom: at rest its place follows from the stop's, and from nothing else."""
+def test_positions_at_rest_depend_on_the_stop_only(formulation: str, rtol: float, tmp_path: Path) -> None:
+    """The loop has one freedom, so its configuration at rest follows from the stop."""
     links = [LINK.format(name=name, x=x, m=m, i=i) for name, x, m, i in
              (("crank", 0.1, 0.5, 2e-3), ("rod", 0.3, 1.0, 3e-2), ("rocker", 0.2, 1.0, 1e-2))]  # fmt: skip
     (tmp_path / "held.urdf").write_text(URDF.format(links="".join(links)), encoding="utf-8")
@@ -51,12 +51,12 @@ def test_a_joint_rests_whatever_the_changes_are(formulation: str, rtol: float, t
     path.write_text(SCENE, encoding="utf-8")
     overrides = {"formulation": formulation, "solver.rtol": rtol}
     names = ["gravity.y", "initial.q.a", "joint.c.lower"]
-    found, plain = sensitivities(path, names, overrides), simulate(path, overrides)
-    assert found.run.status == plain.status == "done"
-    assert [event["name"] for event in found.run.events] == [event["name"] for event in plain.events] == ["c touches"]
+    result, plain = sensitivities(path, names, overrides), simulate(path, overrides)
+    assert result.run.status == plain.status == "done"
+    assert [event["name"] for event in result.run.events] == [event["name"] for event in plain.events] == ["c touches"]
     a, b, c = plain.q_tree[-1]
     crank = 0.2 * np.array([-np.sin(a), np.cos(a)])
     rod, rocker = (x * np.array([-np.sin(at), np.cos(at)]) for x, at in ((0.6, a + b), (0.4, c)))
     rates = np.linalg.solve(np.column_stack([crank + rod, rod]), rocker)
-    wanted = np.column_stack([np.zeros((3, 2)), [*rates, 1.0]])
-    assert np.abs(found.q_tree[-1] - wanted).max() <= 100 * rtol + 1e-10
+    expected = np.column_stack([np.zeros((3, 2)), [*rates, 1.0]])
+    assert np.abs(result.q_tree[-1] - expected).max() <= 100 * rtol + 1e-10
