@@ -12,7 +12,7 @@ import numpy as np
 import ckc_pin
 from ckc_pin.view.style import figure_style
 
-NAME = "theta_2.mass"
+NAME = "link.link_2.mass"
 NOISE = 0.01  # N m, standard deviation of the measured torques
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Arguments", "constant", "labels", "near", "present", "values"]
+__all__ = ["Arguments", "argument_names", "constant", "near", "present", "values"]
 
 NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
 
@@ -25,29 +25,40 @@ def values(given: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
     return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in given.items()])
 
 
-def labels(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
-    """Name the arguments, in the same order: what carries them, what they are, and the axis."""
-    rows = [".".join(name) for name in mechanism.closure.names]
-    carriers = {
-        **{name: list(mechanism.tree.model.names) for name in ("offset", "mass", "centre", "inertia")},
-        **{name: list(mechanism.coordinates) for name in ("armature", "constant")},
-        **{name: list(mechanism.coordinates) for name in ("joint_stiffness", "joint_rest", "joint_damping")},
-        **dict.fromkeys(("length", "affine", "affine_offset"), rows),
+def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
+    """Name the arguments in the order of `Arguments.vector`, as parameters are named: ``link.link_2.mass``.
+
+    Mass, com and inertia are those of the whole body that a joint moves, in the joint's frame. Numbers without a
+    parameter of their own are named by the joint or row that they belong to.
+    """
+    tree, spec = mechanism.tree, mechanism.spec
+    joints, links = list(tree.model.names), mechanism.frames.bodies
+    rows = [".".join(row) for row in mechanism.closure.names]
+    lines = [k for k, spring in enumerate(spec.spring) if spring.joint is None]
+    points = [f"loop.{loop.name}.{end}" for end in ("frame_a", "frame_b") for loop in spec.loop]
+    ends = [f"spring.{k}.{end}" for end in ("frame_a", "frame_b") for k in lines]
+    entry = "xyz".__getitem__
+    by_kind: dict[str, Callable[..., str]] = {
+        "gravity": lambda k: f"gravity.{entry(k)}",
+        "offset": lambda j, k: f"joint.{joints[j]}.xyz.{entry(k)}",
+        "mass": lambda j: f"link.{links[j]}.mass",
+        "centre": lambda j, k: f"link.{links[j]}.com.{entry(k)}",
+        "inertia": lambda j, k, m: f"link.{links[j]}.inertia.i{entry(k)}{entry(m)}",
+        "armature": lambda k: f"joint.{tree.coordinates[k]}.armature",
+        "point": lambda k, i: f"{points[k]}.xyz.{entry(i)}",
+        "length": lambda row: f"loop.{rows[row]}",
+        "affine": lambda row, k: f"{rows[row]}.{tree.coordinates[k]}",
+        "affine_offset": lambda row: f"{rows[row]}.offset",
+        "constant": lambda k: f"joint.{tree.coordinates[k]}.force",
+        "joint_stiffness": lambda k: f"joint.{tree.coordinates[k]}.stiffness",
+        "joint_rest": lambda k: f"joint.{tree.coordinates[k]}.rest",
+        "joint_damping": lambda k: f"joint.{tree.coordinates[k]}.damping",
+        "end": lambda k, i: f"{ends[k]}.xyz.{entry(i)}",
+        "stiffness": lambda k: f"spring.{lines[k]}.stiffness",
+        "rest_length": lambda k: f"spring.{lines[k]}.rest_length",
+        "damping": lambda k: f"spring.{lines[k]}.damping",
     }
-    found = []
-    for name, there in which.items():
-        for index in np.argwhere(there):
-            axes = "".join("xyz"[k] for k in index[1:]) if there.shape[1:] in ((3,), (3, 3)) else ""
-            if name == "gravity":
-                carrier, axes = "", "xyz"[index[0]]
-            elif name == "affine":
-                carrier, axes = carriers[name][index[0]], mechanism.coordinates[index[1]]
-            elif name in carriers:
-                carrier = carriers[name][index[0]]
-            else:
-                carrier, axes = "", ".".join([str(index[0]), *axes])
-            found.append(".".join(part for part in (carrier, name, axes) if part))
-    return found
+    return [by_kind[kind](*index) for kind, present in which.items() for index in np.argwhere(present).tolist()]
 
 
 class Arguments:

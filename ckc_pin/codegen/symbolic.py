@@ -11,7 +11,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.codegen.acceleration import ConstrainedInertia
-from ckc_pin.codegen.arguments import labels, present, values
+from ckc_pin.codegen.arguments import argument_names, present, values
 from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import as_mechanism
@@ -38,7 +38,9 @@ class Symbolic(HasSummary):
     ----------
     coordinates, independent : tuple of str
     parameters : tuple of str
-        Names of the masses, centres, inertias, offsets, lengths, stiffnesses and gravity that are not zero.
+        Names of the masses, centres, inertias, offsets, lengths, stiffnesses and gravity that are not zero, as
+        parameters are named elsewhere. A body's numbers, ``link.link_2.mass``, are those of all links that its joint
+        moves, in the joint's frame.
     values : (k,) array
         The mechanism's values of the parameters.
     q_tree : (nq,) array
@@ -119,7 +121,7 @@ def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:
     return Symbolic(
         coordinates=mechanism.coordinates,
         independent=mechanism.independent,
-        parameters=tuple(labels(mechanism, present(mechanism_numbers))),
+        parameters=tuple(argument_names(mechanism, present(mechanism_numbers))),
         values=values(mechanism_numbers, present(mechanism_numbers)),
         q_tree=np.array(mechanism.q_tree),
         phi=function("phi", terms.rows.phi, q=q, p=p),

@@ -52,7 +52,7 @@ def test_numbers_are_arguments_by_name() -> None:
     named = dict(zip(found.parameters, found.values, strict=True))
     mechanism = load("five_bar")
     k = mechanism.tree.model.getJointId("theta_2")
-    assert named["theta_2.mass"] == mechanism.tree.model.inertias[k].mass
+    assert named["link.link_2.mass"] == mechanism.tree.model.inertias[k].mass
     assert named["gravity.y"] == -9.81
     light = np.array(found.values)
     light[[name.endswith(".mass") for name in found.parameters]] = 0.0
