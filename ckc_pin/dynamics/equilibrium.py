@@ -54,7 +54,7 @@ def stable_equilibrium(mechanism: Mechanism) -> Kinematics:
     Raises
     ------
     InputError
-        The loops hold a free root in part.
+        The loops constrain a free root in part.
     NumericalError
         There is none, or those coordinates do not determine the others there.
     """

@@ -225,7 +225,7 @@ def _why_not_closed(linkage: Linkage, best: Assembly, start: Array) -> str:
         return f"{message}, {miss / linkage.size:.0f} times the mechanism's size of {linkage.size:.3g} m: units?"
     alone = []
     for name in dict.fromkeys(name for name, _ in linkage.closure.names):
-        single = linkage.closure.only(name)
+        single = linkage.closure.select_loop(name)
         closed = close_loops(linkage.tree, single, start, np.ones(linkage.tree.n), EXACT * linkage.size)
         if closed.residual > ROUNDED * linkage.size:
             alone.append(f"{name} (miss {closed.residual:.3g})")

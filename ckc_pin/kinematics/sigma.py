@@ -108,7 +108,7 @@ def sigma(
     Raises
     ------
     InputError
-        The loops hold a free root in part: its place is no function of numbers q.
+        The loops constrain a free root in part: its place is no function of numbers q.
     """
     if mechanism.splits_root:
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")

@@ -283,7 +283,7 @@ def linear_model(
     """
     mechanism = terms.mechanism
     names = tuple(mechanism.coordinates[k] for k in locked)
-    if coincident := mechanism.springs.without_direction(terms.q_tree, COINCIDENCE_TOLERANCE * mechanism.size):
+    if coincident := mechanism.springs.find_without_direction(terms.q_tree, COINCIDENCE_TOLERANCE * mechanism.size):
         raise InputError(
             f"{mechanism.name}: the linear model does not exist there: the ends of {_join_names(tuple(coincident))} "
             "coincide, so the direction of its force is undefined; choose another configuration"

@@ -16,7 +16,7 @@ from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import AT_STOP
+from ckc_pin.mechanism.warnings import STOP_TOLERANCE
 from ckc_pin.native.plant import LOST_RANK
 
 __all__ = [
@@ -133,7 +133,7 @@ def has_unbalanced_force(state: Terms, u_tree: Array, tangent: Array) -> bool:
 def _find_stop_sides(mechanism: Mechanism, q_tree: Array) -> Array:
     """Return for each coordinate -1 at its lower stop, 1 at its upper stop, and 0 elsewhere."""
     joints, q = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
-    tolerance = AT_STOP * mechanism.tree.step_scale
+    tolerance = STOP_TOLERANCE * mechanism.tree.step_scale
     return np.where(q - joints.lower <= tolerance, -1.0, np.where(joints.upper - q <= tolerance, 1.0, 0.0))
 
 

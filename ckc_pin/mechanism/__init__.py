@@ -1,4 +1,4 @@
-"""What a mechanism is: its files, its tree, its closure, its freedoms and the split into q and z."""
+"""Mechanisms: file, URDF tree, loop closures, rank and freedoms, partition into q and z, named parameters."""
 
 from ckc_pin.mechanism.configuration import Kinematics, Partition, Psi
 from ckc_pin.mechanism.library import shipped

@@ -1,7 +1,7 @@
-"""A closure at many configurations at once.
+"""Evaluate constraint rows and their Jacobians at many configurations at once.
 
-The row primitives take arrays of loops, whatever their number: many copies of a mechanism are one mechanism with
-many loops. Only Pinocchio is called once a configuration, which costs two microseconds.
+The row primitives operate on arrays of loops, so many copies of a mechanism are evaluated as one mechanism with many
+loops. Only Pinocchio is called for each configuration, which takes two microseconds.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = ["ManyPoses", "difference_many", "evaluate_closure", "integrate_many",
 
 Renumber = Callable[[IntArray], IntArray]
 
-CHUNK = 2048  # configurations evaluated together: their arrays stay in the processor's cache
+CHUNK = 2048  # configurations evaluated together, so that their arrays fit in the cache
 
 
 def evaluate_closure(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array, Array]:
-    """Return phi and J of a closure at many configurations.
+    """Return the residual phi and the constraint Jacobian J at many configurations.
 
     Parameters
     ----------
@@ -53,37 +53,40 @@ def _evaluate(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Ar
     if isinstance(group, Affine):
         phi = pose.configurations[:, pose.tree.q_index] @ group.matrix.T - group.offset
         return phi, np.broadcast_to(group.matrix, (pose.count, *group.matrix.shape))
-    copies = _copies(group, closure, pose)
+    copies = _repeat(group, closure, pose)
     shape = (pose.count, len(group.out))
     return copies.phi(pose).reshape(shape), copies.jacobian(pose).reshape(*shape, pose.tree.n)
 
 
-def _copies(group: Rows, closure: Closure, pose: ManyPoses) -> Rows:
-    """Return a group of rows for each copy of the mechanism, as one group."""
+def _repeat(group: Rows, closure: Closure, pose: ManyPoses) -> Rows:
+    """Return one group with the rows of all copies of the mechanism."""
     anchors, count = closure.anchors, pose.count
 
-    def each(size: int) -> Renumber:
+    def offset_by(size: int) -> Renumber:
         return lambda numbers: (np.arange(count)[:, None] * size + numbers).ravel()
 
-    several = renumbered(
-        group, each(closure.rows), each(len(anchors.point_joint) // 2), each(len(anchors.direction_joint))
+    repeated = renumber(
+        group,
+        offset_by(closure.rows),
+        offset_by(len(anchors.point_joint) // 2),
+        offset_by(len(anchors.direction_joint)),
     )
-    if isinstance(several, Distance):
-        return replace(several, length=np.tile(several.length, count))
-    if isinstance(several, RelativeLog):
-        joint = each(pose.tree.model.njoints)
+    if isinstance(repeated, Distance):
+        return replace(repeated, length=np.tile(repeated.length, count))
+    if isinstance(repeated, RelativeLog):
+        renumber_joint = offset_by(pose.tree.model.njoints)
         return replace(
-            several,
-            joint_a=joint(several.joint_a),
-            rotation_a=np.tile(several.rotation_a, (count, 1, 1)),
-            joint_b=joint(several.joint_b),
-            rotation_b=np.tile(several.rotation_b, (count, 1, 1)),
+            repeated,
+            joint_a=renumber_joint(repeated.joint_a),
+            rotation_a=np.tile(repeated.rotation_a, (count, 1, 1)),
+            joint_b=renumber_joint(repeated.joint_b),
+            rotation_b=np.tile(repeated.rotation_b, (count, 1, 1)),
         )
-    return several
+    return repeated
 
 
-def renumbered(group: Rows, rows: Renumber, pairs: Renumber, directions: Renumber) -> Rows:
-    """Return a group of rows that refers to other numbers of rows, pairs and directions."""
+def renumber(group: Rows, rows: Renumber, pairs: Renumber, directions: Renumber) -> Rows:
+    """Return a group with new numbers of its rows, pairs and directions."""
     out = rows(group.out)
     if isinstance(group, Component):
         return replace(group, out=out, pair=pairs(group.pair), direction=directions(group.direction))
@@ -93,14 +96,14 @@ def renumbered(group: Rows, rows: Renumber, pairs: Renumber, directions: Renumbe
         return replace(group, out=out, pair=pairs(group.pair))
     if isinstance(group, Affine | RelativeLog):
         return replace(group, out=out)
-    raise TypeError(f"rows of an unknown kind: {type(group).__name__}")
+    raise TypeError(f"renumber: unknown row primitive {type(group).__name__}")
 
 
 def join_closures(a: Closure, b: Closure) -> Closure:
-    """Return one closure with the rows of two, those of the first one first."""
+    """Return a closure with the rows of `a`, then those of `b`."""
     pairs, directions = len(a.anchors.point_joint) // 2, len(a.anchors.direction_joint)
     more = tuple(
-        renumbered(group, lambda k: k + a.rows, lambda k: k + pairs, lambda k: k + directions) for group in b.groups
+        renumber(group, lambda k: k + a.rows, lambda k: k + pairs, lambda k: k + directions) for group in b.groups
     )
     ends = [(x.anchors, len(x.anchors.point_joint) // 2) for x in (a, b)]
     anchors = Anchors(
@@ -110,11 +113,13 @@ def join_closures(a: Closure, b: Closure) -> Closure:
         np.concatenate([x.direction_local for x, _ in ends]),
     )
     aligned = tuple((loop, x + directions, y + directions) for loop, x, y in b.aligned)
-    return Closure(anchors, a.groups + more, a.names + b.names, a.aligned + aligned, a.turned_by + b.turned_by)
+    return Closure(
+        anchors, a.groups + more, a.names + b.names, a.aligned + aligned, a.direction_frames + b.direction_frames
+    )
 
 
 def integrate_many(tree: Tree, q_tree: Array, step: Array) -> Array:
-    """Move configurations (count, nq) by tangent steps (count, n)."""
+    """Return the configurations (count, nq) that tangent steps (count, n) lead to."""
     if tree.is_euclidean:
         return q_tree + step
     return np.array([pin.integrate(tree.model, q, dq) for q, dq in zip(q_tree, step, strict=True)]).reshape(
@@ -123,14 +128,14 @@ def integrate_many(tree: Tree, q_tree: Array, step: Array) -> Array:
 
 
 def difference_many(tree: Tree, start: Array, end: Array) -> Array:
-    """Return the tangent steps (count, n) from configurations to others, (count, nq) each."""
+    """Return the tangent steps (count, n) from configurations `start` to `end`, (count, nq) each."""
     if tree.is_euclidean:
         return end - start
     return np.array([pin.difference(tree.model, a, b) for a, b in zip(start, end, strict=True)]).reshape(-1, tree.n)
 
 
 class ManyPoses(Pose):
-    """A tree at many configurations: what `Pose` has once it has for each, one after the other.
+    """The quantities of `Pose` at many configurations, one after the other.
 
     Parameters
     ----------
@@ -155,11 +160,11 @@ class ManyPoses(Pose):
 
     @lazy
     def p(self) -> Array:
-        """World positions of the points, shape (count, 2 k, 3), metres."""
+        """Positions of the points in the world, shape (count, 2 k, 3), metres."""
         at = self._joints(self.anchors.point_joint)
         local = np.tile(self.anchors.point_local, (self.count, 1))
-        turned = (self.rotation[at] @ local[:, :, None])[:, :, 0]
-        return (turned + self.translation[at]).reshape(self.count, len(self.anchors.point_joint), 3)
+        rotated = (self.rotation[at] @ local[:, :, None])[:, :, 0]
+        return (rotated + self.translation[at]).reshape(self.count, len(self.anchors.point_joint), 3)
 
     @lazy
     def r(self) -> Array:
@@ -183,17 +188,17 @@ class ManyPoses(Pose):
 
     @lazy
     def e(self) -> Array:
-        """World directions, shape (count * m, 3)."""
+        """Directions in world axes, shape (count * m, 3)."""
         at = self._joints(self.anchors.direction_joint)
         local = np.tile(self.anchors.direction_local, (self.count, 1))
         return (self.rotation[at] @ local[:, :, None])[:, :, 0]
 
     @lazy
     def e_angular(self) -> Array:
-        """Angular Jacobians of what the directions are fixed in, shape (count * m, 3, n)."""
+        """Angular Jacobians of the joints that the directions are fixed to, shape (count * m, 3, n)."""
         return self.angular(self._joints(self.anchors.direction_joint))
 
     def angular(self, joint: IntArray) -> Array:
-        """Angular Jacobians of joints, numbered through all copies, shape (len(joint), 3, n)."""
-        copy, own = np.divmod(joint, self.tree.model.njoints)
-        return self.tree.support[own] * self.angular_part[copy]
+        """Angular Jacobians of joints, which are numbered across all copies, shape (len(joint), 3, n)."""
+        copy, number = np.divmod(joint, self.tree.model.njoints)
+        return self.tree.support[number] * self.angular_part[copy]

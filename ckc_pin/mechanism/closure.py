@@ -1,4 +1,4 @@
-"""The closure phi(q') = 0 of eq. 1: every loop type of the design as a table of row primitives."""
+"""The loop closure phi(q') = 0 of eq. 1: which rows each loop type has, and their residuals and Jacobians."""
 
 from __future__ import annotations
 
@@ -12,36 +12,51 @@ from ckc_pin.errors import MechanismError
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
-from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec
+from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, LoopType
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Closure", "ClosureBuilder", "perpendicular"]
 
 _XYZ = np.eye(3)
 
+# Rows of each loop type: of the position, then of the orientation. r = p_A - p_B; a and b are axis_a and axis_b; e1, e2
+# and a are a right-handed basis; log is the rotation vector of R_A^T R_B.
+LOOP_ROWS: dict[LoopType, tuple[str, str]] = {
+    "point": ("r", ""),
+    "point_2d": ("e1.r, e2.r", ""),
+    "hinge": ("r", "e1.b, e2.b"),
+    "cylindrical": ("e1.r, e2.r", "e1.b, e2.b"),
+    "universal": ("r", "a.b"),
+    "prismatic": ("e1.r, e2.r", "log"),
+    "weld": ("r", "log"),
+    "distance": ("length", ""),
+}
+
 
 @dataclass(frozen=True)
 class Closure(Immutable):
-    """All rows of all loops and couplings.
+    """The constraint rows of all loops and couplings of a mechanism.
 
     Attributes
     ----------
     anchors : Anchors
+        Points and directions that the rows refer to.
     groups : tuple of Rows
-        At most one of each primitive.
+        The rows, at most one group of each primitive.
     names : tuple of (loop, row)
-        What each row of phi is, e.g. ("elbow", "x").
+        Name of each row of phi, such as ("elbow", "x").
     aligned : tuple of (loop, a, b)
-        Pairs of directions that must point the same way (a . b > 0) in an assembled hinge.
-    turned_by : tuple of (loop, frame)
-        What each of the anchors' directions turns with, e.g. ("elbow", "frame_a"); the world's turn with no frame, "".
+        Numbers of two directions that point the same way (a . b > 0) in an assembled hinge. Its rows alone would also
+        hold if they pointed against each other.
+    direction_frames : tuple of (loop, frame)
+        The frame that each direction of the anchors is fixed in, such as ("elbow", "frame_a"); "" for the world.
     """
 
     anchors: Anchors
     groups: tuple[Rows, ...]
     names: tuple[tuple[str, str], ...]
     aligned: tuple[tuple[str, int, int], ...]
-    turned_by: tuple[tuple[str, str], ...] = ()
+    direction_frames: tuple[tuple[str, str], ...] = ()
 
     @property
     def rows(self) -> int:
@@ -49,23 +64,23 @@ class Closure(Immutable):
         return len(self.names)
 
     def phi(self, pose: Pose) -> Array:
-        """Residual of the closure, shape (rows,), metres and radians (eq. 27 for the five-bar)."""
+        """Residual phi, shape (rows,), in metres and radians (eq. 27 for the five-bar)."""
         phi = np.empty(len(self.names))
         for group in self.groups:
             phi[group.out] = group.phi(pose)
         return phi
 
     def jacobian(self, pose: Pose) -> Array:
-        """J = d phi / d q', shape (rows, n)."""
+        """Constraint Jacobian J = d phi / d q', shape (rows, n)."""
         jacobian = np.empty((len(self.names), pose.tree.n))
         for group in self.groups:
             jacobian[group.out] = group.jacobian(pose)
         return jacobian
 
     def body_jacobian(self, pose: Pose) -> Array:
-        """d phi / d (the bodies' own velocities) as `BodyPose` has them, shape (rows, joints, 6).
+        """Derivative of phi with respect to the spatial velocities of the bodies, shape (rows, joints, 6).
 
-        Rows of couplings are zero: they hold coordinates, not bodies.
+        `BodyPose` defines these velocities. Rows of couplings are zero, since they constrain coordinates, not bodies.
         """
         bodies = BodyPose(pose, self.anchors)
         jacobian = np.zeros((len(self.names), bodies.linear_part.shape[1]))
@@ -82,33 +97,33 @@ class Closure(Immutable):
         return jacobian_dot
 
     def in_metres(self, tree: Tree) -> Array:
-        """Which rows of phi are lengths (the others are angles or cosines), shape (rows,) of bool."""
+        """Whether each row of phi is a length, shape (rows,); other rows are angles or cosines."""
         metres = np.zeros(len(self.names), dtype=bool)
         for group in self.groups:
             metres[group.out] = group.in_metres(tree)
         return metres
 
-    def only(self, loop: str) -> Closure:
-        """Return the closure with the rows of one loop alone, the others replaced by nothing."""
+    def select_loop(self, loop: str) -> Closure:
+        """Return a closure with the rows of one loop."""
         keep = np.array([k for k, (name, _) in enumerate(self.names) if name == loop], np.intp)
         rows = Selected(self.groups, len(self.names), keep)
         return Closure(self.anchors, (rows,), tuple(self.names[k] for k in keep), ())
 
     def largest_residuals(self, phi: Array) -> dict[str, float]:
-        """Largest |phi| of each loop."""
+        """Return the largest |phi| of each loop."""
         worst: dict[str, float] = {}
         for (loop, _), value in zip(self.names, np.abs(phi), strict=True):
             worst[loop] = max(worst.get(loop, 0.0), float(value))
         return worst
 
     def reversed_hinges(self, pose: Pose) -> list[str]:
-        """Loops whose axes point against each other, which their rows alone cannot tell."""
+        """Return the loops whose axes point against each other (a . b <= 0)."""
         return [loop for loop, a, b in self.aligned if pose.e[a] @ pose.e[b] <= 0]
 
 
 @dataclass(frozen=True)
 class Selected(Immutable):
-    """Some rows of a closure, as a group of its own."""
+    """A selection of the rows of other groups, as one group."""
 
     groups: tuple[Rows, ...]
     rows: int
@@ -116,14 +131,14 @@ class Selected(Immutable):
 
     @property
     def out(self) -> IntArray:
-        """Places of the rows in phi."""
+        """Indices of the rows in phi."""
         return np.arange(len(self.keep))
 
     def _gather(self, parts: list[Array]) -> Array:
-        whole = np.empty((self.rows, *parts[0].shape[1:]))
+        values = np.empty((self.rows, *parts[0].shape[1:]))
         for group, part in zip(self.groups, parts, strict=True):
-            whole[group.out] = part
-        return whole[self.keep]
+            values[group.out] = part
+        return values[self.keep]
 
     def in_metres(self, tree: Tree) -> Array | bool:
         """Whether the rows are lengths."""
@@ -143,7 +158,10 @@ class Selected(Immutable):
 
 
 def perpendicular(axis: Array) -> tuple[Array, Array]:
-    """Return e1, e2 completing a right-handed (e1, e2, axis); for a coordinate axis the cyclic ones."""
+    """Return e1 and e2 that complete a right-handed basis (e1, e2, axis).
+
+    For a coordinate axis they are the next two in cyclic order: x and y for z.
+    """
     along = int(np.argmax(np.abs(axis)))
     if axis[along] > 0 and np.count_nonzero(axis) == 1:
         return _XYZ[(along + 1) % 3], _XYZ[(along + 2) % 3]
@@ -153,7 +171,13 @@ def perpendicular(axis: Array) -> tuple[Array, Array]:
 
 
 class ClosureBuilder:
-    """Collects loops and couplings row by row, then groups the rows by primitive."""
+    """Collects the rows of loops and couplings, then groups them by primitive.
+
+    Parameters
+    ----------
+    tree : Tree
+    frames : Frames
+    """
 
     def __init__(self, tree: Tree, frames: Frames) -> None:
         self.tree = tree
@@ -162,53 +186,53 @@ class ClosureBuilder:
         self.aligned: list[tuple[str, int, int]] = []
         self._pairs: list[tuple[Frame, Frame]] = []
         self._directions: list[tuple[int, Array]] = []
-        self._turned_by: list[tuple[str, str]] = []
+        self._direction_frames: list[tuple[str, str]] = []
         self._components: list[tuple[int, int, int]] = []  # row, pair, direction
         self._dots: list[tuple[int, int, int]] = []  # row, a, b
         self._distances: list[tuple[int, int, float]] = []  # row, pair, length
         self._affine: list[tuple[int, Array, float]] = []  # row, coefficients, offset
         self._logs: list[tuple[list[int], Frame, Frame]] = []
 
-    def pair(self, a: Frame, b: Frame) -> int:
-        """Add a pair of points; return its number."""
-        self._pairs.append((a, b))
-        return len(self._pairs) - 1
-
     def add_loop(self, loop: LoopSpec) -> None:
-        """Add the rows of a loop, in the design's order."""
+        """Add the rows of a loop, in the order of `LOOP_ROWS`.
+
+        Raises
+        ------
+        MechanismError
+            Two loops of one name, an unknown frame, frames of one body, an invalid axis, a wrong or missing length.
+        """
         where = f"loop {loop.name!r}"
         if loop.name in {name for name, _ in self.names}:
             raise MechanismError(f"{where}: two loops have this name")
         a = self.frames.find(loop.frame_a, f"{where}, frame_a")
         b = self.frames.find(loop.frame_b, f"{where}, frame_b")
         if a.joint == b.joint:
-            raise MechanismError(f"{where}: frames A and B move together (the same rigid body); a loop needs two")
+            raise MechanismError(f"{where}: frames A and B belong to the same rigid body; a loop needs two bodies")
         if (loop.length is not None) != (loop.type == "distance"):
             remedy = "needs the key length" if loop.type == "distance" else "has no key length, only 'distance' has"
             raise MechanismError(f"{where}: type {loop.type!r} {remedy}")
         axis_a, axis_b = (_unit(x, f"{where}, {k}") for k, x in (("axis_a", loop.axis_a), ("axis_b", loop.axis_b)))
         e1, e2 = perpendicular(axis_a)
-        pair = self.pair(a, b)
-        if loop.type in ("point", "hinge", "universal", "weld"):
-            self._resolve(loop, pair, a, [("x", _XYZ[0]), ("y", _XYZ[1]), ("z", _XYZ[2])])
-        elif loop.type in ("point_2d", "cylindrical", "prismatic"):
-            self._resolve(loop, pair, a, [(_label(e1, "e1"), e1), (_label(e2, "e2"), e2)])
+        self._pairs.append((a, b))
+        position, orientation = LOOP_ROWS[loop.type]
+        if position == "r":
+            self._add_components(loop, a, [("x", _XYZ[0]), ("y", _XYZ[1]), ("z", _XYZ[2])])
+        elif position == "e1.r, e2.r":
+            self._add_components(loop, a, [(_label(e1, "e1"), e1), (_label(e2, "e2"), e2)])
         elif loop.length is not None:
-            self._distances.append((self._row(loop.name, "length"), pair, loop.length))
-        if loop.type in ("hinge", "cylindrical"):
-            along_b = self._direction(b, axis_b, loop.name, "frame_b")
+            self._distances.append((self._add_row(loop.name, "length"), len(self._pairs) - 1, loop.length))
+        if orientation == "e1.b, e2.b":
+            b_number = self._add_direction(b, axis_b, loop.name, "frame_b")
             for label, e in (("e1.b", e1), ("e2.b", e2)):
-                self._dots.append((self._row(loop.name, label), self._direction(a, e, loop.name, "frame_a"), along_b))
-            self.aligned.append((loop.name, self._direction(a, axis_a, loop.name, "frame_a"), along_b))
-        elif loop.type == "universal":
-            row = self._row(loop.name, "a.b")
-            along_a, along_b = (
-                self._direction(frame, axis, loop.name, label)
-                for frame, axis, label in ((a, axis_a, "frame_a"), (b, axis_b, "frame_b"))
-            )
-            self._dots.append((row, along_a, along_b))
-        elif loop.type in ("prismatic", "weld"):
-            self._logs.append(([self._row(loop.name, label) for label in ("rx", "ry", "rz")], a, b))
+                row = self._add_row(loop.name, label)
+                self._dots.append((row, self._add_direction(a, e, loop.name, "frame_a"), b_number))
+            self.aligned.append((loop.name, self._add_direction(a, axis_a, loop.name, "frame_a"), b_number))
+        elif orientation == "a.b":
+            row = self._add_row(loop.name, "a.b")
+            a_number = self._add_direction(a, axis_a, loop.name, "frame_a")
+            self._dots.append((row, a_number, self._add_direction(b, axis_b, loop.name, "frame_b")))
+        elif orientation == "log":
+            self._logs.append(([self._add_row(loop.name, label) for label in ("rx", "ry", "rz")], a, b))
 
     def add_coupling(self, coupling: CouplingSpec) -> None:
         """Add the row joint - ratio * other - offset = 0."""
@@ -219,15 +243,15 @@ class ClosureBuilder:
             raise MechanismError(f"{where}: a joint cannot be coupled to itself")
         coefficients = np.zeros(self.tree.n)
         coefficients[joint], coefficients[other] = 1.0, -coupling.ratio
-        self._affine.append((self._row(name, "coupling"), coefficients, coupling.offset))
+        self._affine.append((self._add_row(name, "coupling"), coefficients, coupling.offset))
 
     def build(self) -> Closure:
-        """Group the rows by primitive."""
+        """Return the closure, with at most one group of each primitive."""
         groups: list[Rows] = []
         if self._components:
             out, pair, direction = _columns(self._components)
-            turning = any(self._directions[k][0] != 0 for k in direction)
-            groups.append(Component(out, pair, direction, turning))
+            is_turning = any(self._directions[k][0] != 0 for k in direction)
+            groups.append(Component(out, pair, direction, is_turning))
         if self._dots:
             groups.append(Dot(*_columns(self._dots)))
         if self._distances:
@@ -247,36 +271,38 @@ class ClosureBuilder:
             direction_joint=np.array([joint for joint, _ in self._directions], np.intp),
             direction_local=np.array([e for _, e in self._directions]).reshape(-1, 3),
         )
-        return Closure(anchors, tuple(groups), tuple(self.names), tuple(self.aligned), tuple(self._turned_by))
+        return Closure(anchors, tuple(groups), tuple(self.names), tuple(self.aligned), tuple(self._direction_frames))
 
-    def _resolve(self, loop: LoopSpec, pair: int, a: Frame, directions: list[tuple[str, Array]]) -> None:
-        world = Frame(0, np.eye(3), np.zeros(3))
+    def _add_components(self, loop: LoopSpec, a: Frame, directions: list[tuple[str, Array]]) -> None:
+        """Add rows e . (p_A - p_B) of the last pair, with e fixed in frame A or in the world."""
+        in_world = loop.rows_in == "world"
+        frame = Frame(0, np.eye(3), np.zeros(3)) if in_world else a
         for label, e in directions:
-            of_world = loop.rows_in == "world"
-            direction = self._direction(world if of_world else a, e, loop.name, "" if of_world else "frame_a")
-            self._components.append((self._row(loop.name, label), pair, direction))
+            direction = self._add_direction(frame, e, loop.name, "" if in_world else "frame_a")
+            self._components.append((self._add_row(loop.name, label), len(self._pairs) - 1, direction))
 
-    def _row(self, loop: str, label: str) -> int:
+    def _add_row(self, loop: str, label: str) -> int:
         self.names.append((loop, label))
         return len(self.names) - 1
 
-    def _direction(self, frame: Frame, e: Array, loop: str, label: str) -> int:
+    def _add_direction(self, frame: Frame, e: Array, loop: str, label: str) -> int:
         self._directions.append((frame.joint, frame.rotation @ e))
-        self._turned_by.append((loop, label))
+        self._direction_frames.append((loop, label))
         return len(self._directions) - 1
 
 
-def _label(e: Array, otherwise: str) -> str:
-    at = np.flatnonzero(e)
-    return "xyz"[at[0]] if len(at) == 1 and e[at[0]] == 1 else otherwise
+def _label(e: Array, default: str) -> str:
+    """Return "x", "y" or "z" for a coordinate axis."""
+    nonzero = np.flatnonzero(e)
+    return "xyz"[nonzero[0]] if len(nonzero) == 1 and e[nonzero[0]] == 1 else default
 
 
 def _unit(axis: Sequence[float], where: str) -> Array:
     vector = np.array(axis, dtype=float)
     largest = np.abs(vector).max()
     if not np.isfinite(largest) or largest == 0:
-        raise MechanismError(f"{where}: {list(axis)} is no direction; give three finite numbers, not all zero")
-    vector /= largest  # whose squares are numbers
+        raise MechanismError(f"{where}: {list(axis)} is not a direction; give three finite numbers, not all zero")
+    vector /= largest  # so that the squares in the norm neither overflow nor vanish
     return np.asarray(vector / np.linalg.norm(vector))
 
 

@@ -1,4 +1,4 @@
-"""The closure at one configuration, split into q and z: phi, phi_q, phi_z and rho of eqs. 1 to 5."""
+"""Constraint terms at one configuration: phi, J, phi_q, phi_z and rho of eqs. 1 to 5."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["Kinematics", "Partition", "Psi"]
 
 @dataclass(frozen=True)
 class Partition(Immutable):
-    """The split q' = [q; z] of eq. 2: where the independent and the dependent coordinates stand."""
+    """The partition q' = [q; z] of eq. 2: places of the independent and of the dependent coordinates in q'."""
 
     q: IntArray
     z: IntArray
 
 
 class Kinematics:
-    """phi and its first derivatives at one configuration; each computed when first asked for.
+    """Constraint terms at one configuration. Each is computed at its first use.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Kinematics:
 
     @lazy
     def J(self) -> Array:
-        """d phi / d q', shape (rows, n), the tree's order."""
+        """Constraint Jacobian d phi / d q', shape (rows, n), columns in the order of the tree."""
         return self.closure.jacobian(self.pose)
 
     @property
@@ -64,7 +64,7 @@ class Kinematics:
 
     @lazy
     def phi_z_factor(self) -> Factorization:
-        """The factorization that sigma's Newton step, rho and rho_dot share."""
+        """Factorization of phi_z, shared by the Newton steps of sigma, rho and rho_dot."""
         return Factorization(self.phi_z)
 
     @lazy
@@ -80,7 +80,7 @@ class Kinematics:
         return self.closure.jacobian_dot(self.pose, Rate(self.pose, v))
 
     def sigma_min(self) -> float:
-        """Smallest singular value of phi_z (its distance to a singular configuration); inf when z is empty."""
+        """Return the smallest singular value of phi_z, which is zero in a singular configuration; inf if z is empty."""
         if not len(self.partition.z):
             return float("inf")
         if not np.all(np.isfinite(self.phi_z)):
@@ -88,33 +88,33 @@ class Kinematics:
         return float(np.linalg.svd(self.phi_z, compute_uv=False)[len(self.partition.z) - 1])
 
     def margin(self) -> float:
-        """How far q is from failing as coordinates: phi_z's smallest singular value over |J|, both free of units.
+        """Return the smallest singular value of phi_z relative to |J|, both dimensionless; inf if z is empty.
 
-        Infinite when z is empty.
+        It is zero where q does not determine the configuration.
         """
         if not len(self.partition.z):
             return float("inf")
         J = scale_jacobian(self.J, self.tree, self.closure)
         if not np.all(np.isfinite(J)):
             return float("nan")
-        least = np.linalg.svd(J[:, self.partition.z], compute_uv=False)[len(self.partition.z) - 1]
-        return float(least / max(np.linalg.norm(J), 1e-300))
+        smallest = np.linalg.svd(J[:, self.partition.z], compute_uv=False)[len(self.partition.z) - 1]
+        return float(smallest / max(np.linalg.norm(J), 1e-300))
 
     def integrate(self, step: Array) -> Kinematics:
-        """Return the kinematics at the configuration a tangent step away."""
+        """Return the kinematics at the configuration that a tangent step leads to."""
         return Kinematics(self.tree, self.closure, self.partition, self.tree.integrate(self.q_tree, step))
 
 
 class Psi:
-    """Psi(q', q) = [phi(q'); S q' - q] of eq. 3, for people who want to see it whole.
+    """Psi(q', q) = [phi(q'); S q' - q] of eq. 3, for reference.
 
-    sigma solves Psi = 0 for q'. Since its last d rows are solved by putting q in its place, the program
-    iterates on z alone with phi_z, which is the Schur complement of Psi's Jacobian.
+    sigma solves Psi = 0 for q'. The last d equations are solved by inserting q, so the program iterates on z only, with
+    phi_z, the Schur complement of the Jacobian of Psi.
 
     Parameters
     ----------
     at : Kinematics
-        At q'; its tree must consist of joints of one freedom (S q' needs numbers).
+        At q'. Its tree must not have a free root.
     """
 
     def __init__(self, at: Kinematics) -> None:

@@ -1,4 +1,4 @@
-"""Frames by name: a link, ``joint:NAME``, ``world``, or a table that places a frame in one of these."""
+"""Named frames of a tree: a link, ``joint:NAME``, ``world``, or a frame placed relative to one of these."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Frame", "Frames"]
 
 @dataclass(frozen=True)
 class Frame(Immutable):
-    """A frame fixed in a joint of the tree (joint 0: the world): rotation (3, 3), translation (3,)."""
+    """A frame fixed to a joint of the tree (joint 0 is the world): rotation (3, 3), translation (3,)."""
 
     joint: int
     rotation: Array
@@ -27,14 +27,14 @@ class Frame(Immutable):
 class Frames:
     """The named frames of a Pinocchio model.
 
-    `getFrameId` of an unknown name returns `nframes` without an error, and raises when a link and a
-    joint share a name; here links and joints are two dictionaries.
+    Links and joints are separate tables, since a link and a joint may share a name. (Pinocchio's `getFrameId` raises
+    an error then, and returns `nframes` for an unknown name.)
 
     Attributes
     ----------
     links, joints : dict of str to Frame
     bodies : list of str
-        By joint, the world first: the link that it carries, or the joint where fixed joints made several one.
+        Name of the body of each joint, the world first: its link, or the joint if fixed joints merged several links.
     """
 
     def __init__(self, model: Any) -> None:
@@ -52,18 +52,18 @@ class Frames:
                 self.bodies[placed.joint] = link
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Frames:
-        """Copy the tables; a frame stays what it is."""
+        """Copy the tables. The frames are immutable and shared."""
         twin = Frames.__new__(Frames)
         twin.links, twin.joints, twin.bodies = dict(self.links), dict(self.joints), list(self.bodies)
         return twin
 
     def find(self, frame: str | FrameSpec, where: str) -> Frame:
-        """Look a frame up.
+        """Return the frame that a mechanism file describes.
 
         Raises
         ------
         MechanismError
-            No such link or joint; the message lists those there are.
+            The link or joint does not exist; the message lists the valid names.
         """
         if isinstance(frame, str):
             return self._named(frame, where)
@@ -75,10 +75,10 @@ class Frames:
         if name == "world":
             return Frame(0, np.eye(3), np.zeros(3))
         if name.startswith("joint:"):
-            known, key, what = self.joints, name.removeprefix("joint:"), "joint"
+            table, key, what = self.joints, name.removeprefix("joint:"), "joint"
         else:
-            known, key, what = self.links, name, "link"
-        if key not in known:
-            choices = ", ".join(sorted(known))
+            table, key, what = self.links, name, "link"
+        if key not in table:
+            choices = ", ".join(sorted(table))
             raise MechanismError(f"{where}: no {what} {key!r}; there are {choices}")
-        return known[key]
+        return table[key]

@@ -1,4 +1,4 @@
-"""What a joint itself does: rotor inertia, viscous damping, dry friction, stops."""
+"""Rotor inertia, viscous damping, dry friction and stops of joints."""
 
 from __future__ import annotations
 
@@ -16,31 +16,34 @@ __all__ = ["Joints"]
 
 
 class Joints:
-    """Dry friction and stops by coordinate; armature and damping go into the tree's model.
+    """Dry friction and stops of a mechanism's joints, by coordinate.
 
-    What the URDF says holds where the mechanism's file says nothing; its limits are walls only where asked for.
+    Values that the mechanism file does not give come from the URDF. The URDF's limits are stops only if the mechanism
+    file says ``stops = true``.
 
     Parameters
     ----------
     tree : Tree
-        Its model takes the armature and the damping.
+        Armature and damping are written to its model.
     specs : sequence of JointSpec
 
     Raises
     ------
     MechanismError
-        No such joint, a joint named twice, stops without limits or without room between them.
+        An unknown joint, a joint given twice, stops without limits or with equal limits.
 
     Attributes
     ----------
     friction : (n,) array
         Largest force or torque of dry friction, N or N m.
     lower, upper : (n,) array
-        Where the stops are, infinite where there is none.
+        Positions of the stops, rad or m, infinite if there is none.
     restitution : (n,) array
-        Of an impact at a stop: speed after over speed before.
+        Coefficient of restitution of impacts at the stops: speed after over speed before.
+    stopped : (n,) bool array
+        Whether a joint has stops.
     warnings : list of str
-        Limits that are no walls.
+        Joint limits that are not stops.
     """
 
     def __init__(self, tree: Tree, specs: Sequence[JointSpec]) -> None:
@@ -50,12 +53,12 @@ class Joints:
         self.restitution = np.zeros(n)
         lower, upper = tree.limits()
         armature, damping = np.array(model.armature), np.array(model.damping)
-        seen = set[str]()
+        names = set[str]()
         for spec in specs:
             at = tree.joint_index(spec.name, "joint")
-            if spec.name in seen:
+            if spec.name in names:
                 raise MechanismError(f"joint: {spec.name!r} is given twice")
-            seen.add(spec.name)
+            names.add(spec.name)
             if spec.armature is not None:
                 armature[at] = spec.armature
             if spec.damping is not None:
@@ -76,7 +79,7 @@ class Joints:
         self.warnings = _open_limits(tree, (np.isfinite(lower) | np.isfinite(upper)) & ~self.stopped)
 
     def without(self, immobile: BoolArray) -> Joints:
-        """Return the joints without friction and stops where a mask, shape (n,), says that loops hold them still."""
+        """Return a copy without friction and stops of the joints that the mask, shape (n,), says cannot move."""
         joints = copy(self)
         joints.friction = np.where(immobile, 0.0, self.friction)
         joints.lower, joints.upper = np.where(immobile, -np.inf, self.lower), np.where(immobile, np.inf, self.upper)
@@ -84,22 +87,22 @@ class Joints:
         return joints
 
     def has_events(self, smoothing: float | None) -> bool:
-        """Whether joints stick or touch, friction being smoothed or not (None)."""
+        """Whether joints stick or reach stops. `smoothing` is the speed of smoothed friction, or None."""
         return bool(self.stopped.any()) or (smoothing is None and bool(self.friction.any()))
 
     def has_smooth_friction(self, smoothing: float | None) -> bool:
-        """Whether friction is smoothed, so that its work is not part of a run's `dissipated`."""
+        """Whether there is smoothed friction, whose work a run does not count as `dissipated`."""
         return smoothing is not None and bool(self.friction.any())
 
     def smooth_friction(self, v_tree: Array, smoothing: float) -> Array:
-        """Return -F tanh(v / smoothing), N or N m, shape (n,)."""
+        """Return the smoothed friction force -F tanh(v / smoothing), N or N m, shape (n,)."""
         return -self.friction * np.tanh(v_tree / smoothing)
 
 
 def _open_limits(tree: Tree, limited: BoolArray) -> list[str]:
-    """Say which limits a run may pass, and how to make walls of them."""
+    """Warn of limits that a run may pass, and say how to make them stops."""
     names = [tree.coordinates[k] for k in np.flatnonzero(limited)]
     if not names:
         return []
-    some = ", ".join(names if len(names) <= 6 else [*names[:5], f"{len(names) - 5} more"])
-    return [f"joint limits are no walls, a run may pass them: {some}; stops = true in their [[joint]] makes them walls"]
+    listed = ", ".join(names if len(names) <= 6 else [*names[:5], f"{len(names) - 5} more"])
+    return [f"joint limits are not stops, so a run may pass them: {listed}; stops = true in their [[joint]] adds stops"]

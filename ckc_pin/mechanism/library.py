@@ -1,4 +1,4 @@
-"""The files of mechanisms, by shipped name or by path."""
+"""Find mechanism files by shipped name or path, and generate the files of parametrized mechanisms."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ __all__ = [
 ]
 
 GENERATORS = ("n_four_bar",)
-MAX_N = 160  # n = 2 N + 1 coordinates, and memory grows with n^3: 2.2 GB
+MAX_N = 160  # squares: 2 N + 1 coordinates, for which Pinocchio's workspace takes 2.2 GB
 
 
 class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A scene's ``mechanism = {generator = "n_four_bar", N = 40}``; the bound holds before anything is made.
+    """A generated mechanism: ``mechanism = {generator = "n_four_bar", N = 40}`` of a scene.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         N unit squares in a row that share their verticals.
         ``generator = "n_four_bar"``
     N
-        How many.
+        Number of squares.
         ``N = 40``
     """
 
@@ -51,14 +51,14 @@ class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def generate(spec: GeneratorSpec) -> tuple[str, Sources]:
-    """Return the text of the mechanism file and the sources that hold the URDF it names.
+    """Generate a mechanism: return the text of its file, and the sources with its URDF.
 
     Parameters
     ----------
     spec : GeneratorSpec
-        ``n_four_bar``: N unit squares in a row that share their verticals. N + 1 rods stand on ground
-        pins one metre apart, N bars lie on top; all are uniform, 1 m and 1 kg. ``theta_k`` is rod k's
-        angle from +x, ``psi_k`` the angle of bar k against rod k - 1, on whose top it is pinned.
+        ``n_four_bar``: N unit squares in a row that share their verticals. N + 1 rods stand on ground pins one metre
+        apart, and N bars lie on top. All are uniform, 1 m long, and weigh 1 kg. ``theta_k`` is the angle of rod k from
+        +x. ``psi_k`` is the angle of bar k relative to rod k - 1, to whose top it is pinned.
     """
     N = spec.N
     rods = [_link(f"rod_{k}", z=0.0, colour="blue") for k in range(N + 1)]
@@ -160,29 +160,29 @@ MECHANISM_FILE = "mechanism.toml"
 
 @cache
 def library() -> Path:
-    """Folder of the shipped mechanisms: beside the package in a checkout, inside it in a wheel."""
+    """Return the folder of the shipped mechanisms: beside the package in a checkout, inside it in a wheel."""
     package = Path(__file__).resolve().parent.parent
     inside = package / "urdf"
     return inside if inside.is_dir() else package.parent / "urdf"
 
 
 def shipped() -> list[str]:
-    """Names of the shipped mechanisms, those of files and those made by rule."""
+    """Return the names of the shipped mechanisms, from files and generated."""
     return sorted([*(p.parent.name for p in library().glob(f"*/{MECHANISM_FILE}")), *GENERATORS])
 
 
 def is_path(name: str) -> bool:
-    """Whether a mechanism or scene is given by path: it exists, or ends in .toml."""
-    return name.endswith(".toml") or exists(name)  # os.path's own takes names that no file system does
+    """Whether a name of a mechanism or scene is a path: it exists, or ends in .toml."""
+    return name.endswith(".toml") or exists(name)  # unlike Path.exists, this accepts names that no file can have
 
 
 def mechanism_file(name: str | Path) -> Path:
-    """Return the path of a mechanism's file.
+    """Return the path of a mechanism file.
 
     Raises
     ------
     InputError
-        No such mechanism; the message lists the shipped ones.
+        There is no such mechanism; the message lists the shipped ones.
     """
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
@@ -198,26 +198,26 @@ def mechanism_file(name: str | Path) -> Path:
 
 
 def describe_mechanism(name: str) -> str:
-    """What a shipped mechanism is, in a sentence: the first comment of its file, so that the two cannot drift apart."""
+    """Return the description of a shipped mechanism, which is the first sentence of its file's first comment."""
     return first_comment(read_mechanism_texts(name)[0])
 
 
 def first_comment(text: str) -> str:
-    """Return the first sentence of the first comment of a TOML text, without its marks."""
+    """Return the first sentence of the first comment of a TOML text, without the # characters."""
     lines = text.splitlines()
     start = next((k for k, line in enumerate(lines) if line.startswith("#")), len(lines))
     comment = itertools.takewhile(lambda line: line.startswith("#"), lines[start:])
-    whole = " ".join(line.lstrip("# ").strip() for line in comment)
-    return re.split(r"(?<=\.) +(?=[A-Z])", whole, maxsplit=1)[0]
+    sentences = " ".join(line.lstrip("# ").strip() for line in comment)
+    return re.split(r"(?<=\.) +(?=[A-Z])", sentences, maxsplit=1)[0]
 
 
 def read_mechanism_texts(name: str | Path | GeneratorSpec) -> tuple[str, Sources]:
-    """Return the text of a mechanism's file, and where the texts that it names come from.
+    """Return the text of a mechanism file, and the sources of the texts that it names.
 
     Raises
     ------
     InputError
-        A file that is missing or cannot be read.
+        The file is missing or cannot be read.
     """
     if isinstance(name, GeneratorSpec):
         return generate(name)

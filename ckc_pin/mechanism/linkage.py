@@ -1,7 +1,8 @@
-"""The `Linkage`: what a mechanism's files say, before it is assembled."""
+"""The `Linkage`: tree, loops, springs and motors of a mechanism file, before the loops are assembled."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,43 +15,41 @@ from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.joints import Joints
 from ckc_pin.mechanism.motors import motors_of
 from ckc_pin.mechanism.parameters import Overrides, changed
-from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
+from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, MechanismSpec
 from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, merge
 
 __all__ = ["Linkage"]
 
-LARGEST = 1e100  # m: squares of what is larger overflow, and their products
+MAX_OFFSET_M = 1e100  # products of squares of larger lengths overflow
 
 
 class Linkage:
-    """A tree and the loops that close it.
+    """The parts of a mechanism that do not depend on its assembled configuration.
 
     Parameters
     ----------
     spec : MechanismSpec
         The content of ``mechanism.toml``.
     sources : Sources
-        Where the texts of its URDFs come from.
+        The texts of its URDFs.
     overrides : mapping
-        Numbers that are other ones, by name (`mechanism.parameters`).
+        Parameter values by name (`mechanism.parameters`) that replace those of the files.
 
     Raises
     ------
     MechanismError
-        Unknown names, a tree or loops that cannot exist.
+        Unknown names, or a tree or loops that cannot exist.
 
     Attributes
     ----------
     urdf : UrdfTree
-        All trees in one.
+        All trees of the file, merged into one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
     motors : Motors or None
-        None where the file names none.
+        None if the file names no motors.
     points : dict of str to Frame
-    urdf : UrdfTree
-        All trees in one.
     size : float
         Characteristic length, metres.
     warnings : list of str
@@ -64,9 +63,11 @@ class Linkage:
             self.warnings += warnings
             text = ElementTree.tostring(urdf.root, encoding="unicode")
         self.spec, self.sources, self.urdf = spec, sources, urdf
-        self.tree = Tree(_build_model(text, sources.name))
-        self.tree.model.gravity.linear = np.array(spec.gravity)
-        self.frames = Frames(self.tree.model)
+        model = _build_model(text, sources.name)
+        model.gravity.linear = np.array(spec.gravity)
+        self.frames = Frames(model)
+        self.size = _characteristic_length(model, self.frames, spec.loop, sources.name)
+        self.tree = Tree(model, self.size)
         builder = ClosureBuilder(self.tree, self.frames)
         for loop in spec.loop:
             builder.add_loop(loop)
@@ -80,8 +81,6 @@ class Linkage:
         self.points = {p.name: self.frames.find(p.frame, f"point {p.name!r}") for p in spec.point}
         if len(self.points) < len(spec.point):
             raise MechanismError("point: two points have the same name")
-        self.size = _size(self.tree, self.closure, sources.name)
-        self.tree.measure(self.size)
         self.warnings += self.joints.warnings
 
 
@@ -100,12 +99,16 @@ def _build_model(text: str, source: str) -> pin.Model:
         raise MechanismError(f"{source}: Pinocchio cannot build this tree: {error}") from None
 
 
-def _size(tree: Tree, closure: Closure, source: str) -> float:
-    """Characteristic length: the largest offset between joints, or from a joint to a loop's point, metres."""
-    offsets = [placement.translation for placement in tree.model.jointPlacements]
-    parts = np.array([*offsets, *closure.anchors.point_local]).reshape(-1, 3)
-    if not np.abs(parts).max(initial=0.0) <= LARGEST:
+def _characteristic_length(model: pin.Model, frames: Frames, loops: Sequence[LoopSpec], source: str) -> float:
+    """Return the largest distance between neighbouring joints, or from a joint to a loop's frame, metres."""
+    offsets = [placement.translation for placement in model.jointPlacements]
+    for loop in loops:
+        for key, frame in (("frame_a", loop.frame_a), ("frame_b", loop.frame_b)):
+            offsets.append(frames.find(frame, f"loop {loop.name!r}, {key}").translation)
+    vectors = np.array(offsets).reshape(-1, 3)
+    largest = np.abs(vectors).max(initial=0.0)
+    if not largest <= MAX_OFFSET_M:
         raise MechanismError(
-            f"{source}: offsets of joints or loops of {np.abs(parts).max():g} m, more than {LARGEST:g}: units?"
+            f"{source}: joints or loop frames are {largest:g} m apart, more than {MAX_OFFSET_M:g} m; check units"
         )
-    return float(np.linalg.norm(parts, axis=1).max(initial=0.0)) or 1.0
+    return float(np.linalg.norm(vectors, axis=1).max(initial=0.0)) or 1.0

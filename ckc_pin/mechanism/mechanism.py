@@ -1,4 +1,4 @@
-"""The `Mechanism`: a tree, its closure, an assembled configuration, and a checked split into q and z."""
+"""The `Mechanism`: a tree, its loop closures, an assembled configuration, and a checked partition into q and z."""
 
 from __future__ import annotations
 
@@ -18,52 +18,51 @@ from ckc_pin.mechanism.rank import Freedoms, choose_dependent, compute_rank, idl
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
 CONSTRAINED_IN_PART = (
-    "the loops hold a free root in part, so no q of joint coordinates describes it; it starts as assembled "
-    '(at = "assembled"), runs as a DAE (formulation = "dae"), and has no controller'
+    "the loops constrain a free root in part, so its motion has no independent coordinates q; start it as assembled "
+    '(at = "assembled"), run it as a DAE (formulation = "dae"), and without a controller'
 )
 
 
 class Mechanism(HasSummary):
-    """A closed chain: everything that does not depend on the state. `load` makes one.
+    """A closed kinematic chain: everything that does not depend on the state. `load` returns one.
 
     Parameters
     ----------
     linkage : Linkage
-        What its files say.
+        The parts of the mechanism before assembly.
     q_tree : (nq,) array
         The assembled configuration.
     residual, tolerance : float
-        Largest |phi| there; largest |phi| that counts as closed.
+        Largest |phi| in this configuration, and largest |phi| that counts as closed.
     freedoms : Freedoms
-        What the rank of J says there.
+        Degrees of freedom, from the rank of J.
 
     Raises
     ------
     MechanismError
-        Coordinates that cannot serve as q, motors on no joint.
+        Unsuitable independent coordinates, or a motor without a joint.
 
     Attributes
     ----------
     name : str
     n, d : int
-        Coordinates of the tree; freedoms of the mechanism.
+        Number of coordinates of the tree, and of degrees of freedom.
     coordinates, independent, dependent : tuple of str
+        Names of all coordinates, of q and of z.
     actuated : tuple of str
         Names of the motors, in the order of tau.
     motors : Motors
-    urdf : Element
-        All its trees in one <robot>.
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
     urdf : Element
-        All trees in one <robot>, as Pinocchio got them.
+        All trees merged into one <robot>, as Pinocchio read it.
     partition : Partition
     q_tree : (nq,) array
-        The assembled configuration (Pinocchio's q).
+        The assembled configuration, in Pinocchio's q.
     redundant : tuple of str
-        Rows that the others imply, one admissible choice, as "loop.row".
+        Names of redundant constraint rows, one admissible choice, as "loop.row".
     freedoms : Freedoms
-        How d and rank were found.
+        Rank of J and degrees of freedom.
     tolerance : float
         Largest |phi| that counts as closed.
     warnings : list of str
@@ -81,12 +80,12 @@ class Mechanism(HasSummary):
         self.d, self.rank = freedoms.d, freedoms.rank.rank
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
-        self._free_joints()
-        self._split(linkage.motors)
-        self._actuate(linkage.motors)
+        self._drop_ineffective_friction()
+        self._choose_independent(linkage.motors)
+        self._choose_motors(linkage.motors)
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
+        """Return closure, loops, coordinates, motors, assembled configuration, points and warnings."""
         tree = self.tree
         loops = [f"{loop.name} ({loop.type})" for loop in self.spec.loop]
         loops += [f"{one.joint} = {one.ratio:g} {one.other} + {one.offset:g}" for one in self.spec.coupling]
@@ -105,12 +104,12 @@ class Mechanism(HasSummary):
     # --- one configuration -----------------------------------------------------------------------
 
     def kinematics(self, q_tree: Array) -> Kinematics:
-        """Return the closure's terms at a configuration of the tree."""
+        """Return the constraint terms at a configuration of the tree (nq,)."""
         return Kinematics(self.tree, self.closure, self.partition, q_tree)
 
     @property
     def assembled(self) -> Kinematics:
-        """The closure's terms at the assembled configuration."""
+        """The constraint terms at the assembled configuration."""
         return self.kinematics(self.q_tree)
 
     @property
@@ -120,15 +119,15 @@ class Mechanism(HasSummary):
 
     @property
     def has_direct_drives(self) -> bool:
-        """Whether the motors turn the independent joints themselves, so that tau is u of eq. 6."""
+        """Whether each motor drives one independent joint without a gear, in order, so that tau is u of eq. 6."""
         return np.array_equal(self.motors.transmission, np.eye(self.n)[self.partition.q])
 
     def independent_part(self, q_tree: Array) -> Array:
-        """Return q of a configuration, shape (d,)."""
+        """Return the independent coordinates q of a configuration, shape (d,)."""
         return self.tree.to_coordinates(q_tree)[self.partition.q]
 
     def choose_partition(self, at: Kinematics, *, keep_roots_together: bool = True) -> Partition | None:
-        """Return the split whose phi_z is furthest from singular at a configuration, by a pivoted QR.
+        """Return the partition with the best-conditioned phi_z at a configuration, by a pivoted QR.
 
         None if it would split the coordinates of a free root and these are to be kept together.
         """
@@ -139,14 +138,14 @@ class Mechanism(HasSummary):
         return None if z is None else Partition(np.setdiff1d(np.arange(self.n), z), z)
 
     def point_positions(self, q_tree: Array) -> dict[str, Array]:
-        """World positions of the mechanism's named points, metres."""
+        """Return the positions of the named points in the world, metres."""
         pose = Pose(self.tree, self.closure.anchors, q_tree)
         return {
             name: pose.rotation[f.joint] @ f.translation + pose.translation[f.joint] for name, f in self.points.items()
         }
 
     def point_jacobians(self, q_tree: Array) -> dict[str, Array]:
-        """Derivatives of the named points' world positions along the tangent coordinates, (3, n) each."""
+        """Return the Jacobians of the positions of the named points by the tangent coordinates, shape (3, n) each."""
         frames = list(self.points.values())
         if not frames:
             return {}
@@ -159,34 +158,34 @@ class Mechanism(HasSummary):
         return dict(zip(self.points, Pose(self.tree, ends, q_tree).p_jacobian, strict=True))
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
-        """Turn a table by coordinate into a vector, as `Tree.vector` does."""
+        """Convert a table by coordinate to a vector, as `Tree.vector` does; errors name dependent coordinates."""
         if tuple(names) == self.independent:
-            follows = next((name for name in values if name in self.dependent), None)
-            if follows is not None:
-                raise InputError(f"{what}: {follows!r} follows from the loops; there are {', '.join(names)}")
+            dependent = next((name for name in values if name in self.dependent), None)
+            if dependent is not None:
+                raise InputError(f"{what}: {dependent!r} follows from the loops; there are {', '.join(names)}")
         return self.tree.vector(values, names, what, fill)
 
     # --- construction ----------------------------------------------------------------------------
 
-    def _free_joints(self) -> None:
-        """Leave out friction and stops of joints that cannot move: rounding alone would decide what these do."""
+    def _drop_ineffective_friction(self) -> None:
+        """Remove friction and stops of joints that cannot move, where they would act on rounding errors."""
         idle = self.freedoms.immobile & (self.joints.stopped | (self.joints.friction != 0.0))
         if not idle.any():
             return
         self.joints = self.joints.without(idle)
         names = ", ".join(self.coordinates[k] for k in np.flatnonzero(idle))
-        self.warnings.append(f"friction and stops do nothing where the loops hold a joint still: {names}")
+        self.warnings.append(f"friction and stops do nothing in joints that the loops do not let move: {names}")
 
-    def _split(self, motors: Motors | None) -> None:
-        """Choose q and z, or check the choice made."""
-        every = set(range(self.n))
+    def _choose_independent(self, motors: Motors | None) -> None:
+        """Choose q and z, or check the choice of the mechanism file."""
+        coordinates = set(range(self.n))
         chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
-        best = [self.coordinates[k] for k in sorted(every - (chosen or set()))]
+        best = [self.coordinates[k] for k in sorted(coordinates - (chosen or set()))]
         remedy = f"; {', '.join(best) or 'none'} would do" if chosen is not None else ""
-        if chosen is None:  # no choice keeps the six coordinates of a free root together
+        if chosen is None:  # every choice splits the six coordinates of a free root
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
-            best = [self.coordinates[k] for k in sorted(every - set([] if pivoted is None else pivoted.tolist()))]
-        names = list(self.spec.independent) if self.spec.independent is not None else self._driven_first(best, motors)
+            best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
+        names = list(self.spec.independent) if self.spec.independent is not None else self._prefer_driven(best, motors)
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
             raise MechanismError(f"independent: a coordinate is named twice in {names}")
@@ -195,7 +194,7 @@ class Mechanism(HasSummary):
                 f"independent: {len(names)} coordinates ({', '.join(names) or 'none'}) but the mechanism has "
                 f"d = {self.d} freedoms{remedy}"
             )
-        z = np.array(sorted(every - set(at.tolist())), dtype=np.intp)
+        z = np.array(sorted(coordinates - set(at.tolist())), dtype=np.intp)
         if compute_rank(self.freedoms.jacobian[:, z]).rank < len(z):
             raise MechanismError(
                 f"independent: {', '.join(names)} cannot parametrise the mechanism where it is assembled "
@@ -204,7 +203,7 @@ class Mechanism(HasSummary):
         self.splits_root = any(0 < sum(v_at <= k < v_at + 6 for k in at) < 6 for _, v_at in self.tree.free_roots)
         if self.splits_root and chosen is not None:
             raise MechanismError(
-                f"independent: the six coordinates of a free root go together, all independent or none{remedy}"
+                f"independent: the six coordinates of a free root are all independent or all dependent{remedy}"
             )
         if self.splits_root:
             self.warnings.append(CONSTRAINED_IN_PART)
@@ -212,8 +211,8 @@ class Mechanism(HasSummary):
         self.dependent = tuple(self.coordinates[k] for k in z)
         self.partition = Partition(at, z)
 
-    def _driven_first(self, best: list[str], motors: Motors | None) -> list[str]:
-        """Return coordinates that can serve as q: those with motors as far as phi_z stays sound, then others."""
+    def _prefer_driven(self, best: list[str], motors: Motors | None) -> list[str]:
+        """Return independent coordinates: those with motors as far as phi_z stays well conditioned, then others."""
         if motors is None or not motors.names or self.freedoms.dependent is None:
             return best
         driven = np.flatnonzero(motors.transmission.any(axis=0))
@@ -227,16 +226,17 @@ class Mechanism(HasSummary):
         first = [int(k) for k in driven if k not in z]
         return [self.coordinates[k] for k in [*first, *(k for k in range(self.n) if k not in {*z, *first})]]
 
-    def _actuate(self, motors: Motors | None) -> None:
+    def _choose_motors(self, motors: Motors | None) -> None:
+        """Take the file's motors, or one on each independent joint. Warn of freedoms that nothing drives or holds."""
         joints = [name for name in self.independent if name not in self.tree.free_coordinates]
         self.motors = Motors.on_joints(self.tree, joints) if motors is None else motors
         self.actuated = self.motors.names
         anchors = [self.closure.anchors, self.springs.anchors]
-        turns = np.vstack([self.motors.transmission, np.diag(self.springs.joint_stiffness)])
-        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, anchors, turns)
+        shafts = np.vstack([self.motors.transmission, np.diag(self.springs.joint_stiffness)])
+        idle = idle_coordinates(self.tree, self._tangent(), self.q_tree, anchors, shafts)
         if idle:
             self.warnings.append(
-                f"idle freedoms, bodies that spin about themselves and move nothing: {', '.join(idle)}"
+                f"idle freedoms: bodies can spin about themselves without moving anything: {', '.join(idle)}"
             )
 
     def _tangent(self) -> Array:

@@ -1,4 +1,4 @@
-"""Motors: which joints each of them transmission, through which gear, and what it can do."""
+"""Motors: the joints that each of them drives, gears, torque and speed limits."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ __all__ = ["Motors", "motors_of"]
 
 
 class Motors:
-    """The motors of a mechanism: with theta the angles of their shafts, theta_dot = transmission v'.
+    """Motors of a mechanism. Shaft rates are ``theta_dot = transmission @ v_tree``.
 
-    Power is the same on both sides of a gear, so a motor's own torque tau acts on the tree as u' = transmission^T tau.
+    Gears have no losses, so the motor torques tau act on the tree as u' = transmission^T tau.
 
     Parameters
     ----------
     names : sequence of str
     transmission : (m, n) array
-        A motor's rate by the joints' rates: its gear.
+        Shaft rates by joint rates: the gear ratios.
     torque_limit, speed_limit : (m,) array
-        Of the motor itself, N m or N, rad/s or m/s; infinite where there is none.
+        At the shaft, N m or N, and rad/s or m/s; infinite if there is no limit.
     key : str
-        What the mechanism's file calls them.
+        Key of the mechanism file that lists them, for messages.
 
     Raises
     ------
     MechanismError
-        Two motors of one name.
+        Two motors have the same name.
     """
 
     def __init__(
@@ -42,66 +42,67 @@ class Motors:
     ) -> None:
         self.names, self.transmission, self.key = tuple(names), transmission, key
         self.torque_limit, self.speed_limit = torque_limit, speed_limit
-        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
-        if twice is not None:
+        duplicate = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if duplicate is not None:
             raise MechanismError(
                 f"actuated: a joint is named twice in {list(names)}"
                 if key == "actuated"
-                else f"motor: two motors are called {twice!r}; give each a name of its own"
+                else f"motor: two motors are called {duplicate!r}; give them different names"
             )
 
     @classmethod
     def on_joints(cls, tree: Tree, joints: Sequence[str]) -> Motors:
-        """Return a motor for each joint, without gear, limits or a rotor's inertia.
+        """Return one motor for each joint, without gear, limits or rotor inertia.
 
         Raises
         ------
         InputError, MechanismError
-            No such joint, one of a free root, one named twice.
+            An unknown joint, a coordinate of a free root, or a joint named twice.
         """
         at = tree.indices(tuple(joints), "actuated")
-        rooted = [name for name in joints if name in tree.free_coordinates]
-        if rooted:
-            raise MechanismError(f"actuated: {rooted[0]!r} belongs to a free root, which has no motor")
-        without = np.full(len(at), np.inf)
-        return cls(joints, np.eye(tree.n)[at], without, without, "actuated")
+        of_root = [name for name in joints if name in tree.free_coordinates]
+        if of_root:
+            raise MechanismError(f"actuated: {of_root[0]!r} belongs to a free root, which has no motor")
+        unlimited = np.full(len(at), np.inf)
+        return cls(joints, np.eye(tree.n)[at], unlimited, unlimited, "actuated")
 
     def force(self, tau: Array) -> Array:
-        """Return what torques do to the tree, u' of shape (n,)."""
+        """Return the generalized force u' of motor torques on the tree, shape (n,)."""
         return self.transmission.T @ tau
 
     def vector(self, values: Mapping[str, Any], what: str, fill: float | None = None) -> Array:
-        """Turn a table by motor into a vector, shape (m,).
+        """Convert a table by motor to a vector, shape (m,).
 
         Raises
         ------
         InputError
-            A name that is no motor's, a missing one unless `fill` is given, a value that is no number.
+            An unknown motor, a missing one (unless `fill` is given), or a value that is not a number.
         """
         unknown = next((name for name in values if name not in self.names), None)
         if unknown is not None:
-            raise InputError(f"{what}: {unknown!r} is no actuator; there are {', '.join(self.names) or 'none'}")
+            raise InputError(f"{what}: no motor {unknown!r}; there are {', '.join(self.names) or 'none'}")
         missing = [name for name in self.names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(self.names)}")
         try:
             if all(map(is_number, values.values())):
                 return np.array([float(values.get(name, fill)) for name in self.names])
-        except OverflowError:  # an integer of any size
+        except OverflowError:  # an integer that is too large for a float
             pass
-        raise InputError(f"{what}: {dict(values)!r:.80} is no table of numbers by actuator")
+        raise InputError(f"{what}: expected a table of numbers by motor, got {dict(values)!r:.80}")
 
 
 def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
-    """Return the motors of a mechanism's file, None where it names none; rotors go into the tree's model.
+    """Return the motors of a mechanism file, or None if it names none. Rotor inertias are added to the tree's model.
 
     Raises
     ------
     InputError, MechanismError
-        Both ways of naming them, a motor on no joint, a gear that does not turn, a rotor on several joints.
+        Both `actuated` and `motor` are given, a motor has no joint, a gear ratio is zero, or a motor on several joints
+        has a rotor inertia.
     """
     if spec.actuated is not None and spec.motor:
-        raise MechanismError("actuated, motor: give one of them; actuated is short for motors without a gear")
+        raise MechanismError("actuated, motor: give one of them; actuated stands for motors without a gear")
     if spec.actuated is not None:
         return Motors.on_joints(tree, spec.actuated)
     if not spec.motor:
@@ -109,9 +110,9 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
     transmission, armature = np.zeros((len(spec.motor), tree.n)), np.array(tree.model.armature)
     names = []
     for k, motor in enumerate(spec.motor):
-        names.append(_name(motor, k))
+        names.append(_motor_name(motor, k))
         where = f"motor {names[k]!r}"
-        for joint, share in _joints(motor, where).items():
+        for joint, share in _driven_joints(motor, where).items():
             transmission[k, tree.joint_index(joint, where)] = motor.ratio * share
         if not transmission[k].any():
             raise MechanismError(f"{where}: its gear turns no joint; give a ratio other than 0")
@@ -125,21 +126,21 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
                 armature += transmission[k] ** 2 * motor.rotor_inertia
             if not np.all(np.isfinite(armature)):
                 raise MechanismError(
-                    f"{where}: ratio = {motor.ratio:g} with rotor_inertia = {motor.rotor_inertia:g} is too large: what "
-                    "they make of the joint's inertia is no finite number"
+                    f"{where}: ratio = {motor.ratio:g} with rotor_inertia = {motor.rotor_inertia:g} is too large: the "
+                    "inertia at the joint is not finite"
                 )
     tree.model.armature = armature
     limits = np.array([(m.torque_limit or np.inf, m.speed_limit or np.inf) for m in spec.motor])
     return Motors(names, transmission, limits[:, 0], limits[:, 1])
 
 
-def _name(motor: MotorSpec, k: int) -> str:
+def _motor_name(motor: MotorSpec, k: int) -> str:
     if motor.name is None and motor.joint is None:
         raise MechanismError(f"motor {k + 1}: give it a joint, or a name and joints")
     return str(motor.name or motor.joint)
 
 
-def _joints(motor: MotorSpec, where: str) -> dict[str, float]:
+def _driven_joints(motor: MotorSpec, where: str) -> dict[str, float]:
     if (motor.joint is None) == (not motor.joints):
         raise MechanismError(f"{where}: give either joint, or joints, a table of numbers by joint")
     return motor.joints if motor.joint is None else {motor.joint: 1.0}

@@ -1,4 +1,4 @@
-"""Points and directions of a closure in world axes, their Jacobians, and those differentiated once more."""
+"""Points and directions of loops in world axes, their Jacobians, and the time derivatives of the Jacobians."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
 
-# _LEVER[3 * b + i, a] = epsilon_iab, so that (omega x p)_i = sum_ab epsilon_iab omega_a p_b
-_LEVER = np.zeros((9, 3))
+# _LEVI_CIVITA[3 * b + i, a] = epsilon_iab, so that (omega x p)_i = sum_ab epsilon_iab omega_a p_b
+_LEVI_CIVITA = np.zeros((9, 3))
 for _i in range(3):
     _a, _b = (_i + 1) % 3, (_i + 2) % 3
-    _LEVER[3 * _b + _i, _a] = 1.0
-    _LEVER[3 * _a + _i, _b] = -1.0
+    _LEVI_CIVITA[3 * _b + _i, _a] = 1.0
+    _LEVI_CIVITA[3 * _a + _i, _b] = -1.0
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products of rows; np.cross costs ten times as much on a handful of vectors."""
+    """Return the cross products of the rows of two arrays. For a few vectors `np.cross` takes ten times as long."""
     c = np.empty(np.broadcast_shapes(a.shape, b.shape))
     c[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     c[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
@@ -30,12 +30,12 @@ def cross(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True)
 class Anchors(Immutable):
-    """What a closure's rows hold on to: pairs of points, and directions, each fixed in a joint (0: world).
+    """Pairs of points and directions that constraint rows refer to, each fixed to a joint (0 is the world).
 
     Attributes
     ----------
     point_joint, point_local : (2 k,) and (2 k, 3) arrays
-        The k points A, then the k points B.
+        Joint and position in it of the k points A, then of the k points B.
     direction_joint, direction_local : (m,) and (m, 3) arrays
     """
 
@@ -46,7 +46,7 @@ class Anchors(Immutable):
 
 
 class Pose:
-    """A tree at one configuration, seen by a closure's anchors. Everything is a copy or computed from one.
+    """Points and directions of loops at one configuration, with their Jacobians. It holds copies of Pinocchio's data.
 
     Parameters
     ----------
@@ -67,12 +67,12 @@ class Pose:
 
     @property
     def support(self) -> Array:
-        """Which columns of a Jacobian move which joint, shape (joints, 1, columns)."""
+        """1 where a column of a Jacobian moves a joint, otherwise 0, shape (joints, 1, columns)."""
         return self.tree.support
 
     @lazy
     def p(self) -> Array:
-        """World positions of the points, shape (2 k, 3), metres."""
+        """Positions of the points in the world, shape (2 k, 3), metres."""
         at = self.anchors.point_joint
         return (self.rotation[at] @ self.anchors.point_local[:, :, None])[:, :, 0] + self.translation[at]
 
@@ -84,8 +84,8 @@ class Pose:
 
     @lazy
     def lever(self) -> Array:
-        """Matrix (3, 3 n): p @ lever is omega x p for each column of the Jacobian."""
-        return (_LEVER @ self.angular_part).reshape(3, -1)
+        """Matrix (3, 3 n) for which p @ lever is omega x p for each column of the Jacobian."""
+        return (_LEVI_CIVITA @ self.angular_part).reshape(3, -1)
 
     @lazy
     def p_jacobian(self) -> Array:
@@ -101,13 +101,13 @@ class Pose:
 
     @lazy
     def e(self) -> Array:
-        """World directions, shape (m, 3)."""
+        """Directions in world axes, shape (m, 3)."""
         at = self.anchors.direction_joint
         return (self.rotation[at] @ self.anchors.direction_local[:, :, None])[:, :, 0]
 
     @lazy
     def e_angular(self) -> Array:
-        """Angular Jacobians of what the directions are fixed in, shape (m, 3, n)."""
+        """Angular Jacobians of the joints that the directions are fixed to, shape (m, 3, n)."""
         return self.angular(self.anchors.direction_joint)
 
     def angular(self, joint: IntArray) -> Array:
@@ -116,17 +116,18 @@ class Pose:
 
 
 class BodyPose(Pose):
-    """A pose whose Jacobians have six columns for each joint's body, the world's too: columns 6 k to 6 k + 5.
+    """A pose whose Jacobians are with respect to the spatial velocities of all bodies, the world's included.
 
-    They belong to the body's velocity, linear at the world's origin and angular, both in world axes. What such a
-    Jacobian, transposed, makes of a row's multiplier is the wrench on each body: force, moment about the origin.
+    Columns 6 k to 6 k + 5 belong to the body of joint k: its linear velocity at the world's origin, then its angular
+    velocity, in world axes. The transposed Jacobian times the multipliers of the rows is the wrench on each body: force
+    and moment about the origin.
 
     Parameters
     ----------
     pose : Pose
-        Where the bodies are.
+        Poses of the bodies.
     anchors : Anchors
-        Whose Jacobians.
+        Points and directions to differentiate.
     """
 
     def __init__(self, pose: Pose, anchors: Anchors) -> None:
@@ -138,18 +139,18 @@ class BodyPose(Pose):
 
     @lazy
     def support(self) -> Array:
-        """Each body by its own six columns alone, shape (joints, 1, 6 joints)."""
+        """1 where a column belongs to the body, shape (joints, 1, 6 joints)."""
         return np.repeat(np.eye(len(self.translation)), 6, axis=1)[:, None, :]
 
 
 class Rate:
-    """What a pose's Jacobians do along a velocity.
+    """Time derivatives of the points, directions and Jacobians of a pose along a velocity.
 
     Parameters
     ----------
     pose : Pose
     v : (n,) array
-        Any tangent velocity, on or off the closure.
+        Any tangent velocity v'; it need not satisfy the loops.
     """
 
     def __init__(self, pose: Pose, v: Array) -> None:
@@ -161,7 +162,7 @@ class Rate:
 
     @lazy
     def r_dot(self) -> Array:
-        """Rates of the differences, shape (k, 3)."""
+        """Time derivatives of the differences, shape (k, 3)."""
         return self.pose.r_jacobian @ self.v
 
     @lazy
@@ -169,7 +170,7 @@ class Rate:
         """Time derivative of `Pose.r_jacobian`, shape (k, 3, n)."""
         pose = self.pose
         p_dot = pose.p_jacobian @ self.v
-        lever_dot = (_LEVER @ self.angular_part).reshape(3, -1)
+        lever_dot = (_LEVI_CIVITA @ self.angular_part).reshape(3, -1)
         moved = (pose.p @ lever_dot + p_dot @ pose.lever).reshape(len(p_dot), 3, -1) + self.linear_part
         moved *= pose.tree.support[pose.anchors.point_joint]
         k = len(p_dot) // 2
@@ -177,7 +178,7 @@ class Rate:
 
     @lazy
     def e_dot(self) -> Array:
-        """Rates of the directions, shape (m, 3)."""
+        """Time derivatives of the directions, shape (m, 3)."""
         return cross(self.pose.e_angular @ self.v, self.pose.e)
 
     @lazy

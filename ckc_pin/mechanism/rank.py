@@ -1,4 +1,4 @@
-"""The rank of J: scaled to be free of units, by singular values, with the gap that makes it sure."""
+"""Rank of the constraint Jacobian J, degrees of freedom, redundant rows, and the choice of dependent coordinates."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ __all__ = [
     "scale_jacobian",
 ]
 
-RANK_TOLERANCE = 1e-5  # relative; files are rounded to six digits
-SOUND = 0.03  # of the largest pivot: what a column must bring along to be in z in the place of one that shall be in q
-SURE = 1e-9  # singular values between this and the tolerance are neither zero nor not
+RANK_TOLERANCE = 1e-5  # of the largest singular value; numbers in files are rounded to six digits
+MIN_PIVOT = 0.03  # of the largest column; below it a preferred independent coordinate becomes dependent after all
+ROUNDING_LEVEL = 1e-9  # singular values between this and RANK_TOLERANCE make the rank uncertain
 
 
 @dataclass(frozen=True)
 class RankReport:
-    """The rank of J and how sure it is.
+    """The rank of J and how certain it is.
 
     Attributes
     ----------
     rank : int
     above, below : float
-        The singular values on both sides of the cut, relative to the largest; below is 0 at full rank.
+        Smallest singular value that counts and largest that does not, relative to the largest; `below` is 0 at full
+        rank.
     """
 
     rank: int
@@ -47,24 +48,24 @@ class RankReport:
     below: float
 
     @property
-    def sure(self) -> bool:
-        """Whether nothing lies between rounding errors and the tolerance."""
-        return self.below < SURE
+    def is_certain(self) -> bool:
+        """Whether no singular value lies between rounding errors and the tolerance."""
+        return self.below < ROUNDING_LEVEL
 
 
 def scale_jacobian(jacobian: Array, tree: Tree, closure: Closure) -> Array:
-    """Make J dimensionless: lengths in units of the mechanism's size, both in rows and in columns."""
+    """Make J dimensionless: lengths in units of the mechanism's size, in rows and in columns."""
     rows, columns = jacobian_scales(tree, closure)
     return rows[:, None] * jacobian * columns
 
 
 def jacobian_scales(tree: Tree, closure: Closure) -> tuple[Array, Array]:
-    """Return what J's rows, shape (rows,), and its columns, shape (n,), are multiplied with for that."""
+    """Return the factors of the rows, shape (rows,), and columns, shape (n,), that make J dimensionless."""
     return np.where(closure.in_metres(tree), 1.0 / tree.size, 1.0), tree.step_scale
 
 
 def compute_rank(scaled_jacobian: Array) -> RankReport:
-    """Count singular values above the tolerance times the largest."""
+    """Return the number of singular values above `RANK_TOLERANCE` times the largest."""
     if min(scaled_jacobian.shape) == 0:
         return RankReport(0, 0.0, 0.0)
     values = np.linalg.svd(scaled_jacobian, compute_uv=False)
@@ -75,7 +76,7 @@ def compute_rank(scaled_jacobian: Array) -> RankReport:
 
 
 def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
-    """Return one admissible choice of rows that the others imply, in the order of phi."""
+    """Return one admissible choice of rows that the other rows imply, in the order of phi."""
     if scaled_jacobian.shape[0] == rank:
         return np.zeros(0, np.intp)
     order, _ = pivoted_columns(scaled_jacobian.T)
@@ -83,24 +84,24 @@ def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
 
 
 def choose_dependent(
-    scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = (), wanted: Sequence[int] | IntArray = ()
+    scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = (), preferred: Sequence[int] | IntArray = ()
 ) -> IntArray | None:
-    """Choose z so that phi_z is well conditioned, by a pivoted QR.
+    """Choose the dependent coordinates z so that phi_z is well conditioned, by a pivoted QR.
 
-    Of coordinates that are as good, the last is dependent: q is where the tree begins, as motors mostly are.
+    Of equally good coordinates the last becomes dependent, since motors are mostly at the beginning of the tree.
 
     Parameters
     ----------
     scaled_jacobian : (rows, n) array
     rank : int
     blocks : sequence of index arrays
-        Coordinates of free roots. Each is tried as dependent as a whole, then as independent as a whole.
-    wanted : sequence of int
-        Coordinates that shall be independent: dependent only where phi_z would come near to singular without them.
+        Coordinates of free roots, which are all dependent or all independent. Dependent is tried first.
+    preferred : sequence of int
+        Coordinates that become dependent only if phi_z would be nearly singular without them.
 
     Returns
     -------
-    (rank,) int array, or None when a block would have to be split.
+    (rank,) int array, or None if a block would have to be split.
     """
     if rank == 0:
         return np.zeros(0, np.intp)
@@ -110,52 +111,52 @@ def choose_dependent(
         rest = np.setdiff1d(rest, inside)[::-1]
         _, pivots = pivoted_columns(scaled_jacobian[:, inside])
         if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
-            # take the blocks as dependent and choose the rest in what they leave over
+            # The blocks are dependent. Choose the others by their parts orthogonal to the blocks.
             q, _ = np.linalg.qr(scaled_jacobian[:, inside])
-            left = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
-            return np.sort(np.concatenate([inside, _pivots(left, rank - len(inside), rest, wanted)]))
+            remainder = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
+            return np.sort(np.concatenate([inside, _choose_columns(remainder, rank - len(inside), rest, preferred)]))
         if compute_rank(scaled_jacobian[:, rest]).rank < rank:
             return None
-    return np.sort(_pivots(scaled_jacobian[:, rest], rank, rest, wanted))
+    return np.sort(_choose_columns(scaled_jacobian[:, rest], rank, rest, preferred))
 
 
-def _pivots(matrix: Array, count: int, names: IntArray, wanted: Sequence[int] | IntArray) -> IntArray:
-    """Return the names of so many columns by a pivoted QR, those that are wanted elsewhere last."""
-    first = np.flatnonzero(~np.isin(names, wanted))
-    if not 0 < len(first) < len(names):
-        return names[pivoted_columns(matrix)[0][:count]]
+def _choose_columns(matrix: Array, count: int, labels: IntArray, avoided: Sequence[int] | IntArray) -> IntArray:
+    """Return the labels of `count` columns chosen by a pivoted QR, columns to avoid last."""
+    first = np.flatnonzero(~np.isin(labels, avoided))
+    if not 0 < len(first) < len(labels):
+        return labels[pivoted_columns(matrix)[0][:count]]
     order, pivots = pivoted_columns(matrix[:, first])
     largest = np.linalg.norm(matrix, axis=0).max(initial=0.0)
-    first = first[order[: min(count, int(np.sum(pivots > SOUND * largest)))]]
+    first = first[order[: min(count, int(np.sum(pivots > MIN_PIVOT * largest)))]]
     q, _ = np.linalg.qr(matrix[:, first])
-    others = np.setdiff1d(np.arange(len(names)), first)
-    left = matrix[:, others] - q @ (q.T @ matrix[:, others])
-    return names[np.concatenate([first, others[pivoted_columns(left)[0][: count - len(first)]]])]
+    others = np.setdiff1d(np.arange(len(labels)), first)
+    remainder = matrix[:, others] - q @ (q.T @ matrix[:, others])
+    return labels[np.concatenate([first, others[pivoted_columns(remainder)[0][: count - len(first)]]])]
 
 
-IMMOBILE = 1e-9  # of a motion of size one: what a coordinate that cannot move takes part in it
+IMMOBILE_TOLERANCE = 1e-9  # largest part of a coordinate that cannot move in motions of size one
 
 
 @dataclass(frozen=True)
 class Freedoms(Immutable):
-    """What the rank of J says.
+    """Degrees of freedom of a mechanism, from the rank of J.
 
     Attributes
     ----------
     d : int
-        Freedoms, n - rank.
+        Degrees of freedom, n - rank.
     rank : RankReport
-        The rank that J has around the assembled configuration.
+        Rank of J near the assembled configuration.
     singular : bool
-        J has a smaller rank at the assembled configuration itself.
+        J has a smaller rank at the assembled configuration than near it.
     redundant : tuple of (loop, row)
-        Rows that the others imply, one admissible choice.
+        Rows that the other rows imply, one admissible choice.
     immobile : (n,) bool array
-        Coordinates that the loops hold still, here and nearby.
+        Coordinates that the loops do not let move, here and nearby.
     dependent : (rank,) int array or None
-        The best-conditioned choice of z; None when it would split a free root.
+        The best-conditioned choice of z; None if it would split a free root.
     jacobian : (rows, n) array
-        The scaled J that all this is about.
+        The dimensionless J that the rank was computed from.
     warnings : tuple of str
     """
 
@@ -170,22 +171,22 @@ class Freedoms(Immutable):
 
 
 def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable[[Array], list[Array]]) -> Freedoms:
-    """Count the freedoms at a closed configuration, and around it.
+    """Count the degrees of freedom at a closed configuration and near it.
 
-    A change point or a collinear start has a smaller rank than every configuration nearby, so J is also looked at
-    there.
+    At a change point, or at a collinear start, the rank of J is smaller than at every configuration nearby. J is
+    therefore also evaluated there.
 
     Parameters
     ----------
     q_tree : (nq,) array
-        Closed.
+        A closed configuration.
     nearby : callable
-        Given a basis of J's null space there, (k, n), closed configurations a small step along it.
+        Returns closed configurations a small step along the null space of J, of which it gets a basis (k, n).
     """
     jacobian = _scaled_at(tree, closure, q_tree)
     here = there = compute_rank(jacobian)
     jacobians = [(here.rank, jacobian)]
-    for other in nearby(_directions(jacobian)[here.rank :]):
+    for other in nearby(_right_singular_vectors(jacobian)[here.rank :]):
         candidate = _scaled_at(tree, closure, other)
         report = compute_rank(candidate)
         jacobians.append((report.rank, candidate))
@@ -194,14 +195,14 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     immobile = np.full(tree.n, len(jacobians) > 1 or there.rank == tree.n)
     for rank, candidate in jacobians:
         if rank == there.rank:
-            immobile &= np.linalg.norm(_directions(candidate)[rank:], axis=0) <= IMMOBILE
+            immobile &= np.linalg.norm(_right_singular_vectors(candidate)[rank:], axis=0) <= IMMOBILE_TOLERANCE
     warnings: list[str] = []
     if there.rank > here.rank:
         warnings.append(
             f"the assembled configuration is singular: rank J is {here.rank} there and {there.rank} nearby; "
             f"d = {tree.n - there.rank} is what the mechanism has nearby"
         )
-    if not there.sure:
+    if not there.is_certain:
         warnings.append(
             f"the rank is not certain: relative singular values {there.above:.1e} | {there.below:.1e} around the cut "
             f"at {there.rank}; numbers rounded in the files, or nearly singular"
@@ -219,33 +220,37 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     )
 
 
-def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequence[Anchors], turns: Array) -> list[str]:
-    """Name coordinates that only spin a body about itself: no centre of mass moves, nor what loops or springs hold.
+def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequence[Anchors], shafts: Array) -> list[str]:
+    """Name coordinates that only spin a body about itself.
+
+    Such a motion moves no centre of mass, no point of a loop or spring, and no shaft.
 
     Parameters
     ----------
+    tree : Tree
     tangent : (n, d) array
         Basis of the velocities that the loops allow.
+    q_tree : (nq,) array
     anchors : sequence of Anchors
-        Of loops and of springs.
-    turns : (m, n) array
-        What motors, and springs on joints, turn with each joint.
+        Points of loops and springs.
+    shafts : (m, n) array
+        Rates of motor shafts, and of springs on joints, by joint rates.
     """
     ends = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
-    moves = np.vstack([tree.centre_of_mass_jacobians(q_tree), *ends, turns]) @ tangent
+    moves = np.vstack([tree.centre_of_mass_jacobians(q_tree), *ends, shafts]) @ tangent
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)
-    still = directions[int(np.sum(values > 1e-8 * max(values[0], 1e-300))) :]
+    idle_motions = directions[int(np.sum(values > 1e-8 * max(values[0], 1e-300))) :]
     names: list[str] = []
-    for direction in still:
+    for direction in idle_motions:
         motion = np.abs(tangent @ direction)
         names.append(tree.coordinates[int(np.argmax(motion))])
     return list(dict.fromkeys(names))
 
 
-def _directions(jacobian: Array) -> Array:
-    """Right singular vectors of J as rows, the motions that it allows last, (n, n)."""
+def _right_singular_vectors(jacobian: Array) -> Array:
+    """Return the right singular vectors of J as rows, those of its null space last, shape (n, n)."""
     return np.linalg.svd(jacobian, full_matrices=True)[2]
 
 

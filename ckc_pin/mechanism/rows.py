@@ -1,7 +1,11 @@
-"""The primitives that every closure is a table of: phi, J, J's time derivative and what phi_ddot depends on.
+"""Primitives of constraint rows: residual phi, constraint Jacobian J and the time derivative of J.
 
-A primitive is a group of rows evaluated with array operations, whatever the number of loops. Groups
-refer to a closure's `Anchors` by number and read them from a `Pose` and a `Rate`.
+Every loop type is a combination of these five primitives. A primitive holds all rows of its kind and evaluates them
+with array operations. It refers to points and directions of the closure's `Anchors` by number, and reads them from a
+`Pose` and a `Rate`.
+
+This is the readable reference in NumPy. `native/src/loops` evaluates the same rows in C++, and `codegen/rows.py` as
+CasADi expressions.
 
 ==============  ===============================================  ==================================
 primitive       phi                                              used by
@@ -9,7 +13,7 @@ primitive       phi                                              used by
 `Component`     e . (p_A - p_B), e fixed in a link or the world  point, hinge, prismatic, weld, ...
 `Dot`           a . b, two directions fixed in links             hinge, cylindrical, universal
 `Distance`      (r . r - L^2) / (2 L), r = p_A - p_B             distance
-`Affine`        A q' - c                                         couplings, mimic joints
+`Affine`        A q' - c                                         coupling, mimic joint
 `RelativeLog`   log(R_A^T R_B), three rows                       prismatic, weld
 ==============  ===============================================  ==================================
 
@@ -45,33 +49,36 @@ __all__ = [
 
 
 class Rows(Protocol):
-    """A group of rows of one kind; `out` says which rows of phi they are."""
+    """A group of constraint rows of one primitive."""
 
     @property
     def out(self) -> IntArray:
-        """Places of the rows in phi."""
+        """Indices of the rows in phi."""
 
     def in_metres(self, tree: Tree) -> Array | bool:
-        """Whether the rows are lengths."""
+        """Whether the rows are lengths; other rows are angles or cosines."""
 
     def phi(self, pose: Pose) -> Array:
-        """Residual, shape (rows,)."""
+        """Residual phi, shape (rows,)."""
 
     def jacobian(self, pose: Pose) -> Array:
-        """Derivative of phi along the tangent coordinates, shape (rows, n)."""
+        """Constraint Jacobian, shape (rows, n)."""
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
-        """Time derivative of the Jacobian along the rate's velocity, shape (rows, n)."""
+        """Time derivative of the constraint Jacobian at the velocity of `rate`, shape (rows, n)."""
 
 
-def _along(e: Array, jacobian: Array) -> Array:
-    """Rows e_i . J_i of directions (k, 3) and Jacobians (k, 3, n)."""
+def _project(e: Array, jacobian: Array) -> Array:
+    """Return the rows e_i . J_i of directions (k, 3) and Jacobians (k, 3, n)."""
     return (e[:, None, :] @ jacobian)[:, 0, :]
 
 
 @dataclass(frozen=True)
 class Component(Immutable):
-    """e . r, the component of a point difference along a direction; `turning` unless e is the world's."""
+    """e . r, the component of the difference of two points along a direction.
+
+    `turning` is False if all directions are fixed in the world.
+    """
 
     out: IntArray
     pair: IntArray
@@ -86,25 +93,25 @@ class Component(Immutable):
 
     def jacobian(self, pose: Pose) -> Array:
         e = pose.e[self.direction]
-        jacobian = _along(e, pose.r_jacobian[self.pair])
+        jacobian = _project(e, pose.r_jacobian[self.pair])
         if self.turning:  # e_dot . r = (omega x e) . r = omega . (e x r)
-            jacobian += _along(cross(e, pose.r[self.pair]), pose.e_angular[self.direction])
+            jacobian += _project(cross(e, pose.r[self.pair]), pose.e_angular[self.direction])
         return jacobian
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         e = pose.e[self.direction]
-        jacobian_dot = _along(e, rate.r_jacobian_dot[self.pair])
+        jacobian_dot = _project(e, rate.r_jacobian_dot[self.pair])
         if self.turning:
             r, r_dot, e_dot = pose.r[self.pair], rate.r_dot[self.pair], rate.e_dot[self.direction]
-            jacobian_dot += _along(e_dot, pose.r_jacobian[self.pair])
-            jacobian_dot += _along(cross(e_dot, r) + cross(e, r_dot), pose.e_angular[self.direction])
-            jacobian_dot += _along(cross(e, r), rate.e_angular_dot[self.direction])
+            jacobian_dot += _project(e_dot, pose.r_jacobian[self.pair])
+            jacobian_dot += _project(cross(e_dot, r) + cross(e, r_dot), pose.e_angular[self.direction])
+            jacobian_dot += _project(cross(e, r), rate.e_angular_dot[self.direction])
         return jacobian_dot
 
 
 @dataclass(frozen=True)
 class Dot(Immutable):
-    """a . b of two directions: zero when they are perpendicular."""
+    """a . b of two directions, which is zero if they are perpendicular."""
 
     out: IntArray
     a: IntArray
@@ -118,20 +125,20 @@ class Dot(Immutable):
 
     def jacobian(self, pose: Pose) -> Array:
         # (omega_a x a) . b + a . (omega_b x b) = (omega_a - omega_b) . (a x b)
-        turned = cross(pose.e[self.a], pose.e[self.b])
-        return _along(turned, pose.e_angular[self.a] - pose.e_angular[self.b])
+        normal = cross(pose.e[self.a], pose.e[self.b])
+        return _project(normal, pose.e_angular[self.a] - pose.e_angular[self.b])
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         a, b = pose.e[self.a], pose.e[self.b]
-        turned_dot = cross(rate.e_dot[self.a], b) + cross(a, rate.e_dot[self.b])
-        return _along(turned_dot, pose.e_angular[self.a] - pose.e_angular[self.b]) + _along(
+        normal_dot = cross(rate.e_dot[self.a], b) + cross(a, rate.e_dot[self.b])
+        return _project(normal_dot, pose.e_angular[self.a] - pose.e_angular[self.b]) + _project(
             cross(a, b), rate.e_angular_dot[self.a] - rate.e_angular_dot[self.b]
         )
 
 
 @dataclass(frozen=True)
 class Distance(Immutable):
-    """(r . r - L^2) / (2 L): to first order the error of the distance itself, in metres."""
+    """(r . r - L^2) / (2 L), to first order the error of the distance |r| from L, in metres."""
 
     out: IntArray
     pair: IntArray
@@ -145,18 +152,18 @@ class Distance(Immutable):
         return (np.sum(r * r, axis=1) - self.length**2) / (2 * self.length)
 
     def jacobian(self, pose: Pose) -> Array:
-        return _along(pose.r[self.pair] / self.length[:, None], pose.r_jacobian[self.pair])
+        return _project(pose.r[self.pair] / self.length[:, None], pose.r_jacobian[self.pair])
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         length = self.length[:, None]
-        return _along(rate.r_dot[self.pair] / length, pose.r_jacobian[self.pair]) + _along(
+        return _project(rate.r_dot[self.pair] / length, pose.r_jacobian[self.pair]) + _project(
             pose.r[self.pair] / length, rate.r_jacobian_dot[self.pair]
         )
 
 
 @dataclass(frozen=True)
 class Affine(Immutable):
-    """A q' - c in the coordinates of one-freedom joints, whose places in q the tree knows."""
+    """A q' - c, linear in the coordinates of one-freedom joints."""
 
     out: IntArray
     matrix: Array  # (rows, n)
@@ -177,11 +184,11 @@ class Affine(Immutable):
 
 @dataclass(frozen=True)
 class RelativeLog(Immutable):
-    """log(R_A^T R_B): three rows for each pair of frames, zero when they are parallel."""
+    """log(R_A^T R_B), the rotation vector from frame A to frame B: three rows for each pair of frames."""
 
     out: IntArray  # (3 pairs,)
     joint_a: IntArray
-    rotation_a: Array  # (pairs, 3, 3), frame A in its joint
+    rotation_a: Array  # (pairs, 3, 3), orientation of frame A in its joint
     joint_b: IntArray
     rotation_b: Array
 
@@ -215,22 +222,27 @@ class RelativeLog(Immutable):
         return (log_jacobian_dot(u, u_dot) @ body + j_log @ body_dot).reshape(self.out.size, -1)
 
 
-# c = sum of |B_2k| / (2k)! theta^(2k - 2); beyond these terms nothing is left where theta < 1
+# --- logarithm of SO(3) -------------------------------------------------------------------------
+#
+# u_dot = Jlog(u) omega, omega in body axes. Jlog(u) = 1 + [u]/2 + c [u]^2 is the inverse of the right Jacobian of
+# SO(3), with c = 1/theta^2 - cot(theta/2) / (2 theta) and theta = |u|.
+
+# c = sum of |B_2k| / (2k)! theta^(2k - 2). For theta < 1 these terms are enough for double precision.
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330,
               854513 / 138, 236364091 / 2730, 8553103 / 6)  # fmt: skip
 _SERIES = [np.array([b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, 1)])[::-1]]
-_SERIES.append(2 * np.polyder(_SERIES[0]))  # a derivative by theta^2, of which d/dtheta / theta is twice
+_SERIES.append(2 * np.polyder(_SERIES[0]))  # (dc/dtheta) / theta is twice the derivative by theta^2
 
 
 def skew(a: Array) -> Array:
-    """Cross-product matrices of vectors (k, 3)."""
+    """Return the cross-product matrices of vectors (k, 3), shape (k, 3, 3)."""
     m = np.zeros((len(a), 3, 3))
     m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -a[:, 2], a[:, 1], -a[:, 0]
     return m - np.swapaxes(m, 1, 2)
 
 
 def _coefficients(u: Array, count: int) -> list[Array]:
-    """Return c, or c and c'/theta, (k,) each."""
+    """Return c, and if `count` is 2 also (dc/dtheta) / theta, shape (k,) each."""
     square = np.sum(u * u, axis=1)
     if np.all(square < 1.0):
         return [np.polyval(series, square) for series in _SERIES[:count]]
@@ -244,14 +256,14 @@ def _coefficients(u: Array, count: int) -> list[Array]:
 
 
 def log_jacobian(u: Array) -> Array:
-    """Jlog, shape (k, 3, 3)."""
+    """Return Jlog(u), shape (k, 3, 3)."""
     (c,) = _coefficients(u, 1)
     s = skew(u)
     return np.eye(3) + s / 2 + c[:, None, None] * (s @ s)
 
 
 def log_jacobian_dot(u: Array, u_dot: Array) -> Array:
-    """Time derivative of `log_jacobian` along u_dot."""
+    """Return the time derivative of `log_jacobian` at the rate u_dot, shape (k, 3, 3)."""
     c, c_rate = _coefficients(u, 2)
     c_dot = c_rate * np.sum(u * u_dot, axis=1)
     s, s_dot = skew(u), skew(u_dot)

@@ -1,11 +1,13 @@
-"""The tree: a Pinocchio model with names for its coordinates, and what its joints do in world axes.
+"""The URDF tree as a Pinocchio model with named coordinates, and its kinematics in world axes.
 
-What bites in Pinocchio 4.1 and is dealt with here: `data.oMi`, `data.J` and `data.dJ` are live views
-of one workspace, so what is kept is copied; NaN passes through every algorithm in silence, so
-states are checked where they enter. The placements of all joints are read as one strided array instead
-of one Python object a joint; the stride is verified when the tree is made. Between an algorithm and the copy of
-its result another thread may have its turn, so the two happen under a lock; Pinocchio holds the interpreter
-anyway, and a workspace for each thread would take memory by the gigabyte.
+Three properties of Pinocchio 4.1 shape this module:
+
+- `data.oMi`, `data.J` and `data.dJ` are views of one workspace that the next algorithm overwrites. Results are
+  therefore copied. Another thread could run between an algorithm and the copy, so both happen under a lock. A workspace
+  for each thread would take gigabytes of memory, and Pinocchio holds the interpreter lock anyway.
+- The algorithms do not report NaN. States are therefore checked where they enter the program.
+- Reading `data.oMi` creates a Python object for each joint. The placements are therefore read as one strided array,
+  whose layout is checked when the workspace is created.
 """
 
 from __future__ import annotations
@@ -25,90 +27,109 @@ from ckc_pin.errors import InputError, MechanismError
 __all__ = ["Tree"]
 
 
-MOST = 325  # coordinates; Pinocchio's workspace takes about 65 n^3 bytes whatever it is used for, 2.2 GB here
-
-MANY = 100.0  # rad, or the mechanism's size: where rounding of a coordinate begins to be seen in how loops close
-COARSEST = 1e4  # with loops closed to 1e-13 of the mechanism's size, 1e-9 of it: at a million radians
-WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # what belongs to a tree's own data
+MAX_COORDINATES = 325  # Pinocchio's workspace takes about 65 n^3 bytes, here 2.2 GB
+LARGE_COORDINATE = 100.0  # rad, or mechanism sizes: above it, rounding of a coordinate shows in the closure of loops
+MAX_TOLERANCE_FACTOR = 1e4  # reached at a million radians; a closure to 1e-13 of the size is then one to 1e-9
+UNLIMITED = 1e300  # joint limits of this size and above mean that there is no limit
+WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # attributes that copies do not share
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Tree:
-    """A Pinocchio model, one workspace for it, and the labels of its tangent coordinates.
+    """A Pinocchio model with named coordinates and a workspace.
 
     Parameters
     ----------
     model : pinocchio.Model
-        Joints of one freedom, and free-flyers.
+        Its joints have one degree of freedom, or are free-flyers.
+    size : float
+        Characteristic length of the mechanism, metres.
 
     Attributes
     ----------
     coordinates : tuple of str
-        A label for each tangent coordinate, Pinocchio's order: the joint's name, or six of them
-        ``root.x ... root.rz`` for a free root.
-    n : int
-        Number of tangent coordinates.
+        Names of the tangent coordinates in Pinocchio's order: the joint's name, or ``root.x`` to ``root.rz`` for a
+        free root.
+    n, nq : int
+        Number of tangent coordinates, and of entries of Pinocchio's q.
+    is_euclidean : bool
+        There is no free root, so that q is a vector of n numbers.
+    index : dict of str to int
+        Place of each name in `coordinates`.
+    q_index : (n,) int array
+        Place in q of each coordinate of a one-freedom joint. For a free root: of its position, then unspecified.
+    free_roots : list of (int, int)
+        Place in q and in v' of each free root.
+    free_coordinates : set of str
+        Names of the coordinates of free roots.
+    in_metres : (n,) bool array
+        Whether each coordinate is a length; the others are angles.
+    step_scale : (n,) array
+        Unit in which steps of each coordinate are compared: one radian, or `size`.
+    support : (joints, 1, n) array
+        1 where a coordinate moves a joint, otherwise 0.
+    parent_joint : (n,) int array
+        Joint that carries the joint of each coordinate.
 
     Raises
     ------
     MechanismError
-        More coordinates than a workspace is made for.
+        More than `MAX_COORDINATES` coordinates.
     """
 
-    def __init__(self, model: Any) -> None:
-        if model.nv > MOST:
-            raise MechanismError(f"{model.nv} coordinates in the tree; at most {MOST} are taken")
-        self._work_on(model)
+    def __init__(self, model: Any, size: float = 1.0) -> None:
+        if model.nv > MAX_COORDINATES:
+            raise MechanismError(f"the tree has {model.nv} coordinates; at most {MAX_COORDINATES} are supported")
+        self._attach(model)
         self.n: int = model.nv
         self.nq: int = model.nq
         self.is_euclidean = self.n == self.nq
         self.coordinates = tuple(_labels(model))
         self.index = {label: k for k, label in enumerate(self.coordinates)}
-        # where the coordinate of a one-freedom joint stands in q (a free root's: its position, then nothing)
-        self.q_index = np.array(_places(model), dtype=np.intp)
+        self.q_index = np.array(_q_indices(model), dtype=np.intp)
         self.free_roots = [(j.idx_q, j.idx_v) for j in list(model.joints)[1:] if j.nq == 7]
         self.free_coordinates = {self.coordinates[v + k] for _, v in self.free_roots for k in range(6)}
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
-        self.measure(1.0)
-        # support[joint, 0, k] is 1 where coordinate k moves the joint
+        self.size = size
+        self.step_scale = np.where(self.in_metres, size, 1.0)
+        self._q_scale = np.ones(self.nq)
+        self._q_scale[self.q_index] = self.step_scale
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
-        self.parent_joint = np.zeros(self.n, dtype=np.intp)  # by coordinate: the joint whose body its own is fixed to
+        self.parent_joint = np.zeros(self.n, dtype=np.intp)
         for k, joint in list(enumerate(model.joints))[1:]:
             self.support[k] = self.support[parents[k]]
             self.support[k, 0, joint.idx_v : joint.idx_v + joint.nv] = 1.0
             self.parent_joint[joint.idx_v : joint.idx_v + joint.nv] = parents[k]
 
-    def measure(self, size: float) -> None:
-        """Take the mechanism's size, m; steps are measured in `reach`, shape (n,): one radian, or that size."""
-        self.size = size
-        self.step_scale = np.where(self.in_metres, size, 1.0)
-        self._units = np.ones(self.nq)
-        self._units[self.q_index] = self.step_scale
-
     def tolerance_factor(self, q_tree: Array) -> float:
-        """Return how much coarser loops close there than near zero, at least 1.
+        """Return the factor by which rounding of large coordinates increases the closure tolerance.
 
-        Coordinates are rounded as they are large: a crank's after many turns, all of what is far from the origin. What
-        is beyond `COARSEST` does not count as closed.
+        Coordinates are rounded relative to their size: a crank after many turns, a mechanism far from the origin. The
+        factor is 1 up to `LARGE_COORDINATE`, and at most `MAX_TOLERANCE_FACTOR`.
         """
-        return min(max(1.0, float(np.abs(q_tree / self._units).max(initial=0.0)) / MANY), COARSEST)
+        largest = float(np.abs(q_tree / self._q_scale).max(initial=0.0))
+        return min(max(1.0, largest / LARGE_COORDINATE), MAX_TOLERANCE_FACTOR)
 
-    def _work_on(self, model: Any) -> None:
+    def step_size(self, step: Array) -> Any:
+        """Return the largest entry of each tangent step (..., n), in radians or in units of the mechanism's size."""
+        return np.abs(step / self.step_scale).max(axis=-1, initial=0.0)
+
+    def _attach(self, model: Any) -> None:
         self.model = model
-        self.lock = RLock()  # held while something is in the workspace
+        self.lock = RLock()  # held until a result has been copied from the workspace
 
     @cached_property
     def data(self) -> Any:
-        """Pinocchio's workspace, made where it is first needed: it has some n^3 numbers."""
+        """Pinocchio's workspace of about n^3 numbers, created at first use."""
         return self.model.createData()
 
     @cached_property
     def _placement(self) -> Array:
         return _strided_placements(self.data)
 
-    # a matrix of one column would come as a vector
+    # Pinocchio returns a matrix of one column as a vector, hence the reshape.
     @cached_property
     def _jacobian(self) -> Array:
         return self.data.J.reshape(6, self.n)
@@ -118,22 +139,22 @@ class Tree:
         return self.data.dJ.reshape(6, self.n)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tree:
-        """Copy the model, and give the copy a workspace of its own; labels and places stay as they are."""
+        """Copy the model, with a new workspace. Names and indices are shared."""
         twin = memo[id(self)] = Tree.__new__(Tree)
         twin.__dict__.update(self.__getstate__())
-        twin._work_on(self.model.copy())
+        twin._attach(self.model.copy())
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the workspace behind, whose views would come back as arrays that nothing writes to."""
+        """Leave out the workspace: its views would be restored as arrays that Pinocchio does not update."""
         return {name: value for name, value in self.__dict__.items() if name not in WORKSPACE}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._work_on(self.model)
+        self._attach(self.model)
 
     def evaluate(self, algorithm: Callable[..., Any], *state: Array) -> Array:
-        """Return a copy of what an algorithm of Pinocchio, (model, data, *state), leaves in the workspace."""
+        """Call an algorithm of Pinocchio, (model, data, *state), and return a copy of its result."""
         with self.lock:
             return np.array(algorithm(self.model, self.data, *state))
 
@@ -144,7 +165,7 @@ class Tree:
             return self._placement.copy(), self._jacobian.copy()
 
     def many_kinematics(self, q_tree: Array) -> tuple[Array, Array]:
-        """Return what `kinematics` does for each of (count, nq) configurations: (count, joints, 12), (count, 6, n)."""
+        """Return `kinematics` of (count, nq) configurations, shapes (count, joints, 12) and (count, 6, n)."""
         with self.lock:
             placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
             for k, q in enumerate(q_tree):
@@ -153,13 +174,13 @@ class Tree:
         return placement, jacobian
 
     def jacobian_dot(self, q_tree: Array, v_tree: Array) -> Array:
-        """Return d/dt of the world Jacobian (6, n) along v_tree."""
+        """Return the time derivative of the world Jacobian along v', shape (6, n)."""
         with self.lock:
             pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
             return self._jacobian_dot.copy()
 
     def limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits by coordinate, infinite where there is none, shape (n,) each."""
+        """Return lower and upper joint limits, shape (n,) each, infinite if there is no limit."""
         lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
         for k, label in enumerate(self.coordinates):
             if label not in self.free_coordinates:
@@ -167,12 +188,12 @@ class Tree:
                     self.model.lowerPositionLimit[self.q_index[k]],
                     self.model.upperPositionLimit[self.q_index[k]],
                 )
-                lower[k] = low if low > -1e300 else -np.inf
-                upper[k] = high if high < 1e300 else np.inf
+                lower[k] = low if low > -UNLIMITED else -np.inf
+                upper[k] = high if high < UNLIMITED else np.inf
         return lower, upper
 
     def centre_of_mass_jacobians(self, q_tree: Array) -> Array:
-        """Jacobians of the centres of mass of all moving bodies that have mass, stacked: (3 bodies, n)."""
+        """Return the stacked Jacobians of the centres of mass of all moving bodies with mass, shape (3 bodies, n)."""
         placement, jacobian = self.kinematics(q_tree)
         rows = [np.zeros((0, self.n))]
         for joint in range(1, self.model.njoints):
@@ -184,7 +205,7 @@ class Tree:
         return np.vstack(rows)
 
     def integrate(self, q_tree: Array, step: Array) -> Array:
-        """Move a configuration by a tangent step."""
+        """Return the configuration that a tangent step leads to."""
         return q_tree + step if self.is_euclidean else np.asarray(pin.integrate(self.model, q_tree, step))
 
     def difference(self, start: Array, end: Array) -> Array:
@@ -192,14 +213,14 @@ class Tree:
         return end - start if self.is_euclidean else np.asarray(pin.difference(self.model, start, end))
 
     def configuration_rate(self, q_tree: Array, v_tree: Array) -> Array:
-        """Time derivative of Pinocchio's q at a tangent velocity, shape (nq,)."""
+        """Return the time derivative of Pinocchio's q at a tangent velocity v', shape (nq,)."""
         if self.is_euclidean:
             return v_tree
         rate = np.empty(self.nq)
         rate[self.q_index] = v_tree
         for q_at, v_at in self.free_roots:
             x, y, z, w = q_tree[q_at + 3 : q_at + 7]
-            p, q, r = v_tree[v_at + 3 : v_at + 6]  # angular velocity in the body's axes
+            p, q, r = v_tree[v_at + 3 : v_at + 6]  # angular velocity in body axes
             rotation = pin.Quaternion(np.array([x, y, z, w])).matrix()
             rate[q_at : q_at + 3] = rotation @ v_tree[v_at : v_at + 3]
             rate[q_at + 3 : q_at + 7] = 0.5 * np.array(
@@ -207,31 +228,21 @@ class Tree:
             )
         return rate
 
-    def bracket(self, v_tree: Array) -> Array:
-        """Return the (n, n) matrix that makes [v', x] of x; zero but for free roots, whose motions do not commute.
-
-        A tangent step x beside a motion v' changes at its own rate less [v', x].
-        """
-        matrix = np.zeros((self.n, self.n))
-        for _, at in self.free_roots:
-            matrix[at : at + 6, at : at + 6] = pin.Motion(v_tree[at : at + 6]).action
-        return matrix
-
     def axis(self, joint: int) -> tuple[Array, bool]:
-        """Return the axis of a one-freedom joint in its body, shape (3,), and whether it turns; else it slides."""
+        """Return the axis of a one-freedom joint in its body, shape (3,), and whether the joint is revolute."""
         model = self.model.joints[joint]
         data = model.createData()
         model.calc(data, self.neutral())
-        along = np.asarray(data.S).reshape(6)
-        turns = not along[:3].any()
-        return (along[3:] if turns else along[:3]), turns
+        motion = np.asarray(data.S).reshape(6)
+        is_revolute = not motion[:3].any()
+        return (motion[3:] if is_revolute else motion[:3]), is_revolute
 
     def neutral(self) -> Array:
-        """Return the configuration with all coordinates zero."""
+        """Return the configuration in which all coordinates are zero, shape (nq,)."""
         return np.asarray(pin.neutral(self.model))
 
     def to_coordinates(self, q_tree: Array) -> Array:
-        """Return the n numbers that files and JSON carry (a free root: position, rotation vector)."""
+        """Convert q to the n numbers of files and JSON. A free root has its position and rotation vector."""
         if self.is_euclidean:
             return np.array(q_tree)
         numbers = np.array(q_tree[self.q_index])
@@ -242,7 +253,7 @@ class Tree:
         return numbers
 
     def from_coordinates(self, numbers: Array) -> Array:
-        """Inverse of `to_coordinates`."""
+        """Convert the n numbers of files and JSON to q, the inverse of `to_coordinates`."""
         if self.is_euclidean:
             return np.array(numbers, dtype=float)
         q_tree = self.neutral()
@@ -253,23 +264,23 @@ class Tree:
         return q_tree
 
     def named(self, vector: Array) -> dict[str, float]:
-        """Return a tangent vector keyed by coordinate."""
+        """Return a vector (n,) as a table by coordinate."""
         return {label: float(x) for label, x in zip(self.coordinates, vector, strict=True)}
 
     def indices(self, names: tuple[str, ...], what: str) -> IntArray:
-        """Return where coordinates stand; InputError names the valid ones."""
+        """Return the places of coordinates in `coordinates` (InputError lists the valid names)."""
         for name in names:
             if name not in self.index:
                 raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
         return np.array([self.index[name] for name in names], dtype=np.intp)
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
-        """Turn a table by coordinate into a vector.
+        """Convert a table by coordinate to a vector in the order of `names`.
 
         Raises
         ------
         InputError
-            An unknown name, a missing one (unless `fill` is given), a value that is not finite.
+            An unknown name, a missing one (unless `fill` is given), or a value that is not a finite number.
         """
         unknown = next((name for name in values if name not in names), None)
         if unknown is not None:
@@ -277,21 +288,21 @@ class Tree:
         missing = [name for name in names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(names)}")
-        strange = next((name for name in names if not is_number(values.get(name, 0.0))), None)
-        if strange is not None:
-            raise InputError(f"{what}: {strange} = {values[strange]!r:.80}: expected a number")
+        invalid = next((name for name in names if not is_number(values.get(name, 0.0))), None)
+        if invalid is not None:
+            raise InputError(f"{what}: {invalid} = {values[invalid]!r:.80}: expected a number")
         vector = np.array([float(values.get(name, fill if fill is not None else np.nan)) for name in names])
         if not np.all(np.isfinite(vector)):
-            bad = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
-            raise InputError(f"{what}: {bad} = {values[bad]} is not a finite number")
+            name = names[int(np.flatnonzero(~np.isfinite(vector))[0])]
+            raise InputError(f"{what}: {name} = {values[name]} is not a finite number")
         return vector
 
     def units(self, per: str = "") -> list[str]:
-        """Return the unit of each coordinate, rad or m, ``per="/s"`` of its rate."""
+        """Return the unit of each coordinate, "rad" or "m", followed by `per`, such as "/s" for its rate."""
         return [f"{'m' if length else 'rad'}{per}" for length in self.in_metres]
 
     def joint_index(self, joint: str, where: str) -> int:
-        """Return where a joint of one freedom stands; MechanismError names those there are."""
+        """Return the place in `coordinates` of a joint with one freedom (MechanismError lists these joints)."""
         if joint not in self.index or joint in self.free_coordinates:
             single = ", ".join(c for c in self.coordinates if c not in self.free_coordinates)
             raise MechanismError(f"{where}: no joint of one freedom called {joint!r}; there are {single}")
@@ -299,7 +310,7 @@ class Tree:
 
 
 def _in_metres(model: Any, label: str) -> bool:
-    """Whether a coordinate is a length: a prismatic joint, or a free root's position."""
+    """Whether a coordinate is a length: of a prismatic joint, or the position of a free root."""
     joint, _, axis = label.rpartition(".")
     if model.existJointName(label):
         return model.joints[model.getJointId(label)].shortname().startswith("JointModelP")
@@ -313,22 +324,22 @@ def _labels(model: Any) -> list[str]:
     return labels
 
 
-def _places(model: Any) -> list[int]:
-    places: list[int] = []
+def _q_indices(model: Any) -> list[int]:
+    indices: list[int] = []
     for joint in list(model.joints)[1:]:
-        places += [joint.idx_q] if joint.nv == 1 else [joint.idx_q + k for k in (0, 1, 2, 3, 4, 5)]
-    return places
+        indices += [joint.idx_q] if joint.nv == 1 else [joint.idx_q + k for k in (0, 1, 2, 3, 4, 5)]
+    return indices
 
 
 def _strided_placements(data: Any) -> Array:
-    """View data.oMi as (joints, 12): rotation by columns, then translation.
+    """Return a view of data.oMi of shape (joints, 12): the rotation by columns, then the translation.
 
-    Valid because Pinocchio keeps its placements in one contiguous vector; checked, not assumed.
+    Pinocchio stores its placements in one contiguous vector, which is checked here.
     """
     rotations = [placement.rotation for placement in data.oMi]
     starts = np.array([r.__array_interface__["data"][0] for r in rotations])
     ends = np.array([m.translation.__array_interface__["data"][0] for m in data.oMi])
     if np.any(np.diff(starts) != 96) or np.any(ends - starts != 72):
-        raise RuntimeError("this Pinocchio lays its placements out differently; ckc_pin needs pin 4.1")
-    first = rotations[0].T.reshape(-1)  # stored by columns: the transpose shares the memory
+        raise RuntimeError("this version of Pinocchio stores joint placements in another layout; install pin 4.1")
+    first = rotations[0].T.reshape(-1)  # the rotation is stored by columns, so the transpose shares its memory
     return np.lib.stride_tricks.as_strided(first, shape=(len(rotations), 12), strides=(96, 8))

@@ -1,4 +1,4 @@
-"""What of a mechanism may not be meant, and what it weighs: findings that `check` names. None is an error."""
+"""Warnings about a mechanism's model, joint limits and stops, its mass, and the properties of its joints."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ __all__ = [
     "list_limit_violations",
 ]
 
-FAR = 0.5  # rad, or sizes of the mechanism: further from q_guess than that is another pose than the one described
-ROUNDING = 1e-9  # rad, or sizes: at a limit, not beyond it
-AT_STOP = 1e-11  # rad, or sizes: so far beyond a stop is at it
-LENGTH = 1e-12  # sizes: less is no length
+FAR_FROM_GUESS = 0.5  # rad, or mechanism sizes: an assembled coordinate further from its guess is reported
+LIMIT_TOLERANCE = 1e-9  # rad, or mechanism sizes: a coordinate so close to its limit is within it
+STOP_TOLERANCE = 1e-11  # rad, or mechanism sizes: a coordinate so little beyond a stop is at the stop
+MIN_LENGTH = 1e-12  # mechanism sizes: a link between joints closer than this has no length
 
 
 def find_model_warnings(mechanism: Mechanism) -> list[str]:
-    """Name links without mass, springs that do nothing, and coordinates that assembly took far from their guess."""
-    says = []
-    if weightless := _weightless(mechanism):
-        says.append(f"links that move without mass (no <inertial>, or its mass is 0): {', '.join(weightless)}")
+    """Warn of links without mass, springs without effect, and coordinates assembled far from their guess."""
+    warnings = []
+    if massless := _massless_links(mechanism):
+        warnings.append(f"links that move without mass (no <inertial>, or its mass is 0): {', '.join(massless)}")
     for k, spring in enumerate(mechanism.spec.spring):
         if not spring.stiffness and not spring.damping:
-            says.append(f"spring {k + 1} does nothing: it has neither stiffness nor damping")
+            warnings.append(f"spring {k + 1} does nothing: it has neither stiffness nor damping")
         elif spring.frame_a is not None and spring.frame_b is not None:
             ends = [mechanism.frames.find(frame, f"spring {k + 1}").joint for frame in (spring.frame_a, spring.frame_b)]
             if ends[0] == ends[1]:
-                says.append(f"spring {k + 1} does nothing: its frames move together (the same rigid body)")
-    if far := _far_from_guess(mechanism):
-        says.append(
-            f"assembled more than {FAR:g} rad, or {FAR:g} of the size {mechanism.size:.3g} m, from q_guess: "
-            f"{', '.join(far)}"
+                warnings.append(f"spring {k + 1} does nothing: its frames belong to the same rigid body")
+    if distant := _far_from_guess(mechanism):
+        warnings.append(
+            f"assembled more than {FAR_FROM_GUESS:g} rad, or {FAR_FROM_GUESS:g} of the size {mechanism.size:.3g} m, "
+            f"from q_guess: {', '.join(distant)}"
         )
-    return says
+    return warnings
 
 
 def list_limit_violations(mechanism: Mechanism, q_tree: Array) -> list[str]:
-    """Return the coordinates of a configuration that are outside their joints' limits, with both."""
+    """List the coordinates that are outside their joint limits, with value and limits."""
     lower, upper = mechanism.tree.limits()
-    numbers, slack = mechanism.tree.to_coordinates(q_tree), ROUNDING * mechanism.tree.step_scale
-    outside = np.flatnonzero((numbers < lower - slack) | (numbers > upper + slack))
+    numbers, tolerance = mechanism.tree.to_coordinates(q_tree), LIMIT_TOLERANCE * mechanism.tree.step_scale
+    outside = np.flatnonzero((numbers < lower - tolerance) | (numbers > upper + tolerance))
     names = mechanism.coordinates
     return [f"{names[k]} = {numbers[k]:.6g} (limits {lower[k]:.6g} to {upper[k]:.6g})" for k in outside]
 
 
 def describe_stop_violation(mechanism: Mechanism, q_tree: Array) -> str:
-    """Say which coordinate of a configuration is furthest beyond its stops, with both; empty where none is."""
+    """Describe the coordinate that is furthest beyond its stops; empty if there is none."""
     joints, numbers = mechanism.joints, mechanism.tree.to_coordinates(q_tree)
-    off = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.step_scale
-    worst = int(np.argmax(off))
-    if off[worst] <= AT_STOP:
+    excess = np.maximum(joints.lower - numbers, numbers - joints.upper) / mechanism.tree.step_scale
+    worst = int(np.argmax(excess))
+    if excess[worst] <= STOP_TOLERANCE:
         return ""
     return (
         f"{mechanism.coordinates[worst]} = {numbers[worst]:.6g} is beyond its stops, "
@@ -64,9 +64,9 @@ def describe_stop_violation(mechanism: Mechanism, q_tree: Array) -> str:
 
 
 def compute_moving_mass(mechanism: Mechanism) -> tuple[float, Array]:
-    """Mass of all bodies that move, kg, and their inertia as assembled, kg m^2.
+    """Return the mass of all moving bodies, kg, and their inertia in the assembled configuration, kg m^2.
 
-    The inertia, (3, 3), is about their common centre of mass and in the world's axes. Armature has no part in either.
+    The inertia, shape (3, 3), is about the common centre of mass, in world axes. Neither includes armature.
     """
     placement, _ = mechanism.tree.kinematics(mechanism.q_tree)
     bodies = list(mechanism.tree.model.inertias)[1:]
@@ -85,9 +85,10 @@ def compute_moving_mass(mechanism: Mechanism) -> tuple[float, Array]:
 
 
 def describe_joints(mechanism: Mechanism) -> dict[str, dict[str, float]]:
-    """Return armature, damping, friction, stops and restitution of the joints that have one of them but damping.
+    """Return the properties of all joints that have armature, friction or stops.
 
-    `lower` and `upper` are where the stops are, infinite where there is none.
+    Keys are armature, damping, friction, lower, upper and restitution. `lower` and `upper` are the positions of the
+    stops, infinite if there is none.
     """
     joints, model = mechanism.joints, mechanism.tree.model
     columns = {
@@ -98,16 +99,16 @@ def describe_joints(mechanism: Mechanism) -> dict[str, dict[str, float]]:
         "upper": joints.upper,
         "restitution": joints.restitution,
     }
-    acting = np.flatnonzero((model.armature != 0) | (joints.friction != 0) | joints.stopped)
-    return {mechanism.coordinates[k]: {name: float(x[k]) for name, x in columns.items()} for k in acting}
+    listed = np.flatnonzero((model.armature != 0) | (joints.friction != 0) | joints.stopped)
+    return {mechanism.coordinates[k]: {name: float(x[k]) for name, x in columns.items()} for k in listed}
 
 
-def _weightless(mechanism: Mechanism) -> list[str]:
-    """Name moving links without mass, but for the crosses of universal and ball joints.
+def _massless_links(mechanism: Mechanism) -> list[str]:
+    """Name moving links without mass, except for the crosses of universal and ball joints.
 
-    Those are links without length: every joint that they carry is where their own is.
+    Such a cross has no length: the joints on it have the same origin as the joint that carries it.
     """
-    model, least = mechanism.tree.model, LENGTH * mechanism.size
+    model, min_length = mechanism.tree.model, MIN_LENGTH * mechanism.size
     lengths: dict[int, float] = {}
     for joint in range(1, model.njoints):
         parent, arm = int(model.parents[joint]), float(np.linalg.norm(model.jointPlacements[joint].translation))
@@ -115,17 +116,17 @@ def _weightless(mechanism: Mechanism) -> list[str]:
     return [
         mechanism.frames.bodies[joint]
         for joint in range(1, model.njoints)
-        if model.inertias[joint].mass == 0 and not lengths.get(joint, np.inf) <= least
+        if model.inertias[joint].mass == 0 and not lengths.get(joint, np.inf) <= min_length
     ]
 
 
 def _far_from_guess(mechanism: Mechanism) -> list[str]:
-    """Name the coordinates of q_guess that the assembled configuration is far from."""
+    """List the coordinates of q_guess that differ much from the assembled configuration."""
     tree, guess = mechanism.tree, mechanism.spec.q_guess
     numbers = tree.to_coordinates(mechanism.q_tree)
-    found = []
+    distant = []
     for name, value in guess.items():
         at = tree.index[name]
-        if abs(numbers[at] - value) > FAR * tree.step_scale[at]:
-            found.append(f"{name} = {numbers[at]:.4g} (guess {value:.4g})")
-    return found
+        if abs(numbers[at] - value) > FAR_FROM_GUESS * tree.step_scale[at]:
+            distant.append(f"{name} = {numbers[at]:.4g} (guess {value:.4g})")
+    return distant

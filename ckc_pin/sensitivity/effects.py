@@ -98,7 +98,7 @@ def _locks(carrier: int, place: Place, index: int, turn: Array, slide: Array) ->
 def _directions(mechanism: Mechanism, loop: str, end: int) -> Iterator[tuple[Place, int]]:
     """Directions and relative rotations that turn with a loop's frame."""
     closure, label = mechanism.closure, ("frame_a", "frame_b")[end]
-    yield from (("direction", k) for k, frame in enumerate(closure.turned_by) if frame == (loop, label))
+    yield from (("direction", k) for k, frame in enumerate(closure.direction_frames) if frame == (loop, label))
     for group in closure.groups:
         if isinstance(group, RelativeLog):
             loops = [closure.names[out][0] for out in group.out[::3]]

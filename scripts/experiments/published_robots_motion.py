@@ -45,7 +45,7 @@ def given_back(draft: Draft) -> float:
     """Find how far the torques of a motion give it back.
 
     Every independent coordinate swings and has a motor; on a free root, which none drives, motors push as they
-    would for that. Ranges are no walls.
+    would for that. Ranges are not stops.
 
     Returns
     -------

@@ -83,7 +83,7 @@ CONTROLLER = [
     ),
     Bad("no K_D", _tracking(), ["the key 'K_D' is missing"], {"tracking.scene.toml": ("K_D = 10.0", "")}),
     _value("torque_limit=0", "controller.torque_limit = 0: expected a number greater than 0"),
-    _value("torque_limit={theta_2=3.0}", f"controller.torque_limit: 'theta_2' is no actuator; there are {JOINTS}"),
+    _value("torque_limit={theta_2=3.0}", f"controller.torque_limit: no motor 'theta_2'; there are {JOINTS}"),
     _value("torque_limit={theta_1=-3.0}", "controller.torque_limit.theta_1 = -3.0: expected a number greater than 0"),
     _value("torque_limit=strong", "controller.torque_limit = 'strong': expected a number or a table"),
     _target("q_d=1", "controller.q_d = 1: expected a table"),

@@ -81,7 +81,7 @@ LOOPS = [
     _edit("loop frame key", '"tip_left"', '{lnk = "tip"}', "loop[0].frame_a: unknown key 'lnk'; valid: link, xyz, rpy"),
     _edit("loop frame number", '"tip_left"', "3", "loop[0].frame_a = 3: expected a string or a table"),
     _edit("loop frame at nan", '"tip_left"', '{link = "base", xyz = [0.0, nan, 0.0]}', f"xyz[1] = nan: {FINITE}"),
-    _edit("loop on one body", '"tip_left"', '"link_4"', "loop 'elbow': frames A and B move together"),
+    _edit("loop on one body", '"tip_left"', '"link_4"', "loop 'elbow': frames A and B belong to the same rigid body"),
     _add(
         "two loops of one name",
         '[[loop]]\nname = "elbow"\ntype = "point"\nframe_a = "base"\nframe_b = "link_2"',

@@ -136,7 +136,7 @@ def test_joints_that_do_something_are_listed(bar: Path) -> None:
     assert "joint theta_1 armature 0.5 kg m² damping 0.3 N m s/rad friction 0.25 N m" in shown
     assert "joint theta_2 stops -2 to 2.5 rad restitution 0.75" in shown
     assert warnings("bar") == [
-        "joint limits are no walls, a run may pass them: theta_4; stops = true in their [[joint]] makes them walls"
+        "joint limits are not stops, so a run may pass them: theta_4; stops = true in their [[joint]] adds stops"
     ]
 
 
@@ -179,7 +179,7 @@ def test_springs_within_one_body_are_named(bar: Path) -> None:
         '[[spring]]\nframe_a = "world"\nframe_b = {link = "base", xyz = [0.0, 1.0, 0.0]}\ndamping = 1.0\n'
         '[[spring]]\nframe_a = "base"\nframe_b = "tip_left"\nstiffness = 1.0',
     )
-    says = "does nothing: its frames move together (the same rigid body)"
+    says = "does nothing: its frames belong to the same rigid body"
     assert warnings("bar") == [f"spring 1 {says}", f"spring 2 {says}"]
 
 

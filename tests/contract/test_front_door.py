@@ -249,7 +249,7 @@ def _warned(answer: Outcome) -> list[str]:
 
 
 def test_a_warning_is_said_once_and_where_it_matters() -> None:
-    about_limits = "joint limits are no walls"
+    about_limits = "joint limits are not stops"
     assert any(about_limits in warning for warning in check("talos").warnings)
     assert _warned(ckc("run", "talos", *SHORT)) == []
     assert _warned(ckc("run", "five_bar_as_printed/tracking", *SHORT)) == [], "so short it stays inside"

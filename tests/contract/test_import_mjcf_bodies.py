@@ -132,7 +132,7 @@ def test_active_ranges_are_stops_and_others_are_limits(tmp_path: Path) -> None:
     assert draft.left_out == ["range of ball joint ball"]
     assert draft.guessed[1:] == ["ranges are hard stops without rebound; in MuJoCo they are soft: acts"]
     assert mechanism.warnings == [
-        "joint limits are no walls, a run may pass them: rests; stops = true in their [[joint]] makes them walls"
+        "joint limits are not stops, so a run may pass them: rests; stops = true in their [[joint]] adds stops"
     ]
 
 

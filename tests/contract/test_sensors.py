@@ -312,7 +312,7 @@ BAD = [
     (_set("drive.torque_resolution=0"), "controller.drive.torque_resolution = 0: expected a number greater than 0"),
     (
         _set("drive.torque_rate={theta_2=1.0}"),
-        f"controller.drive.torque_rate: 'theta_2' is no actuator; there are {JOINTS}",
+        f"controller.drive.torque_rate: no motor 'theta_2'; there are {JOINTS}",
     ),
 ]
 

@@ -63,15 +63,15 @@ def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical
     "overrides", [{"formulation": "reduced"}, {"formulation": "spf"}, {"initial.at": "equilibrium"}]
 )
 def test_what_needs_numbers_q_is_refused(top: Path, overrides: dict[str, str]) -> None:
-    with pytest.raises(InputError, match=r"hold a free root in part.*runs as a DAE"):
+    with pytest.raises(InputError, match=r"constrain a free root in part.*run it as a DAE"):
         simulate(top / "default.scene.toml", overrides)
 
 
 def test_check_says_so(top: Path) -> None:
     found = check(top / "mechanism.toml")
     assert (found.d, found.rank) == (3, 3)
-    assert any("hold a free root in part" in warning for warning in found.warnings)
-    with pytest.raises(InputError, match="hold a free root in part"):
+    assert any("constrain a free root in part" in warning for warning in found.warnings)
+    with pytest.raises(InputError, match="constrain a free root in part"):
         terms(load(top / "mechanism.toml"), {"root.rx": 0.1, "root.ry": 0.0, "root.rz": 0.0})
 
 

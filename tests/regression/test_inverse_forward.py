@@ -121,7 +121,9 @@ def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> No
     overrides = waves(mechanism, 0.1)
     if mechanism.splits_root or mechanism.independent_root_coordinates:
         says = (
-            "hold a free root in part" if mechanism.splits_root else r"the motion along root\.\w+.* is driven by none"
+            "constrain a free root in part"
+            if mechanism.splits_root
+            else r"the motion along root\.\w+.* is driven by none"
         )
         with pytest.raises(InputError, match=says):
             inverse_dynamics(scene, overrides)
