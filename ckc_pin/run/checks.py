@@ -94,11 +94,11 @@ def check_desired(
 
     Returns None where there is no desired motion.
     """
-    near = None if start is None else start.at
+    reference = None if start is None else start.at
     if isinstance(controller, Tracking):
-        return follow_desired(mechanism, controller.desired, t_end, near)
+        return follow_desired(mechanism, controller.desired, t_end, reference)
     if isinstance(controller, SetPoint):
-        target = sigma(mechanism, controller.q_d, near)
+        target = sigma(mechanism, controller.q_d, reference)
         return DesiredCheck(None, 0.0, target.at.sigma_min()) if target.verdict == "converged" else None
     return None
 

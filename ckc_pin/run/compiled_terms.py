@@ -50,7 +50,7 @@ def select_derivative_library(
 def compile_during_run(mechanism: Mechanism, loop: Any, missing_arguments: Mapping[str, BoolArray] | None) -> None:
     """Compile a mechanism's terms and give them to a loop that has started with Pinocchio's.
 
-    The loop goes on with Pinocchio's terms if there is no compiler or CasADi, or if there are too many coordinates.
+    The loop keeps Pinocchio's terms if there is no compiler or CasADi, or if there are too many coordinates.
 
     Parameters
     ----------

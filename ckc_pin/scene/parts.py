@@ -76,11 +76,11 @@ def build_scene_controller(
         return None
     with scene.sources.prefix_errors():
         q = {name: x for name, x in spec.initial.q.items() if name in mechanism.coordinates}
-        near = find_branch(mechanism, q)
-        if not is_chart(near):  # The start itself is refused later, with a better message.
-            near = mechanism.assembled
+        reference = find_branch(mechanism, q)
+        if not is_chart(reference):  # The start itself is refused later, with a better message.
+            reference = mechanism.assembled
         return make_controller(
-            spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, near, load_model
+            spec.controller, mechanism, spec.coriolis_velocity, spec.t_end, scene.sources, reference, load_model
         )
 
 

@@ -113,5 +113,5 @@ EVENTS = [
 
 
 @pytest.mark.parametrize("case", [*SCENE, *SOLVER, *START, *EVENTS], ids=lambda case: case.what)
-def test_bad_scene(case: Bad, bar: Path) -> None:
+def test_invalid_scene_is_rejected(case: Bad, bar: Path) -> None:
     expect(case, bar)

@@ -34,7 +34,7 @@ class NanAfter:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_nan_from_a_controller_is_named_and_everything_before_is_kept(formulation: str, tmp_path: Path) -> None:
+def test_nan_of_a_controller_keeps_earlier_results(formulation: str, tmp_path: Path) -> None:
     overrides = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 0.01}
     run = simulate("five_bar/swing", overrides, controller=NanAfter(0.203))
     assert run.status == "stopped"
@@ -45,7 +45,7 @@ def test_nan_from_a_controller_is_named_and_everything_before_is_kept(formulatio
     assert Run.load(run.save(tmp_path / "run.npz")).message == run.message
 
 
-def test_min_step_ends_a_run_that_needs_shorter_ones() -> None:
+def test_step_below_min_step_stops_the_run() -> None:
     """Where theta_1, theta_3 stop to determine the rest, steps become as short as you like."""
 
     class Push:
@@ -59,7 +59,7 @@ def test_min_step_ends_a_run_that_needs_shorter_ones() -> None:
     assert 0.2 < run.t[-1] < 0.25
 
 
-def test_numbers_as_people_write_them() -> None:
+def test_budget_messages_format_numbers() -> None:
     for text, value in ((".1", 0.1), ("1.", 1.0), ("+.5", 0.5), ("1.e-1", 0.1), ("1e-1", 0.1)):
         answer = ckc("run", "five_bar/swing", "--json", "--set", f"t_end={text}", "--set", "formulation=reduced")
         assert answer.code == 0
@@ -68,7 +68,7 @@ def test_numbers_as_people_write_them() -> None:
         assert ckc("run", "five_bar/swing", "--set", f"t_end={text}").code == 2
 
 
-def test_a_run_that_no_file_could_hold_is_refused() -> None:
+def test_run_larger_than_a_file_is_rejected() -> None:
     names = {"solver.output_dt": 1e-6, "t_end": 1.0, "mechanism": {"generator": "n_four_bar", "N": 40}}
     scene = load_scene("n_four_bar", names)
     with pytest.raises(InputError, match=r"solver.output_dt: 1000001 output instants of \d+ numbers each"):
@@ -90,7 +90,7 @@ def interrupts() -> Iterator[Interrupts]:
         signal.signal(number, handler)
 
 
-def test_the_second_interrupt_is_let_pass_and_the_third_is_not(interrupts: Interrupts) -> None:
+def test_third_interrupt_is_not_deferred(interrupts: Interrupts) -> None:
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
     signal.raise_signal(signal.SIGINT)
@@ -98,7 +98,7 @@ def test_the_second_interrupt_is_let_pass_and_the_third_is_not(interrupts: Inter
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_what_is_deferred_for_is_finished_first(interrupts: Interrupts) -> None:
+def test_deferred_interrupt_waits_for_the_work(interrupts: Interrupts) -> None:
     done = []
 
     def save() -> None:
@@ -112,7 +112,7 @@ def test_what_is_deferred_for_is_finished_first(interrupts: Interrupts) -> None:
     assert len(done) == 3
 
 
-def test_what_was_ignored_stays_ignored(interrupts: Interrupts) -> None:
+def test_ignored_signals_stay_ignored(interrupts: Interrupts) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     interrupts.install()
     signal.raise_signal(signal.SIGINT)
@@ -152,7 +152,7 @@ ckc_pin.cli.main()
     ],
     ids=["interrupted before", "done before"],
 )
-def test_signals_while_saving(
+def test_signals_while_saving_leave_a_complete_file(
     t_end: str, first: list[signal.Signals], meanwhile: list[signal.Signals], code: int, status: str, tmp_path: Path
 ) -> None:
     """Ctrl-C twice at once, or not at all; then more of them while the run is written."""
@@ -217,7 +217,7 @@ def _zip(path: Path, entries: list[tuple[str, bytes]]) -> Path:
 
 
 @pytest.mark.parametrize("what", BOMBS)
-def test_bombs_are_not_expanded(
+def test_decompression_bombs_are_not_expanded(
     what: str, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entries, says = BOMBS[what]
@@ -229,21 +229,21 @@ def test_bombs_are_not_expanded(
     assert says in str(error.value)
 
 
-def test_an_entry_twice_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_duplicate_entry_is_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="Duplicate name"):
         path = _zip(tmp_path / "run.npz", [*whole.items(), ("t.npy", whole["t.npy"])])
     with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 
-def test_an_entry_that_is_no_array_is_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_entry_that_is_no_array_is_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
     rename: Callable[[str], str] = lambda name: "t" if name == "t.npy" else name  # noqa: E731
     path = _zip(tmp_path / "run.npz", [(rename(name), data) for name, data in whole.items()])
     with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 
-def test_names_that_are_numbers_are_refused(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_numeric_names_are_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
     stream = io.BytesIO()
     np.save(stream, np.zeros(4))
     path = _zip(tmp_path / "run.npz", [*(whole | {"coordinates.npy": stream.getvalue()}).items()])

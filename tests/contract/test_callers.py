@@ -42,7 +42,7 @@ class Own:
 
 
 @pytest.mark.parametrize(("scene", "overrides"), SCENES, ids=str)
-def test_it_is_called_once_an_evaluation_with_the_terms_of_its_state(scene, overrides):
+def test_controller_is_called_once_per_evaluation_with_its_terms(scene, overrides):
     loaded = load_scene(scene, overrides)
     own = Own(prepare(loaded).controller)
     theirs, mine = simulate(loaded), simulate(loaded, controller=own)
@@ -60,7 +60,7 @@ def test_it_is_called_once_an_evaluation_with_the_terms_of_its_state(scene, over
             assert np.abs(value - wanted).max(initial=0.0) <= 1e-11 * max(1.0, np.abs(wanted).max(initial=0.0)), name
 
 
-def test_terms_that_are_kept_stay_as_they_were():
+def test_stored_terms_do_not_change():
     scene = load_scene("five_bar/set_point", {"formulation": "reduced", "t_end": 0.2})
     kept: list[Terms] = []
     inner = prepare(scene).controller
@@ -84,7 +84,7 @@ class Broken(Exception):
     """Nobody else's."""
 
 
-def test_what_it_raises_is_carried_out_whole_and_the_loop_can_be_started_again():
+def test_controllers_exception_is_raised_and_the_loop_restarts():
     scene = load_scene("five_bar/set_point", {"formulation": "reduced", "t_end": 0.1})
     inner = prepare(scene).controller
     assert inner is not None
@@ -110,7 +110,7 @@ def test_what_it_raises_is_carried_out_whole_and_the_loop_can_be_started_again()
     assert np.array_equal(again.q_tree, simulate(scene, controller=fails).q_tree)
 
 
-def test_what_an_event_raises_too():
+def test_event_functions_exception_is_raised():
     def function(t: float, terms: Terms) -> float:
         raise Broken("at once")
 
@@ -118,7 +118,7 @@ def test_what_an_event_raises_too():
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(function, name="broken")])
 
 
-def test_a_keyboard_interrupt_in_it_ends_the_run_as_any():
+def test_keyboard_interrupt_in_a_controller_ends_the_run():
     class Interrupts:
         def u(self, t: float, terms: Terms) -> Any:
             if t > 0.5:
@@ -130,7 +130,7 @@ def test_a_keyboard_interrupt_in_it_ends_the_run_as_any():
     assert 0.3 < run.t[-1] <= 0.5
 
 
-def test_an_event_is_asked_a_few_times_a_step():
+def test_event_function_is_called_a_few_times_per_step():
     asked = []
 
     def function(t: float, terms: Terms) -> float:
@@ -143,7 +143,7 @@ def test_an_event_is_asked_a_few_times_a_step():
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
-def test_simulators_in_threads_do_not_disturb_each_other(formulation: str):
+def test_simulators_in_threads_are_independent(formulation: str):
     """Four mechanisms, eight simulators, each with its own u: bit for bit what they do one after the other."""
 
     def walk(number: int) -> Any:
@@ -161,7 +161,7 @@ def test_simulators_in_threads_do_not_disturb_each_other(formulation: str):
         assert np.array_equal(one, other)
 
 
-def test_callers_controllers_in_threads_get_their_own_terms():
+def test_controllers_in_threads_get_their_own_terms():
     def run(number: int) -> Any:
         target = -0.5 - 0.05 * number
 

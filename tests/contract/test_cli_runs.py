@@ -68,7 +68,7 @@ def test_events_of_one_direction(direction: int, crossings: tuple[list[float], l
     assert found.t[-1] == 2.0, "an event that does not stop the run does not"
 
 
-def test_an_event_that_stops_is_the_last_instant(crossings: tuple[list[float], list[float]]) -> None:
+def test_stopping_event_is_the_last_instant(crossings: tuple[list[float], list[float]]) -> None:
     event = {"coordinate": "theta_2", "value": LEVEL, "stop": True}
     found = simulate("five_bar/swing", {"solver.rtol": 1e-11, "event": [*EVENTS, event]})
     assert found.status == "done"
@@ -82,7 +82,7 @@ def test_an_event_that_stops_is_the_last_instant(crossings: tuple[list[float], l
 # --- limits and actuators --------------------------------------------------------------------------
 
 
-def test_a_torque_limit_clips_tau_and_u(run: Callable[..., Run]) -> None:
+def test_torque_limit_clips_tau_and_u(run: Callable[..., Run]) -> None:
     free = run("five_bar/tracking", t_end=0.3)
     assert np.abs(free.tau).max() > 6
     limited = run("five_bar/tracking", t_end=0.3, controller__torque_limit=5.0)
@@ -93,7 +93,7 @@ def test_a_torque_limit_clips_tau_and_u(run: Callable[..., Run]) -> None:
     assert np.abs(one.tau[:, 1]).max() > 3.0
 
 
-def test_a_limit_on_motors_elsewhere(bar: Path) -> None:
+def test_torque_limit_of_distal_motors(bar: Path) -> None:
     """The motors on the distal joints: tau is theirs, u = rho^T tau with rho from the appendix."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     old = 'actuated = ["theta_1", "theta_3"]'
@@ -120,7 +120,7 @@ class ByHand:
         return -10.0 * (terms.q - self.q_d) - 1.0 * terms.q_dot + self.h
 
 
-def test_a_controller_from_python_takes_the_place_of_the_scenes(run: Callable[..., Run]) -> None:
+def test_python_controller_replaces_the_scenes_controller(run: Callable[..., Run]) -> None:
     q_d = np.full(2, np.pi / 4)
     shipped = run("five_bar/set_point", t_end=0.3)
     own = simulate("five_bar/set_point", {"t_end": 0.3}, controller=ByHand(q_d))
@@ -130,7 +130,7 @@ def test_a_controller_from_python_takes_the_place_of_the_scenes(run: Callable[..
     assert shipped.lyapunov is not None
 
 
-def test_a_desired_trajectory_is_any_callable(run: Callable[..., Run]) -> None:
+def test_desired_trajectory_may_be_a_function(run: Callable[..., Run]) -> None:
     """Eq. 21 as a Python function against the scene's harmonics, by the same steps: their Jacobians differ."""
     shipped = run("five_bar/tracking", t_end=0.3, solver__method="DOP853")
     law = Tracking(np.eye(2), 10.0 * np.eye(2), desired)
@@ -139,7 +139,7 @@ def test_a_desired_trajectory_is_any_callable(run: Callable[..., Run]) -> None:
     assert_close(own.u, shipped.u, 1e-9)
 
 
-def test_a_trajectory_in_a_file_gives_the_same_run(bar: Path, run: Callable[..., Run]) -> None:
+def test_trajectory_file_gives_the_same_run(bar: Path, run: Callable[..., Run]) -> None:
     """Eq. 21 sampled at 20 ms; columns in another order, blank lines, spaces."""
     t = np.arange(0.0, 1.01, 0.02)
     rows = [f"{q[1]!r}, {x!r} ,{q[0]!r}" for x, q in ((float(x), desired(float(x))[0].tolist()) for x in t)]
@@ -150,7 +150,7 @@ def test_a_trajectory_in_a_file_gives_the_same_run(bar: Path, run: Callable[...,
     assert_close(sampled.u, exact.u, 1e-4)
 
 
-def test_a_controllers_own_error_is_its_own() -> None:
+def test_controllers_exception_is_not_wrapped() -> None:
     class Broken:
         def u(self, t: float, terms: Terms) -> Array:
             raise ZeroDivisionError("a mistake in the controller")
@@ -159,7 +159,7 @@ def test_a_controllers_own_error_is_its_own() -> None:
         simulate("five_bar/swing", controller=Broken())
 
 
-def test_a_controller_that_gives_nan_cannot_start() -> None:
+def test_nan_at_the_start_is_rejected() -> None:
     class Lost:
         def u(self, t: float, terms: Terms) -> Array:
             return np.full(2, np.nan)
@@ -171,7 +171,7 @@ def test_a_controller_that_gives_nan_cannot_start() -> None:
 # --- on the way ------------------------------------------------------------------------------------
 
 
-def test_progress_is_reported_on_the_way() -> None:
+def test_progress_is_reported() -> None:
     reports: list[tuple[float, float]] = []
     simulate(
         "five_bar/swing",
@@ -187,7 +187,7 @@ def test_progress_is_reported_on_the_way() -> None:
     ("budget", "value", "says"),
     [("max_rhs", 200, "max_rhs = 200 right-hand sides"), ("max_wall_s", 0.25, "max_wall_s = 0.25 s")],
 )
-def test_a_budget_keeps_what_there_is(budget: str, value: float, says: str, tmp_path: Path) -> None:
+def test_exhausted_budget_keeps_results(budget: str, value: float, says: str, tmp_path: Path) -> None:
     found = simulate("five_bar/swing", {f"solver.{budget}": value, "t_end": 1000.0, "solver.output_dt": 0.001})
     assert found.status == "stopped"
     assert says in found.message
@@ -198,7 +198,7 @@ def test_a_budget_keeps_what_there_is(budget: str, value: float, says: str, tmp_
     assert Run.load(found.save(tmp_path / "run.npz")).message == found.message
 
 
-def test_an_interrupt_in_a_controller_keeps_what_there_is() -> None:
+def test_interrupt_in_a_controller_keeps_results() -> None:
     class Impatient:
         def u(self, t: float, terms: Terms) -> Array:
             if t > 0.2:
@@ -212,7 +212,7 @@ def test_an_interrupt_in_a_controller_keeps_what_there_is() -> None:
     assert_close(found.energy, found.energy[0], 1e-7)
 
 
-def test_numpy_values_change_a_scene_like_pythons() -> None:
+def test_overrides_accept_numpy_values() -> None:
     overrides = {
         "t_end": np.float64(0.5),
         "solver.max_rhs": np.int64(7),
@@ -225,7 +225,7 @@ def test_numpy_values_change_a_scene_like_pythons() -> None:
     assert load_scene("five_bar/tracking", overrides).to_dict()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
 
 
-def test_a_scene_is_complete() -> None:
+def test_overrides_beside_a_scene_are_rejected() -> None:
     scene = load_scene("five_bar/swing", {"t_end": 0.01})
     assert simulate(scene).t[-1] == 0.01
     with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):

@@ -67,18 +67,18 @@ def test_sign_changes_within_a_step(function: Callable[[float], float], roots: l
 
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])
-def test_what_starts_on_zero_has_crossed_if_it_came_from_the_other_side(sign: int) -> None:
+def test_start_on_zero_counts_if_it_came_from_the_other_side(sign: int) -> None:
     assert _walk(lambda t: t, sign) == ([(0.0, 1)] if sign == -1 else [], 1, False)
 
 
-def test_what_ends_on_zero_waits_for_the_next_step() -> None:
+def test_end_on_zero_is_decided_by_the_next_step() -> None:
     assert _walk(lambda t: t - 1.0) == ([], -1, True)
     assert _walk(lambda t: t - 1.0, -1, 1.0, 2.0)[0] == [(1.0, 1)]
     assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0)[0] == []
 
 
 @pytest.mark.parametrize(("root", "slope"), [(0.3, 1.0), (0.3, -40.0), (0.0007, 1.0), (0.9995, 3.0)])
-def test_a_root_is_looked_for_where_that_costs_less(root: float, slope: float) -> None:
+def test_root_search_uses_the_cheap_function_first(root: float, slope: float) -> None:
     """In a function that is off by 1e-7, and then in the right one, which is asked little more than once."""
     asked: list[float] = []
 
@@ -92,7 +92,7 @@ def test_a_root_is_looked_for_where_that_costs_less(root: float, slope: float) -
 
 
 @pytest.mark.parametrize("off", [1e-7, -1e-7])
-def test_where_two_roots_are_nearly_one_the_right_function_decides(off: float) -> None:
+def test_exact_function_decides_between_nearly_equal_roots(off: float) -> None:
     """What costs less crosses twice where the right function does not, or does not where that crosses twice."""
     for depth in (0.5e-7, -0.5e-7):
         found, _, _ = _core.walk(
@@ -159,7 +159,7 @@ def test_two_crossings_in_one_step(formulation: str, motion: Callable[[float], A
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_margins_and_functions_are_located(formulation: str, motion: Callable[[float], Array]) -> None:
+def test_singular_value_and_function_events_are_located(formulation: str, motion: Callable[[float], Array]) -> None:
     def margin(t: float) -> float:
         return float(np.linalg.svd(FIVE_BAR.phi_z(motion(t)[:4]), compute_uv=False)[-1])
 
@@ -205,7 +205,7 @@ def test_events_do_not_change_the_motion() -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_an_event_that_is_far_from_happening_is_not_looked_for(formulation: str, either_terms: str) -> None:
+def test_distant_events_cost_no_evaluations(formulation: str, either_terms: str) -> None:
     """A coordinate's value is ruled out by what a step knows already: after the first no state in between is closed."""
     overrides: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
     plain = simulate("five_bar/swing", overrides, profile=True)
@@ -227,7 +227,7 @@ def _limit(bar: Path, joint: str, lower: float, upper: float) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_limits_are_events_and_no_walls(formulation: str, bar: Path, motion: Callable[[float], Array]) -> None:
+def test_joint_limits_are_events_without_contact(formulation: str, bar: Path, motion: Callable[[float], Array]) -> None:
     _limit(bar, "theta_2", -3.0, 0.5)
     _limit(bar, "theta_3", -1.4, 3.0)
     beyond = {"theta_2": lambda t: float(motion(t)[1] - 0.5), "theta_3": lambda t: float(-1.4 - motion(t)[2])}
@@ -250,7 +250,7 @@ def test_limits_are_events_and_no_walls(formulation: str, bar: Path, motion: Cal
     assert stopped.message.endswith("s: theta_3 at its lower limit")
 
 
-def test_limits_that_are_not_there(bar: Path) -> None:
+def test_event_of_missing_limits_is_rejected(bar: Path) -> None:
     scene = bar / "swing.scene.toml"
     with pytest.raises(InputError, match=r"event\[0\]: no joint of five_bar has limits in its URDF"):
         simulate(scene, {"event": [{"of": "limit"}]})
@@ -262,7 +262,7 @@ def test_limits_that_are_not_there(bar: Path) -> None:
 # --- start, end, graze, order --------------------------------------------------------------------
 
 
-def test_a_run_that_starts_on_the_value_has_not_crossed_it() -> None:
+def test_start_on_the_value_is_no_event() -> None:
     """From rest: every rate starts at zero; theta_1 starts at the value, and comes back to it once a swing."""
     start = load_scene("five_bar/swing").spec.initial.q
     observed = [{"coordinate": c, "of": "q_dot"} for c in ("theta_1", "theta_2")]
@@ -272,19 +272,19 @@ def test_a_run_that_starts_on_the_value_has_not_crossed_it() -> None:
     assert run.events == []
 
 
-def test_a_value_that_is_reached_at_the_end_is_an_event() -> None:
+def test_value_reached_at_the_end_is_an_event() -> None:
     run = simulate("five_bar/swing", {"t_end": 0.25}, events=[Event(lambda t, terms: t - 0.25, stop=True, name="bell")])
     assert [(event["t"], event["name"], event["direction"]) for event in run.events] == [(0.25, "bell", 1)]
     assert run.t[-1] == 0.25
     assert simulate("five_bar/swing", {"t_end": 0.25}, events=[Event(lambda t, terms: t - 0.26)]).events == []
 
 
-def test_a_graze_is_no_event() -> None:
+def test_touching_the_value_is_no_event() -> None:
     run = simulate("five_bar/swing", {"t_end": 0.5}, events=[Event(lambda t, terms: (t - 0.2) ** 2)])
     assert run.events == []
 
 
-def test_directions_and_order() -> None:
+def test_events_have_directions_and_are_ordered() -> None:
     def wave(t: float, terms: Terms) -> float:
         return float(np.sin(20 * t + 0.1))
 
@@ -302,7 +302,7 @@ def test_directions_and_order() -> None:
 # --- in files and on the command line ------------------------------------------------------------
 
 
-def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
+def test_events_are_in_json_and_in_the_run_file(tmp_path: Path) -> None:
     words = ("run", "five_bar/swing", "--set", "t_end=.3", "--set", 'event=[{coordinate="theta_2", value=.5}]')
     bad = ckc(*words, "--json")
     assert bad.code == 2, "a table's numbers are TOML"
@@ -324,7 +324,7 @@ def test_events_are_in_the_json_and_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_events_between_a_simulators_steps(formulation: str) -> None:
+def test_simulator_reports_events_within_its_steps(formulation: str) -> None:
     """One that stops ends the step early, and does not happen again at once."""
     overrides = {
         "solver.rtol": 1e-10,

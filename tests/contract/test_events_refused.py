@@ -23,32 +23,32 @@ from tests.contract.helpers.bad import Bad, expect
         ((lambda t: t - 0.5,), r"Event: expected a function of \(t, terms\), got <lambda>\(t\)"),
     ],
 )
-def test_a_bad_event_is_refused(arguments: tuple[Any, ...], says: str) -> None:
+def test_invalid_event_is_rejected(arguments: tuple[Any, ...], says: str) -> None:
     with pytest.raises(InputError, match=says):
         Event(*arguments)
 
 
 @pytest.mark.parametrize("value", [None, "0.3", np.zeros(2), [0.1], 1j])
-def test_a_function_that_gives_no_number_is_refused(value: Any) -> None:
+def test_event_function_must_return_a_number(value: Any) -> None:
     with pytest.raises(InputError, match=r"the event 'odd' gave .*; a number is needed"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: value, name="odd")])
 
 
 @pytest.mark.parametrize("kind", [bool, np.bool_], ids=["Python's", "NumPy's"])
-def test_a_truth_value_is_refused_at_once(kind: Any) -> None:
+def test_event_function_must_not_return_a_bool(kind: Any) -> None:
     """From False to True no sign changes: it would never be met."""
     with pytest.raises(InputError, match=r"the event 'late' gave False; a number that changes sign .* t - 0\.5"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: kind(t > 0.5), name="late")])
 
 
-def test_a_function_alone_is_refused() -> None:
+def test_bare_function_is_rejected_as_event() -> None:
     with pytest.raises(
         InputError, match=r"events\[0\]: .* is no Event; write Event\(function, direction, stop, name\)"
     ):
         simulate("five_bar/swing", events=[lambda t, terms: t])  # type: ignore[list-item]
 
 
-def test_a_function_that_becomes_nan_stops_the_run() -> None:
+def test_nan_of_an_event_function_stops_the_run() -> None:
     def lost(t: float, terms: Terms) -> float:
         return float("nan") if t > 0.2 else 1.0
 
@@ -76,11 +76,11 @@ BAD = [
 
 
 @pytest.mark.parametrize(("event", "says"), BAD, ids=[event for event, _ in BAD])
-def test_bad_events_in_a_scene(event: str, says: str, bar: Path) -> None:
+def test_invalid_scene_event_is_rejected(event: str, says: str, bar: Path) -> None:
     expect(Bad(event, (*SCENE, f"event=[{event}]"), [says]), bar)
 
 
-def test_an_open_chain_has_no_margin(tmp_path: Path) -> None:
+def test_open_chain_has_no_singular_value_event(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no closed loop, so there is no sigma_min_J"):
         simulate(_pendulum(tmp_path), {"event": [{"of": "sigma_min_J", "value": 0.1}]})
 

@@ -34,11 +34,11 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
-def test_wrong_number(case: Bad, bar: Path) -> None:
+def test_invalid_number_of_links_is_rejected(case: Bad, bar: Path) -> None:
     expect(case, bar)
 
 
-def test_by_name_it_has_its_usual_size() -> None:
+def test_generator_by_name_has_default_size() -> None:
     found = ckc("check", "n_four_bar", "--json").json
     assert (found["n"], found["d"], found["rows"]) == (9, 1, 8)
     assert found["independent"] == ["theta_0"]
@@ -48,13 +48,13 @@ def test_by_name_it_has_its_usual_size() -> None:
 
 
 @pytest.mark.parametrize("N", [1, 2, 13])
-def test_any_number(N: int) -> None:
+def test_generator_builds_any_size(N: int) -> None:
     found = check(load_scene("n_four_bar", {"mechanism.N": N}))
     assert (found.n, found.d, found.rows, found.rank) == (2 * N + 1, 1, 2 * N, 2 * N)
     assert found.warnings == ()
 
 
-def test_scene_of_ones_own(tmp_path: Path) -> None:
+def test_users_scene_of_a_generator_runs(tmp_path: Path) -> None:
     path = tmp_path / "own.scene.toml"
     path.write_text(SCENE)
     run = simulate(path)
@@ -63,13 +63,13 @@ def test_scene_of_ones_own(tmp_path: Path) -> None:
     assert len(run.coordinates) == 7
 
 
-def test_listed_like_the_others() -> None:
+def test_generator_is_listed() -> None:
     entry = next(m for m in ckc("list", "--json").json["mechanisms"] if m["name"] == "n_four_bar")
     assert "any number N" in entry["about"]
     assert "default" in entry["scenes"]
 
 
-def test_a_saved_run_carries_what_was_made(tmp_path: Path) -> None:
+def test_saved_run_contains_the_generated_mechanism(tmp_path: Path) -> None:
     run = simulate("n_four_bar", {"mechanism.N": 3, "t_end": 0.1})
     again = Run.load(run.save(tmp_path / "run.npz"))
     assert again.mechanism.coordinates == run.coordinates
@@ -80,14 +80,14 @@ def test_a_saved_run_carries_what_was_made(tmp_path: Path) -> None:
     assert again.texts["n_four_bar.urdf"] == sources.texts["n_four_bar.urdf"]
 
 
-def test_what_is_made_can_be_written_down_and_loaded(tmp_path: Path) -> None:
+def test_generated_mechanism_can_be_saved_and_loaded(tmp_path: Path) -> None:
     text, sources = generate(GeneratorSpec(generator="n_four_bar", N=2))
     (tmp_path / "mechanism.toml").write_text(text)
     (tmp_path / "n_four_bar.urdf").write_text(sources.texts["n_four_bar.urdf"])
     assert load(tmp_path).coordinates == load(GeneratorSpec(generator="n_four_bar", N=2)).coordinates
 
 
-def test_a_tree_too_large_for_a_workspace_is_refused(tmp_path: Path) -> None:
+def test_too_large_tree_is_rejected(tmp_path: Path) -> None:
     """Pinocchio's workspace grows with the cube of the coordinates: a small file could ask for all memory."""
     links = "".join(f'<link name="l{k}"/>' for k in range(MOST + 2))
     joints = "".join(

@@ -51,10 +51,12 @@ def test_json() -> None:
     assert (found["status"], found["exceeded"], found["redundant"]) == ("done", [], [])
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith("| `inverse`"))
-    assert [key for key in (*found, *elbow, "motor", "t_most") if not re.search(rf"\b{key}\b", row)] == []
+    section = page.partition("\n## inverse\n")[2].partition("\n## ")[0]
+    keys = (*found, *elbow, "motor", "t_most")
+    assert [key for key in keys if not re.search(rf"\b{key}\b", row + section)] == []
 
 
-def test_table_names_the_largest_of_each_and_what_exceeds_its_limit() -> None:
+def test_table_names_largest_forces_and_exceeded_limits() -> None:
     answer = ckc("inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_1 = 1.2, theta_3 = 2.0}")
     assert (answer.code, answer.err) == (0, "")
     found = inverse_dynamics("five_bar/tracking", {"controller.torque_limit": {"theta_1": 1.2, "theta_3": 2.0}})
@@ -90,11 +92,13 @@ def test_files(tmp_path: Path) -> None:
         assert_close(saved["joint_forces"][:, k], found.joint_forces[joint], 0)
     assert json.loads(saved["meta"].tobytes())["status"] == "done"
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "run_file.md").read_text(encoding="utf-8")
-    says = page.partition("`inverse.npz` has")[2].partition("##")[0]
-    assert [name for name in saved if not re.search(rf"\b{name}\b", says)] == []
+    section = page.partition("\n## inverse.npz\n")[2].partition("\n## ")[0]
+    assert [name for name in saved if not re.search(rf"\b{name}\b", section)] == []
 
 
-def test_a_recorded_run(run: Callable[..., ckc_pin.Run], tmp_path: Path) -> None:
+def test_inverse_dynamics_of_a_recorded_run_returns_its_torques(
+    run: Callable[..., ckc_pin.Run], tmp_path: Path
+) -> None:
     recorded = run("five_bar/tracking", formulation="reduced")
     recorded.save(tmp_path / "run.npz")
     for what in (str(tmp_path), str(tmp_path / "run.npz")):
@@ -113,7 +117,7 @@ LINE = (
 )
 
 
-def test_a_point_s_path() -> None:
+def test_work_along_a_point_path_equals_the_energy() -> None:
     """Forces do the work that the energy tells."""
     found = inverse_dynamics("five_bar/tracking", {"controller.desired": {
         "point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 2.0}
@@ -131,7 +135,7 @@ def test_a_point_s_path() -> None:
     assert_close(energy - energy[0], work, 1e-6)
 
 
-def test_a_path_that_leaves_the_workspace_is_given_up_to_there() -> None:
+def test_path_is_followed_up_to_the_workspace_boundary() -> None:
     answer = ckc("inverse", "five_bar/tracking", "--set", LINE, "--json")
     assert answer.code == 3
     found = answer.json
@@ -143,7 +147,7 @@ def test_a_path_that_leaves_the_workspace_is_given_up_to_there() -> None:
     assert len(found["tau"]) == len(found["t"]) > 10
 
 
-def test_a_trajectory_that_leaves_the_workspace_is_given_up_to_there(tmp_path: Path) -> None:
+def test_trajectory_is_followed_up_to_the_workspace_boundary(tmp_path: Path) -> None:
     answer = ckc("inverse", "five_bar_as_printed/tracking", "--out", str(tmp_path))
     assert answer.code == 3
     assert "the motion cannot be followed beyond t = 4.393" in answer.err
@@ -157,7 +161,7 @@ def test_redundant_rows_are_named() -> None:
     assert "open" not in found.message
 
 
-def test_forces_of_redundant_rows_are_said_to_be_open(bar: Path) -> None:
+def test_message_names_redundant_rows(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(text.replace('"point_2d"', '"point"'), encoding="utf-8")
     answer = ckc("inverse", "bar/tracking.scene.toml", *SHORT, "--json")
@@ -168,7 +172,7 @@ def test_forces_of_redundant_rows_are_said_to_be_open(bar: Path) -> None:
     assert_close(answer.json["tau"], flat.tau, 1e-9)
 
 
-def test_an_interrupted_one_keeps_what_it_has() -> None:
+def test_interrupted_inverse_dynamics_keeps_its_results() -> None:
     def stop(t: float, t_end: float) -> None:
         if t > 0.1:
             raise KeyboardInterrupt("SIGTERM")
@@ -205,7 +209,7 @@ def test_bad_input(case: Bad, bar: Path) -> None:
     expect(case, bar)
 
 
-def test_a_run_of_another_mechanism(run: Callable[..., ckc_pin.Run]) -> None:
+def test_run_of_another_mechanism_is_rejected(run: Callable[..., ckc_pin.Run]) -> None:
     recorded, other = run("five_bar/tracking", formulation="reduced"), ckc_pin.load("four_bar")
     with pytest.raises(InputError, match=r"the run's coordinates are theta_1, .*its mechanism's crank"):
         inverse_dynamics(replace(recorded, texts=other.sources.texts))
@@ -213,7 +217,7 @@ def test_a_run_of_another_mechanism(run: Callable[..., ckc_pin.Run]) -> None:
         inverse_dynamics(recorded, {"mechanism": "four_bar"})
 
 
-def test_a_run_with_open_loops() -> None:
+def test_run_with_open_loops_is_rejected() -> None:
     recorded = ckc_pin.simulate("five_bar/swing", {
         "formulation": "spf", "initial.at": None, "initial.q": {"theta_1": -1.2, "theta_3": -1.9},
         "initial.w": [1e-3, 0.0], "t_end": 0.05})  # fmt: skip
@@ -221,7 +225,7 @@ def test_a_run_with_open_loops() -> None:
         inverse_dynamics(recorded)
 
 
-def test_a_passive_run_of_too_few_motors_is_no_mistake(bar: Path) -> None:
+def test_passive_run_needs_no_motors(bar: Path) -> None:
     """Nothing is asked of them: loop and joint forces alone are to be told."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'))
@@ -235,7 +239,7 @@ def test_a_passive_run_of_too_few_motors_is_no_mistake(bar: Path) -> None:
         inverse_dynamics(broken)
 
 
-def test_what_moves_freely_needs_no_motor(tmp_path: Path) -> None:
+def test_free_root_needs_no_motor(tmp_path: Path) -> None:
     """An arm turns on a body that floats: along the body's freedoms the forces are nothing, but for rounding."""
     write(tmp_path, "free", "root.z = 0.5")
     text = (tmp_path / "mechanism.toml").read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ def mine(folder: Path, name: str = "five_bar") -> Path:
     return Path(shutil.copytree(library() / name, folder / name)) / "mechanism.toml"
 
 
-def test_it_is_built_once(tmp_path: Path, monkeypatch) -> None:
+def test_mechanism_is_built_once(tmp_path: Path, monkeypatch) -> None:
     built, assemble_mechanism = [], loading.assemble_mechanism
     monkeypatch.setattr(loading, "assemble_mechanism", lambda *given: built.append(1) or assemble_mechanism(*given))
     path = mine(tmp_path)
@@ -30,7 +30,7 @@ def test_it_is_built_once(tmp_path: Path, monkeypatch) -> None:
     assert again.sources.texts == first.sources.texts
 
 
-def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
+def test_changed_file_is_read_again(tmp_path: Path) -> None:
     path = mine(tmp_path)
     before = load(path)
     urdf = path.parent / "five_bar.urdf"
@@ -44,7 +44,7 @@ def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
     assert load(path).sources.texts["mechanism.toml"].endswith("# a remark\n")
 
 
-def test_what_somebody_does_to_theirs_is_theirs(tmp_path: Path) -> None:
+def test_loaded_mechanisms_do_not_share_mutable_data(tmp_path: Path) -> None:
     path = mine(tmp_path)
     state = ({"theta_1": -1.2, "theta_3": -1.9}, {"theta_1": 0.4, "theta_3": -0.3})
     first = load(path)
@@ -61,7 +61,7 @@ def test_what_somebody_does_to_theirs_is_theirs(tmp_path: Path) -> None:
     assert not second.springs.joint_stiffness.any()
 
 
-def test_two_have_two_workspaces() -> None:
+def test_copies_have_separate_workspaces() -> None:
     one, other = load("delta"), load("delta")
     placements, _ = one.tree.kinematics(one.q_tree)
     q_tree = other.tree.integrate(other.q_tree, 0.1 * np.ones(other.n))
@@ -72,7 +72,7 @@ def test_two_have_two_workspaces() -> None:
     assert other.springs.tree is other.tree
 
 
-def test_a_workspace_is_made_when_it_is_needed() -> None:
+def test_workspace_is_allocated_on_demand() -> None:
     """It has some n^3 numbers, and what is kept to be copied needs none."""
     load("delta")
     assert all("data" not in vars(kept.tree) for kept in loading._built.values())
@@ -82,7 +82,7 @@ def test_a_workspace_is_made_when_it_is_needed() -> None:
     assert "data" in vars(again.tree)
 
 
-def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
+def test_cache_has_a_limited_size(tmp_path: Path, monkeypatch) -> None:
     """What was loaded long ago is built again, what was loaded lately is copied."""
     paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.MOST_KEPT + 3)]
     for path in paths:
@@ -95,7 +95,7 @@ def test_only_so_many_are_kept(tmp_path: Path, monkeypatch) -> None:
     assert len(built) == 1
 
 
-def test_what_nobody_may_change_is_shared() -> None:
+def test_immutable_data_are_shared() -> None:
     """A copy of what is frozen is itself, its arrays being read-only; tables and springs are everybody's own."""
     one, other = load("five_bar"), load("five_bar")
     assert other.closure is one.closure

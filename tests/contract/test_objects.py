@@ -40,7 +40,7 @@ def _values(name: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_a_repr_is_one_screen_and_says_what_it_is(name: str) -> None:
+def test_repr_fits_on_one_screen(name: str) -> None:
     for value in _values(name):
         shown = repr(value)
         lines = shown.split("\n")
@@ -53,7 +53,7 @@ def test_a_repr_is_one_screen_and_says_what_it_is(name: str) -> None:
         assert html.count("<tr>") == len(value.summary().rows) >= 3
 
 
-def test_others_are_one_screen_too() -> None:
+def test_other_reprs_fit_on_one_screen() -> None:
     run = simulate("five_bar/tracking", {"t_end": 0.1})
     for value in (
         ckc_pin.inverse_dynamics(run),
@@ -65,7 +65,7 @@ def test_others_are_one_screen_too() -> None:
         assert max(map(len, lines)) <= WIDTH + 10
 
 
-def test_a_card_breaks_between_items_counts_what_it_leaves_out_and_moves_no_cursor() -> None:
+def test_summary_breaks_between_items_and_counts_omitted_ones() -> None:
     items = [f"joint_{k} = {k}.5 rad" for k in range(40)]
     summary = Summary("a\x1b[2J", [("all", items), ("said", "word " * 60)])
     whole, clipped = summary.text(60, None).split("\n"), summary.text(60).split("\n")
@@ -78,7 +78,7 @@ def test_a_card_breaks_between_items_counts_what_it_leaves_out_and_moves_no_curs
     assert "<b>" not in Summary("<b>", [("<b>", ["<b>"]), ("x", "<b>")]).html()
 
 
-def test_names_are_never_broken_and_have_units(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_summary_keeps_names_whole_with_units(monkeypatch: pytest.MonkeyPatch) -> None:
     for columns in ("80", "100", "140"):
         monkeypatch.setenv("COLUMNS", columns)
         for words in (("check", "two_ur5"), ("run", "two_ur5", "--set", "t_end=0.01")):
@@ -93,7 +93,7 @@ def test_names_are_never_broken_and_have_units(monkeypatch: pytest.MonkeyPatch) 
 # --- parts -------------------------------------------------------------------------------------------
 
 
-def test_a_coordinate_and_an_array_by_name(swing: Run) -> None:
+def test_run_is_indexed_by_coordinate_and_array_name(swing: Run) -> None:
     assert np.array_equal(swing["theta_3"], swing.q_tree[:, 2])
     assert swing["energy"] is swing.energy
     with pytest.raises(
@@ -105,7 +105,7 @@ def test_a_coordinate_and_an_array_by_name(swing: Run) -> None:
         swing[3]  # type: ignore[index]
 
 
-def test_the_state_at_an_instant_is_the_nearest_output(swing: Run) -> None:
+def test_sel_returns_the_nearest_output(swing: Run) -> None:
     found = swing.sel(t=0.1234)
     assert isinstance(found, State)
     assert found.t == swing.t[12]
@@ -121,7 +121,7 @@ def test_the_state_at_an_instant_is_the_nearest_output(swing: Run) -> None:
 
 
 @pytest.mark.parametrize("velocity", ["rho", "actual"])
-def test_a_simulator_goes_on_from_a_state_of_a_run(velocity: str) -> None:
+def test_simulator_continues_from_a_state_of_a_run(velocity: str) -> None:
     """Also off the manifold, where the velocity that C takes is another than the motion's."""
     overrides = {"formulation": "spf", "epsilon": 0.1, "initial.w": [0.01, -0.02], "coriolis_velocity": velocity,
                "t_end": 0.2, "solver.rtol": 1e-10, "solver.output_dt": 0.1}  # fmt: skip
@@ -136,7 +136,7 @@ def test_a_simulator_goes_on_from_a_state_of_a_run(velocity: str) -> None:
     assert_close(simulator.step(dt=0.1).q_tree, run.q_tree[-1], 1e-7)
 
 
-def test_a_part_of_a_run_is_a_run(swing: Run, tmp_path: Path) -> None:
+def test_slice_of_a_run_is_a_run(swing: Run, tmp_path: Path) -> None:
     event = {"coordinate": "theta_2", "value": 0.5}
     whole = simulate(SWING, {"t_end": 0.4, "solver.output_dt": 0.01, "event": [event]})
     part = whole.sel(t=slice(0.1, 0.2))
@@ -159,7 +159,7 @@ def test_a_part_of_a_run_is_a_run(swing: Run, tmp_path: Path) -> None:
 # --- other programs ----------------------------------------------------------------------------------
 
 
-def test_csv_has_every_number_to_its_last_digit(swing: Run, tmp_path: Path) -> None:
+def test_csv_has_all_digits(swing: Run, tmp_path: Path) -> None:
     with swing.to_csv(tmp_path / "run.csv").open(encoding="utf-8", newline="") as file:
         head, *rows = csv.reader(file)
     numbers = np.array(rows, dtype=float)
@@ -180,7 +180,7 @@ def test_csv_has_every_number_to_its_last_digit(swing: Run, tmp_path: Path) -> N
         swing.to_csv(tmp_path / "run.csv" / "run.csv")
 
 
-def test_xarray_and_pandas_have_the_same_by_name(swing: Run) -> None:
+def test_xarray_and_pandas_have_the_runs_values(swing: Run) -> None:
     data, frame = swing.to_xarray(), swing.to_pandas()
     one = data.q_tree.sel(coordinate="theta_3").sel(t=0.2, method="nearest")
     assert float(one) == swing.q_tree[20, 2]
@@ -198,7 +198,7 @@ def test_xarray_and_pandas_have_the_same_by_name(swing: Run) -> None:
 
 
 @pytest.mark.parametrize(("method", "package"), [("to_xarray", "xarray"), ("to_pandas", "pandas")])
-def test_what_is_not_installed_is_named(method: str, package: str, swing: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_named(method: str, package: str, swing: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=rf"{method} needs {package}: pip install 'ckc_pin\[data\]'"):
         getattr(swing, method)()
@@ -207,7 +207,7 @@ def test_what_is_not_installed_is_named(method: str, package: str, swing: Run, m
 # --- to look at --------------------------------------------------------------------------------------
 
 
-def test_figures_of_a_run_show_and_write_themselves(swing: Run, tmp_path: Path) -> None:
+def test_run_figures_are_displayed_and_saved(swing: Run, tmp_path: Path) -> None:
     figures = swing.plot()
     assert isinstance(figures, Figures)
     assert set(figures) == {"motion", "motion_snapshots"}
@@ -221,7 +221,7 @@ def test_figures_of_a_run_show_and_write_themselves(swing: Run, tmp_path: Path) 
     assert list(ckc_pin.plot(swing, swing)) == list(figures)
 
 
-def test_playback_of_a_run_is_a_page_within_the_page(swing: Run, tmp_path: Path) -> None:
+def test_playback_is_an_embedded_page(swing: Run, tmp_path: Path) -> None:
     assert not in_notebook()
     playback = swing.play(inline=True, speed=0.5)
     assert isinstance(playback, Playback)

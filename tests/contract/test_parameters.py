@@ -81,7 +81,7 @@ def folder(at: Path, toml: str = SPRUNG, urdf: str = URDF) -> Path:
 
 
 @pytest.mark.parametrize(("name", "value", "text", "old", "new"), EDITS, ids=[edit[0] for edit in EDITS])
-def test_a_name_does_what_an_edited_file_does(
+def test_parameter_override_equals_an_edited_file(
     tmp_path: Path, name: str, value: object, text: str, old: str, new: str
 ) -> None:
     plain = folder(tmp_path / "plain")
@@ -98,7 +98,7 @@ def test_a_name_does_what_an_edited_file_does(
     assert not np.array_equal(run.q_tree, ckc_pin.simulate(plain).q_tree)
 
 
-def test_a_run_records_what_was_changed_and_plays_it(tmp_path: Path) -> None:
+def test_run_records_its_parameters(tmp_path: Path) -> None:
     done = ckc("run", "five_bar/swing", "--set", "joint.theta_2.xyz.x=0.28", "--set", "link.link_2.mass=0.4",
                "--set", "t_end=0.05", "--json", "--out", str(tmp_path))  # fmt: skip
     assert done.code == 0
@@ -108,7 +108,7 @@ def test_a_run_records_what_was_changed_and_plays_it(tmp_path: Path) -> None:
     assert run.points["tip"][-1].tolist() == done.json["points"]["tip"]
 
 
-def test_a_scene_has_a_table_of_them(tmp_path: Path) -> None:
+def test_scene_has_a_table_of_parameters(tmp_path: Path) -> None:
     at = folder(tmp_path / "own")
     with (at / "default.scene.toml").open("a") as scene:
         scene.write("[parameters]\nlink.arm.mass = 2.0\n'gravity.y' = -5\n")
@@ -134,13 +134,13 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("overrides", "says"), REFUSED, ids=[str(overrides) for overrides, _ in REFUSED])
-def test_what_cannot_be_is_refused_by_name(overrides: dict[str, object], says: str) -> None:
+def test_invalid_parameter_is_rejected_by_name(overrides: dict[str, object], says: str) -> None:
     with pytest.raises(CkcError, match=r"parameters|not closed") as error:
         ckc_pin.simulate("five_bar/swing", overrides)
     assert says in str(error.value)
 
 
-def test_names_of_every_shipped_mechanism_take_their_own_values() -> None:
+def test_parameters_of_shipped_mechanisms_accept_their_values() -> None:
     from ckc_pin.mechanism.parameters import values_of
 
     for name in sorted(path.name for path in library().iterdir() if (path / "mechanism.toml").exists()):

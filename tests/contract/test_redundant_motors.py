@@ -39,7 +39,7 @@ def plain() -> Run:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_the_least_torques(plain: Run, formulation: str) -> None:
+def test_torques_have_minimum_norm(plain: Run, formulation: str) -> None:
     run = plain if formulation == "spf" else lift(formulation=formulation)
     for k, q_tree in enumerate(run.q_tree):
         T = transmission(run.mechanism, q_tree)
@@ -49,7 +49,7 @@ def test_the_least_torques(plain: Run, formulation: str) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_preload_moves_nothing(plain: Run, formulation: str) -> None:
+def test_preload_does_not_change_the_motion(plain: Run, formulation: str) -> None:
     """Tau differs by the preload's projection on the null space, the motion does not."""
     without = plain if formulation == "spf" else lift(formulation=formulation)
     run = lift(controller__allocation__preload=PRELOAD, formulation=formulation)
@@ -63,7 +63,7 @@ def test_a_preload_moves_nothing(plain: Run, formulation: str) -> None:
         assert_close(run.tau[k] - without.tau[k], left, 1e-8)
 
 
-def test_weights(plain: Run) -> None:
+def test_large_weights_reduce_torques(plain: Run) -> None:
     """Torques that cost a thousand times as much are hardly used, and the motion is the same."""
     tired = [name for name in plain.actuated if name.startswith("right")]
     run = lift(controller__allocation__weights=dict.fromkeys(tired, 1e3))
@@ -76,7 +76,7 @@ def test_weights(plain: Run) -> None:
 
 
 @pytest.mark.parametrize("limit", [21.0, 18.0])
-def test_limits(plain: Run, limit: float) -> None:
+def test_limited_torques_agree_with_the_reference(plain: Run, limit: float) -> None:
     """As the reference in NumPy; while the other motors can take over what one has too much, nothing changes."""
     run = lift(controller__torque_limit=limit, controller__allocation__preload=PRELOAD)
     assert run.status == "done"
@@ -92,7 +92,7 @@ def test_limits(plain: Run, limit: float) -> None:
     assert off < 1e-9 if limit == 21.0 else off > 1e-5
 
 
-def test_what_is_out_of_reach_is_missed_by_least() -> None:
+def test_unreachable_u_has_minimum_error() -> None:
     """Where no tau within limits gives u: hardly further from it than any, each row measured by its size."""
     limit = 12.0
     overrides = {"t_end": 1e-3, "controller.torque_limit": limit}
@@ -108,7 +108,7 @@ def test_what_is_out_of_reach_is_missed_by_least() -> None:
     assert_close(run.tau[0], allocate(T, free.u[0], np.full(12, limit), np.ones(12), np.zeros(12)), 1e-7)
 
 
-def test_a_motor_at_its_own_limit(tmp_path: Path) -> None:
+def test_motor_table_limits_apply(tmp_path: Path) -> None:
     """[[motor]] in the place of actuated: names, and limits below the controller's."""
     text = (library() / "two_ur5" / "mechanism.toml").read_text("utf-8")
     before, _, rest = text.partition("actuated = [")

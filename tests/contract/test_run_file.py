@@ -39,7 +39,7 @@ def saved(tracked: Run, tmp_path: Path) -> Path:
     return tracked.save(tmp_path / "run.npz")
 
 
-def test_the_file_has_the_promised_arrays(tracked: Run, saved: Path) -> None:
+def test_run_file_has_the_documented_arrays(tracked: Run, saved: Path) -> None:
     with np.load(saved, allow_pickle=False) as data:
         assert set(data.files) >= ARRAYS | {"lyapunov"}
         for name in ARRAYS - {"coordinates"}:
@@ -53,7 +53,7 @@ def test_the_file_has_the_promised_arrays(tracked: Run, saved: Path) -> None:
     assert "<robot" in texts["five_bar.urdf"]
 
 
-def test_an_uncontrolled_run_has_no_lyapunov_function(run: Callable[..., Run], tmp_path: Path) -> None:
+def test_uncontrolled_run_has_no_lyapunov_function(run: Callable[..., Run], tmp_path: Path) -> None:
     swing = run("five_bar/swing", t_end=0.1)
     path = swing.save(tmp_path / "run.npz")
     with np.load(path, allow_pickle=False) as data:
@@ -61,7 +61,7 @@ def test_an_uncontrolled_run_has_no_lyapunov_function(run: Callable[..., Run], t
     assert Run.load(path).lyapunov is None
 
 
-def test_saved_and_loaded_is_equal_field_by_field(tracked: Run, saved: Path) -> None:
+def test_saved_run_is_loaded_unchanged(tracked: Run, saved: Path) -> None:
     loaded = Run.load(saved)
     assert tracked.events
     assert tracked.profile
@@ -76,24 +76,24 @@ def test_saved_and_loaded_is_equal_field_by_field(tracked: Run, saved: Path) -> 
     assert loaded.to_dict() == tracked.to_dict()
 
 
-def test_a_number_that_is_not_finite_comes_back(tracked: Run, tmp_path: Path) -> None:
+def test_nonfinite_numbers_are_saved_and_loaded(tracked: Run, tmp_path: Path) -> None:
     odd = dataclasses.replace(tracked, max_phi=np.nan, energy=np.full_like(tracked.energy, np.inf))
     loaded = Run.load(odd.save(tmp_path / "run.npz"))
     assert np.isnan(loaded.max_phi)
     assert np.all(loaded.energy == np.inf)
 
 
-def test_a_run_whose_file_names_no_terms_is_shown(tracked: Run) -> None:
+def test_run_file_without_terms_has_a_summary(tracked: Run) -> None:
     stats = {name: value for name, value in tracked.stats.items() if name != "terms"}
     shown = dataclasses.replace(tracked, stats=stats).summary()
     assert dict(shown.rows)["terms"] == "pinocchio"
 
 
-def test_a_folder_stands_for_its_run(saved: Path) -> None:
+def test_load_accepts_a_folder(saved: Path) -> None:
     assert np.array_equal(Run.load(saved.parent).t, Run.load(saved).t)
 
 
-def test_the_file_alone_is_enough(tracked: Run, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_file_is_self_contained(tracked: Run, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     monkeypatch.chdir(empty)
@@ -105,7 +105,7 @@ def test_the_file_alone_is_enough(tracked: Run, saved: Path, tmp_path: Path, mon
     assert_close(Run.load(saved).points["tip"], tracked.points["tip"], 0.0)
 
 
-def test_a_model_and_a_trajectory_travel_along(bar: Path, tmp_path: Path) -> None:
+def test_run_file_contains_model_and_trajectory(bar: Path, tmp_path: Path) -> None:
     text = (bar / "five_bar.urdf").read_text(encoding="utf-8").replace('mass value="0.2451"', 'mass value="0.3"')
     (bar / "heavy.urdf").write_text(text, encoding="utf-8")
     model = (bar / "mechanism.toml").read_text(encoding="utf-8").replace("five_bar.urdf", "heavy.urdf")
@@ -121,7 +121,7 @@ def test_a_model_and_a_trajectory_travel_along(bar: Path, tmp_path: Path) -> Non
     assert 'value="0.2451"' in loaded.texts["five_bar.urdf"]
 
 
-def test_loop_forces_are_the_multipliers_by_loop_name(tracked: Run, saved: Path) -> None:
+def test_loop_forces_satisfy_eq_1(tracked: Run, saved: Path) -> None:
     """D' v'_dot + C' v' + h' = u' + J^T lambda, with v'_dot from differences along a fine run."""
     fine = simulate("five_bar/swing", {"t_end": 0.02, "solver.output_dt": 1e-3, "solver.rtol": 1e-11})
     forces = fine.loop_forces()
@@ -140,7 +140,7 @@ def test_loop_forces_are_the_multipliers_by_loop_name(tracked: Run, saved: Path)
     assert_close(Run.load(saved).loop_forces()["elbow"], tracked.loop_forces()["elbow"], 0.0)
 
 
-def test_columns_by_name(tracked: Run) -> None:
+def test_column_index_by_name(tracked: Run) -> None:
     assert tracked.column("theta_3") == 2
     with pytest.raises(InputError, match="no coordinate 'theta_9' in this run; there are theta_1, theta_2"):
         tracked.column("theta_9")
@@ -149,7 +149,7 @@ def test_columns_by_name(tracked: Run) -> None:
 # --- written whole or not at all -------------------------------------------------------------------
 
 
-def test_a_failing_write_leaves_the_old_file(tracked: Run, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_keeps_the_old_file(tracked: Run, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = saved.read_bytes()
 
     def half(file: io.BufferedWriter, **content: Any) -> None:
@@ -163,7 +163,7 @@ def test_a_failing_write_leaves_the_old_file(tracked: Run, saved: Path, monkeypa
     assert [path.name for path in saved.parent.iterdir()] == ["run.npz"]
 
 
-def test_an_interrupted_write_leaves_the_old_file(tracked: Run, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_write_keeps_the_old_file(tracked: Run, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = saved.read_bytes()
 
     def interrupted(handle: int) -> None:
@@ -240,7 +240,7 @@ TAMPERED: dict[str, tuple[Callable[[Contents], None], str]] = {
 
 
 @pytest.mark.parametrize("what", TAMPERED)
-def test_a_tampered_file_is_refused(what: str, saved: Path) -> None:
+def test_tampered_file_is_rejected(what: str, saved: Path) -> None:
     tamper, says = TAMPERED[what]
     with np.load(saved, allow_pickle=False) as data:
         content = {name: data[name] for name in data.files}
@@ -253,7 +253,7 @@ def test_a_tampered_file_is_refused(what: str, saved: Path) -> None:
     assert str(error.value).endswith("; ckc run SCENE --out DIR writes a new one")
 
 
-def test_loop_forces_are_no_numbers_where_nothing_determines_them() -> None:
+def test_loop_forces_are_nan_where_J_loses_rank() -> None:
     run = simulate("n_four_bar", {"mechanism.N": 1, "t_end": 0.02})
     q_tree = run.q_tree.copy()
     q_tree[1] = 0.0  # all bars in line
@@ -263,13 +263,13 @@ def test_loop_forces_are_no_numbers_where_nothing_determines_them() -> None:
 
 
 @pytest.mark.parametrize("length", [0, 10, 1000, -1])
-def test_a_truncated_file_is_refused(length: int, saved: Path) -> None:
+def test_truncated_file_is_rejected(length: int, saved: Path) -> None:
     saved.write_bytes(saved.read_bytes()[:length])
     with pytest.raises(InputError, match=r"run\.npz: not a run file, or damaged"):
         Run.load(saved)
 
 
-def test_flipped_bytes_are_refused_or_harmless(tracked: Run, saved: Path) -> None:
+def test_flipped_bytes_are_rejected_or_harmless(tracked: Run, saved: Path) -> None:
     """Every byte of an npz is under a checksum but for a few of its containers' own."""
     whole = saved.read_bytes()
     refused = 0
@@ -287,14 +287,14 @@ def test_flipped_bytes_are_refused_or_harmless(tracked: Run, saved: Path) -> Non
 
 
 @pytest.mark.parametrize("content", [b"", b"not a run", b"PK\x03\x04", b"\x93NUMPY" + bytes(200), b"\x00" * 10000])
-def test_another_file_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_other_file_types_are_rejected(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     path.write_bytes(content)
     with pytest.raises(InputError, match="not a run file, or damaged"):
         Run.load(path)
 
 
-def test_an_array_that_asks_for_too_much_is_refused_before_it_is_made(saved: Path) -> None:
+def test_too_large_array_is_rejected_before_allocation(saved: Path) -> None:
     """A header of a few bytes that promises 8 TB."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
@@ -308,7 +308,7 @@ def test_an_array_that_asks_for_too_much_is_refused_before_it_is_made(saved: Pat
         Run.load(saved)
 
 
-def test_a_missing_run_is_named(tmp_path: Path) -> None:
+def test_missing_run_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere: no such run file"):
         Run.load(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"run\.npz: no such run file; ckc run SCENE --out DIR writes one$"):

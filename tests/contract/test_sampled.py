@@ -61,7 +61,7 @@ def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Ar
         ("tracking", 0.0005, 0.00025),
     ],
 )
-def test_the_loop_in_numpy(scene: str, period: float, delay: float, formulation: str) -> None:
+def test_sampled_control_agrees_with_numpy(scene: str, period: float, delay: float, formulation: str) -> None:
     t_end = 15 * period
     instants, states, acts = loop(LAWS[scene], period, delay, t_end)
     overrides = {
@@ -88,7 +88,7 @@ def test_the_loop_in_numpy(scene: str, period: float, delay: float, formulation:
 
 
 @pytest.mark.parametrize("scene", ["set_point", "tracking"])
-def test_the_continuous_controller_in_the_limit(scene: str) -> None:
+def test_sampled_control_converges_to_continuous_control(scene: str) -> None:
     """First order: half the sample time and delay, half the difference."""
     t_end = 0.04 if scene == "set_point" else 0.02
     overrides = {"formulation": "reduced", "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": 0.01}
@@ -120,7 +120,7 @@ def test_a_sampled_controller_from_python() -> None:
         assert_close(run.lyapunov, shipped.lyapunov, 1e-6)
 
 
-def test_it_is_asked_at_its_instants_only() -> None:
+def test_sampled_controller_is_called_at_its_instants_only() -> None:
     asked: list[float] = []
 
     class Counting:
@@ -133,7 +133,7 @@ def test_it_is_asked_at_its_instants_only() -> None:
     assert_close(run.q_tree, simulate("five_bar/swing", {"t_end": 0.05}).q_tree, 1e-9)
 
 
-def test_a_sampled_nan_stops_at_its_instant() -> None:
+def test_sampled_nan_stops_the_run_at_its_instant() -> None:
     class Fails:
         def __init__(self, after: float) -> None:
             self.after = after
@@ -160,7 +160,7 @@ def test_a_sampled_nan_stops_at_its_instant() -> None:
         ((0.1, np.inf), "delay = inf"),
     ],
 )
-def test_a_bad_clock_is_refused(arguments: tuple[Any, ...], says: str) -> None:
+def test_invalid_sampling_is_rejected(arguments: tuple[Any, ...], says: str) -> None:
     with pytest.raises(InputError, match=says):
         Sampled(LAWS, *arguments)  # type: ignore[arg-type]
 
@@ -176,6 +176,6 @@ BAD = [
 
 
 @pytest.mark.parametrize(("overrides", "says"), BAD, ids=[" ".join(overrides) for overrides, _ in BAD])
-def test_a_bad_clock_in_a_scene(overrides: tuple[str, ...], says: str, bar: Path) -> None:
+def test_invalid_sampling_of_a_scene_is_rejected(overrides: tuple[str, ...], says: str, bar: Path) -> None:
     words = [word for change in overrides for word in ("--set", f"controller.{change}")]
     expect(Bad("clock", ("run", "bar/tracking.scene.toml", *words), [says]), bar)

@@ -131,7 +131,7 @@ SENSORS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("scene", ["set_point", "tracking"])
-def test_sensors(scene: str, name: str) -> None:
+def test_sensors_agree_with_numpy(scene: str, name: str) -> None:
     """Both laws see what is measured; terms are those where the loops close at it."""
     keys, formulation = SENSORS[name], FORMULATIONS[len(name) % 3]
     period = 0.002 if scene == "set_point" else 0.0005
@@ -159,7 +159,7 @@ DRIVES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("name", DRIVES)
-def test_drives(formulation: str, name: str) -> None:
+def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
     keys, period = DRIVES[name], 0.002
     given = {k: {m: x for m, x in v.items() if x} if isinstance(v, dict) else v for k, v in table(keys).items()}
     overrides = {
@@ -204,7 +204,7 @@ class OwnTorques:
 
 @pytest.mark.parametrize("controller", [Own(), OwnTorques()], ids=["u", "tau"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_controller_of_ones_own_sees_what_is_measured(formulation: str, controller: Any) -> None:
+def test_callers_controller_gets_measured_terms(formulation: str, controller: Any) -> None:
     keys = {"resolution": 1e-3, "rate": "difference", "filter": 0.003}
     period = 0.002
     own = Sampled(controller, period, period / 4, keys, {"torque_resolution": 1e-3})
@@ -223,7 +223,7 @@ def test_a_controller_of_ones_own_sees_what_is_measured(formulation: str, contro
 
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
-def test_a_wrong_model_sees_it_too(tmp_path: Path, convention: str) -> None:
+def test_controllers_own_model_gets_measured_terms(tmp_path: Path, convention: str) -> None:
     """Eq. 16 with links that are too heavy, at what coarse encoders say."""
     from tests.regression.test_control import heavy_model
 
@@ -241,7 +241,7 @@ def test_a_wrong_model_sees_it_too(tmp_path: Path, convention: str) -> None:
     assert_is(simulate("five_bar/tracking", overrides), *loop(law, Seen(period, **keys), 33))
 
 
-def test_noise_is_normal_and_a_matter_of_its_seed() -> None:
+def test_noise_is_normal_and_reproducible() -> None:
     """What a controller reads at rest: mean, deviation, fourth moment, and nothing from step to step."""
 
     class Reads:
@@ -275,7 +275,7 @@ def test_noise_is_normal_and_a_matter_of_its_seed() -> None:
     assert np.abs(found - noise(4)).max() > 1.0
 
 
-def test_without_sensors_nothing_changes() -> None:
+def test_empty_sensor_table_has_no_effect() -> None:
     """An empty table is no sensor: the same numbers, and as many right-hand sides."""
     overrides = {"t_end": 0.02, "controller.sample_time": 0.001}
     plain = simulate("five_bar/set_point", overrides)
@@ -284,7 +284,7 @@ def test_without_sensors_nothing_changes() -> None:
     assert plain.stats["rhs"] == empty.stats["rhs"]
 
 
-def test_a_measurement_that_no_configuration_has() -> None:
+def test_measurement_out_of_reach_stops_the_run() -> None:
     overrides = {"t_end": 0.05, "controller.sample_time": 0.001, "controller.sensor": {"q_noise": 30.0}}
     with pytest.raises(NumericalError, match="the loops do not close at what the sensors say of q"):
         simulate("five_bar/tracking", overrides)
@@ -318,17 +318,17 @@ BAD = [
 
 
 @pytest.mark.parametrize(("words", "says"), BAD, ids=[" ".join(words[4:]) for words, _ in BAD])
-def test_bad_sensors(words: tuple[str, ...], says: str, bar: Path) -> None:
+def test_invalid_sensor_is_rejected(words: tuple[str, ...], says: str, bar: Path) -> None:
     expect(Bad("sensor", words, [says]), bar)
 
 
 @pytest.mark.parametrize("key", ["sensor", "drive"])
-def test_sensors_and_drives_need_a_clock(key: str, bar: Path) -> None:
+def test_sensors_and_drives_need_a_sample_time(key: str, bar: Path) -> None:
     entry = {"sensor": "resolution=0.1", "drive": "torque_rate=1.0"}[key]
     words = ("run", "bar/tracking.scene.toml", "--set", f"controller.{key}.{entry}")
     expect(Bad("clock", words, [f"controller.{key}: give sample_time too"]), bar)
 
 
-def test_a_bad_table_from_python() -> None:
+def test_invalid_sensor_table_from_python_is_rejected() -> None:
     with pytest.raises(InputError, match="Sampled: sensor: unknown key 'steps'"):
         Sampled(Own(), 0.1, sensor={"steps": 1})

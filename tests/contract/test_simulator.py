@@ -35,7 +35,7 @@ def assert_same(ours: State, theirs: State, tolerance: float = 0.0) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_free_swing_is_the_whole_run(formulation: str) -> None:
+def test_steps_of_a_free_swing_agree_with_the_run(formulation: str) -> None:
     overrides = {**TIGHT, "formulation": formulation, "t_end": 0.5, "solver.output_dt": 0.01}
     run, simulator = simulate("five_bar/swing", overrides), Simulator("five_bar/swing", overrides)
     start = simulator.state.terms.energy
@@ -48,7 +48,7 @@ def test_a_free_swing_is_the_whole_run(formulation: str) -> None:
     assert abs(simulator.state.terms.energy - start) < 1e-9
 
 
-def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
+def test_steps_off_the_manifold_agree_with_the_run() -> None:
     overrides = {
         **TIGHT,
         "formulation": "spf",
@@ -71,7 +71,7 @@ def test_an_spf_off_its_manifold_is_the_whole_run() -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_the_u_of_a_sampled_run_gives_that_run(formulation: str) -> None:
+def test_steps_with_sampled_u_agree_with_the_run(formulation: str) -> None:
     period = 0.001
     overrides = {**TIGHT, "formulation": formulation, "t_end": 0.05, "solver.output_dt": period}
     run = simulate("five_bar/tracking", {**overrides, "controller.sample_time": period})
@@ -103,7 +103,7 @@ class Push:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf"])
-def test_it_stops_where_simulate_stops(formulation: str) -> None:
+def test_step_stops_where_simulate_stops(formulation: str) -> None:
     u = np.array([1.0, -1.0])
     overrides = {"formulation": formulation, "t_end": 2.0, "solver.output_dt": 0.01}
     run = simulate("five_bar/swing", overrides, controller=Push(u))
@@ -118,7 +118,7 @@ def test_it_stops_where_simulate_stops(formulation: str) -> None:
 
 
 @pytest.mark.parametrize("u", [None, NO_FORCE], ids=["None", "zeros"])
-def test_what_moves_freely_passes_where_the_free_run_passes(u: Array | None) -> None:
+def test_steps_cross_rank_loss_like_the_run(u: Array | None) -> None:
     overrides = {
         **TIGHT,
         "formulation": "reduced",
@@ -138,7 +138,7 @@ def test_what_moves_freely_passes_where_the_free_run_passes(u: Array | None) -> 
     assert_close(simulator.step(np.ones(2), 1e-3).q, state.q, 0.1)  # the user's own q again
 
 
-def test_a_budget_is_a_numerical_error() -> None:
+def test_exhausted_budget_raises_numerical_error() -> None:
     simulator = Simulator("five_bar/swing", {"solver.max_rhs": 100, "solver.max_wall_s": 1e-9})
     with pytest.raises(NumericalError, match="max_rhs = 100"):
         _push_on(simulator, None, 20)
@@ -147,7 +147,7 @@ def test_a_budget_is_a_numerical_error() -> None:
     assert simulator.step(None, 0.01).t == 0.01
 
 
-def test_a_step_is_cheap() -> None:
+def test_step_costs_one_extra_evaluation() -> None:
     """One evaluation of a held u's motion more than the method's own: nothing is prepared again."""
     scene = load_scene("five_bar/swing", {"formulation": "reduced"})
     simulator = Simulator(scene)
@@ -161,7 +161,7 @@ def test_a_step_is_cheap() -> None:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_a_u_that_stays_costs_hardly_more_than_the_run(formulation: str) -> None:
+def test_constant_u_costs_hardly_more_than_the_run(formulation: str) -> None:
     """Steps of the method reach beyond those of the caller while nothing changes."""
     overrides = {"formulation": formulation, "t_end": 1.0}
     simulator, u = Simulator("five_bar/swing", overrides), np.array([0.05, -0.02])
@@ -172,7 +172,7 @@ def test_a_u_that_stays_costs_hardly_more_than_the_run(formulation: str) -> None
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 @pytest.mark.parametrize("dt", [1e-3, 7e-3])
-def test_a_u_that_changes_now_and_then(formulation: str, dt: float) -> None:
+def test_changing_u_agrees_with_scipy(formulation: str, dt: float) -> None:
     """Against SciPy on the equations in NumPy, from change to change: what reached beyond a change is made again."""
     u, random = [0.0, 0.0], np.random.default_rng(5)
     simulator = Simulator("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-9})
@@ -198,7 +198,7 @@ def test_a_u_that_changes_now_and_then(formulation: str, dt: float) -> None:
 
 @pytest.mark.parametrize("dt", [2e-3, 0.05])
 @pytest.mark.parametrize("changing", [False, True])
-def test_steps_over_positions_where_j_loses_rank(dt: float, changing: bool) -> None:
+def test_steps_over_rank_loss_agree_with_the_pendulum(dt: float, changing: bool) -> None:
     """A row of parallelograms, flat three times, against its pendulum's equation; u none, or tiny and changing."""
     simulator, random = Simulator("n_four_bar", {"mechanism.N": 7, "formulation": "dae"}), np.random.default_rng(3)
     for k in range(round(3.0 / dt)):
@@ -239,7 +239,7 @@ def test_reset_restores_exactly(formulation: str) -> None:
     assert_same(simulator.step([0.9, -0.2], 0.004), first[3], 1e-8)
 
 
-def test_two_simulators_do_not_know_each_other() -> None:
+def test_simulators_are_independent() -> None:
     alone = _play(Simulator("five_bar/swing"))
     one, two = Simulator("five_bar/swing"), Simulator("five_bar/swing", {"formulation": "reduced"})
     for k, expected in enumerate(alone):
@@ -253,7 +253,7 @@ def test_two_simulators_do_not_know_each_other() -> None:
     assert_same(one.step(None, 0.01), two.step(None, 0.01), 1e-7)
 
 
-def test_a_state_stays_as_it_is() -> None:
+def test_state_does_not_change_with_later_steps() -> None:
     simulator = Simulator("five_bar/swing")
     state = simulator.step(None, 0.05)
     q_tree, v_tree = state.q_tree, state.v_tree.copy()
@@ -263,7 +263,7 @@ def test_a_state_stays_as_it_is() -> None:
     assert_close(state.terms.energy, Simulator("five_bar/swing").step(None, 0.05).terms.energy, 0.0)
 
 
-def test_reset_to_a_table() -> None:
+def test_reset_accepts_an_initial_table() -> None:
     simulator = Simulator("five_bar/swing")
     table = {"q": {"theta_1": np.float64(-1.2), "theta_3": -1.5}, "q_dot": {"theta_3": 0.5}}
     state = simulator.reset(table)
@@ -286,7 +286,7 @@ def test_reset_to_a_table() -> None:
         (3, "expected a State or a table"),
     ],
 )
-def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> None:
+def test_invalid_reset_is_rejected_and_keeps_the_state(state: Any, says: str) -> None:
     simulator = Simulator("five_bar/swing")
     before = simulator.step(None, 0.01)
     with pytest.raises(InputError, match=says):
@@ -312,7 +312,7 @@ def test_a_bad_state_is_refused_and_changes_nothing(state: Any, says: str) -> No
         (None, 1e-30, "dt = 1e-30"),
     ],
 )
-def test_a_bad_step_is_refused_and_moves_nothing(u: Any, dt: Any, says: str) -> None:
+def test_invalid_step_is_rejected_and_keeps_the_state(u: Any, dt: Any, says: str) -> None:
     simulator = Simulator("five_bar/swing")
     before = simulator.step(None, 0.01)
     with pytest.raises(InputError, match=says):
@@ -321,7 +321,7 @@ def test_a_bad_step_is_refused_and_moves_nothing(u: Any, dt: Any, says: str) -> 
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_copy_is_refused_and_what_does_the_same_is_named(copied: Callable[[Simulator], Any]) -> None:
+def test_copies_are_rejected_with_an_alternative(copied: Callable[[Simulator], Any]) -> None:
     """A copy would share the loop: what one steps, the other would too."""
     simulator, other = Simulator("five_bar/swing", TIGHT), Simulator("five_bar/swing", TIGHT)
     _push_on(simulator, np.array([0.1, 0.2]), 10)
@@ -334,13 +334,13 @@ def test_a_copy_is_refused_and_what_does_the_same_is_named(copied: Callable[[Sim
     assert_same(other.step([0.2, 0.1], 0.01), simulator.step([0.2, 0.1], 0.01), 1e-8)
 
 
-def test_limits_of_torque_hold() -> None:
+def test_steps_respect_torque_limits() -> None:
     free = Simulator("five_bar/tracking", {"formulation": "reduced"})
     limited = Simulator("five_bar/tracking", {"formulation": "reduced", "controller.torque_limit": 2.0})
     assert_same(limited.step([9.0, -9.0], 0.01), free.step([2.0, -2.0], 0.01), 1e-13)
 
 
-def test_a_scene_is_complete() -> None:
+def test_overrides_beside_a_scene_are_rejected() -> None:
     scene = load_scene("five_bar/swing")
     assert Simulator(scene).step(None, 0.01).t == 0.01
     with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):

@@ -24,7 +24,7 @@ from ckc_pin.kinematics.sigma import sigma
 
 
 @pytest.mark.parametrize(("t_end", "output_dt"), [(0.02, 1e10), (0.02, 0.03), (1e-300, 1.0), (5e-324, None)])
-def test_output_instants_reach_from_zero_to_t_end_once(t_end: float, output_dt: float | None) -> None:
+def test_output_instants_include_zero_and_t_end_once(t_end: float, output_dt: float | None) -> None:
     """The last instant took the place of the first where output_dt is far beyond t_end, or both were 501 times 0."""
     run = simulate("five_bar/swing", {"t_end": t_end, "solver.output_dt": output_dt})
     assert run.t.tolist() == [0.0, t_end]
@@ -39,24 +39,24 @@ WORDS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("overrides", "says"), WORDS, ids=lambda x: str(x)[:40])
-def test_a_scene_out_of_range_is_refused_in_words(overrides: dict[str, Any], says: str) -> None:
+def test_scene_values_out_of_range_are_rejected(overrides: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError) as error:
         simulate("five_bar/swing", overrides)
     assert says in str(error.value)
 
 
-def test_integers_that_no_file_can_carry_are_refused() -> None:
+def test_too_large_integers_are_rejected() -> None:
     """Where any value is taken they came as far as the scene's binary form."""
     with pytest.raises(InputError, match=r"controller.desired.theta_1.offset = 10+: .*64 bits"):
         simulate("five_bar/tracking", {"controller.desired.theta_1.offset": 10**40})
 
 
-def test_gains_whose_squares_overflow_are_refused() -> None:
+def test_gains_whose_squares_overflow_are_rejected() -> None:
     with pytest.raises(InputError, match=r"controller.K_D: an entry is above 1e\+100"):
         simulate("five_bar/tracking", {"controller.K_D": 1.7e308})
 
 
-def test_lengths_whose_squares_overflow_are_refused(bar: Path) -> None:
+def test_lengths_whose_squares_overflow_are_rejected(bar: Path) -> None:
     """The singular values of such a closure do not exist."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(
@@ -67,7 +67,7 @@ def test_lengths_whose_squares_overflow_are_refused(bar: Path) -> None:
         load(bar)
 
 
-def test_a_start_a_thousand_turns_away_is_found_without_the_way() -> None:
+def test_start_many_turns_away_is_assembled_directly() -> None:
     """Newton's method went there step by step, whatever the number."""
     far = 2 * np.pi * 10**5 + load("four_bar").assembled.q_tree[0]
     assert sigma(load("four_bar"), np.array([far])).iterations < 6000
@@ -85,7 +85,7 @@ def restless() -> Any:
     sys.setswitchinterval(before)
 
 
-def test_one_mechanism_in_threads_gives_each_its_own_terms(restless: Any) -> None:
+def test_mechanism_in_threads_gives_correct_terms(restless: Any) -> None:
     """Pinocchio's workspace was read after another thread had written to it."""
     mechanism = load("five_bar")
     states = [({"theta_1": -1.2 + 1e-3 * k, "theta_3": -1.9}, {"theta_1": 0.01 * k}) for k in range(200)]
@@ -100,7 +100,7 @@ def test_one_mechanism_in_threads_gives_each_its_own_terms(restless: Any) -> Non
             assert np.array_equal(alone, list(pool.map(numbers, states)))
 
 
-def test_one_simulator_in_threads_steps_or_refuses(restless: Any) -> None:
+def test_simulator_in_threads_steps_or_rejects(restless: Any) -> None:
     """Two steps at once moved one state."""
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
 
@@ -119,7 +119,7 @@ def test_one_simulator_in_threads_steps_or_refuses(restless: Any) -> None:
     assert simulator.step(None, 1e-3).t == 1e-3
 
 
-def test_a_pickled_mechanism_is_the_same() -> None:
+def test_pickled_mechanism_is_equal() -> None:
     """Its views of Pinocchio's workspace came back as arrays that nothing wrote to."""
     mechanism = load("five_bar")
     twin = pickle.loads(pickle.dumps(mechanism))
@@ -132,7 +132,7 @@ def test_a_pickled_mechanism_is_the_same() -> None:
 
 
 @pytest.mark.parametrize("what", ["step", "reset", "stats", "events"])
-def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
+def test_event_function_cannot_call_its_simulator(what: str) -> None:
     acts: dict[str, Callable[[], Any]] = {
         "step": lambda: simulator.step(None, 1e-3),
         "reset": lambda: simulator.reset(),
@@ -154,7 +154,7 @@ def test_an_event_cannot_move_the_simulator_that_asks_it(what: str) -> None:
     assert simulator.step(None, 1e-3).t > 0
 
 
-def test_what_an_output_callback_does_to_its_array_is_its_own_affair() -> None:
+def test_output_callback_gets_a_copy() -> None:
     """It was a view of what the run records."""
     overrides = {"t_end": 0.02}
 
@@ -165,21 +165,21 @@ def test_what_an_output_callback_does_to_its_array_is_its_own_affair() -> None:
     assert np.array_equal(spoilt.q_tree, simulate("five_bar/swing", overrides).q_tree)
 
 
-def test_a_state_cannot_be_changed() -> None:
+def test_state_arrays_are_read_only() -> None:
     state = Simulator("five_bar/swing", {"formulation": "reduced"}).state
     with pytest.raises(ValueError, match="read-only"):
         state.v_tree[0] = 1.0
 
 
 @pytest.mark.parametrize("u", [np.array([1j, 0.0]), ["1", "2"], np.array([b"1", b"2"]), [10**400, 0]], ids=str)
-def test_what_numpy_would_take_for_numbers_is_no_u(u: Any) -> None:
+def test_u_must_be_real_numbers(u: Any) -> None:
     """A complex u lost its imaginary part, text was read."""
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
     with pytest.raises(InputError, match="u: expected a vector of numbers, got"):
         simulator.step(u, 1e-3)
 
 
-def test_an_event_too_large_for_a_number_is_refused() -> None:
+def test_too_large_event_value_is_rejected() -> None:
     with pytest.raises(InputError, match=r"the event 'big' gave an integer that is too large"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: 10**400, name="big")])
 
@@ -216,7 +216,7 @@ CHANGED: list[Callable[[dict[str, Any]], Any]] = [
 
 
 @pytest.mark.parametrize("change", CHANGED, ids=range(len(CHANGED)))
-def test_what_tables_and_figures_read_of_a_run_is_checked(change: Callable[..., Any], tmp_path: Path) -> None:
+def test_metadata_of_run_files_is_checked(change: Callable[..., Any], tmp_path: Path) -> None:
     """Its hashes were right, and `ckc plot` ended in a KeyError."""
     path = _saved(tmp_path)
     _with_meta(path, change)
@@ -224,7 +224,7 @@ def test_what_tables_and_figures_read_of_a_run_is_checked(change: Callable[..., 
         Run.load(path)
 
 
-def test_a_run_with_the_mechanism_of_another_is_refused(tmp_path: Path) -> None:
+def test_run_with_another_mechanism_is_rejected(tmp_path: Path) -> None:
     path = _saved(tmp_path)
     other = load("slider_crank").sources.texts
     _with_meta(path, lambda meta: meta.update(texts=other))
@@ -232,12 +232,12 @@ def test_a_run_with_the_mechanism_of_another_is_refused(tmp_path: Path) -> None:
         Run.load(path).to_dict()
 
 
-def test_a_message_is_one_line_that_no_terminal_obeys() -> None:
+def test_message_is_one_line_without_control_characters() -> None:
     assert str(CkcError("a\nb\x1b[2J é")) == r"a\nb\x1b[2J é"
 
 
 @pytest.mark.parametrize("size", [0, 100, 2000])
-def test_a_full_disk_leaves_what_was_there(size: int, tmp_path: Path) -> None:
+def test_full_disk_keeps_the_old_file(size: int, tmp_path: Path) -> None:
     """With a limit on the size of files, which a process sets for itself, in the disk's place."""
     before = _saved(tmp_path).read_bytes()
     program = f"""
@@ -258,7 +258,7 @@ except ckc_pin.InputError as error:
     assert os.listdir(tmp_path) == ["run.npz"]
 
 
-def test_what_a_killed_process_left_is_cleared_and_what_another_writes_is_not(tmp_path: Path) -> None:
+def test_temporary_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     for content in (b"", b"half"):
         (tmp_path / f".run.npz.{len(content)}{UNFINISHED}").write_bytes(content)

@@ -87,7 +87,7 @@ class Spring:
 
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_controller_of_torques(geared: Path, formulation: str, named: bool) -> None:
+def test_torque_controller_agrees_with_scipy(geared: Path, formulation: str, named: bool) -> None:
     overrides = {"formulation": formulation, "t_end": 0.3, "solver.rtol": 1e-11, "solver.output_dt": 0.1}
     run = simulate(geared / "swing.scene.toml", overrides, controller=Spring(named))
     assert run.actuated == ("left", "belt")
@@ -100,7 +100,7 @@ def test_a_controller_of_torques(geared: Path, formulation: str, named: bool) ->
     assert run.stats["python_calls"] > 0
 
 
-def test_sampled_torques_stay_while_u_does_not(geared: Path) -> None:
+def test_sampled_torques_are_constant_while_u_varies(geared: Path) -> None:
     overrides = {"formulation": "dae", "t_end": 0.1, "solver.rtol": 1e-11, "solver.output_dt": 0.01}
     run = simulate(geared / "swing.scene.toml", overrides, controller=Sampled(Spring(True), 0.02, 0.01))
     y, acts = start_of(run), np.zeros(2)
@@ -115,7 +115,7 @@ def test_sampled_torques_stay_while_u_does_not(geared: Path) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_steps_with_torques(geared: Path, formulation: str) -> None:
+def test_steps_with_tau_agree_with_scipy(geared: Path, formulation: str) -> None:
     simulator = Simulator(geared / "swing.scene.toml", {"formulation": formulation, "solver.rtol": 1e-11})
     state, rng = simulator.state, np.random.default_rng(4)
     y = np.concatenate([state.q, state.q_dot])
@@ -132,7 +132,7 @@ def test_steps_with_torques(geared: Path, formulation: str) -> None:
     assert simulator.stats["python_calls"] == 0
 
 
-def test_a_swing_driven_by_torques_needs_no_q(geared: Path) -> None:
+def test_torques_need_no_chart(geared: Path) -> None:
     """Where phi_z becomes singular the reduced model goes on in other coordinates, as the DAE does."""
     runs = []
     for formulation in ("reduced", "dae"):
@@ -149,7 +149,7 @@ def test_a_swing_driven_by_torques_needs_no_q(geared: Path) -> None:
     assert_close(runs[0][0].q_tree, runs[1][0].q_tree, 1e-6)
 
 
-def test_a_motor_that_turns_too_fast_is_named(geared: Path) -> None:
+def test_motor_above_its_speed_limit_is_named(geared: Path) -> None:
     run = simulate(geared / "swing.scene.toml", {"t_end": 1.0})
     assert_close(run.motor_rates, run.v_tree @ TURNS.T, 1e-12)
     fastest = np.abs(run.motor_rates).max(axis=0)
@@ -171,7 +171,7 @@ def csv(folder: Path, values: Array) -> None:
 
 @pytest.mark.parametrize("interpolation", ["hold", "linear"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_torques_of_a_file(geared: Path, formulation: str, interpolation: str) -> None:
+def test_torques_from_a_file_agree_with_scipy(geared: Path, formulation: str, interpolation: str) -> None:
     values = VALUES if interpolation == "hold" else 0.3 * VALUES  # on a line a limit would be met in between
     csv(geared, values)
     overrides = {
@@ -203,7 +203,7 @@ def test_torques_of_a_file(geared: Path, formulation: str, interpolation: str) -
     assert "drive.csv" in kept.texts
 
 
-def test_names_with_commas_are_quoted_as_programs_do(geared: Path) -> None:
+def test_csv_names_with_commas_are_quoted(geared: Path) -> None:
     overrides = {"t_end": 0.15, "controller": {"type": "torques", "file": "drive.csv"}, "solver.terms": "pinocchio"}
     csv(geared, VALUES)
     wanted = simulate(geared / "swing.scene.toml", overrides)
@@ -258,7 +258,7 @@ BAD = [
 
 
 @pytest.mark.parametrize("case", BAD, ids=lambda case: case.what)
-def test_bad_torques(case: Bad, bar: Path) -> None:
+def test_invalid_torque_file_is_rejected(case: Bad, bar: Path) -> None:
     expect(case, bar)
 
 
@@ -272,7 +272,7 @@ def test_bad_torques(case: Bad, bar: Path) -> None:
         ({"tau": [0.0, 0.0], "u": [0.0, 0.0]}, "give either u or tau, not both"),
     ],
 )
-def test_bad_steps(geared: Path, given: dict[str, Any], says: str) -> None:
+def test_invalid_tau_is_rejected(geared: Path, given: dict[str, Any], says: str) -> None:
     simulator = Simulator(geared / "swing.scene.toml")
     before = simulator.step(tau={"belt": 0.1}, dt=0.01)
     with pytest.raises(InputError, match=says):
@@ -290,7 +290,7 @@ def test_bad_steps(geared: Path, given: dict[str, Any], says: str) -> None:
         ({"weights": {"left_elbow_joint": 0}}, "weights.left_elbow_joint = 0: expected a number greater than 0"),
     ],
 )
-def test_bad_allocation(allocation: dict[str, Any], says: str) -> None:
+def test_invalid_allocation_is_rejected(allocation: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
         simulate("two_ur5/lift", {"controller.allocation": allocation})
 
@@ -309,12 +309,12 @@ class Both(Spring):
         (object(), "expected an object with one of the methods.*, got an object"),
     ],
 )
-def test_a_controller_has_one_method(controller: Any, says: str) -> None:
+def test_controller_must_have_one_of_u_and_tau(controller: Any, says: str) -> None:
     with pytest.raises(InputError, match=says):
         simulate("five_bar/swing", controller=controller)
 
 
-def test_without_motors_q_is_chosen_as_without_the_key(bar: Path) -> None:
+def test_empty_actuated_does_not_change_the_partition(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text("utf-8")
     chosen = []
     for motors in ("", "actuated = []\n"):
@@ -325,7 +325,7 @@ def test_without_motors_q_is_chosen_as_without_the_key(bar: Path) -> None:
     assert chosen[1].actuated == ()
 
 
-def test_what_no_motor_drives_is_named_and_torques_still_act(bar: Path) -> None:
+def test_undriven_freedom_is_named_and_torques_still_act(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text("utf-8")
     (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', "actuated = []"), "utf-8")
     with pytest.raises(

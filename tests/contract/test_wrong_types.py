@@ -198,7 +198,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_it_says_what_it_takes(name: str) -> None:
+def test_wrong_argument_is_named_with_the_expected_type(name: str) -> None:
     call, says = CALLS[name]
     with pytest.raises(InputError) as error:
         call()
@@ -208,7 +208,7 @@ def test_it_says_what_it_takes(name: str) -> None:
     assert len(message) < 400
 
 
-def test_numbers_of_numpy_and_lists_are_taken_as_pythons() -> None:
+def test_numpy_numbers_and_lists_are_accepted() -> None:
     wanted = load("five_bar", {MASS: 0.3, "gravity": (0.0, -5.0, 0.0)}).tree.model
     for mass, gravity in ((np.float64(0.3), np.array([0, -5.0, 0])), (np.array(0.3), [0, -5, 0])):
         found = load("five_bar", {MASS: mass, "gravity": gravity}).tree.model
@@ -222,7 +222,7 @@ def test_numbers_of_numpy_and_lists_are_taken_as_pythons() -> None:
     assert (np.abs(taken["initial.q.theta_1"] + 1.25) <= 0.25).all()
 
 
-def test_a_plain_function_is_a_controller_as_good_as_an_object() -> None:
+def test_function_and_object_controllers_give_the_same_run() -> None:
     """Of itself, sampled, as a lambda, as an object that can be called: bit for bit the same motion."""
 
     class Called:
@@ -240,7 +240,7 @@ def test_a_plain_function_is_a_controller_as_good_as_an_object() -> None:
     assert np.abs(sampled[0].u[-1]).max() > 1e-3
 
 
-def test_gains_of_controllers_are_taken_as_a_scene_takes_them() -> None:
+def test_controllers_accept_gains_like_scenes() -> None:
     mechanism = five_bar()
     by_number = SetPoint(mechanism, 10.0, 1, Q)
     by_name = SetPoint(mechanism, {"theta_1": 10.0, "theta_3": 10.0}, [[1, 0], [0, 1]], [-1.2, -1.9])
@@ -251,7 +251,7 @@ def test_gains_of_controllers_are_taken_as_a_scene_takes_them() -> None:
     )
 
 
-def test_runs_of_two_mechanisms_do_not_lie_on_each_other() -> None:
+def test_runs_of_two_mechanisms_are_not_drawn_together() -> None:
     runs = [simulate(name, SHORT) for name in (SWING, "four_bar")]
     for pair in (runs, runs[::-1]):
         with pytest.raises(InputError, match="other coordinates; play runs of different mechanisms one by one"):

@@ -65,7 +65,7 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
 
 @formulations
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])
-def test_errors_fall_with_the_tolerance(exact: Exact, formulation: str, method: str) -> None:
+def test_errors_decrease_with_rtol(exact: Exact, formulation: str, method: str) -> None:
     """At steps and between: by more than half the decades that rtol falls, and never far above rtol itself."""
     tolerances = np.array([1e-4, 1e-6, 1e-8, 1e-10])
     found = np.array([errors(exact, formulation, method=method, rtol=rtol) for rtol in tolerances])
@@ -77,12 +77,12 @@ def test_errors_fall_with_the_tolerance(exact: Exact, formulation: str, method: 
 
 
 @formulations
-def test_outputs_of_Radau_between_steps_are_as_good_as_its_steps(exact: Exact, formulation: str) -> None:
+def test_radau_outputs_between_steps_are_as_accurate_as_steps(exact: Exact, formulation: str) -> None:
     """Its own interpolant is of the order of its stages, and would be off by more."""
     at_steps, between = errors(exact, formulation, method="Radau", rtol=1e-8)
     assert np.all(between <= 15 * at_steps)
 
 
-def test_the_reference_is_the_stored_one(exact: Exact) -> None:
+def test_reference_matches_the_stored_solution(exact: Exact) -> None:
     stored = trajectory("swing")
     assert_close(exact(0.5), np.concatenate([stored.q_tree[0, Q], stored.v_tree[0, Q]]), 1e-12)

@@ -92,7 +92,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
 
 @pytest.mark.parametrize("formulation", OFF)
 @pytest.mark.parametrize("method", METHODS)
-def test_observed_order(exact: dict[bool, Exact], formulation: str, method: str) -> None:
+def test_method_has_its_order_of_convergence(exact: dict[bool, Exact], formulation: str, method: str) -> None:
     """Neither projection nor Newton's iteration on z nor w changes an order."""
     name, rtol, order, order_between, steps = METHODS[method]
     coarse, fine = (errors(exact[OFF[formulation]], formulation, name, rtol, n) for n in (steps, 2 * steps))
@@ -102,7 +102,7 @@ def test_observed_order(exact: dict[bool, Exact], formulation: str, method: str)
 
 
 @pytest.mark.parametrize("stages", [2, 3])
-def test_order_of_collocation(exact: dict[bool, Exact], stages: int) -> None:
+def test_collocation_step_has_its_order_of_convergence(exact: dict[bool, Exact], stages: int) -> None:
     """The step across losses of rank: of order 2 s at its end, which one step shows as 2 s + 1."""
     ready = ready_at("dae")
 

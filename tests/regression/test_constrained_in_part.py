@@ -34,7 +34,7 @@ def top(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_it_swings_as_a_pendulum(top: Path) -> None:
+def test_body_on_ball_joint_swings_as_a_pendulum(top: Path) -> None:
     """About y: (0.02 + 1 * 0.1^2) angle'' = 1 * 9.81 * 0.1 cos(angle), from level."""
     run = simulate(top / "default.scene.toml", {"solver.rtol": 1e-10})
     angle = solve_ivp(lambda t, y: [y[1], 0.981 * np.cos(y[0]) / 0.03], (0, 1), [0, 0], rtol=1e-12, atol=1e-13)
@@ -44,7 +44,7 @@ def test_it_swings_as_a_pendulum(top: Path) -> None:
     assert run.max_phi <= 1e-12
 
 
-def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical(top: Path) -> None:
+def test_spinning_top_conserves_energy_and_vertical_angular_momentum(top: Path) -> None:
     spin = {"root.rx": 20.0, "root.rz": 1.0}
     run = simulate(top / "default.scene.toml", {"solver.rtol": 1e-10, "initial.q_dot": spin})
     assert run.status == "done"
@@ -62,12 +62,12 @@ def test_a_spun_one_keeps_its_energy_and_its_angular_momentum_about_the_vertical
 @pytest.mark.parametrize(
     "overrides", [{"formulation": "reduced"}, {"formulation": "spf"}, {"initial.at": "equilibrium"}]
 )
-def test_what_needs_numbers_q_is_refused(top: Path, overrides: dict[str, str]) -> None:
+def test_formulations_and_starts_that_need_q_are_rejected(top: Path, overrides: dict[str, str]) -> None:
     with pytest.raises(InputError, match=r"constrain a free root in part.*run it as a DAE"):
         simulate(top / "default.scene.toml", overrides)
 
 
-def test_check_says_so(top: Path) -> None:
+def test_check_reports_the_partly_constrained_root(top: Path) -> None:
     found = check(top / "mechanism.toml")
     assert (found.d, found.rank) == (3, 3)
     assert any("constrain a free root in part" in warning for warning in found.warnings)
@@ -75,7 +75,7 @@ def test_check_says_so(top: Path) -> None:
         terms(load(top / "mechanism.toml"), {"root.rx": 0.1, "root.ry": 0.0, "root.rz": 0.0})
 
 
-def test_rates_of_a_free_root_are_in_its_own_axes(top: Path) -> None:
+def test_free_root_rates_are_in_body_axes(top: Path) -> None:
     """A quarter turn about z, thrown along its x and spun about its y: along the world's y, nose down."""
     (top / "mechanism.toml").write_text(MECHANISM.partition("[[loop]]")[0])
     turned, thrown = {"root.rz": np.pi / 2}, {"root.x": 2.0, "root.ry": 0.3}

@@ -38,7 +38,7 @@ def test_tracking(run: Callable[..., Run], formulation: str) -> None:
 
 
 @formulations
-def test_tracking_as_shipped(run: Callable[..., Run], formulation: str) -> None:
+def test_shipped_tracking_scene_matches_the_reference(run: Callable[..., Run], formulation: str) -> None:
     """At its own rtol, 1e-8."""
     ours, reference = run("five_bar/tracking", formulation=formulation), trajectory("tracking")
     rows = reference.rows(ours)
@@ -47,14 +47,14 @@ def test_tracking_as_shipped(run: Callable[..., Run], formulation: str) -> None:
 
 
 @formulations
-def test_tracking_error_at_the_end(run: Callable[..., Run], formulation: str) -> None:
+def test_tracking_error_decays_exponentially(run: Callable[..., Run], formulation: str) -> None:
     """The notes' figure; e^-t times the initial one."""
     ours = run("five_bar/tracking", formulation=formulation)
     assert ours.t[-1] == 9.5
     assert_close(ours.q_tree[-1, Q] - desired(9.5)[0], [-1.0775e-4, -1.281e-4], 6e-9)
 
 
-def test_tracking_with_another_epsilon(run: Callable[..., Run]) -> None:
+def test_tracking_from_consistent_start_does_not_depend_on_epsilon(run: Callable[..., Run]) -> None:
     """From a consistent start the SPF is the reduced model whatever epsilon is."""
     assert_follows(
         run("five_bar/tracking", formulation="spf", epsilon=1e-3, solver__rtol=TIGHT), trajectory("tracking")
@@ -62,7 +62,7 @@ def test_tracking_with_another_epsilon(run: Callable[..., Run]) -> None:
 
 
 @formulations
-def test_torque_maxima(run: Callable[..., Run], formulation: str) -> None:
+def test_tracking_torques_match_the_papers_maxima(run: Callable[..., Run], formulation: str) -> None:
     """24.84 N m at the start (the paper's 30), 1.35 N m after 4 s (the paper's 5)."""
     ours = run("five_bar/tracking", formulation=formulation)
     largest = np.abs(ours.u).max(axis=1)
@@ -79,7 +79,7 @@ def test_set_point(run: Callable[..., Run], file: str, formulation: str) -> None
 
 
 @pytest.mark.parametrize("scene", ["five_bar/set_point", "five_bar/tracking"])
-def test_lyapunov_functions_decrease(run: Callable[..., Run], scene: str) -> None:
+def test_lyapunov_function_decreases_along_the_closed_loop(run: Callable[..., Run], scene: str) -> None:
     """Eqs. 15 and 18: along the closed loop, to rounding."""
     lyapunov = run(scene, formulation="reduced").lyapunov
     assert lyapunov is not None
@@ -102,7 +102,7 @@ def heavy_model(folder: Path, attributes: str) -> str:
 
 
 @formulations
-def test_tracking_with_a_model_whose_links_are_too_heavy(
+def test_tracking_with_too_heavy_model_matches_the_reference(
     run: Callable[..., Run], tmp_path: Path, formulation: str
 ) -> None:
     model = heavy_model(tmp_path, "value|i[xyz][xyz]")
@@ -110,21 +110,21 @@ def test_tracking_with_a_model_whose_links_are_too_heavy(
     assert_follows(ours, trajectory("tracking_heavy_links"))
 
 
-def test_tracking_with_a_model_whose_masses_alone_are_too_large(run: Callable[..., Run], tmp_path: Path) -> None:
+def test_tracking_with_too_large_masses_matches_the_reference(run: Callable[..., Run], tmp_path: Path) -> None:
     ours = run(
         "five_bar/tracking", formulation="dae", controller__model=heavy_model(tmp_path, "value"), solver__rtol=TIGHT
     )
     assert_follows(ours, trajectory("tracking_heavy_masses"))
 
 
-def test_as_printed_says_when_the_desired_trajectory_leaves() -> None:
+def test_printed_trajectory_leaves_the_workspace() -> None:
     found = check("five_bar_as_printed/tracking")
     assert found.desired is not None
     assert_close(found.desired.leaves_at, 4.39313, 5.1e-6)
     assert "leaves the workspace at t = 4.39313 s" in " ".join(found.warnings)
 
 
-def test_the_default_reading_stays_inside() -> None:
+def test_default_trajectory_stays_in_the_workspace() -> None:
     found = check("five_bar/tracking")
     assert found.desired is not None
     assert found.desired.leaves_at is None
@@ -132,7 +132,7 @@ def test_the_default_reading_stays_inside() -> None:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_as_printed_stalls_at_the_singular_configuration(run: Callable[..., Run], formulation: str) -> None:
+def test_printed_trajectory_stops_at_the_singular_configuration(run: Callable[..., Run], formulation: str) -> None:
     """As a DAE too: eq. 16's D grows without bound there."""
     ours = run("five_bar_as_printed/tracking", formulation=formulation, solver__rtol=1e-6)
     assert ours.status == "stopped"
@@ -145,7 +145,7 @@ def test_as_printed_stalls_at_the_singular_configuration(run: Callable[..., Run]
 
 
 @pytest.mark.parametrize("sampled", [{}, {"sample_time": 0.05, "delay": 0.02}], ids=["continuous", "sampled"])
-def test_set_point_control_goes_on_in_other_coordinates_where_phi_z_is_singular(sampled: dict[str, float]) -> None:
+def test_set_point_control_changes_coordinates_where_phi_z_is_singular(sampled: dict[str, float]) -> None:
     """It looks at q and q_dot alone, and u acts on their joints: as the DAE, which needs no q to go on."""
     names = ("theta_1", "theta_3")
     overrides = {

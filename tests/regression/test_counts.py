@@ -24,12 +24,12 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_fixed_runs_count_what_they_did(name: str) -> None:
+def test_evaluation_counts_match_the_recorded_ones(name: str) -> None:
     """Within 2 %; `tests/regression/counts.py` says how to write the numbers anew."""
     assert changed(measured(name), recorded()[name]) == {}
 
 
-def test_a_count_that_changes_by_more_than_two_percent_is_seen() -> None:
+def test_count_change_above_two_percent_is_detected() -> None:
     for name, known in recorded().items():
         assert set(known) == set(COUNTED)
         assert changed(known, known) == {}
@@ -41,7 +41,7 @@ def test_a_count_that_changes_by_more_than_two_percent_is_seen() -> None:
 
 
 @pytest.mark.parametrize(("scene", "formulation"), LIMITS)
-def test_evaluations_at_rtol_1e_8(run: Callable[..., Run], scene: str, formulation: str) -> None:
+def test_number_of_evaluations_at_rtol_1e_8_is_bounded(run: Callable[..., Run], scene: str, formulation: str) -> None:
     ours = run(scene, formulation=formulation)
     limit, newton_per_rhs = LIMITS[scene, formulation]
     assert ours.scene["solver"]["rtol"] == 1e-8
@@ -49,14 +49,14 @@ def test_evaluations_at_rtol_1e_8(run: Callable[..., Run], scene: str, formulati
     assert ours.stats["newton"] <= newton_per_rhs * ours.stats["rhs"]
 
 
-def test_epsilon_costs_nothing_in_eq_17s_coordinates(run: Callable[..., Run]) -> None:
+def test_epsilon_does_not_change_the_cost_in_coordinates_of_eq_17(run: Callable[..., Run]) -> None:
     """The stiff part is in closed form: from a consistent start the right-hand sides are the same for every epsilon."""
     counts = {run("five_bar/swing", formulation="spf", epsilon=epsilon).stats["rhs"] for epsilon in (1e-1, 1e-6, 1e-12)}
     assert len(counts) == 1
 
 
 @pytest.mark.parametrize("scene", ["five_bar/swing", "five_bar/tracking"])
-def test_epsilon_costs_little_off_the_manifold(run: Callable[..., Run], scene: str) -> None:
+def test_epsilon_hardly_changes_the_cost_off_the_manifold(run: Callable[..., Run], scene: str) -> None:
     """Against the reduced model at equal tolerance: three tenths more right-hand sides for any epsilon."""
     reduced = run(scene, formulation="reduced").stats["rhs"]
     for epsilon in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
@@ -68,13 +68,13 @@ def test_epsilon_costs_little_off_the_manifold(run: Callable[..., Run], scene: s
 
 # right-hand sides hardly depend on it, so that these are Newton corrections for what z is predicted from
 @pytest.mark.parametrize("scene", ["andrews", "delta", "stewart", "talos"])
-def test_newton_corrections_of_other_mechanisms(run: Callable[..., Run], scene: str) -> None:
+def test_number_of_newton_corrections_is_bounded(run: Callable[..., Run], scene: str) -> None:
     ours = run(scene, formulation="reduced", t_end=0.05, solver__output_dt=0.005)
     assert ours.stats["newton"] <= 1.6 * ours.stats["rhs"]
 
 
 @pytest.mark.parametrize(("scene", "rtol", "t_end"), [("andrews/default", 1e-13, 0.05), ("delta/default", 1e-12, 0.6)])
-def test_rounding_does_not_shorten_steps(scene: str, rtol: float, t_end: float) -> None:
+def test_rounding_errors_do_not_reduce_the_step_size(scene: str, rtol: float, t_end: float) -> None:
     """What y and its rates tell differently of the rest of the motion is rounding here, which no shorter step mends."""
     rhs = {}
     for formulation in ("dae", "reduced"):
@@ -84,7 +84,7 @@ def test_rounding_does_not_shorten_steps(scene: str, rtol: float, t_end: float) 
     assert rhs["reduced"] < 2.5 * rhs["dae"]
 
 
-def test_a_crank_that_has_turned_often_is_rounded_as_its_angle_is() -> None:
+def test_large_angles_do_not_reduce_the_step_size() -> None:
     """After 16 turns the rod's angle, where it passes zero, is not known to 1e-13 of itself: no step can mend that."""
     overrides = {"t_end": 5.0, "solver.output_dt": 0.5, "solver.method": "DOP853"}
     tight = simulate("slider_crank", {**overrides, "formulation": "reduced", "solver.rtol": 1e-13})
@@ -95,7 +95,7 @@ def test_a_crank_that_has_turned_often_is_rounded_as_its_angle_is() -> None:
 
 
 @pytest.mark.parametrize("scene", ["five_bar/friction", "talos/default"])
-def test_auto_is_as_good_as_the_better_method_where_joints_change_often(scene: str) -> None:
+def test_auto_costs_no_more_than_the_better_method_with_many_mode_transitions(scene: str) -> None:
     rhs = {}
     for method in ("auto", "DOP853", "Radau"):
         run = simulate(scene, {"solver.method": method})
@@ -104,14 +104,14 @@ def test_auto_is_as_good_as_the_better_method_where_joints_change_often(scene: s
     assert rhs["auto"] <= (1.0 + TOLERANCE) * min(rhs["DOP853"], rhs["Radau"])
 
 
-def test_events_are_located_with_few_terms() -> None:
+def test_event_location_evaluates_few_terms() -> None:
     """Joints that slide and stick are looked at by what the state shows, and by what a right-hand side has left."""
     run = simulate("talos/default", profile=True)
     assert len(run.events) > 150
     assert run.profile["D_tree"]["calls"] <= 1.4 * run.stats["rhs"]
 
 
-def test_an_uncontrolled_run_evaluates_no_matrix_C() -> None:
+def test_uncontrolled_run_evaluates_no_coriolis_matrix() -> None:
     """An acceleration asks for D' and the bias, never for C', nor for the matrix rho_dot."""
     profile = simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, profile=True).profile
     assert "D_tree" in profile

@@ -46,7 +46,7 @@ def ida(scene: str, overrides: dict[str, Any], rtol: float, times: Array) -> tup
         ("bricard", 1.0, 1e-8, 1e-6),  # redundant rows
     ],
 )
-def test_ida_agrees_with_the_projected_dae(scene: str, t_end: float, q_error: float, rate_error: float) -> None:
+def test_projected_dae_agrees_with_sundials_ida(scene: str, t_end: float, q_error: float, rate_error: float) -> None:
     overrides = {"formulation": "dae", "t_end": t_end, "solver.output_dt": t_end / 7}
     ours = simulate(scene, {**overrides, "solver.rtol": 1e-11})
     q_tree, v_tree = ida(scene, overrides, 1e-10, ours.t)
@@ -54,7 +54,7 @@ def test_ida_agrees_with_the_projected_dae(scene: str, t_end: float, q_error: fl
     np.testing.assert_allclose(v_tree, ours.v_tree, rtol=0, atol=rate_error)
 
 
-def test_ida_against_an_integration_in_numpy() -> None:
+def test_sundials_ida_agrees_with_the_numpy_reference() -> None:
     exact = trajectory("swing")
     assert exact.t[0] == 0.5
     q_tree, _ = ida("five_bar/swing", {"formulation": "dae"}, 1e-10, np.array([0.0, 0.5]))
@@ -64,7 +64,7 @@ def test_ida_against_an_integration_in_numpy() -> None:
 # --- Baumgarte --------------------------------------------------------------------------------------
 
 
-def test_what_drifts_is_damped_by_baumgarte_and_closed_by_projection(run: Callable[..., Run]) -> None:
+def test_baumgarte_damps_drift_and_projection_removes_it(run: Callable[..., Run]) -> None:
     def swing(**solver: object) -> Run:
         return run("five_bar/swing", formulation="dae", t_end=5.0, solver__rtol=1e-6, **solver)
 
@@ -77,7 +77,7 @@ def test_what_drifts_is_damped_by_baumgarte_and_closed_by_projection(run: Callab
     assert projected.max_phi <= 1e-12
 
 
-def test_baumgarte_decays_as_it_says() -> None:
+def test_baumgarte_residual_decays_critically_damped() -> None:
     """Off the closure by hand: phi follows phi_ddot + 2 alpha phi_dot + beta^2 phi = 0, critically damped."""
     overrides = {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0], "solver.rtol": 1e-11}
     ready = prepare(load_scene("five_bar/swing", overrides))
@@ -98,7 +98,7 @@ def test_baumgarte_decays_as_it_says() -> None:
         ({"formulation": "dae", "solver.projection": False, "solver.baumgarte": [1.0, -1.0]}, "baumgarte"),
     ],
 )
-def test_what_does_not_go_together(overrides: dict[str, object], said: str) -> None:
+def test_incompatible_dae_settings_are_rejected(overrides: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
         simulate("five_bar/swing", overrides)
 
@@ -111,7 +111,7 @@ def test_what_does_not_go_together(overrides: dict[str, object], said: str) -> N
         ((-0.57268896, -1.80892173), (-6.54795127, 1.28531818)),
     ],
 )
-def test_a_constant_u_does_the_work_that_is_gained_where_q_is_no_chart(
+def test_energy_equals_work_of_constant_u_where_q_is_no_chart(
     q: tuple[float, float], q_dot: tuple[float, float]
 ) -> None:
     """phi_z passes through singular configurations, where a velocity closed by z alone may be anything."""
@@ -155,7 +155,7 @@ def by_slider(folder: Path, pin: str = 'type = "point_2d"\n') -> str:
 @pytest.mark.parametrize(
     "pin", ['type = "point_2d"\n', 'type = "hinge"\naxis_a = [0.0, 0.0, 1.0]\n'], ids=["point", "hinge"]
 )
-def test_a_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) -> None:
+def test_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) -> None:
     """From every coordinate, with redundant rows too; as the one whose q is the crank does."""
     scene = by_slider(tmp_path, pin)
     overrides = {
@@ -179,13 +179,13 @@ def test_a_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) 
         {"controller": {"type": "set_point", "K_P": 4.0, "K_V": 1.0, "q_d": {"slider": 0.28}}},
     ],
 )
-def test_who_needs_q_does_not_start_there(tmp_path: Path, more: dict[str, Any]) -> None:
+def test_starts_that_need_q_are_rejected_where_q_is_no_chart(tmp_path: Path, more: dict[str, Any]) -> None:
     scene = by_slider(tmp_path)
     with pytest.raises(NumericalError, match="singular: slider do not determine crank, rod there"):
         simulate(scene, {"initial": {"q": IN_LINE}, **more})
 
 
-def test_neither_does_a_controller_of_ones_own(tmp_path: Path) -> None:
+def test_callers_controller_is_rejected_where_q_is_no_chart(tmp_path: Path) -> None:
     scene = by_slider(tmp_path)
     with pytest.raises(NumericalError, match="singular: slider do not determine crank, rod there"):
         simulate(scene, {"initial": {"q": IN_LINE}}, controller=lambda t, terms: np.zeros(1))

@@ -18,7 +18,9 @@ SLIDER_CRANK = library() / "slider_crank"
 
 
 @pytest.mark.parametrize(("name", "trials"), [("talos", 100), ("two_ur5", 60), ("flyball", 80)])
-def test_what_falls_far_comes_to_rest(name: str, trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equilibrium_search_converges_from_far_configurations(
+    name: str, trials: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Through where q is no chart (talos, two_ur5), along soft and stiff directions at once (flyball, talos)."""
     model, tried = load(name), []
 
@@ -45,7 +47,7 @@ def test_what_falls_far_comes_to_rest(name: str, trials: int, monkeypatch: pytes
         assert [q["rod_1"], q["rod_2"]] == pytest.approx([np.pi / 2, np.pi / 2], abs=1e-9)
 
 
-def test_rest_where_q_is_no_chart_is_refused(tmp_path: Path) -> None:
+def test_equilibrium_where_q_is_no_chart_is_rejected(tmp_path: Path) -> None:
     """Gravity along the rail: the crank hangs down in line with the rod, where the slider's place says nothing."""
     text = (SLIDER_CRANK / "mechanism.toml").read_text()
     text = text.replace('["crank"]', '["slider"]').replace("[0.0, -9.81, 0.0]", "[9.81, 0.0, 0.0]")

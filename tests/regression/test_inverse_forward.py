@@ -96,7 +96,7 @@ def assert_integrates_back(scene: str | Path, overrides: dict[str, Any], found: 
 
 
 @pytest.mark.parametrize("scene", CONTROLLED)
-def test_shipped_scenes_at_each_instant(scene: str) -> None:
+def test_inverse_dynamics_of_shipped_scenes_satisfies_eq_1(scene: str) -> None:
     assert len(CONTROLLED) >= 10
     found = inverse_dynamics(scene, {"t_end": 1.0, "solver.output_dt": 0.05})
     assert found.status == "done"
@@ -105,7 +105,7 @@ def test_shipped_scenes_at_each_instant(scene: str) -> None:
 
 
 @pytest.mark.parametrize("name", shipped())
-def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
+def test_inverse_dynamics_reproduces_motion_of_shipped_mechanisms(name: str) -> None:
     overrides = waves(load_scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
     found = inverse_dynamics(name, overrides)
     assert found.status == "done"
@@ -114,7 +114,7 @@ def test_shipped_mechanisms_swing_as_they_should(name: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_random_mechanisms_swing_as_they_should(seed: int, tmp_path: Path) -> None:
+def test_inverse_dynamics_reproduces_motion_of_random_mechanisms(seed: int, tmp_path: Path) -> None:
     """A free root that the loops leave free is held by no motor: refused, by name."""
     scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
     mechanism = load_scene_mechanism(ckc_pin.load_scene(scene))

@@ -77,16 +77,16 @@ def assert_swings_as_it_should(draft: Draft, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_imported_models_swing_as_they_should(name: str, tmp_path: Path) -> None:
+def test_inverse_dynamics_reproduces_motion_of_imported_models(name: str, tmp_path: Path) -> None:
     assert_swings_as_it_should(MODELS[name](tmp_path), tmp_path / "written")
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_robots_of_a_package_swing_as_they_should(name: str, tmp_path: Path) -> None:
+def test_inverse_dynamics_reproduces_motion_of_package_robots(name: str, tmp_path: Path) -> None:
     assert_swings_as_it_should(robot(ROBOTS[name]), tmp_path)
 
 
-def test_what_published_robots_are_measured_by(tmp_path: Path) -> None:
+def test_published_robots_are_moved_along_all_driven_freedoms(tmp_path: Path) -> None:
     """Their motion: of all freedoms, or on a free root of motors. Where nothing tells it, an error says so."""
     assert given_back(MODELS["connects, friction, rotor and gear"](tmp_path)) < 1e-9
     pushed = model(tmp_path, FLOATING, "<actuator><motor joint='left'/><motor joint='right'/></actuator>")
@@ -95,13 +95,13 @@ def test_what_published_robots_are_measured_by(tmp_path: Path) -> None:
         given_back(robot("romeo_description/urdf/romeo.urdf"))
 
 
-def test_what_no_motor_holds_is_named(tmp_path: Path) -> None:
+def test_freedom_without_motor_is_named(tmp_path: Path) -> None:
     scene = written(imported(tmp_path, legs(), YAML), tmp_path / "written")
     with pytest.raises(InputError, match=r"a_hip cannot drive every freedom; the motion along b_knee is driven by"):
         inverse_dynamics(scene, waves(load(tmp_path / "written" / "mechanism.toml"), 0.1))
 
 
-def test_fingers_without_inertia_have_no_motion_to_give_back(tmp_path: Path) -> None:
+def test_massless_fingers_are_rejected(tmp_path: Path) -> None:
     """Romeo's fingers and what they are geared to weigh nothing: torques leave their accelerations open."""
     scene = written(robot("romeo_description/urdf/romeo.urdf"), tmp_path)
     with pytest.raises((InputError, MechanismError), match="mass"):

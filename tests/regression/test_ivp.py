@@ -48,7 +48,7 @@ RUNS = [
 
 
 @pytest.mark.parametrize(("scene", "overrides"), RUNS, ids=str)
-def test_a_run_is_the_motion_of_its_equations(scene, overrides):
+def test_run_agrees_with_its_equations_integrated_by_scipy(scene, overrides):
     run = simulate(scene, overrides)
     assert run.status == "done"
     problem = as_ivp(scene, overrides)
@@ -69,7 +69,7 @@ def _near(found, wanted):
     assert np.abs(found - wanted).max() <= 100 * 1e-8 * max(1.0, np.abs(wanted).max())
 
 
-def test_a_sampled_controller_is_no_function_of_time_and_state():
+def test_as_ivp_rejects_a_sampled_controller():
     with pytest.raises(InputError, match=r"controller\.sample_time"):
         as_ivp("five_bar/set_point", {"controller.sample_time": 0.01})
 
@@ -79,7 +79,7 @@ def test_overrides_need_a_name():
         as_ivp(load_scene("five_bar/swing"), {"t_end": 1.0})
 
 
-def test_where_there_is_no_state_there_is_no_rate():
+def test_rate_is_nan_where_no_state_exists():
     """As SciPy's solvers take it: the step is shortened."""
     problem = as_ivp("five_bar/swing", REDUCED)
     assert np.isnan(problem.f(0.0, problem.y0 + np.array([1e3, 0.0, 0.0, 0.0]))).all()

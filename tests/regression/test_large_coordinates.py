@@ -50,7 +50,7 @@ def falling(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("scene", ["slider_crank", "four_bar/turning"])
-def test_a_crank_turns_on(scene: str, formulation: str) -> None:
+def test_crank_turns_accurately_after_many_turns(scene: str, formulation: str) -> None:
     """More than a hundred times: 1e-13 rad, near zero some rounding, is less than one at 512 rad."""
     run = ckc_pin.simulate(scene, {"t_end": 90.0, "formulation": formulation, "solver.output_dt": 1.0})
     assert run.status == "done", run.message
@@ -61,7 +61,7 @@ def test_a_crank_turns_on(scene: str, formulation: str) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("turns", TURNS)
-def test_turns_before_the_start_change_nothing(turns: int, formulation: str) -> None:
+def test_motion_does_not_depend_on_initial_turns(turns: int, formulation: str) -> None:
     overrides = {"formulation": formulation, "t_end": 2.0, "solver.rtol": 1e-8}
     at, more = np.pi / 2, 2 * np.pi * turns
     wanted = ckc_pin.simulate("four_bar/turning", overrides)
@@ -74,7 +74,7 @@ def test_turns_before_the_start_change_nothing(turns: int, formulation: str) -> 
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
-def test_it_falls_from_the_origin_as_from_afar(falling: str, formulation: str) -> None:
+def test_free_fall_does_not_depend_on_position(falling: str, formulation: str) -> None:
     """The centre of mass falls as Galileo says, and what turns about it does not know where it is."""
     start = {"a": 1.0, "root.x": 0.0, "root.y": 0.0, "root.z": 0.0, "root.rx": 0.0, "root.ry": 0.0, "root.rz": 0.0}
     overrides = {
@@ -96,7 +96,7 @@ def test_it_falls_from_the_origin_as_from_afar(falling: str, formulation: str) -
     assert long["root.y"][-1] < -4000
 
 
-def test_an_angle_that_is_rounded_too_coarsely_stops_the_run() -> None:
+def test_too_large_angle_stops_the_run() -> None:
     """One of 6e9 rad is known to 1e-6: no loop closes as it should."""
     given = {"initial": {"q": {"crank": 2e9 * np.pi + np.pi / 2}, "q_dot": {"crank": 12.0}}, "t_end": 0.1}
     run = ckc_pin.simulate("four_bar/turning", given)

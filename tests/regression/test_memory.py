@@ -48,7 +48,7 @@ def test_memory_does_not_grow_with_steps(name: str) -> None:
     assert sizes[(count - 1) // 20] - sizes[1] <= ALLOWED * (count - 20)
 
 
-def test_nor_with_the_steps_of_a_simulator() -> None:
+def test_memory_does_not_grow_with_simulator_steps() -> None:
     simulator = Simulator("five_bar/swing", {"formulation": "dae"})
     u = np.zeros(2)
 

@@ -74,7 +74,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_energy_is_kept(case: str) -> None:
+def test_energy_is_conserved_without_control(case: str) -> None:
     scene, formulation, rtol, overrides = CASES[case]
     overrides = {"t_end": 4.0, "solver.output_dt": 0.02, **overrides, "formulation": formulation, "solver.rtol": rtol}
     run = simulate(scene, overrides)
@@ -83,7 +83,7 @@ def test_energy_is_kept(case: str) -> None:
     assert off <= 100 * rtol * max(1.0, kinetic(run).max())
 
 
-def test_three_formulations_are_as_good_as_each_other() -> None:
+def test_three_formulations_conserve_energy_equally_well() -> None:
     """Over random motions of the five-bar: medians of what the energy is off by, over rtol, within a factor of 30."""
     random = np.random.default_rng(18)
     off: dict[str, list[float]] = {"reduced": [], "spf": [], "dae": []}
@@ -101,7 +101,7 @@ def test_three_formulations_are_as_good_as_each_other() -> None:
     assert max(map(max, off.values())) <= 100
 
 
-def test_a_reduced_run_stops_where_z_is_not_known_to_the_tolerance() -> None:
+def test_reduced_run_stops_where_z_is_less_accurate_than_rtol() -> None:
     """Towards the flat four-bars rounding is magnified by phi_z: it took 400,000 right-hand sides to say so."""
     overrides = {
         "formulation": "reduced", "t_end": 0.13, "solver.rtol": 4.5e-10,
@@ -115,7 +115,7 @@ def test_a_reduced_run_stops_where_z_is_not_known_to_the_tolerance() -> None:
     assert np.abs(run.energy - run.energy[0]).max() < 100 * 4.5e-10
 
 
-def test_a_motion_that_runs_away_is_no_singular_chart() -> None:
+def test_diverging_motion_is_not_reported_as_singular() -> None:
     """It said that phi_z's least singular value is nan: sampled velocity feedback that is too strong for its period."""
     overrides = {
         "formulation": "dae", "t_end": 1.4, "solver.rtol": 2e-5,

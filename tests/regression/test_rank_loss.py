@@ -23,14 +23,14 @@ def n_four_bar(N: int, rtol: float, **overrides: Any) -> Run:
 
 
 @pytest.mark.parametrize(("N", "rtol"), [(1, 1e-5), (2, 1e-11), (7, 1e-8)])
-def test_a_dozen_crossings(N: int, rtol: float) -> None:
+def test_crossings_of_rank_loss_stay_on_the_branch(N: int, rtol: float) -> None:
     run = n_four_bar(N, rtol)
     assert run.status == "done", run.message
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(N, 10.0), abs=min(1e4 * rtol, 1e-4))
 
 
 @pytest.mark.parametrize("N", [2, 7])
-def test_no_step_is_as_long_as_one_lucky_estimate_would_have_it(N: int) -> None:
+def test_step_size_growth_is_limited(N: int) -> None:
     """With SciPy's growth of a step, up to tenfold, one of these runs in ten is off by 1,000 to 12,000 times rtol."""
     wanted = [first_top_pin(N, float(t)) for t in range(11)]
     for rtol in np.geomspace(3e-9, 6e-8, 14).tolist():
@@ -40,7 +40,7 @@ def test_no_step_is_as_long_as_one_lucky_estimate_would_have_it(N: int) -> None:
 
 
 @pytest.mark.parametrize("t_end", [0.7, 0.7084500152, 0.75])
-def test_a_run_may_end_before_at_or_behind_a_crossing(t_end: float) -> None:
+def test_run_may_end_before_at_or_after_a_crossing(t_end: float) -> None:
     run = n_four_bar(1, 1e-10, t_end=t_end)
     assert run.status == "done", run.message
     assert run.t[-1] == t_end
@@ -48,13 +48,13 @@ def test_a_run_may_end_before_at_or_behind_a_crossing(t_end: float) -> None:
 
 
 @pytest.mark.parametrize(("rtol", "rhs"), [(1e-5, 48), (1e-7, 75)])
-def test_a_run_that_ends_well_before_a_crossing_costs_nothing_for_it(rtol: float, rhs: int) -> None:
+def test_run_far_from_a_crossing_costs_no_extra_evaluations(rtol: float, rhs: int) -> None:
     """The first is at 0.7085 s, of four squares at 0.7179 s; the numbers are the solver's own, with nobody watching."""
     for N in (1, 4):
         assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # of the interpolant
 
 
-def test_what_a_coarse_run_passes_over_is_crossed_when_it_is_run_again() -> None:
+def test_coarse_run_is_repeated_when_crossings_were_missed() -> None:
     """At 1e-3 steps pass over three rank losses before the first is noticed."""
     run = n_four_bar(4, 1e-3)
     assert run.status == "done", run.message
@@ -62,14 +62,14 @@ def test_what_a_coarse_run_passes_over_is_crossed_when_it_is_run_again() -> None
 
 
 @pytest.mark.parametrize("rtol", [1e-2, 1e-3])
-def test_steps_from_one_side_of_a_peak_to_behind_the_next_zero_are_noticed(rtol: float) -> None:
+def test_step_over_peak_and_zero_of_the_monitor_is_detected(rtol: float) -> None:
     """Rising at both ends: with forty squares that went unseen all the way, and the pin ended 0.08 m off."""
     run = n_four_bar(40, rtol)
     assert run.status == "done", run.message
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(40, 10.0), abs=1e-4)
 
 
-def test_what_is_recorded_across_a_crossing_is_as_good_as_elsewhere() -> None:
+def test_outputs_across_a_crossing_are_accurate() -> None:
     run = n_four_bar(2, 1e-10, t_end=0.8, solver__output_dt=0.01)
     exact = [first_top_pin(2, float(t)) for t in run.t[1:]]
     np.testing.assert_allclose(run.points["B0"][1:, :2], exact, rtol=0, atol=1e-8)
@@ -80,7 +80,7 @@ def test_what_is_recorded_across_a_crossing_is_as_good_as_elsewhere() -> None:
 @pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])
 @pytest.mark.parametrize("formulation", ["reduced", "spf"])
 @pytest.mark.parametrize("N", [1, 2, 7])
-def test_models_that_need_the_branch_from_J_stop(N: int, formulation: str, rtol: float) -> None:
+def test_formulations_that_cannot_cross_rank_loss_stop(N: int, formulation: str, rtol: float) -> None:
     run = n_four_bar(N, rtol, formulation=formulation)
     assert run.status == "stopped"
     assert "J loses rank" in run.message or "phi_z is singular" in run.message
@@ -90,7 +90,7 @@ def test_models_that_need_the_branch_from_J_stop(N: int, formulation: str, rtol:
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
-def test_a_start_at_a_singular_position(formulation: str) -> None:
+def test_start_where_J_loses_rank_is_rejected(formulation: str) -> None:
     """No coordinates help there, so none are proposed."""
     with pytest.raises(NumericalError, match=r"the start theta_0 = 0 is singular: J loses rank.*; start elsewhere$"):
         simulate("n_four_bar", {"formulation": formulation, "initial.q": {"theta_0": 0.0}})
@@ -176,7 +176,7 @@ output_dt = 0.1
 
 
 @pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-11])
-def test_a_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float) -> None:
+def test_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float) -> None:
     run = simulate(write_four_bar(tmp_path, ROCKER, "dae", rtol))
     theta, theta_dot = one_freedom.turning(four_bar, 0.5, SPEED, run.t)
     assert theta[-1] > 3 * np.pi  # in line at pi and at 3 pi
@@ -187,7 +187,7 @@ def test_a_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float
 
 @pytest.mark.parametrize("excess", [1e-2, 1e-4])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
-def test_branches_that_only_come_near_are_not_mistaken_for_crossing(tmp_path: Path, excess: float, rtol: float) -> None:
+def test_near_miss_of_branches_is_not_a_crossing(tmp_path: Path, excess: float, rtol: float) -> None:
     """With a longer rocker the rods are never in line, and its pin stays on the side where it was."""
 
     def near_miss(theta: float) -> one_freedom.State:
@@ -204,7 +204,7 @@ def test_branches_that_only_come_near_are_not_mistaken_for_crossing(tmp_path: Pa
 
 @pytest.mark.parametrize("scene", ["four_bar/turning", "five_bar/swing", "slider_crank"])
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
-def test_a_run_without_a_crossing_evaluates_nothing_more(scene: str, rtol: float) -> None:
+def test_run_without_crossing_costs_no_extra_evaluations(scene: str, rtol: float) -> None:
     """Three to begin, twelve a step, one where its end was put on the closure, three for the output inside the last."""
     overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.method": "DOP853", "t_end": 1.0}
     stats = simulate(scene, {**overrides, "solver.output_dt": 1.0}).stats

@@ -63,7 +63,7 @@ def test_bricard_from_the_command_line() -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_bricard_swings_over_and_back_in_its_period(formulation: str) -> None:
+def test_bricard_swings_with_its_period(formulation: str) -> None:
     overrides: dict[str, Any] = {"formulation": formulation, "t_end": 1.1 * BRICARD_PERIOD}
     overrides["event"] = [
         {"coordinate": "hinge_1", "of": "q_dot", "value": 0.0, "direction": 1},
@@ -87,7 +87,9 @@ def test_bricard_swings_over_and_back_in_its_period(formulation: str) -> None:
         ("slider_crank_spatial", 6.0, one_freedom.slider_crank_spatial),
     ],
 )
-def test_slider_cranks(scene: str, rate: float, mechanism: one_freedom.Mechanism, formulation: str) -> None:
+def test_slider_cranks_match_the_one_line_integral(
+    scene: str, rate: float, mechanism: one_freedom.Mechanism, formulation: str
+) -> None:
     run = simulate(scene, {"formulation": formulation, "t_end": 1.5, "solver.rtol": 1e-11, "solver.output_dt": 0.5})
     theta, theta_dot = one_freedom.turning(mechanism, 0.0, rate, run.t)
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= 1e-9
@@ -134,7 +136,7 @@ def test_n_four_bar(N: int) -> None:
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf"])
 @pytest.mark.parametrize("N", [1, 7, 40])
-def test_n_four_bar_in_its_chart(N: int, formulation: str) -> None:
+def test_n_four_bar_in_reduced_coordinates_matches_the_pendulum(N: int, formulation: str) -> None:
     run = simulate("n_four_bar", {"mechanism.N": N, "formulation": formulation, "solver.output_dt": 0.3})
     assert run.points["B0"][-1] == pytest.approx([*first_top_pin(N, 0.6), 0.0], abs=1e-8)
 
@@ -196,7 +198,7 @@ def test_pendulum_period(tmp_path: Path, formulation: str) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_pendulum_geared_to_a_wheel(tmp_path: Path, formulation: str) -> None:
+def test_geared_wheel_adds_its_reflected_inertia(tmp_path: Path, formulation: str) -> None:
     """A wheel that turns three times as fast, backwards, adds 9 of its moments of inertia to m l^2."""
     izz = 0.05
     coupling = '[[coupling]]\njoint = "wheel_turn"\nother = "swing"\nratio = -3.0\noffset = 0.4\n'
@@ -206,7 +208,7 @@ def test_pendulum_geared_to_a_wheel(tmp_path: Path, formulation: str) -> None:
     assert run.q_tree[:, run.column("wheel_turn")] == pytest.approx(0.4 - 3 * run.q_tree[:, run.column("swing")])
 
 
-def test_pendulum_on_a_distance(tmp_path: Path) -> None:
+def test_distance_loop_gives_the_pendulum_period(tmp_path: Path) -> None:
     loop = """independent = ["x"]
 [q_guess]
 x = 0.95
@@ -224,7 +226,7 @@ length = 1.0
     assert run.t[-1] == pytest.approx(one_freedom.pendulum_period(start), abs=1e-9)
 
 
-def test_trial_stages_far_away_are_not_followed() -> None:
+def test_far_trial_stages_are_rejected_without_following_sigma() -> None:
     """At 1e-3 a step proposes stages 1e5 turns of the crank away: following sigma there took a minute."""
     overrides = {"formulation": "reduced", "t_end": 5.0, "solver.method": "DOP853", "solver.rtol": 1e-3}
     run = simulate("slider_crank", overrides)

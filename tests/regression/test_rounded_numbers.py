@@ -48,7 +48,7 @@ def bennett(folder: Path, digits: int) -> Path:
 
 
 @pytest.mark.parametrize("digits", [8, 7, 6])
-def test_assembled_where_the_exact_one_is(digits: int, tmp_path: Path) -> None:
+def test_rounded_mechanism_assembles_like_the_exact_one(digits: int, tmp_path: Path) -> None:
     """Not where another start happens to leave a little less open, here on the other side of a folded pose."""
     exact, found = load(bennett(tmp_path / "exact", 17)), load(bennett(tmp_path / "rounded", digits))
     assert np.abs(exact.assembled.phi).max() < 1e-12
@@ -59,7 +59,7 @@ def test_assembled_where_the_exact_one_is(digits: int, tmp_path: Path) -> None:
     assert np.abs(found.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
 
 
-def test_the_way_to_a_configuration_leaves_no_trace(tmp_path: Path) -> None:
+def test_sigma_does_not_depend_on_the_path(tmp_path: Path) -> None:
     """Within what is open, which is what counts as closed, z is the same from everywhere."""
     mechanism = load(bennett(tmp_path / "rounded", 6))
     assert np.abs(mechanism.assembled.phi).max() > 1e-9
@@ -68,7 +68,7 @@ def test_the_way_to_a_configuration_leaves_no_trace(tmp_path: Path) -> None:
     assert_close(np.ptp(ends, axis=0), 0.0, 1e-13)
 
 
-def test_torques_of_a_motion_give_it_back(tmp_path: Path) -> None:
+def test_inverse_dynamics_reproduces_the_motion_of_rounded_mechanism(tmp_path: Path) -> None:
     """To rounding too, with loops that close to six digits."""
     scene = bennett(tmp_path / "rounded", 6) / "default.scene.toml"
     scene.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n')
@@ -76,7 +76,7 @@ def test_torques_of_a_motion_give_it_back(tmp_path: Path) -> None:
     assert_integrates_back(scene, overrides, inverse_dynamics(scene, overrides))
 
 
-def test_of_coordinates_as_good_as_each_other_rounding_chooses_none() -> None:
+def test_rounding_does_not_select_equivalent_coordinates() -> None:
     """Two legs alike, each with a rod that spins between two joints, in axes turned at random."""
     random = np.random.default_rng(1)
     leg = random.normal(size=(3, 4))

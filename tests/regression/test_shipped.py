@@ -54,12 +54,12 @@ def mechanism(name: str) -> Mechanism:
     return load(name)
 
 
-def test_each_is_known_here() -> None:
+def test_all_shipped_mechanisms_are_covered() -> None:
     assert shipped() == sorted(MOBILITY)
 
 
 @pytest.mark.parametrize("name", MOBILITY)
-def test_freedoms(name: str) -> None:
+def test_number_of_freedoms_is_correct(name: str) -> None:
     found = check(mechanism(name))
     assert (found.n, found.d, found.rows, found.rank) == MOBILITY[name]
     assert len(found.redundant) == found.rows - found.rank
@@ -69,11 +69,11 @@ def test_freedoms(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(MOBILITY) - set(OF_OTHERS)))
-def test_nothing_to_warn_about(name: str) -> None:
+def test_shipped_mechanisms_have_no_warnings(name: str) -> None:
     assert check(mechanism(name)).warnings == ()
 
 
-def test_each_says_what_it_is() -> None:
+def test_shipped_files_have_descriptions() -> None:
     for name, about, scenes in list_catalogue():
         assert len(about.split()) > 5, name
         assert "default" in scenes, name
@@ -81,7 +81,7 @@ def test_each_says_what_it_is() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(shipped()) - {"n_four_bar"}))
-def test_each_moving_link_can_be_seen(name: str) -> None:
+def test_moving_links_have_visible_shapes(name: str) -> None:
     for file in (library() / name).glob("*.urdf"):
         for link in ElementTree.parse(file).getroot().findall("link"):
             if link.find("inertial") is not None:
@@ -89,7 +89,7 @@ def test_each_moving_link_can_be_seen(name: str) -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_each_scene_runs(scene: str) -> None:
+def test_shipped_scene_runs(scene: str) -> None:
     run = simulate(scene, {"t_end": 0.01, "solver.output_dt": None})
     assert run.status == "done", run.message
     assert run.max_phi <= 1e-10
@@ -113,7 +113,7 @@ def drift(run: Run) -> float:
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("name", FREE)
-def test_energy_is_kept(name: str, formulation: str) -> None:
+def test_energy_is_conserved_without_control(name: str, formulation: str) -> None:
     t_end = FREE[name]
     overrides = {"formulation": formulation, "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": t_end / 100}
     run = simulate(name, overrides)
@@ -124,7 +124,7 @@ def test_energy_is_kept(name: str, formulation: str) -> None:
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
-def test_energy_of_talos_goes_into_its_dampers_and_friction(formulation: str) -> None:
+def test_talos_energy_equals_work_of_dampers_and_friction(formulation: str) -> None:
     run = simulate("talos", {"formulation": formulation, "t_end": 0.1, "solver.output_dt": 1e-4})
     power = np.sum(run.mechanism.springs.joint_damping * run.v_tree**2, axis=1)
     assert len(power) % 2 == 1
@@ -200,7 +200,9 @@ def assert_same_motion(folder: Path) -> None:
 
 @pytest.mark.parametrize("ends", [("world", "slider_link"), ("slider_link", "world")], ids=" to ".join)
 @pytest.mark.parametrize(("kind", "rows"), [("prismatic", 5), ("cylindrical", 4)])
-def test_cut_at_the_rail(tmp_path: Path, kind: str, rows: int, ends: tuple[str, str]) -> None:
+def test_loop_cut_at_the_rail_gives_the_same_motion(
+    tmp_path: Path, kind: str, rows: int, ends: tuple[str, str]
+) -> None:
     """The slider pinned to the rod in the tree, its rail a loop: redundant rows, the same motion."""
     tree = ElementTree.parse(SLIDER_CRANK / "slider_crank.urdf")
     joint = next(j for j in tree.getroot().findall("joint") if j.get("name") == "slider")
@@ -225,7 +227,7 @@ OTHER_PINS = {
 
 
 @pytest.mark.parametrize(("loop", "rows"), OTHER_PINS.values(), ids=OTHER_PINS)
-def test_closed_with_more_rows_than_it_takes(tmp_path: Path, loop: str, rows: int) -> None:
+def test_redundant_loop_types_give_the_same_motion(tmp_path: Path, loop: str, rows: int) -> None:
     """What a planar pin is in space, told by a ball, a hinge, a universal joint."""
     (tmp_path / "slider_crank.urdf").write_text((SLIDER_CRANK / "slider_crank.urdf").read_text())
     text = (SLIDER_CRANK / "mechanism.toml").read_text()
@@ -245,7 +247,7 @@ def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
     assert simulate(name, {"formulation": "spf", "t_end": 0.01}).status == "done"
 
 
-def test_redundant_rows_are_off_together_or_not_at_all() -> None:
+def test_contradictory_w_of_redundant_rows_is_rejected() -> None:
     """w of Bricard's hinge has four freedoms for five rows."""
     overrides = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
     with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):

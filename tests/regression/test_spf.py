@@ -26,7 +26,7 @@ def eq_17(run: Callable[..., Run], epsilon: float, w: list[float]) -> Run:
 
 @starts
 @epsilons
-def test_eq_8_as_printed_is_eq_17(run: Callable[..., Run], epsilon: float, w: list[float]) -> None:
+def test_eq_8_as_printed_agrees_with_eq_17(run: Callable[..., Run], epsilon: float, w: list[float]) -> None:
     """All rates too: z_dot is reported with the exact w, not with phi, whose error epsilon would divide."""
     printed, levels = eq_8(run, epsilon, w), eq_17(run, epsilon, w)
     assert printed.stats["method"] == "Radau"
@@ -36,7 +36,7 @@ def test_eq_8_as_printed_is_eq_17(run: Callable[..., Run], epsilon: float, w: li
 
 
 @starts
-def test_eq_8_as_printed_bears_any_epsilon(run: Callable[..., Run], w: list[float]) -> None:
+def test_eq_8_as_printed_works_for_any_epsilon(run: Callable[..., Run], w: list[float]) -> None:
     """Down to where epsilon divides rounding errors: a bounded number of right-hand sides, and outputs as good."""
     counts = []
     for epsilon in (1e-4, 1e-8, 1e-12):
@@ -73,7 +73,7 @@ TABLE = [
 
 
 @pytest.mark.parametrize(("convention", "start", "errors"), TABLE)
-def test_where_C_takes_its_velocity(
+def test_coriolis_velocity_convention_has_the_expected_error(
     run: Callable[..., Run], convention: str, start: str, errors: dict[float, float]
 ) -> None:
     """O(epsilon) from rest in both conventions, and from a moving start with rho q_dot; not with the actual z_dot."""

@@ -35,7 +35,7 @@ BUDGETS = {1e-4: 940, 1e-6: 950, 1e-8: 1_600, 1e-9: 1_850, 1e-10: 2_000}
 
 
 @pytest.mark.parametrize("rtol", BUDGETS)
-def test_the_error_along_tracking_is_the_tolerance(
+def test_error_along_tracking_is_within_tolerance(
     run: Callable[..., Run], exact: Callable[[float], Array], rtol: float
 ) -> None:
     ours = run("five_bar/tracking", formulation="spf", solver__rtol=rtol, solver__output_dt=0.01)
@@ -46,7 +46,7 @@ def test_the_error_along_tracking_is_the_tolerance(
 
 
 @pytest.mark.parametrize(("rtol", "budget"), [(1e-6, 2_040), (1e-8, 2_940)])
-def test_the_dae_does_as_well(
+def test_dae_error_along_tracking_is_within_tolerance(
     run: Callable[..., Run], exact: Callable[[float], Array], rtol: float, budget: int
 ) -> None:
     """On its closure at every output, though no step is edited."""
@@ -57,7 +57,7 @@ def test_the_dae_does_as_well(
     assert max(np.abs(FIVE_BAR.phi(q)).max() for q in ours.q_tree) <= 1e-12
 
 
-def test_what_becomes_stiff_on_the_way_is_noticed() -> None:
+def test_auto_detects_stiffness_during_the_run() -> None:
     """A damper that grips while the spring beside it, stretched at the start, still pushes: at first modes grow."""
     case = next(case for case in GROUPS["spring"]() if case.name == "line 1e+06 N/m, damped")
     longer = {**case.overrides, "t_end": 0.4, "solver.output_dt": 0.1}
@@ -66,7 +66,7 @@ def test_what_becomes_stiff_on_the_way_is_noticed() -> None:
     assert auto.rhs < 0.6 * explicit.rhs
 
 
-def test_a_controller_of_the_callers_costs_as_many_right_hand_sides() -> None:
+def test_callers_controller_costs_as_many_right_hand_sides() -> None:
     """Its gradient is known to nobody: the Jacobian is made of differences, as with eq. 14's own."""
     overrides = {"formulation": "reduced", "t_end": 3.0}
     known = simulate("five_bar/set_point", overrides)
@@ -99,7 +99,7 @@ MODES = {
 
 
 @pytest.mark.parametrize("case", MODES)
-def test_stiffness_follows_the_modes(case: str) -> None:
+def test_stiffness_detection_follows_the_modes(case: str) -> None:
     modes, t_end, stiff = MODES[case]
     random = np.random.default_rng(0)
     blocks = np.zeros((len(modes), len(modes)))

@@ -20,7 +20,7 @@ formulations = pytest.mark.parametrize("formulation", FORMULATIONS)
 
 @readings
 @formulations
-def test_the_motion_is_the_independent_one(run: Callable[..., Run], file: str, formulation: str) -> None:
+def test_swing_matches_the_independent_integration(run: Callable[..., Run], file: str, formulation: str) -> None:
     reference = trajectory(file)
     ours = run(reference.name, formulation=formulation, solver__rtol=1e-10)
     rows = reference.rows(ours)
@@ -39,7 +39,7 @@ def test_formulations_agree_pairwise(run: Callable[..., Run], file: str) -> None
         assert_close(a.v_tree[-1], b.v_tree[-1], 1e-8)
 
 
-def test_the_notes_figure_at_two_seconds(run: Callable[..., Run]) -> None:
+def test_swing_at_two_seconds_matches_the_notes(run: Callable[..., Run]) -> None:
     ours = run("five_bar/swing", formulation="dae", solver__rtol=1e-10)
     assert_close(ours.q_tree[-1, [0, 2]], [-1.0561629, -1.2552036], 5.1e-8)
 
@@ -54,7 +54,7 @@ def test_energy_is_conserved(run: Callable[..., Run], file: str, formulation: st
 
 @readings
 @formulations
-def test_every_output_is_closed(run: Callable[..., Run], file: str, formulation: str) -> None:
+def test_loops_are_closed_at_every_output(run: Callable[..., Run], file: str, formulation: str) -> None:
     """By the numpy five-bar's phi and J, not by what the run says of itself."""
     reference = trajectory(file)
     ours, model = run(reference.name, formulation=formulation, solver__rtol=1e-10), REFERENCES[reference.mechanism]
