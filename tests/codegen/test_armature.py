@@ -1,4 +1,4 @@
-"""Rotors on the joints of the five-bar: every term and every way to move it against the appendix in numpy."""
+"""Rotor inertia at the five-bar's joints: every term and formulation against the appendix in NumPy."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ START = np.array([-1.1, -2.0])
 
 @dataclass(frozen=True)
 class Geared(FiveBar):
-    """A five-bar whose joints turn rotors: kg m^2 as seen from the joint, their axes at rest otherwise."""
+    """A five-bar with rotors at its joints; inertias in kg m^2 as seen from the joint."""
 
     rotors: tuple[float, ...] = (0.03, 0.008, 0.05, 0.002)
 
     def D_tree(self, q_tree: Array) -> Array:
-        """D' of eq. 24 and what the rotors add, (4, 4)."""
+        """Return D' of eq. 24 plus the rotors' inertia, (4, 4)."""
         return super().D_tree(q_tree) + np.diag(self.rotors)
 
 
@@ -57,7 +57,7 @@ def mechanism(folder: Path) -> Mechanism:
 
 
 def states() -> list[tuple[Array, Array, Array]]:
-    """Closed configurations, velocities on the closure, torques."""
+    """Return closed configurations, velocities q_dot and torques."""
     random, found = np.random.default_rng(11), []
     for _ in range(20):
         q_tree = GEARED.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.4, 0.4, 2))
@@ -65,7 +65,7 @@ def states() -> list[tuple[Array, Array, Array]]:
     return found
 
 
-def test_terms_have_the_rotors(mechanism: Mechanism) -> None:
+def test_terms_include_rotor_inertia(mechanism: Mechanism) -> None:
     for q_tree, q_dot, _ in states():
         v_tree = GEARED.rho(q_tree) @ q_dot
         found = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
@@ -76,8 +76,8 @@ def test_terms_have_the_rotors(mechanism: Mechanism) -> None:
         assert_close(found.energy, GEARED.energy(q_tree, v_tree), 1e-11)
 
 
-def test_accelerations_have_the_rotors(mechanism: Mechanism) -> None:
-    """In NumPy, in C++ with Pinocchio's terms and with compiled ones, and of CasADi."""
+def test_accelerations_include_rotor_inertia(mechanism: Mechanism) -> None:
+    """In NumPy, in C++ with Pinocchio's and with compiled terms, and by CasADi."""
     cores = [_core.Core(core_table(mechanism)), _core.Core(core_table(mechanism, compile_terms(mechanism)))]
     expressions = symbolic(mechanism)
     for q_tree, q_dot, u in states():
@@ -97,8 +97,8 @@ def test_accelerations_have_the_rotors(mechanism: Mechanism) -> None:
         assert_close(float(expressions.kinetic(q_tree, v_tree, expressions.values)), kinetic, EXACT * max(1, kinetic))
 
 
-def swung(five_bar: FiveBar) -> Array:
-    """q and q_dot at t = 1 s, by the appendix and SciPy."""
+def integrate_appendix(five_bar: FiveBar) -> Array:
+    """Return q and q_dot at t = 1 s, by the appendix and SciPy."""
 
     def f(t: float, y: Array) -> Array:
         return np.concatenate([y[2:], five_bar.acceleration(five_bar.sigma(y[:2]), y[2:], np.zeros(2))])
@@ -108,28 +108,30 @@ def swung(five_bar: FiveBar) -> Array:
 
 
 @pytest.fixture(scope="module")
-def swing() -> Array:
-    """With rotors; without them it swings elsewhere."""
-    found = swung(GEARED)
-    assert np.abs(swung(FIVE_BAR) - found).max() > 0.1
+def end_of_swing() -> Array:
+    """Return q and q_dot at t = 1 s with rotors, which differ from those without."""
+    found = integrate_appendix(GEARED)
+    assert np.abs(integrate_appendix(FIVE_BAR) - found).max() > 0.1
     return found
 
 
 @pytest.mark.parametrize("generated", [False, True])
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
-def test_the_swing_is_that_of_the_appendix(formulation: str, generated: bool, folder: Path, swing: Array) -> None:
+def test_swing_with_rotors_is_that_of_the_appendix(
+    formulation: str, generated: bool, folder: Path, end_of_swing: Array
+) -> None:
     whose = "generated" if generated else "pinocchio"
     run = simulate(folder, {"formulation": formulation, "solver.terms": whose})
     assert run.stats["terms"] == whose
-    assert_close(run.q_tree[-1][[0, 2]], swing[:2], 1e-8)
-    assert_close(run.v_tree[-1][[0, 2]], swing[2:], 1e-8)
+    assert_close(run.q_tree[-1][[0, 2]], end_of_swing[:2], 1e-8)
+    assert_close(run.v_tree[-1][[0, 2]], end_of_swing[2:], 1e-8)
     assert_close(run.energy, GEARED.energy(GEARED.sigma(START), np.zeros(4)), 1e-9)
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
-def test_the_readable_equations_have_the_rotors(formulation: str, folder: Path, swing: Array) -> None:
+def test_reference_formulations_include_rotor_inertia(formulation: str, folder: Path, end_of_swing: Array) -> None:
     problem = as_ivp(folder, {"formulation": formulation})
     found = solve_ivp(problem.f, problem.t_span, problem.y0, "DOP853", rtol=1e-10, atol=1e-12)
     at = problem.terms(1.0, found.y[:, -1])
-    assert_close(at.q, swing[:2], 1e-8)
-    assert_close(at.q_dot, swing[2:], 1e-8)
+    assert_close(at.q, end_of_swing[:2], 1e-8)
+    assert_close(at.q_dot, end_of_swing[2:], 1e-8)

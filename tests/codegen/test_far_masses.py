@@ -1,4 +1,4 @@
-"""Compiled terms with masses far from those of the mechanism's files are as good as Pinocchio's."""
+"""Compiled terms are as accurate as Pinocchio's with masses far from those of the mechanism's files."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tests.analytic.many_digits import ManyDigits, exact
 
 SCENES = {"stewart": 0.3, "five_bar/swing": 0.5, "four_bar/turning": 0.5}  # s
 SETS = 6
-# A leg so light that the spring on it alone would give it 1e8 m/s^2
+# A leg so light that its spring alone would accelerate it with 1e8 m/s^2
 LIGHT_LEG = {"link.piston_1.mass": 1e-6, "link.cylinder_1.mass": 1e-6}
-# A set of masses that stopped the reduced model with a false reason
+# A set of masses with which the reduced model once stopped for a wrong reason
 STOPPED = {
     "link.cylinder_1.mass": 2e-5, "link.piston_1.mass": 1e-6, "link.cylinder_2.mass": 20.0,
     "link.piston_2.mass": 1e-4, "link.cylinder_4.mass": 3e-4, "link.piston_5.mass": 8e-6,
@@ -27,7 +27,7 @@ STOPPED = {
 
 
 def masses(scene: str, random: np.random.Generator) -> dict[str, float]:
-    """About half of a mechanism's masses anywhere from 1e-6 to 1e3 kg."""
+    """Return random masses from 1e-6 to 1e3 kg for about half of a mechanism's links."""
     mechanism = load(scene.partition("/")[0])
     names = [name for name in values_of(mechanism.spec, mechanism.urdf) if name.endswith(".mass")]
     return {name: float(10 ** random.uniform(-6, 3)) for name in names if random.random() < 0.5}
@@ -35,7 +35,7 @@ def masses(scene: str, random: np.random.Generator) -> dict[str, float]:
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_status_and_right_hand_sides_are_those_of_pinocchios_terms(scene: str, formulation: str) -> None:
+def test_extreme_masses_take_as_many_steps_as_with_pinocchios_terms(scene: str, formulation: str) -> None:
     random = np.random.default_rng(3)
     for _ in range(SETS):
         overrides: dict[str, Any] = {**masses(scene, random), "formulation": formulation, "controller": None}
@@ -46,7 +46,7 @@ def test_status_and_right_hand_sides_are_those_of_pinocchios_terms(scene: str, f
 
 
 @pytest.mark.parametrize("overrides", [LIGHT_LEG, STOPPED], ids=["light leg", "false reason"])
-def test_the_general_elimination_takes_over_and_is_counted(overrides: dict[str, float]) -> None:
+def test_general_elimination_takes_over_and_is_counted(overrides: dict[str, float]) -> None:
     wanted = {**overrides, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
     theirs, ours = (simulate("stewart", {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated"))
     assert ours.status == theirs.status == "done"
@@ -56,15 +56,15 @@ def test_the_general_elimination_takes_over_and_is_counted(overrides: dict[str, 
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_masses_of_the_files_are_eliminated_as_compiled(scene: str) -> None:
+def test_masses_of_the_files_need_no_general_elimination(scene: str) -> None:
     for formulation in ("dae", "reduced"):
         overrides = {"formulation": formulation, "controller": None, "t_end": 0.3, "solver.terms": "generated"}
         run = simulate(scene, overrides)
         assert run.stats["rhs_by_terms"] == {"generated": run.stats["rhs"]}
 
 
-def test_acceleration_of_a_light_leg_has_all_digits() -> None:
-    """Against forty digits of the tests' own model."""
+def test_acceleration_of_a_light_leg_has_twelve_digits() -> None:
+    """The reference is the tests' own model with forty digits."""
     wanted = {**LIGHT_LEG, "formulation": "dae", "controller": None, "solver.terms": "generated"}
     ready = prepare(load_scene("stewart", wanted))
     ready.begin()
@@ -75,10 +75,10 @@ def test_acceleration_of_a_light_leg_has_all_digits() -> None:
     assert np.abs(ready.loop.rhs(0.01, y)[nq:] - right).max() <= 1e-12 * np.abs(right).max()
 
 
-def test_a_library_does_not_depend_on_the_masses_it_was_first_asked_for_with(
+def test_a_library_does_not_depend_on_the_masses_of_the_first_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither its order of elimination nor whether it can be checked: rounding with these masses is 1e-9."""
+    """Neither its elimination order nor its check depends on them. Rounding errors with these masses are 1e-9."""
     names = []
     for k, overrides in enumerate([{}, STOPPED]):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(k)))
@@ -86,8 +86,8 @@ def test_a_library_does_not_depend_on_the_masses_it_was_first_asked_for_with(
     assert names[0] == names[1]
 
 
-def test_each_member_of_an_ensemble_is_judged_by_its_own_masses() -> None:
-    """A member is the run with its numbers to the bit, whichever thread it is in and whatever ran there before."""
+def test_general_elimination_is_chosen_per_ensemble_member() -> None:
+    """A member is bitwise equal to the run with its parameters, in any thread and after any other member."""
     overrides: dict[str, Any] = {"formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-9}
     overrides["solver.terms"] = "generated"
     light = {name: [1e-6, 1.0] for name in LIGHT_LEG}

@@ -15,7 +15,7 @@ from tests.analytic.five_bar import FIVE_BAR
 from tests.codegen.test_compiled import COUPLED, FREE
 from tests.native.loops import started
 
-STEP = 1e-30  # of a complex step, which takes no differences
+STEP = 1e-30  # of a complex step, which has no cancellation
 K_P, K_V = 30.0, 4.0
 
 
@@ -32,19 +32,19 @@ def five_bar(formulation: str, controlled: bool) -> Any:
 
 
 def control(controlled: bool, q: Any, q_dot: Any) -> Any:
-    """Eq. 14's torque but for what does not change with the state."""
+    """Return the part of eq. 14's torque that depends on the state."""
     return -K_P * q - K_V * q_dot if controlled else np.zeros(2)
 
 
 @pytest.mark.parametrize("controlled", [False, True])
-def test_the_daes_jacobian_is_that_of_the_appendix(controlled: bool) -> None:
-    """Off the closure too."""
+def test_jacobian_of_the_dae_is_that_of_the_appendix(controlled: bool) -> None:
+    """At states on and off the manifold."""
     loop, random = five_bar("dae", controlled), np.random.default_rng(0)
     here = loop.y[:4]
     for _ in range(20):
         y = np.concatenate([here + random.uniform(-0.3, 0.3, 4), random.uniform(-3, 3, 4)])
         rate = loop.rhs(0.0, y)
-        # what the target's constants make of u: eq. 1 is linear in it
+        # u follows from the acceleration, which is linear in it
         D, J = FIVE_BAR.D_tree(y[:4]), FIVE_BAR.J(y[:4])
         u = _applied(D, J, rate[4:] - FIVE_BAR.acceleration_and_multipliers(y[:4], y[4:], np.zeros(2))[0])
         wanted = np.zeros((8, 8))
@@ -57,7 +57,7 @@ def test_the_daes_jacobian_is_that_of_the_appendix(controlled: bool) -> None:
 
 
 @pytest.mark.parametrize("controlled", [False, True])
-def test_the_reduced_models_jacobian_is_that_of_the_appendix(controlled: bool) -> None:
+def test_jacobian_of_the_reduced_model_is_that_of_the_appendix(controlled: bool) -> None:
     loop, random = five_bar("reduced", controlled), np.random.default_rng(1)
     start = loop.y[:2]
     for _ in range(20):
@@ -69,20 +69,20 @@ def test_the_reduced_models_jacobian_is_that_of_the_appendix(controlled: bool) -
         for k in range(4):
             dq, dv = 1j * STEP * np.eye(4)[k, :2], 1j * STEP * np.eye(4)[k, 2:]
             change = control(controlled, dq, dv)
-            moved = here + FIVE_BAR.rho(here) @ dq  # the closure to first order, which is all there is
+            moved = here + FIVE_BAR.rho(here) @ dq  # to first order, which a complex step makes exact
             wanted[2:, k] = FIVE_BAR.acceleration(moved, y[2:] + dv, u + change).imag / STEP
         assert np.abs(loop.jacobian(0.0, y) - wanted).max() <= 1e-10 * np.abs(wanted).max()
 
 
 def _applied(D: Any, J: Any, a: Any) -> Any:
-    """The u of theta_1 and theta_3 that adds a to the acceleration of the closed loops."""
+    """Return the torques at theta_1 and theta_3 that add a to the acceleration."""
     inverse = np.linalg.inv(np.block([[D, -J.T], [J, np.zeros((2, 2))]]))[:4, :4]
     return np.linalg.lstsq(inverse[:, [0, 2]], a, rcond=None)[0]
 
 
 @pytest.mark.parametrize("name", ["bricard", "flyball", FREE, COUPLED])
-def test_other_daes_jacobians_are_the_differences(name: str | int, tmp_path: Path) -> None:
-    """Extrapolated central ones of the general core, along motions that keep quaternions' lengths."""
+def test_jacobians_of_other_daes_agree_with_differences(name: str | int, tmp_path: Path) -> None:
+    """The differences are extrapolated and central, of the general core, along motions that keep quaternions' norms."""
     folder = name if isinstance(name, str) else str(random_mechanism(name).write(tmp_path / "mechanism"))
     mechanism = load(folder)
     compile_terms(mechanism)
@@ -119,10 +119,12 @@ def dae(mechanism: str, terms: str, folder: Path) -> Any:
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
-def test_an_implicit_run_counts_no_right_hand_sides_for_its_jacobians(formulation: str) -> None:
+def test_exact_jacobians_cost_no_right_hand_sides(formulation: str) -> None:
     overrides = {"formulation": formulation, "solver.method": "Radau", "solver.rtol": 1e-6, "t_end": 1.0}
     ours, theirs = (simulate("five_bar/swing", {**overrides, "solver.terms": x}) for x in ("generated", "pinocchio"))
     assert ours.stats["jacobians"] == theirs.stats["jacobians"] > 0
     assert np.abs(ours.q_tree[-1] - theirs.q_tree[-1]).max() < 1e-5
     assert ours.stats["differences"] == theirs.stats["differences"] == 0
-    assert ours.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.02)  # the general core's are exact too
+    assert ours.stats["rhs"] == pytest.approx(
+        theirs.stats["rhs"], rel=0.02
+    )  # the general core's Jacobians are exact too

@@ -1,4 +1,4 @@
-"""The CasADi functions that a person gets, against the reference's terms and CasADi's own derivatives."""
+"""The public CasADi functions, against the reference's terms and CasADi's derivatives."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.conftest import assert_close
 
 
 @pytest.mark.parametrize("name", ["five_bar", "slider_crank_spatial", "flyball", "stewart"])
-def test_functions_are_the_terms(name: str) -> None:
+def test_symbolic_functions_evaluate_to_the_terms(name: str) -> None:
     mechanism, found, random = load(name), symbolic(name), np.random.default_rng(5)
     n, p = mechanism.n, found.values
     assert (found.coordinates, len(found.parameters)) == (mechanism.coordinates, len(p))
@@ -36,8 +36,8 @@ def test_functions_are_the_terms(name: str) -> None:
             assert_close(np.array(ours), theirs, 1e-10 * max(1.0, float(np.abs(theirs).max(initial=0.0))))
 
 
-def test_derivatives_are_what_casadi_makes_of_them() -> None:
-    """J is that of phi; the power of gravity is the rate of the potential energy."""
+def test_casadi_derivatives_of_symbolic_functions_are_consistent() -> None:
+    """J is the Jacobian of phi, and the force of gravity is the gradient of the potential energy."""
     found = symbolic("five_bar")
     q = cs.SX.sym("q", 4)
     gradient = cs.Function("gradient", [q], [cs.jacobian(found.phi(q, found.values), q)])
@@ -47,7 +47,7 @@ def test_derivatives_are_what_casadi_makes_of_them() -> None:
     assert_close(np.array(h(at)), np.array(found.bias_tree(at, np.zeros(4), found.values)), 1e-12)
 
 
-def test_numbers_are_arguments_by_name() -> None:
+def test_parameters_are_named_arguments() -> None:
     found = symbolic("five_bar")
     named = dict(zip(found.parameters, found.values, strict=True))
     mechanism = load("five_bar")
@@ -60,7 +60,7 @@ def test_numbers_are_arguments_by_name() -> None:
     assert float(found.potential(at, light)) == 0.0 != float(found.potential(at, found.values))
 
 
-def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_symbolic_without_casadi_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "casadi", None)
     with pytest.raises(InputError, match=r"pip install ckc_pin\[symbolic\]"):
         ckc_pin.symbolic("five_bar")

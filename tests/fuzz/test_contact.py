@@ -1,4 +1,4 @@
-"""The fuzz suite for contact: its references against closed forms, and what its judges see."""
+"""Fuzz suite for contact: its references against closed forms, and its judges on correct and wrong runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ G = 9.81
 
 
 def stack(masses: list[float], gravity: float = 0.0) -> dict[str, str]:
-    """Slides one on another along x, pulled back by gravity."""
+    """Return the files of sliders on top of each other along x, with gravity along -x."""
     parts, above = ['<link name="base"/>'], "base"
     for k, mass in enumerate(masses):
         parts.append(
@@ -41,23 +41,23 @@ def stack(masses: list[float], gravity: float = 0.0) -> dict[str, str]:
     return {"mechanism.toml": mechanism, "m.urdf": f'<robot name="m">{"".join(parts)}</robot>'}
 
 
-def law(masses: list[float], rates: list[float], e: list[float]) -> tuple[Array, float]:
-    """World velocities after the impact of a stack whose gaps are all closed, and the energy lost."""
+def impact_velocities(masses: list[float], rates: list[float], e: list[float]) -> tuple[Array, float]:
+    """Return world velocities after the impact of a stack without gaps, and the energy lost."""
     bodies = np.tril(np.ones((len(masses), len(masses))))
     impact = answer_impact(bodies.T @ np.diag(masses) @ bodies, np.eye(len(masses)), np.array(rates), np.array(e))
     return bodies @ impact.v, impact.lost
 
 
-def test_the_law_answers_a_cradle_body_by_body() -> None:
-    """Equal masses in contact between walls far away: the last one leaves at the speed of the first."""
-    after, lost = law([1.0] * 4, [0.0, 0.0, 0.0, -1.0], [1.0] * 4)
-    # the last body flies in from above, the first one bounces off the ground, and the last one leaves again
+def test_impact_law_propagates_through_a_cradle() -> None:
+    """Equal masses in contact: the last one leaves at the speed of the first."""
+    after, lost = impact_velocities([1.0] * 4, [0.0, 0.0, 0.0, -1.0], [1.0] * 4)
+    # the last body hits the stack, the first one bounces off the ground, and the last one leaves again
     assert_close(after, [0.0, 0.0, 0.0, 1.0], 1e-14)
     assert lost == 0.0
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_the_law_leaves_no_stop_approaching_and_loses_what_it_says(seed: int) -> None:
+def test_impact_law_leaves_no_stop_approaching_and_balances_energy(seed: int) -> None:
     random = np.random.default_rng(seed)
     n, m = int(random.integers(1, 6)), int(random.integers(1, 7))
     root = random.normal(size=(n, n)) * 10 ** random.uniform(-2, 2, n)
@@ -73,7 +73,7 @@ def test_the_law_leaves_no_stop_approaching_and_loses_what_it_says(seed: int) ->
         assert_close(0.5 * impact.v @ D @ impact.v + impact.lost, 0.5 * size**2, 1e-9 * size**2)
 
 
-def test_one_stop_alone_obeys_newton() -> None:
+def test_a_single_impact_obeys_newtons_law() -> None:
     random = np.random.default_rng(3)
     root = random.normal(size=(3, 3))
     D, n, v = root @ root.T, random.normal(size=(1, 3)), random.normal(size=3)
@@ -84,15 +84,15 @@ def test_one_stop_alone_obeys_newton() -> None:
 
 
 @pytest.mark.parametrize(("k", "count"), [(0, 3), (1, 31), (2, 314)])
-def test_the_slides_count_pi(k: int, count: int) -> None:
-    """A unit mass between a wall and one of 100^k: floor(pi 10^k) impacts."""
+def test_reference_of_slides_counts_collisions_that_give_pi(k: int, count: int) -> None:
+    """A unit mass between a wall and a mass of 100^k has floor(pi 10^k) impacts."""
     model = read(stack([1.0, 100.0**k]))
     elastic = Contact(lower=0.0, restitution=1.0)
     history = Slides(model, {"x0": elastic, "x1": elastic}).run(np.array([1.0, 1.0]), np.array([0.0, -1.0]), 20.0)
     assert len(history.impacts) == count
 
 
-def test_a_slide_bounces_sticks_and_slides_as_in_closed_form() -> None:
+def test_reference_of_slides_agrees_with_closed_forms() -> None:
     model = read(stack([2.0], G))
     history = Slides(model, {"x0": Contact(lower=0.0, restitution=0.5)}).run(np.array([1.0]), np.zeros(1), 2.0)
     flight = np.sqrt(2 / G)
@@ -101,13 +101,13 @@ def test_a_slide_bounces_sticks_and_slides_as_in_closed_form() -> None:
     assert len(found) > 10
     assert_close(found, ends[: len(found)], 1e-12)
     rubbing = Slides(model, {"x0": Contact(friction=30.0)}).run(np.zeros(1), np.array([3.0]), 2.0)
-    stops_after = 3.0 / (G + 15.0)  # 30 N on 2 kg, which hold it then
+    stops_after = 3.0 / (G + 15.0)  # 30 N on 2 kg, which then sticks
     q, v = rubbing.at(np.array([stops_after + 0.1]))
     assert_close(q[0, 0], 1.5 * stops_after, 1e-12)
     assert_close(v[0, 0], 0.0, 0.0)
 
 
-def test_the_time_stepping_scheme_converges_to_the_slides() -> None:
+def test_time_stepping_converges_to_the_reference_of_slides() -> None:
     model = read(stack([1.0, 3.0], G))
     contacts = {"x0": Contact(0.7, 0.0, np.inf, 0.6), "x1": Contact(2.0, 0.0, np.inf, 0.3)}
     q, v, end = np.array([0.05, 0.1]), np.array([-0.4, 0.2]), 0.15
@@ -117,11 +117,11 @@ def test_the_time_stepping_scheme_converges_to_the_slides() -> None:
     exact, _ = history.at(end * np.arange(1, 11) / 10)
     errors = [np.abs(TimeStepping(model, contacts).run(q, v, end, n, 10) - exact).mean() for n in (400, 1600)]
     assert errors[0] < 1e-3
-    assert errors[1] < errors[0] / 2  # first order, if not evenly: impacts are rounded to a step
+    assert errors[1] < errors[0] / 2  # first order, but not smoothly: impacts are rounded to a step
 
 
-def test_the_time_stepping_scheme_converges_to_smooth_closed_chains() -> None:
-    """Without contact it integrates what the suite's judge does."""
+def test_time_stepping_converges_on_closed_chains_without_contact() -> None:
+    """Without contact it integrates the same equations as the suite's judge."""
     model = read(dict(ckc_pin.load("five_bar").sources.texts))
     at = ckc_pin.load("five_bar").assembled
     order = [ckc_pin.load("five_bar").coordinates.index(label) for label in model.labels]
@@ -144,7 +144,7 @@ def bouncing(tmp_path: Path) -> tuple[Case, ckc_pin.Run]:
     return case, ckc_pin.simulate(case.write(tmp_path / "case"), overrides)
 
 
-def test_the_judges_accept_a_right_run_and_see_wrong_ones(tmp_path: Path) -> None:
+def test_judges_accept_a_correct_run_and_reject_wrong_ones(tmp_path: Path) -> None:
     case, run = bouncing(tmp_path)
     model = read(case.texts)
     assert len(run.events) >= 2
@@ -169,18 +169,18 @@ def test_the_judges_accept_a_right_run_and_see_wrong_ones(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["pendulums", "closed"])
-def test_drawn_chains_are_right(kind: str) -> None:
+def test_runs_of_random_chains_are_correct(kind: str) -> None:
     record = judge_seed(1, kind)
     assert record.findings == [], record
     assert record.runs >= 3
 
 
-def test_a_seed_is_one_case() -> None:
+def test_a_seed_always_draws_the_same_case() -> None:
     for seed in range(4):
         assert draw(seed) == draw(seed)
 
 
-def test_the_table_names_the_seeds() -> None:
+def test_table_names_the_seeds_with_findings() -> None:
     record = Record(17, "stack", runs=3, compared=True)
     record.add("grown", "dae", "energy grows by 0.1 of the largest")
     text = table([record, Record(18, "stack", runs=3, compared=True)])
@@ -188,7 +188,7 @@ def test_the_table_names_the_seeds() -> None:
     assert "seed 17 stack (dae): energy grows by 0.1" in text
 
 
-def test_the_command_runs_seeds_and_writes_their_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fuzz_command_runs_seeds_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = tmp_path / "rows.csv"
     assert main(["--contact", "--kind", "truss", "--seed", "2000", "--runs", "2", "--out", str(rows)]) == 0
     assert "formulations agree in 100.00 % of 2 cases" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Verdicts on events: right runs pass, tampered ones do not."""
+"""Verdicts on events: correct runs pass, tampered ones do not."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ OVERRIDES: dict[str, Any] = {
     "initial": {"q": {"theta_1": -1.0, "theta_3": 1.5}, "q_dot": {"theta_1": 1.0, "theta_3": 3.0}},
     "controller": None,
 }
-ASKED = [{"of": "q", "coordinate": "theta_2", "value": 1.0}, {"of": "q_dot", "coordinate": "theta_1", "value": 0.0}]
+EVENTS = [{"of": "q", "coordinate": "theta_2", "value": 1.0}, {"of": "q_dot", "coordinate": "theta_1", "value": 0.0}]
 
 
 @cache
-def seen() -> Run:
-    """A motion with crossings of an angle and of a rate, both ways."""
-    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": ASKED})
+def run_with_events() -> Run:
+    """Return a motion with crossings of an angle and of a rate in both directions."""
+    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": EVENTS})
     assert {(e["of"], e["direction"]) for e in run.events} == {("q", -1), ("q", 1), ("q_dot", -1), ("q_dot", 1)}
     return run
 
@@ -41,28 +41,31 @@ def judge_of(run: Run) -> tuple[Judge, list[int]]:
     return judge, [run.coordinates.index(label) for label in judge.model.labels]
 
 
-def test_rows_tell_which_crossings_there_are() -> None:
-    run = seen()
-    assert between_rows(run, ASKED) == ""
+def test_missing_and_extra_crossings_are_found_between_rows() -> None:
+    run = run_with_events()
+    assert between_rows(run, EVENTS) == ""
     for k, event in enumerate(run.events):
         lost = [*run.events[:k], *run.events[k + 1 :]]
         turned = [*run.events[:k], {**event, "direction": -event["direction"]}, *run.events[k + 1 :]]
         for events in (lost, turned, [*run.events, event]):
-            assert event["coordinate"] in between_rows(replace(run, events=events), ASKED)
+            assert event["coordinate"] in between_rows(replace(run, events=events), EVENTS)
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
-def test_rows_tell_of_crossings_one_way(direction: int) -> None:
-    asked = [{**event, "direction": direction} for event in ASKED]
-    met = [event for event in seen().events if event["direction"] == direction]
-    assert between_rows(replace(seen(), events=met), asked) == ""
-    assert between_rows(replace(seen(), events=[*met, *met]), [*asked, *asked]) == ""
-    for k in range(len(met)):
-        assert between_rows(replace(seen(), events=met[:k] + met[k + 1 :]), asked)
+def test_crossings_in_one_direction_are_found_between_rows(direction: int) -> None:
+    events_one_way = [{**event, "direction": direction} for event in EVENTS]
+    crossings = [event for event in run_with_events().events if event["direction"] == direction]
+    assert between_rows(replace(run_with_events(), events=crossings), events_one_way) == ""
+    assert (
+        between_rows(replace(run_with_events(), events=[*crossings, *crossings]), [*events_one_way, *events_one_way])
+        == ""
+    )
+    for k in range(len(crossings)):
+        assert between_rows(replace(run_with_events(), events=crossings[:k] + crossings[k + 1 :]), events_one_way)
 
 
-def test_events_are_where_the_judge_is_on_their_value() -> None:
-    run = seen()
+def test_event_times_agree_with_the_judge() -> None:
+    run = run_with_events()
     off, _ = located(run, *judge_of(run), RTOL, DOUBTFUL)
     assert off < 10
     late = [{**event, "t": event["t"] + 2e-4 * (k == 2)} for k, event in enumerate(run.events)]
@@ -71,13 +74,13 @@ def test_events_are_where_the_judge_is_on_their_value() -> None:
     assert t == late[2]["t"]
 
 
-def test_a_value_short_of_a_turn_is_crossed_twice_and_one_beyond_it_never() -> None:
-    first = next(event["t"] for event in seen().events if event["of"] == "q_dot")
-    stop = [{**ASKED[1], "stop": True}]
+def test_values_next_to_a_turning_point_are_crossed_twice_or_never() -> None:
+    first = next(event["t"] for event in run_with_events().events if event["of"] == "q_dot")
+    stop = [{**EVENTS[1], "stop": True}]
     turn = float(ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": stop}).q_tree[-1, 0])
     inner, outer = turn - 1e-8, turn + 1e-8
-    asked = [{"of": "q", "coordinate": "theta_1", "value": value} for value in (inner, outer)]
-    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": [ASKED[1], *asked]})
+    events_one_way = [{"of": "q", "coordinate": "theta_1", "value": value} for value in (inner, outer)]
+    run = ckc_pin.simulate("five_bar/swing", {**OVERRIDES, "event": [EVENTS[1], *events_one_way]})
     assert on_both_sides(run, "theta_1", first, inner, outer) == ""
     beside = [event for event in run.events if event["of"] == "q" and event["t"] < 0.1]
     assert len(beside) == 2
@@ -91,6 +94,6 @@ def test_a_value_short_of_a_turn_is_crossed_twice_and_one_beyond_it_never() -> N
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
 @pytest.mark.parametrize("seed", range(4))
-def test_values_beside_a_turn(formulation: str, seed: int) -> None:
+def test_events_next_to_turning_points_are_correct(formulation: str, seed: int) -> None:
     motion = Motion(seed, "five_bar", "five_bar/swing", {**OVERRIDES, "formulation": formulation})
-    assert beside_a_turn(motion, seen().coordinates) == ""
+    assert beside_a_turn(motion, run_with_events().coordinates) == ""

@@ -1,4 +1,4 @@
-"""A share of the fuzz suite: random motions of shipped and random mechanisms, none of them raw or wrong."""
+"""A part of the fuzz suite: random motions of shipped and random mechanisms, without errors or wrong results."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from scripts.experiments.fuzz.record import run_motion
 ANGLE, RATE = st.floats(-3.14, 3.14), st.floats(-20, 20)
 
 
-ONCE_WRONG = [100193]  # an output row on another branch
-ONCE_WRONG_RANDOM = [301017]  # Radau's Jacobian was noise: it took steps that were no solution
+REGRESSION_SEEDS_SHIPPED = [100193]  # had an output row on another branch
+REGRESSION_SEEDS_RANDOM = [301017]  # Radau accepted wrong steps with a Jacobian that was noise
 
 
-@pytest.mark.parametrize("seed", [*range(8), *ONCE_WRONG])
-def test_random_motions_of_shipped_mechanisms_are_right(seed: int) -> None:
+@pytest.mark.parametrize("seed", [*range(8), *REGRESSION_SEEDS_SHIPPED])
+def test_random_motions_of_shipped_mechanisms_are_correct(seed: int) -> None:
     record = one(seed, "shipped")
     assert record.verdict in ("done", "stopped", "refused"), record
     assert not record.off, record
 
 
-@pytest.mark.parametrize("seed", [*range(8), *ONCE_WRONG_RANDOM])
-def test_random_motions_of_random_mechanisms_are_right(seed: int) -> None:
+@pytest.mark.parametrize("seed", [*range(8), *REGRESSION_SEEDS_RANDOM])
+def test_random_motions_of_random_mechanisms_are_correct(seed: int) -> None:
     record = one(seed, "random")
     assert record.verdict in ("done", "stopped", "refused"), record
     assert not record.off, record
@@ -42,7 +42,7 @@ def test_random_motions_of_random_mechanisms_are_right(seed: int) -> None:
 
 @settings(max_examples=10, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(ANGLE, ANGLE, RATE, RATE, st.floats(-10, -2), st.sampled_from(["reduced", "spf", "dae"]))
-def test_the_five_bar_moves_right_from_anywhere(
+def test_five_bar_motions_from_any_state_are_correct(
     q_1: float, q_3: float, rate_1: float, rate_3: float, digits: float, formulation: str
 ) -> None:
     if sigma(ckc_pin.load("five_bar"), np.array([q_1, q_3])).verdict != "converged":
@@ -65,8 +65,8 @@ SAMPLED = {**SET_POINT, "sample_time": 0.004, "delay": 0.0068}
 
 @pytest.mark.parametrize("controller", [SET_POINT, SAMPLED, {**SET_POINT, "torque_limit": 0.5}])
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_controlled_motions_are_judged(controller: dict[str, Any], formulation: str) -> None:
-    """With the control law read anew: a law of other gains, limits or delays is not that of the run."""
+def test_controlled_motions_are_judged_with_their_control_law(controller: dict[str, Any], formulation: str) -> None:
+    """The judge implements the control law independently: other gains, limits or delays do not fit the run."""
     overrides = {
         "formulation": formulation,
         "t_end": 0.3,
@@ -86,8 +86,8 @@ def test_controlled_motions_are_judged(controller: dict[str, Any], formulation: 
             joint_forces({**controller, **other}, model, run, 0.0004)
 
 
-def test_a_force_that_is_off_moves_otherwise() -> None:
-    """The judge's pieces answer to what acts along the joints."""
+def test_judge_accounts_for_joint_forces() -> None:
+    """The judge's motion changes with a force at a joint."""
     judge = Judge(read(dict(ckc_pin.load("five_bar").sources.texts)))
     at = ckc_pin.load("five_bar").assembled
     order = [ckc_pin.load("five_bar").coordinates.index(label) for label in judge.model.labels]
@@ -99,8 +99,8 @@ def test_a_force_that_is_off_moves_otherwise() -> None:
     assert np.abs(gained - np.linalg.solve(D, [1.0, 0.0])).max() < 1e-3 * np.abs(gained).max()
 
 
-def test_the_suite_sees_a_run_that_is_off() -> None:
-    """A run at 1e-3 passed off as one at 1e-9 is found out."""
+def test_suite_rejects_an_inaccurate_run() -> None:
+    """A run with tolerance 1e-3 does not pass as one with 1e-9."""
     with drawn(10, "shipped", "five_bar") as motion:
         coarse = replace(
             motion, overrides={**motion.overrides, "formulation": "dae", "solver.rtol": 1e-3, "t_end": 1.0}

@@ -1,4 +1,4 @@
-"""The judge of the fuzz suite: closed forms, published figures, energy, and the equations in tree coordinates."""
+"""The fuzz suite's judge against closed forms, published results, conservation of energy, and eq. 1."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PENDULUM = {
     '<joint name="pin" type="continuous"><parent link="ground"/><child link="rod"/>'
     '<origin xyz="0 0 0" rpy="0 1.5707963267948966 0"/><axis xyz="-2 0 0"/></joint></robot>',
 }
-PERIOD = 2.36784194757624  # released horizontal, of 1 m
+PERIOD = 2.36784194757624  # s, of a pendulum of 1 m released horizontally
 
 
 def texts(name: str) -> dict[str, str]:
@@ -31,7 +31,7 @@ def texts(name: str) -> dict[str, str]:
 
 
 def follow(judge: Judge, q: Array, v: Array, times: Array, substeps: int = 4) -> tuple[Array, Array]:
-    """One motion piece after piece, by steps of one length."""
+    """Integrate one motion piece by piece with a fixed step size."""
     q, v = q[None], v[None]
     for dt in np.diff(times):
         near = q + dt * v
@@ -44,9 +44,11 @@ def start(model: Model, numbers: dict[str, float]) -> Array:
     return np.array([numbers.get(label, 0.0) for label in model.labels])
 
 
-def test_a_pendulum_is_back_after_its_period() -> None:
+def test_a_pendulum_returns_after_its_period() -> None:
     judge = Judge(read(PENDULUM))
-    horizontal = np.array([-np.arctan2(0.6, 0.8)])  # the axis is the world's z, the mass at (0.8, 0.6) across it
+    horizontal = np.array(
+        [-np.arctan2(0.6, 0.8)]
+    )  # the axis is the world's z, with the mass at (0.8, 0.6) perpendicular to it
     x, *_ = split(state(judge.model, horizontal[None], np.zeros((1, 1))))
     assert np.abs(x[0, 0, 1]) < 1e-15
     q, v = follow(judge, horizontal, np.zeros(1), np.linspace(0, PERIOD, 21))
@@ -54,7 +56,7 @@ def test_a_pendulum_is_back_after_its_period() -> None:
     assert abs(v[0]) < 1e-9
 
 
-def test_the_row_of_squares_accelerates_as_its_closed_form() -> None:
+def test_acceleration_of_a_row_of_squares_is_the_closed_form() -> None:
     judge = Judge(read(texts("n_four_bar")))
     angle, N = 1.1, 4
     q = start(judge.model, {f"theta_{k}": angle for k in range(N + 1)} | {f"psi_{k}": -angle for k in range(1, N + 1)})
@@ -65,7 +67,7 @@ def test_the_row_of_squares_accelerates_as_its_closed_form() -> None:
     assert np.abs(alpha[0, rods, 2] + k * np.cos(angle)).max() < 1e-11
 
 
-def test_andrews_mechanism_ends_where_the_literature_says() -> None:
+def test_andrews_mechanism_ends_at_the_published_state() -> None:
     judge = Judge(read(texts("andrews")))
     names = ["beta", "theta", "gamma", "phi", "delta", "omega", "eps"]
     first = [-0.0617138900142764496, 0, 0.455279819163070380, 0.222668390165885885, 0.487364979543842550,
@@ -78,7 +80,7 @@ def test_andrews_mechanism_ends_where_the_literature_says() -> None:
     assert np.abs(q - start(model, dict(zip(names, last, strict=True)))).max() < 1e-9
 
 
-def test_bricards_third_hinge_is_where_the_literature_says() -> None:
+def test_bricards_third_hinge_ends_at_the_published_position() -> None:
     judge = Judge(read(texts("bricard")))
     q, v = follow(judge, np.zeros(5), np.zeros(5), np.linspace(0, 1, 11))
     x, R, _, _ = split(state(judge.model, q[None], v[None]))
@@ -90,17 +92,17 @@ def test_bricards_third_hinge_is_where_the_literature_says() -> None:
 @pytest.mark.parametrize(
     "name", ["five_bar", "slider_crank_spatial", "delta", "stewart", "three_rrr", "two_ur5", "talos"]
 )
-def test_shipped_mechanisms_accelerate_as_the_equations_in_tree_coordinates(name: str) -> None:
-    same_accelerations(ckc_pin.load(name), texts(name))
+def test_accelerations_of_shipped_mechanisms_are_those_of_eq_1(name: str) -> None:
+    assert_same_accelerations(ckc_pin.load(name), texts(name))
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_random_mechanisms_accelerate_as_the_equations_in_tree_coordinates(seed: int, tmp_path: Path) -> None:
+def test_accelerations_of_random_mechanisms_are_those_of_eq_1(seed: int, tmp_path: Path) -> None:
     made = random_mechanism(seed)
-    same_accelerations(ckc_pin.load(made.write(tmp_path)), made.texts)
+    assert_same_accelerations(ckc_pin.load(made.write(tmp_path)), made.texts)
 
 
-def same_accelerations(mechanism: ckc_pin.Mechanism, files: dict[str, str]) -> None:
+def assert_same_accelerations(mechanism: ckc_pin.Mechanism, files: dict[str, str]) -> None:
     judge, at = Judge(read(files)), mechanism.assembled
     random = np.random.default_rng(0)
     J, v_tree = at.J, random.uniform(-1, 1, mechanism.n)
@@ -112,7 +114,7 @@ def same_accelerations(mechanism: ckc_pin.Mechanism, files: dict[str, str]) -> N
     back = coordinates(judge.model, Y, q)
     assert np.abs(back[0] - q).max() < 1e-12
     assert np.abs(back[1] - v).max() < 1e-12 * max(1, mechanism.size)
-    step = 1e-4  # rates by differences of order 6: dY/dt is the judge's, so is the way back
+    step = 1e-4  # v' by differences of order 6 along the judge's dY/dt
     rate, _ = judge.motion.rate(Y, q)
     ends = [coordinates(judge.model, Y + k * step * rate, q)[1][0] for k in (-3, -2, -1, 1, 2, 3)]
     v_dot = np.array([-1, 9, -45, 45, -9, 1]) @ np.array(ends) / (60 * step)
@@ -121,7 +123,7 @@ def same_accelerations(mechanism: ckc_pin.Mechanism, files: dict[str, str]) -> N
 
 
 @pytest.mark.parametrize("seed", [2, 5, 21])
-def test_random_mechanisms_without_dampers_keep_their_energy(seed: int) -> None:
+def test_energy_of_random_mechanisms_is_conserved_without_dampers(seed: int) -> None:
     made = random_mechanism(seed)
     judge = Judge(read({**made.texts, "mechanism.toml": made.texts["mechanism.toml"].replace("damping", "#")}))
     model = judge.model

@@ -1,4 +1,4 @@
-"""The verdict on the way back: a right run passes, a tampered one does not."""
+"""The verdict on reversed motions: a correct run passes, a tampered one does not."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scripts.experiments.fuzz.reversal import INSTANTS, reversal
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
-def test_a_motion_goes_back_along_its_past(formulation: str) -> None:
+def test_a_reversed_motion_retraces_its_path(formulation: str) -> None:
     overrides = {
         "formulation": formulation,
         "t_end": 0.6,

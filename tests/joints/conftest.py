@@ -1,4 +1,4 @@
-"""Small mechanisms whose joints rub and stop, written as a user would."""
+"""Small mechanisms with joint friction and stops, written as files of a user."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Limits = tuple[float, float]
 
 
 def slide(name: str, parent: str, link: str, mass: float, lower: float = -1e3) -> str:
-    """A link that slides along x."""
+    """Return the URDF of a link that slides along x."""
     return f"""<link name="{link}"><inertial><mass value="{mass!r}"/>
         <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
       <joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{link}"/><axis xyz="1 0 0"/>
@@ -27,7 +27,7 @@ def slide(name: str, parent: str, link: str, mass: float, lower: float = -1e3) -
 
 @pytest.fixture
 def scene_of(tmp_path: Path) -> Make:
-    """Write a URDF, what a mechanism's file says beside it, and a start; return the scene."""
+    """Return a function that writes a URDF, a mechanism's file and a scene, and returns the scene's path."""
 
     def make(urdf: str, mechanism: str, start: str, t_end: float) -> Path:
         (tmp_path / "m.urdf").write_text(f'<robot name="m"><link name="base"/>{urdf}</robot>')
@@ -41,7 +41,7 @@ def scene_of(tmp_path: Path) -> Make:
 
 @pytest.fixture
 def with_joints(tmp_path: Path) -> Callable[..., Path]:
-    """Write a shipped mechanism with [[joint]] tables, and limits of its URDF; return its folder."""
+    """Return a function that writes a shipped mechanism with [[joint]] tables and limits in its URDF."""
 
     def make(
         name: str, joints: dict[str, dict[str, Any]], limits: dict[str, tuple[float, float]] | None = None

@@ -1,7 +1,7 @@
-"""Moreau's time-stepping scheme for a delta on its stops, on Pinocchio's terms alone: nothing of the package.
+"""Moreau's time-stepping scheme for a delta on its stops, with Pinocchio's terms and nothing of the package.
 
-Each step takes the momentum on over h, and closes with the velocity nearest in the metric of D' that keeps the loops
-closed and leads off every stop that is reached at `restitution` times the speed of approach.
+Each step integrates the momentum over h. It then projects the velocity, in the metric of D', onto those that keep the
+loops closed and leave every reached stop with at least `restitution` times the speed of approach.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ Limits = tuple[float, float]
 
 
 class SteppingDelta:
-    """A folder's delta, let go from rest."""
+    """A folder's delta, released from rest."""
 
     def __init__(self, folder: Path, stops: dict[str, Limits], restitution: float) -> None:
-        said = tomllib.loads((folder / "mechanism.toml").read_text())
-        self.model = model = pin.buildModelFromUrdf(str(folder / said["urdf"]))
-        model.gravity.linear = np.array(said["gravity"])
+        file = tomllib.loads((folder / "mechanism.toml").read_text())
+        self.model = model = pin.buildModelFromUrdf(str(folder / file["urdf"]))
+        model.gravity.linear = np.array(file["gravity"])
         self.restitution = restitution
         self.balls = [
-            tuple(self._add(loop["name"], loop[side]) for side in ("frame_a", "frame_b")) for loop in said["loop"]
+            tuple(self._add(loop["name"], loop[side]) for side in ("frame_a", "frame_b")) for loop in file["loop"]
         ]
         self.data = model.createData()
         joints = [model.joints[model.getJointId(name)] for name in stops]
         self.arms_q, self.arms = [joint.idx_q for joint in joints], [joint.idx_v for joint in joints]
         self.rest = [k for k in range(model.nv) if k not in self.arms]
         self.lower, self.upper = np.array(list(stops.values())).T
-        self.guess = said["q_guess"]
+        self.guess = file["q_guess"]
 
     def _add(self, name: str, place: dict[str, Any]) -> int:
         link = self.model.frames[self.model.getFrameId(place["link"])]
@@ -45,7 +45,7 @@ class SteppingDelta:
         )
 
     def start(self, arms: Array) -> Array:
-        """The closed configuration at these angles of the arms, from the file's guess."""
+        """Return the closed configuration at given angles of the arms, from the file's guess."""
         v = np.zeros(self.model.nv)
         for name, value in self.guess.items():
             first = self.model.joints[self.model.getJointId(name)].idx_v
@@ -55,7 +55,7 @@ class SteppingDelta:
         return self.closed(pin.integrate(self.model, pin.neutral(self.model), v))
 
     def closed(self, q: Array) -> Array:
-        """By Newton's method, the arms staying where they are."""
+        """Close the loops by Newton's method without moving the arms."""
         for _ in range(30):
             phi, J = self.closure(q)
             if np.abs(phi).max() < 1e-13:
@@ -66,7 +66,7 @@ class SteppingDelta:
         raise AssertionError("the delta does not close")
 
     def closure(self, q: Array) -> tuple[Array, Array]:
-        """How far the balls are from their sockets, (18,), and its Jacobian."""
+        """Return the balls' distances from their sockets, (18,), and the Jacobian."""
         pin.computeJointJacobians(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
         phi, J = [], []
@@ -77,7 +77,7 @@ class SteppingDelta:
         return np.concatenate(phi), np.concatenate(J)
 
     def run(self, arms: Array, duration: float, steps: int, seen: int) -> Array:
-        """The arms' angles after they were let go, at `seen` instants evenly, (seen, 3)."""
+        """Return the arms' angles after their release at `seen` equidistant instants, (seen, 3)."""
         h, q, v, found = duration / steps, self.start(arms), np.zeros(self.model.nv), []
         for step in range(1, steps + 1):
             middle = pin.integrate(self.model, q, 0.5 * h * v)
@@ -88,7 +88,7 @@ class SteppingDelta:
         return np.array(found)
 
     def stepped(self, q: Array, v: Array, h: float) -> Array:
-        """The velocity after a step whose middle is q."""
+        """Return the velocity after a step with midpoint q."""
         D = np.array(pin.crba(self.model, self.data, q))
         D = np.triu(D) + np.triu(D, 1).T
         bias = pin.nonLinearEffects(self.model, self.data, q, v)
@@ -102,15 +102,15 @@ class SteppingDelta:
         side = np.where(angles >= self.upper, 1.0, np.where(angles <= self.lower, -1.0, 0.0))
         at = np.flatnonzero(side)
         if len(at):
-            # off the stops, at least at `after`: the least impulses x >= 0 of free + inertia^-1 G x
+            # impulses x >= 0 of free + inertia^-1 G x, after which the arms leave the stops with at least `after`
             G = -np.eye(len(self.arms))[:, at] * side[at]
             after = self.restitution * np.maximum(side[at] * before[at], 0.0)
             root = np.linalg.cholesky(np.linalg.inv(inertia))
-            free = free + np.linalg.solve(inertia, G @ _least(root.T @ G, G.T @ free - after))
+            free = free + np.linalg.solve(inertia, G @ _solve_complementarity(root.T @ G, G.T @ free - after))
         return np.asarray(rho @ free)
 
 
-def _least(root: Array, gap: Array) -> Array:
+def _solve_complementarity(root: Array, gap: Array) -> Array:
     """Return x >= 0 with root^T root x + gap >= 0 and one of them zero, for each x."""
     target = np.linalg.lstsq(root.T, -gap, rcond=None)[0]
     return np.asarray(nnls(root, target)[0])

@@ -1,4 +1,4 @@
-"""Events where joints hit, stick and touch: jumps over a value, and rates that come to zero and stay there."""
+"""Events at mode transitions of joints: values that an impact skips, and rates that become zero and stay zero."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def slider(scene_of: Make, x: float, rate: float, joint: str, t_end: float, grav
     return scene_of(slide("x", "base", "block", 1.0, 0.0), f'{more}[[joint]]\nname = "x"\n{joint}', start, t_end)
 
 
-def met(events: list[Table], name: str) -> list[tuple[float, int]]:
+def occurrences(events: list[Table], name: str) -> list[tuple[float, int]]:
     return [(event["t"], event["direction"]) for event in events if event["name"] == name]
 
 
@@ -39,7 +39,7 @@ def step_through(scene: Path, overrides: Table, t_end: float, events: list[Event
     return simulator.events
 
 
-def from_all_callers(scene: Path, overrides: Table, t_end: float, own: list[Event]) -> list[list[Table]]:
+def events_by_caller(scene: Path, overrides: Table, t_end: float, own: list[Event]) -> list[list[Table]]:
     """The events that `simulate`, a `Simulator` and `sensitivities` report."""
     return [
         simulate(scene, overrides, events=own).events,
@@ -48,13 +48,13 @@ def from_all_callers(scene: Path, overrides: Table, t_end: float, own: list[Even
     ]
 
 
-# --- jumps ---------------------------------------------------------------------------------------
+# --- impacts ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("seed", range(7))
-def test_an_event_that_an_impact_jumps_over_is_at_the_impact(scene_of: Make, formulation: str, seed: int) -> None:
-    """At x / v the rate goes from -v to e v: once over each value between them, in the first step or a later one."""
+def test_an_event_whose_value_an_impact_skips_occurs_at_the_impact(scene_of: Make, formulation: str, seed: int) -> None:
+    """At x / v the rate jumps from -v to e v, once across each value between them, in the first step or a later one."""
     random = np.random.default_rng(seed)
     x, v, e = random.uniform(0.1, 1.0), random.uniform(0.5, 5.0), random.uniform(0.0, 1.0)
     value, beyond = float(random.uniform(-v, e * v)), 1.1 * v
@@ -63,18 +63,18 @@ def test_an_event_that_an_impact_jumps_over_is_at_the_impact(scene_of: Make, for
     own = [Event(lambda t, terms: terms.q_dot[0] ** 3 - value**3, name="own")]
     for max_step in (10.0, 0.3 * x / v):
         overrides = {"formulation": formulation, "event": events, "solver.max_step": max_step}
-        for found in from_all_callers(scene, overrides, 2 * x / v, own):
+        for found in events_by_caller(scene, overrides, 2 * x / v, own):
             hit = (pytest.approx(x / v, abs=1e-10), 1)
-            assert met(found, f"x's rate = {value:g}") == [hit], "rising, once"
-            assert met(found, "own") == [hit]
-            assert not met(found, f"x's rate = {beyond:g}")
-            assert not met(found, f"x's rate = {-beyond:g}")
+            assert occurrences(found, f"x's rate = {value:g}") == [hit], "rising, once"
+            assert occurrences(found, "own") == [hit]
+            assert not occurrences(found, f"x's rate = {beyond:g}")
+            assert not occurrences(found, f"x's rate = {-beyond:g}")
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("x", [0.0, 0.6])
-def test_a_run_that_a_jump_stops_ends_with_the_state_after(scene_of: Make, formulation: str, x: float) -> None:
-    """Also at the start, where a run begins against a stop."""
+def test_a_run_stopped_by_an_impact_ends_with_the_state_after_it(scene_of: Make, formulation: str, x: float) -> None:
+    """Also if the run starts with an impact."""
     scene = slider(scene_of, x, -2.0, "stops = true\nrestitution = 0.5\n", 1.0)
     for event, own in (([rate_event(0.3, 1, True)], []), ([], [Event(lambda t, y: y.q_dot[0] - 0.3, 1, True, "own")])):
         overrides = {"formulation": formulation, "event": event}
@@ -88,14 +88,14 @@ def test_a_run_that_a_jump_stops_ends_with_the_state_after(scene_of: Make, formu
         simulator = Simulator(scene, overrides, events=own)
         assert simulator.step(None, 0.9).v_tree == pytest.approx([1.0])
         assert simulator.state.t == pytest.approx(x / 2.0, abs=1e-11)
-        assert simulator.step(None, 0.5).t == pytest.approx(x / 2.0 + 0.5), "it does not happen again"
+        assert simulator.step(None, 0.5).t == pytest.approx(x / 2.0 + 0.5), "the event does not occur again"
         if event:
             assert varied.end_time == pytest.approx([x / 4.0, 0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_jump_where_friction_of_another_joint_changes_too(scene_of: Make, formulation: str) -> None:
-    """One block meets its stop at 1 s, where friction has brought another one to rest."""
+def test_an_impact_while_another_joint_begins_to_stick(scene_of: Make, formulation: str) -> None:
+    """One block hits its stop at 1 s, at the instant at which friction stops another one."""
     urdf = slide("x", "base", "block", 1.0, 0.0) + slide("y", "base", "other", 1.0)
     joints = '[[joint]]\nname = "x"\nstops = true\nrestitution = 0.5\n[[joint]]\nname = "y"\nfriction = 0.5\n'
     start = "q = {x = 1.0, y = 0.0}\nq_dot = {x = -1.0, y = 0.5}\n"
@@ -103,30 +103,32 @@ def test_a_jump_where_friction_of_another_joint_changes_too(scene_of: Make, form
     overrides = {"formulation": formulation, "event": [rate_event(0.2), rate_event(0.0, joint="y")]}
     own = [Event(lambda t, terms: terms.q_dot[0] + terms.q_dot[1] - 0.2, name="own")]
     for found in (simulate(scene, overrides, events=own).events, step_through(scene, overrides, 3.0, own)):
-        assert met(found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
-        assert met(found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
-        assert met(found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
+        assert occurrences(found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
+        assert occurrences(found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
+        assert occurrences(found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_ball_that_bounces_turns_at_each_impact_and_apex(scene_of: Make, formulation: str) -> None:
+def test_a_bouncing_balls_rate_is_zero_at_each_impact_and_apex(scene_of: Make, formulation: str) -> None:
     e, fall = 0.4, np.sqrt(2.0 / G)
     scene = slider(scene_of, 1.0, 0.0, f"stops = true\nrestitution = {e}\n", 1.8, G)
     own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     flights = 2 * fall * e ** np.arange(1, 60)
     impacts, apexes = fall + np.r_[0.0, np.cumsum(flights)], fall + np.cumsum(flights) - flights / 2
     overrides = {"formulation": formulation, "event": [rate_event(0.0)], "solver.rtol": 1e-10}
-    for found in from_all_callers(scene, overrides, 1.8, own):
+    for found in events_by_caller(scene, overrides, 1.8, own):
         bounces = sum(event["name"] == "x bounces" for event in found)
         for name in ("own", "x's rate = 0"):
-            here = met(found, name)
-            assert [direction for _, direction in here] == [1, -1] * bounces + [1], "the last one is the touch"
+            here = occurrences(found, name)
+            assert [direction for _, direction in here] == [1, -1] * bounces + [1], (
+                "the last one is where contact begins"
+            )
             assert [t for t, _ in here[::2]] == pytest.approx(impacts[: bounces + 1], abs=1e-9)
             assert [t for t, _ in here[1::2]] == pytest.approx(apexes[:bounces], abs=1e-9)
 
 
-def test_a_body_that_hands_on_all_its_speed_comes_to_rest_once(scene_of: Make) -> None:
-    """Equal masses, e = 1: the one that comes stays where it hits the other one at 1 s, and nothing holds it."""
+def test_a_body_that_transfers_all_momentum_comes_to_rest_once(scene_of: Make) -> None:
+    """Equal masses, e = 1: the moving one stops where it hits the other one at 1 s, although nothing holds it there."""
     urdf = slide("a", "base", "one", 1.0) + slide("b", "one", "two", 1.0, 0.0)
     joints = 'gravity = [0, 0, 0]\n[[joint]]\nname = "b"\nstops = true\nrestitution = 1.0\n'
     scene = scene_of(urdf, joints, "q = {a = 0.0, b = 1.0}\nq_dot = {a = 1.0, b = -1.0}\n", 3.0)
@@ -135,7 +137,11 @@ def test_a_body_that_hands_on_all_its_speed_comes_to_rest_once(scene_of: Make) -
         for t_end in (1.5, 2.0, 3.3):
             overrides = {"formulation": formulation, "t_end": t_end, "event": [rate_event(0.0, joint="a")]}
             run = simulate(scene, overrides, events=own)
-            assert met(run.events, "a's rate = 0") == met(run.events, "own") == [(pytest.approx(1.0, abs=1e-10), -1)]
+            assert (
+                occurrences(run.events, "a's rate = 0")
+                == occurrences(run.events, "own")
+                == [(pytest.approx(1.0, abs=1e-10), -1)]
+            )
 
 
 # --- rest ----------------------------------------------------------------------------------------
@@ -143,15 +149,15 @@ def test_a_body_that_hands_on_all_its_speed_comes_to_rest_once(scene_of: Make) -
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("t_end", [1.5, 2.0, 3.7])
-def test_a_joint_that_touches_comes_to_rest_once(scene_of: Make, formulation: str, t_end: float) -> None:
-    """At 1 s it is at its stop, e = 0, and stays there: the rate is zero then, and the coordinate its stop."""
+def test_a_joint_that_stays_at_its_stop_comes_to_rest_once(scene_of: Make, formulation: str, t_end: float) -> None:
+    """At 1 s it hits its stop with e = 0 and stays: its rate becomes zero, and its coordinate is at the stop."""
     scene = slider(scene_of, 1.0, -1.0, "stops = true\nrestitution = 0.0\n", t_end)
     events = [rate_event(0.0), rate_event(0.0, of="q"), rate_event(-0.5), {"of": "limit", "coordinate": "x"}]
     own = [Event(lambda t, y: y.q_dot[0], name="rate"), Event(lambda t, y: y.q[0], name="place")]
     once = {"x's rate = 0": 1, "x = 0": -1, "x's rate = -0.5": 1, "x at its lower limit": 1, "rate": 1, "place": -1}
-    for found in from_all_callers(scene, {"formulation": formulation, "event": events}, t_end, own):
+    for found in events_by_caller(scene, {"formulation": formulation, "event": events}, t_end, own):
         for name, direction in once.items():
-            assert met(found, name) == [(pytest.approx(1.0, abs=1e-10), direction)], name
+            assert occurrences(found, name) == [(pytest.approx(1.0, abs=1e-10), direction)], name
     stopped = simulate(scene, {"formulation": formulation, "event": [rate_event(0.0, stop=True)]})
     assert stopped.t[-1] == pytest.approx(1.0, abs=1e-10)
     assert stopped.v_tree[-1] == pytest.approx([0.0], abs=1e-12)
@@ -160,7 +166,7 @@ def test_a_joint_that_touches_comes_to_rest_once(scene_of: Make, formulation: st
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("again", [1.0, -1.0])
 def test_a_joint_that_sticks_comes_to_rest_once_and_moves_on(scene_of: Make, formulation: str, again: float) -> None:
-    """Pushed for 1 s with twice its friction it slides until 2 s. That it moves again, either way, is no event."""
+    """Pushed for 1 s with twice its friction it slides until 2 s. Sliding again in either direction is no event."""
     scene = slider(scene_of, 5.0, 0.0, "friction = 0.5\n", 20.0)
     own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     simulator = Simulator(scene, {"formulation": formulation, "event": [rate_event(0.0)]}, events=own)
@@ -168,12 +174,12 @@ def test_a_joint_that_sticks_comes_to_rest_once_and_moves_on(scene_of: Make, for
         simulator.step([push], dt)
     for name in ("own", "x's rate = 0"):
         rests = [(pytest.approx(2.0, abs=1e-9), -1), (pytest.approx(6.0, abs=1e-9), -1 if again > 0 else 1)]
-        assert met(simulator.events, name) == rests
+        assert occurrences(simulator.events, name) == rests
 
 
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6, 1e-9])
-def test_joints_that_others_at_rest_hold_come_to_rest_once(rtol: float) -> None:
-    """Friction in two joints of the five-bar stops all four, from the rate that an impact gave them."""
+def test_joints_locked_by_sticking_joints_come_to_rest_once(rtol: float) -> None:
+    """Friction in two joints of the five-bar stops all four after an impact."""
     names = [f"theta_{k}" for k in (1, 2, 3, 4)]
     own = [Event(lambda t, terms, k=k: terms.v_tree[k], name=name) for k, name in enumerate(names)]  # type: ignore[misc]
     overrides = {
@@ -191,15 +197,15 @@ def test_joints_that_others_at_rest_hold_come_to_rest_once(rtol: float) -> None:
         rest = next(event["t"] for event in run.events if event["name"] == "theta_1 sticks")
         for name, directions in counts.items():
             for called in (name, f"{name}'s rate = 0"):
-                here = met(run.events, called)
+                here = occurrences(run.events, called)
                 assert [direction for _, direction in here] == directions, called
                 if name != "theta_3":
                     assert [t for t, _ in here] == pytest.approx([impact, rest], abs=1e-2 * rtol + 1e-9)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_events_across_sticking_and_impacts_do_not_change_the_motion(formulation: str) -> None:
-    """And functions report what the scene's events do."""
+def test_events_do_not_change_a_motion_with_sticking_and_impacts(formulation: str) -> None:
+    """Event functions report the same occurrences as the scene's events."""
     names = [f"theta_{k}" for k in (1, 2, 3, 4)]
     plain = simulate("five_bar/friction", {"formulation": formulation})
     monitored = simulate(
@@ -210,14 +216,14 @@ def test_events_across_sticking_and_impacts_do_not_change_the_motion(formulation
     assert monitored.stats["rhs"] == plain.stats["rhs"]
     assert_close(monitored.q_tree, plain.q_tree, 1e-9)  # as closely as the loops close
     for name in names:
-        own, of_scene = met(monitored.events, name), met(monitored.events, f"{name}'s rate = 0")
+        own, of_scene = occurrences(monitored.events, name), occurrences(monitored.events, f"{name}'s rate = 0")
         assert [direction for _, direction in own] == [direction for _, direction in of_scene]
         assert [t for t, _ in own] == pytest.approx([t for t, _ in of_scene], abs=1e-8)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_joint_that_the_loops_hold_has_no_events(scene_of: Make, formulation: str) -> None:
-    """Its end is a point of the base: whatever the other joint does, it cannot turn."""
+def test_a_joint_fixed_by_the_loops_has_no_events(scene_of: Make, formulation: str) -> None:
+    """The end of its arm is fixed to the base: it cannot turn, whatever the other joint does."""
     pinned = """<link name="arm"><inertial><mass value="1"/>
         <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
       <joint name="c" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="1 0 0"/></joint>"""

@@ -1,4 +1,4 @@
-"""Dry friction against closed forms: what slides when, and where it sticks."""
+"""Dry friction against closed forms: times of sliding and sticking, and dissipated energy."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tests.joints.conftest import FORMULATIONS, Make, slide
 TIGHT = {"solver.rtol": 1e-12}
 
 
-def named(run: Run, name: str) -> list[float]:
-    """When something happened."""
+def event_times(run: Run, name: str) -> list[float]:
+    """Return the times of the events of a name."""
     return [float(event["t"]) for event in run.events if event["name"] == name]
 
 
@@ -30,8 +30,8 @@ def oscillator(scene_of: Make, mass: float, stiffness: float, friction: float, x
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("seed", range(4))
-def test_a_coulomb_damped_oscillator_turns_every_half_period(scene_of: Make, formulation: str, seed: int) -> None:
-    """Each half swing is a cosine about a shifted centre, and 2 F / k shorter than the one before."""
+def test_coulomb_damped_oscillator_reverses_every_half_period(scene_of: Make, formulation: str, seed: int) -> None:
+    """Each half swing is a cosine about a shifted centre, and its amplitude is 2 F / k smaller than the one before."""
     rng = np.random.default_rng(seed)
     mass, stiffness = float(rng.uniform(0.1, 10.0)), float(rng.uniform(1.0, 1e3))
     start = float(rng.uniform(0.5, 2.0) * rng.choice([-1, 1]))
@@ -44,8 +44,8 @@ def test_a_coulomb_damped_oscillator_turns_every_half_period(scene_of: Make, for
     scene = oscillator(scene_of, mass, stiffness, friction, start, turns[-1] + half)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     assert run.status == "done"
-    assert_close(named(run, "x slides"), turns[:-1], 1e-10)
-    assert_close(named(run, "x sticks"), turns[-1:], 1e-10)
+    assert_close(event_times(run, "x slides"), turns[:-1], 1e-10)
+    assert_close(event_times(run, "x sticks"), turns[-1:], 1e-10)
     assert_close(run.q_tree[-1], [x], 1e-10)
     assert_close(run.v_tree[-1], [0.0], 1e-15)
     assert run.dissipated is not None
@@ -54,7 +54,7 @@ def test_a_coulomb_damped_oscillator_turns_every_half_period(scene_of: Make, for
     assert_close(run.energy + run.dissipated, np.full(len(run.t), run.energy[0]), 1e-9 * run.energy[0])
 
 
-def test_it_stays_where_friction_holds_it(scene_of: Make) -> None:
+def test_a_block_sticks_if_the_spring_force_is_below_friction(scene_of: Make) -> None:
     scene = oscillator(scene_of, 1.0, 100.0, 10.0, 0.0999, 2.0)
     run = simulate(scene, TIGHT)
     assert [event["name"] for event in run.events] == ["x sticks"]
@@ -65,8 +65,8 @@ def test_it_stays_where_friction_holds_it(scene_of: Make) -> None:
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_block_on_a_belt_sticks_and_slips(scene_of: Make, formulation: str) -> None:
-    """A belt of finite mass, so that the whole is two cosines stuck together; its phases solved here by themselves."""
+def test_stick_slip_times_of_a_block_on_a_belt(scene_of: Make, formulation: str) -> None:
+    """The belt has finite mass, so that both phases are cosines. The test solves for their ends itself."""
     m, M, k, F, speed = 1.3, 40.0, 55.0, 6.0, 0.7
     urdf = slide("belt", "base", "b", M) + slide("x", "b", "block", m)
     spring = '[[spring]]\nframe_a = "block"\nframe_b = {link = "base", xyz = [-50.0, 0.0, 0.0]}\nrest_length = 50.0\n'
@@ -75,28 +75,28 @@ def test_a_block_on_a_belt_sticks_and_slips(scene_of: Make, formulation: str) ->
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     slips, sticks = belt_phases(m, M, k, F, speed, 12.0)
     assert len(slips) > 3
-    assert_close(named(run, "x slides"), slips, 1e-10)
-    assert_close(named(run, "x sticks"), [0.0, *sticks], 1e-10)
+    assert_close(event_times(run, "x slides"), slips, 1e-10)
+    assert_close(event_times(run, "x sticks"), [0.0, *sticks], 1e-10)
 
 
 def belt_phases(m: float, M: float, k: float, F: float, speed: float, t_end: float) -> tuple[list[float], list[float]]:
-    """When the block begins to slip on the belt, and when it sticks to it again."""
+    """Return the times at which the block begins to slip on the belt, and at which it sticks again."""
     slips, sticks = [], []
-    t, x, v = 0.0, 0.0, speed  # the block's, of the world
+    t, x, v = 0.0, 0.0, speed  # of the block in the world
     while True:
-        together = np.sqrt(k / (m + M))  # stuck: one body on the spring, until the belt's pull on the block is F
+        together = np.sqrt(k / (m + M))  # sticking: one body on the spring, until the friction force reaches F
         size, phase = np.hypot(x, v / together), np.arctan2(v / together, x)
         most = F * (m + M) / (k * M)
         if size <= most:
             return slips, sticks
         wait = (phase - np.arccos(most / size)) / together
         if x > most or wait < 0:
-            raise AssertionError("the phases do not follow each other as this test thinks")
+            raise AssertionError("the phases do not alternate as this test assumes")
         t, x, v = t + wait, most, -size * together * np.sin(together * wait - phase)
         if t > t_end:
             return slips, sticks
         slips.append(t)
-        alone = np.sqrt(k / m)  # slipping: pulled on with F, which slows the belt down
+        alone = np.sqrt(k / m)  # slipping: friction F accelerates the block and slows the belt down
         a, b = x - F / k, v / alone
         belt = v
 
@@ -113,8 +113,8 @@ def belt_phases(m: float, M: float, k: float, F: float, speed: float, t_end: flo
         sticks.append(t)
 
 
-def test_smoothed_friction_is_an_ode(scene_of: Make) -> None:
-    """tanh(v / v_s), integrated by SciPy."""
+def test_smoothed_friction_is_integrated_as_an_ode(scene_of: Make) -> None:
+    """The reference is F tanh(v / v_s), integrated by SciPy."""
     scene = oscillator(scene_of, 2.0, 200.0, 30.0, 1.0, 1.2)
     run = simulate(scene, {"solver.rtol": 1e-9, "friction_smoothing": 1e-2})
     assert run.events == []
@@ -127,8 +127,8 @@ def test_smoothed_friction_is_an_ode(scene_of: Make) -> None:
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
-def test_energy_falls_by_the_work_of_smoothed_friction(with_joints: Callable[..., Path], formulation: str) -> None:
-    """The integral of F tanh(v / rate) v by Simpson's rule over close output instants."""
+def test_energy_decreases_by_the_work_of_smoothed_friction(with_joints: Callable[..., Path], formulation: str) -> None:
+    """The work is the integral of F tanh(v / rate) v by Simpson's rule over the output instants."""
     F, rate, step = 0.02, 0.3, 1e-3
     scene = with_joints("five_bar", {name: {"friction": F} for name in ("theta_1", "theta_4")}) / "swing.scene.toml"
     overrides = {"formulation": formulation, "friction_smoothing": rate, "t_end": 1.0}
@@ -139,8 +139,8 @@ def test_energy_falls_by_the_work_of_smoothed_friction(with_joints: Callable[...
     assert_close(run.energy[-1] + work, run.energy[0], 1e-8)
 
 
-def test_dissipated_is_unknown_with_smoothed_friction(with_joints: Callable[..., Path]) -> None:
-    """Also with stops, of which it would have the impacts alone."""
+def test_dissipated_energy_is_not_reported_with_smoothed_friction(with_joints: Callable[..., Path]) -> None:
+    """Nor with stops in addition: it would be the energy of the impacts alone."""
     limits = {"theta_1": (-2.0, 2.0)}
     folder = with_joints("five_bar", {"theta_1": {"friction": 0.02, "stops": True}}, limits)
     scene = folder / "swing.scene.toml"
@@ -154,10 +154,10 @@ def test_dissipated_is_unknown_with_smoothed_friction(with_joints: Callable[...,
     assert all(np.isnan(found[name].to_numpy()).all() for name in ("end", "most", "path"))
 
 
-def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Path]) -> None:
-    """All four joints of a five-bar stick, with two freedoms: it lets go when no forces within their bounds hold it.
+def test_motion_is_unique_where_friction_forces_are_not(with_joints: Callable[..., Path]) -> None:
+    """Four joints of a five-bar with two freedoms stick until no friction forces within bounds are in equilibrium.
 
-    That is a linear program in the forces, whose value is one when it does.
+    That is a linear program in the forces, whose value is one when the joints begin to slide.
     """
     friction = np.array([0.2, 0.5, 0.35, 0.4])
     names = ("theta_1", "theta_2", "theta_3", "theta_4")
@@ -177,7 +177,7 @@ def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Pa
     assert_close(run.q_tree[resting], np.tile(run.q_tree[0], (resting.sum(), 1)), 1e-13)
 
     def load_factor(t: float) -> float:
-        """The least part of all friction that holds it."""
+        """Return the smallest fraction of all friction forces that is in equilibrium."""
         needed = t * push - terms.rho.T @ terms.h_tree
         found = linprog(
             [0, 0, 0, 0, 1],
@@ -190,7 +190,7 @@ def test_where_forces_are_not_unique_the_motion_is(with_joints: Callable[..., Pa
     assert_close(run.events[4]["t"], brentq(lambda t: load_factor(t) - 1.0, 0.0, 0.8, xtol=1e-12), 1e-8)
 
 
-def test_what_joints_at_rest_rule_out_is_refused(scene_of: Make, with_joints: Callable[..., Path]) -> None:
+def test_options_that_sticking_joints_exclude_are_refused(scene_of: Make, with_joints: Callable[..., Path]) -> None:
     scene = oscillator(scene_of, 1.0, 100.0, 10.0, 1.0, 1.0)
     with pytest.raises(InputError, match="joints that stick or touch are rows of their closure"):
         simulate(scene, {"formulation": "spf", "spf_coordinates": "z"})

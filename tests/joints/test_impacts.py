@@ -30,7 +30,7 @@ def stack(
     scene_of: Make, masses: list[float], e: list[float], q: list[float], rates: list[float], t_end: float,
     gravity: float = 0.0, ground: bool = True,
 ) -> Path:  # fmt: skip
-    """Sliders on a line, each on a stop of the one before; the first on a wall or on nothing."""
+    """Write sliders on a line, each on a stop of the one before; the first one on a wall if `ground`."""
     urdf, joints, above = "", "", "base"
     for k, mass in enumerate(masses):
         urdf += slide(NAMES[k], above, f"body_{k}", mass, 0.0 if k or ground else -1e3)
@@ -40,12 +40,12 @@ def stack(
     return scene_of(urdf, f"gravity = [{-gravity!r}, 0, 0]\n{joints}", start, t_end)
 
 
-def bodies(run: Run) -> Array:
-    """Velocities in the world by row."""
+def body_velocities(run: Run) -> Array:
+    """Return the bodies' velocities in the world by row."""
     return np.cumsum(run.v_tree[:, [run.column(name) for name in NAMES[: len(run.coordinates)]]], axis=1)
 
 
-def conserves(run: Run, tolerance: float = 1e-10) -> None:
+def assert_energy_balance(run: Run, tolerance: float = 1e-10) -> None:
     assert run.dissipated is not None
     largest = np.abs(run.energy).max()
     assert np.all(np.diff(run.dissipated) >= -1e-12 * largest)
@@ -54,7 +54,7 @@ def conserves(run: Run, tolerance: float = 1e-10) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize(("k", "count"), [(0, 3), (1, 31), (2, 314), (3, 3141)])
-def test_bounces_of_a_unit_mass_between_a_wall_and_a_heavy_one_count_pi(
+def test_number_of_collisions_between_wall_and_heavy_mass_gives_pi(
     scene_of: Make, formulation: str, k: int, count: int
 ) -> None:
     """floor(pi 10^k) impacts for a mass of 100^k (Galperin)."""
@@ -63,45 +63,43 @@ def test_bounces_of_a_unit_mass_between_a_wall_and_a_heavy_one_count_pi(
     assert run.status == "done"
     assert [event["of"] for event in run.events] == ["stop"] * count
     assert_close(run.energy / run.energy[0], np.ones(len(run.t)), 1e-9)
-    light, heavy = bodies(run)[-1]
+    light, heavy = body_velocities(run)[-1]
     assert -1e-12 < light < heavy
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("n", [2, 3, 5])
 @pytest.mark.parametrize("apart", [0.0, 0.125])
-def test_the_last_of_a_cradle_leaves_at_the_speed_of_the_first(
+def test_last_body_of_a_cradle_leaves_at_the_speed_of_the_first(
     scene_of: Make, formulation: str, n: int, apart: float
 ) -> None:
-    """Equal sliders, elastic, in contact or not; the law answers one pair after the other."""
+    """Equal elastic sliders, in contact or apart: the impact propagates from pair to pair."""
     gaps, rates = [0.0, 0.5, *[apart] * (n - 2)], [1.5, -1.5, *[0.0] * (n - 2)]
     scene = stack(scene_of, [1.0] * n, [1.0] * n, gaps, rates, 2.0, ground=False)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     assert run.status == "done"
-    assert_close(bodies(run)[-1], [*[0.0] * (n - 1), 1.5], 1e-12)
-    conserves(run)
+    assert_close(body_velocities(run)[-1], [*[0.0] * (n - 1), 1.5], 1e-12)
+    assert_energy_balance(run)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("ratio", [1.0, 1e3])
-def test_two_that_hit_a_third_from_both_sides_leave_it_at_rest(
+def test_symmetric_impacts_leave_the_middle_body_at_rest(
     scene_of: Make, formulation: str, e: float, ratio: float
 ) -> None:
     scene = stack(scene_of, [1.0, ratio, 1.0], [e] * 3, [0.0, 0.5, 0.5], [1.0, -1.0, -1.0], 1.0, ground=False)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     assert run.status == "done"
-    assert_close(bodies(run)[-1], [-e, 0.0, e], 1e-12)
+    assert_close(body_velocities(run)[-1], [-e, 0.0, e], 1e-12)
     assert {event["coordinate"] for event in run.events} == {"b", "c"}
     assert_close([event["t"] for event in run.events], 0.5, 1e-12)
-    conserves(run)
+    assert_energy_balance(run)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("ratio", [1.0, 1e4])
-def test_a_light_body_under_a_falling_one_stays_where_nothing_bounces(
-    scene_of: Make, formulation: str, ratio: float
-) -> None:
+def test_inelastic_impact_on_a_light_body_keeps_it_at_rest(scene_of: Make, formulation: str, ratio: float) -> None:
     scene = stack(scene_of, [1.0, ratio], [0.0, 0.0], [0.0, 0.5], [0.0, 0.0], 1.0, gravity=G)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     assert run.status == "done"
@@ -113,14 +111,14 @@ def test_a_light_body_under_a_falling_one_stays_where_nothing_bounces(
     assert_close(run.q_tree[run.t > landed], np.zeros((1, 2)), 1e-13)
     assert run.dissipated is not None
     assert_close(run.dissipated[-1], ratio * G * 0.5, 1e-10 * ratio)
-    conserves(run)
+    assert_energy_balance(run)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_stop_that_is_left_gives_nothing(scene_of: Make, formulation: str) -> None:
-    """A unit mass reaches the wall while a heavy one, in contact with it, moves off: billiards within one instant."""
+def test_a_separating_contact_gets_no_impulse(scene_of: Make, formulation: str) -> None:
+    """A unit mass hits the wall while a heavy one in contact with it moves away: several impacts at one instant."""
     masses, rates = np.array([1.0, 1000.0]), np.array([-1.0, 0.0])
-    while True:  # the wall, then the other body, as long as one of them is approached
+    while True:  # impacts with the wall and the other body in turn, until nothing approaches
         if rates[0] < 0:
             rates[0] *= -1
         elif rates[1] < rates[0]:
@@ -130,15 +128,17 @@ def test_a_stop_that_is_left_gives_nothing(scene_of: Make, formulation: str) -> 
     scene = stack(scene_of, [1.0, 1000.0], [1.0, 1.0], [0.0, 0.0], [-1.0, 1.0], 1.0)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     assert run.status == "done"
-    assert_close(bodies(run)[-1], rates, 1e-12)
+    assert_close(body_velocities(run)[-1], rates, 1e-12)
     assert_close(run.energy, np.full(len(run.t), 0.5), 1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize(("e_x", "e_y"), list(product([0.0, 0.5, 1.0], repeat=2)))
-def test_jammed_racks_lose_all_they_have(scene_of: Make, formulation: str, way: float, e_x: float, e_y: float) -> None:
-    """Two racks geared against each other, y = -x, both at their lower stop."""
+def test_jammed_racks_lose_all_kinetic_energy(
+    scene_of: Make, formulation: str, way: float, e_x: float, e_y: float
+) -> None:
+    """Two racks geared against each other, y = -x, are both at their lower stops."""
     urdf = slide("x", "base", "one", 1.0, 0.0) + slide("y", "base", "two", 1.0, 0.0)
     gear = '[[coupling]]\njoint = "y"\nother = "x"\nratio = -1.0\n'
     mechanism = f'gravity = [0, 0, 0]\nindependent = ["x"]\n{stop("x", e_x)}{stop("y", e_y)}{gear}'
@@ -157,7 +157,7 @@ FOOT = """<link name="{name}"><inertial><mass value="{mass}"/><inertia ixx="1e-3
 
 
 def rod(scene_of: Make, e: float, tilt: float, height: float) -> Path:
-    """A rod of 2 m on two feet that slide up and down, each with a stop at 0; one lets it slide along x."""
+    """Write a rod of 2 m on two vertical sliders, each with a stop at 0; on one of them it also slides along x."""
     guide = (
         '<joint name="{}" type="prismatic"><parent link="{}"/><child link="{}"/><origin xyz="{} 0 0"/><axis xyz="{}"/>'
     )
@@ -182,7 +182,7 @@ def rod(scene_of: Make, e: float, tilt: float, height: float) -> Path:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("e", [0.0, 0.3, 1.0])
-def test_a_rod_that_falls_flat_on_both_ends_rises_flat(scene_of: Make, formulation: str, e: float) -> None:
+def test_a_rod_that_lands_on_both_ends_rises_without_rotation(scene_of: Make, formulation: str, e: float) -> None:
     run = simulate(rod(scene_of, e, 0.0, 0.5), {**TIGHT, "formulation": formulation})
     assert run.status == "done"
     landed = np.sqrt(2 * 0.5 / G)
@@ -195,13 +195,13 @@ def test_a_rod_that_falls_flat_on_both_ends_rises_flat(scene_of: Make, formulati
         assert_close(ends[flight], np.repeat(expected[flight, None], 2, axis=1), 1e-10)
     else:
         assert np.all(np.abs(ends[run.t > landed + 1e-9]) < 1e-12)
-    conserves(run, 1e-9)
+    assert_energy_balance(run, 1e-9)
 
 
 @pytest.mark.parametrize("e", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("tilt", [1e-13, 1e-12, 1e-11])
-def test_ends_that_land_almost_at_once_are_answered_alike(scene_of: Make, e: float, tilt: float) -> None:
-    """What is right is not unique in the limit; it has to be one answer, and energy must not grow."""
+def test_nearly_simultaneous_impacts_do_not_depend_on_tolerance(scene_of: Make, e: float, tilt: float) -> None:
+    """The limit is not unique. All tolerances must give the same motion, and energy must not increase."""
     scene = rod(scene_of, e, tilt, 0.5)
     runs = [
         simulate(scene, {"formulation": formulation, "solver.rtol": rtol, "t_end": 0.4})
@@ -210,5 +210,5 @@ def test_ends_that_land_almost_at_once_are_answered_alike(scene_of: Make, e: flo
     ]
     for run in runs:
         assert run.status == "done"
-        conserves(run, 1e-6)
+        assert_energy_balance(run, 1e-6)
         assert_close(run.v_tree[-1], runs[-1].v_tree[-1], 1e-5)

@@ -1,4 +1,4 @@
-"""Friction and stops in mechanisms with loops: three formulations, and a time-stepping scheme of the tests' own."""
+"""Friction and stops in mechanisms with loops: three formulations against each other and against time stepping."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tests.conftest import assert_close
 from tests.joints.conftest import FORMULATIONS
 from tests.joints.stepping_delta import SteppingDelta
 
-Made = Callable[..., Path]
+WriteMechanism = Callable[..., Path]
 NAMES = ("theta_1", "theta_2", "theta_3", "theta_4")
 FRICTION = np.array([0.05, 0.02, 0.04, 0.03])
 STOPS = {"arm_1": (-0.3, 1.2), "arm_2": (-0.4, 1.2), "arm_3": (-0.5, 1.2)}
 
 
-def rubbing(with_joints: Made) -> Path:
+def write_five_bar_with_friction(with_joints: WriteMechanism) -> Path:
     return with_joints("five_bar", {name: {"friction": float(f)} for name, f in zip(NAMES, FRICTION, strict=True)})
 
 
-def alike(runs: dict[str, Run], tolerance: float) -> None:
-    """All formulations give one motion, whose events are the same at the same times."""
+def assert_same_motion(runs: dict[str, Run], tolerance: float) -> None:
+    """Assert that all formulations give the same motion with the same events."""
     one = runs["dae"]
     names = [event["name"] for event in one.events]
     for run in runs.values():
@@ -42,9 +42,9 @@ def alike(runs: dict[str, Run], tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_five_bar_with_friction_in_four_joints(with_joints: Made, seed: int) -> None:
+def test_formulations_agree_on_a_five_bar_with_friction_in_four_joints(with_joints: WriteMechanism, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    folder = rubbing(with_joints)
+    folder = write_five_bar_with_friction(with_joints)
     overrides = {
         "solver.rtol": 1e-12,
         "t_end": 3.0,
@@ -54,27 +54,27 @@ def test_a_five_bar_with_friction_in_four_joints(with_joints: Made, seed: int) -
     }
     runs = {f: simulate(folder / "swing.scene.toml", {**overrides, "formulation": f}) for f in FORMULATIONS}
     assert len(runs["dae"].events) > 8
-    alike(runs, 1e-8)
+    assert_same_motion(runs, 1e-8)
 
 
-def test_a_time_stepping_scheme_converges_to_it(with_joints: Made) -> None:
-    """Moreau's scheme, first order: velocities by a bounded least-squares problem a step, with the appendix's terms."""
-    run = simulate(rubbing(with_joints) / "swing.scene.toml", {"solver.rtol": 1e-11, "t_end": 1.0})
+def test_time_stepping_converges_to_the_motion_with_friction(with_joints: WriteMechanism) -> None:
+    """Moreau's scheme with the appendix's terms, of first order; each step solves a bounded least-squares problem."""
+    run = simulate(write_five_bar_with_friction(with_joints) / "swing.scene.toml", {"solver.rtol": 1e-11, "t_end": 1.0})
     assert len(run.events) > 4
     steps = np.array([250, 1000, 4000])
-    errors = np.array([np.abs(stepped(run.q_tree[0], 1.0, n) - run.q_tree[-1]).max() for n in steps])
-    assert np.all(errors * steps < 1.0)  # of first order, if not evenly: when a joint turns is rounded to a step
+    errors = np.array([np.abs(time_stepping(run.q_tree[0], 1.0, n) - run.q_tree[-1]).max() for n in steps])
+    assert np.all(errors * steps < 1.0)  # first order, but not smoothly: times of reversal are rounded to a step
     assert errors[-1] < errors[0] / 8
 
 
-def stepped(q_tree: Array, duration: float, steps: int) -> Array:
-    """Where the five-bar with friction is after a time, released from rest: q, q_dot and friction's impulses a step."""
+def time_stepping(q_tree: Array, duration: float, steps: int) -> Array:
+    """Return the configuration of the five-bar with friction a time after its release from rest, by time stepping."""
     h, q, q_dot = duration / steps, q_tree[[0, 2]].copy(), np.zeros(2)
     for _ in range(steps):
         there = FIVE_BAR.sigma(q)
         rho, D = FIVE_BAR.rho(there), FIVE_BAR.D(there)
         free = q_dot - h * np.linalg.solve(D, FIVE_BAR.C(there, rho @ q_dot) @ q_dot + FIVE_BAR.h(there))
-        # the impulses, within their bounds, that leave least kinetic energy: sticking where that can be
+        # the impulses within their bounds that minimize the kinetic energy: joints stick if they can
         root = np.linalg.cholesky(np.linalg.inv(D))
         found = lsq_linear(root.T @ rho.T, -np.linalg.solve(root, free), (-h * FRICTION, h * FRICTION), method="bvls")
         q_dot = free + np.linalg.solve(D, rho.T @ found.x)
@@ -83,21 +83,21 @@ def stepped(q_tree: Array, duration: float, steps: int) -> Array:
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6])
-def test_a_delta_falls_on_its_stops(with_joints: Made, restitution: float) -> None:
+def test_formulations_agree_on_a_delta_that_falls_on_its_stops(with_joints: WriteMechanism, restitution: float) -> None:
     joints = {name: {"stops": True, "restitution": restitution} for name in STOPS}
     folder = with_joints("delta", joints, STOPS)
     overrides = {"solver.rtol": 1e-10, "t_end": 0.6}
     runs = {f: simulate(folder / "default.scene.toml", {**overrides, "formulation": f}) for f in FORMULATIONS}
     assert any(event["of"] == "stop" for event in runs["dae"].events)
-    alike(runs, 1e-8)
+    assert_same_motion(runs, 1e-8)
     for name, (lower, upper) in STOPS.items():
         q = runs["dae"].q_tree[:, runs["dae"].column(name)]
         assert lower - 1e-10 <= q.min() <= q.max() <= upper + 1e-10
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6])
-def test_a_time_stepping_scheme_converges_to_the_delta_s_impacts(with_joints: Made, restitution: float) -> None:
-    """First order, if not evenly: when an arm meets its stop is rounded to a step."""
+def test_time_stepping_converges_to_the_impacts_of_a_delta(with_joints: WriteMechanism, restitution: float) -> None:
+    """First order, but not smoothly: times of impacts are rounded to a step."""
     folder = with_joints("delta", {name: {"stops": True, "restitution": restitution} for name in STOPS}, STOPS)
     run = simulate(folder / "default.scene.toml", {"solver.rtol": 1e-11, "solver.output_dt": 0.0225, "t_end": 0.45})
     assert len(run.events) > 3
@@ -109,8 +109,8 @@ def test_a_time_stepping_scheme_converges_to_the_delta_s_impacts(with_joints: Ma
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] < -0.8
 
 
-def test_a_simulator_meets_what_a_run_does(with_joints: Made) -> None:
-    scene = rubbing(with_joints) / "swing.scene.toml"
+def test_simulator_finds_the_events_of_a_run(with_joints: WriteMechanism) -> None:
+    scene = write_five_bar_with_friction(with_joints) / "swing.scene.toml"
     run = simulate(scene, {"solver.rtol": 1e-11, "t_end": 1.0})
     simulator = Simulator(scene, {"solver.rtol": 1e-11, "t_end": 1.0})
     for _ in range(40):
@@ -122,8 +122,8 @@ def test_a_simulator_meets_what_a_run_does(with_joints: Made) -> None:
 
 @pytest.mark.parametrize("rtol", [1e-2, 1e-4, 1e-7])
 @pytest.mark.parametrize("method", ["auto", "RK45", "Radau"])
-def test_at_every_tolerance_and_with_every_method(with_joints: Made, rtol: float, method: str) -> None:
-    scene = rubbing(with_joints) / "swing.scene.toml"
+def test_friction_with_all_methods_and_tolerances(with_joints: WriteMechanism, rtol: float, method: str) -> None:
+    scene = write_five_bar_with_friction(with_joints) / "swing.scene.toml"
     fine = simulate(scene, {"solver.rtol": 1e-12, "t_end": 0.8})
     run = simulate(scene, {"solver.rtol": rtol, "solver.method": method, "t_end": 0.8})
     assert run.status == "done"
@@ -131,9 +131,11 @@ def test_at_every_tolerance_and_with_every_method(with_joints: Made, rtol: float
 
 
 @pytest.mark.parametrize("clock", [{}, {"sample_time": 0.005}, {"sample_time": 0.005, "delay": 0.002}])
-def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float]) -> None:
-    """It starts at rest, held by all four joints, and what is sampled lets it go at an instant of the clock."""
-    scene = rubbing(with_joints) / "set_point.scene.toml"
+def test_friction_under_control_with_compiled_and_pinocchios_terms(
+    with_joints: WriteMechanism, clock: dict[str, float]
+) -> None:
+    """All four joints stick at the start. A sampled controller makes them slide at a sampling instant."""
+    scene = write_five_bar_with_friction(with_joints) / "set_point.scene.toml"
     compile_terms(load(scene.parent))
     overrides = {f"controller.{key}": value for key, value in clock.items()}
     runs = [
@@ -147,7 +149,7 @@ def test_under_control_whoever_s_terms(with_joints: Made, clock: dict[str, float
         assert_close(run.q_tree, runs[0].q_tree, 1e-8)
 
 
-def test_the_shipped_scene_that_rubs_and_stops() -> None:
+def test_formulations_agree_on_the_shipped_friction_scene() -> None:
     runs = [simulate("five_bar/friction", {"formulation": f, "solver.rtol": 1e-11}) for f in FORMULATIONS]
     one = runs[0]
     names = [event["name"] for event in one.events]

@@ -1,4 +1,4 @@
-"""Random mechanisms whose joints rub and stop: formulations agree, loops stay closed, energy is accounted for."""
+"""Random mechanisms with friction and stops: formulations agree, loops stay closed, and energy is balanced."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scripts.experiments.fuzz.contact.stops import with_limits
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.conftest import assert_close
 
-# 0, 13, 41: a row that follows from others at one instant alone; 12, 19: joints that loops leave no way;
-# 28, 54: many bounces that die out together
+# 0, 13, 41: a row that is redundant at one instant only; 12, 19: joints that the loops fix;
+# 28, 54: many bounces that decay together
 SEEDS = [0, 12, 13, 19, 28, 41, 54, 101, 102, 103, 104, 105]
 
 
-def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
-    """Most joints get friction, of the size of what gravity and springs do there, and some stops near by."""
+def write_with_friction_and_stops(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Write a random mechanism with some stops, and friction of the size of gravity and spring forces."""
     random = np.random.default_rng([seed, 77])
     random_mechanism(seed).write(folder)
     mechanism = load(folder)
@@ -46,8 +46,8 @@ def rubbing(seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_random_mechanisms_rub_and_stop(seed: int, tmp_path: Path) -> None:
-    scene, overrides = rubbing(seed, tmp_path / "random")
+def test_formulations_agree_on_random_mechanisms_with_friction_and_stops(seed: int, tmp_path: Path) -> None:
+    scene, overrides = write_with_friction_and_stops(seed, tmp_path / "random")
     runs = [simulate(scene, {**overrides, "formulation": formulation}) for formulation in ("dae", "reduced")]
     for run in runs:
         assert run.status == "done", run.message

@@ -1,4 +1,4 @@
-"""Stops against closed forms: when a joint meets one, and how it goes on."""
+"""Joint stops against closed forms: times of impacts, and the motion after them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PENDULUM = """<link name="rod"><inertial><origin xyz="0 0 -0.6"/><mass value="1.
     <limit lower="0" upper="9" effort="1" velocity="1"/></joint>"""
 
 
-def bounces(run: Run) -> list[float]:
+def bounce_times(run: Run) -> list[float]:
     return [float(event["t"]) for event in run.events if event["name"].endswith("bounces")]
 
 
@@ -37,8 +37,8 @@ def stop(joint: str, restitution: float) -> str:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("restitution", [0.3, 0.7])
-def test_a_pendulum_bounces_at_its_lowest(scene_of: Make, formulation: str, restitution: float) -> None:
-    """Between two impacts half a period passes, by an elliptic integral; e shortens sin(amplitude / 2)."""
+def test_times_of_a_bouncing_pendulum(scene_of: Make, formulation: str, restitution: float) -> None:
+    """Half a period, an elliptic integral, is between two impacts. Each one multiplies sin(amplitude / 2) by e."""
     start = 2.1
     scene = scene_of(PENDULUM, stop("theta", restitution), f"q = {{theta = {start}}}\n", 6.0)
     run = simulate(scene, {**TIGHT, "formulation": formulation})
@@ -49,7 +49,7 @@ def test_a_pendulum_bounces_at_its_lowest(scene_of: Make, formulation: str, rest
         wanted.append(t)
         k *= restitution
         t += 2 * ellipk(k**2) / rate
-    found = bounces(run)[: len(wanted)]
+    found = bounce_times(run)[: len(wanted)]
     assert len(found) >= 5
     assert_close(found, wanted[: len(found)], 1e-10)
     assert run.dissipated is not None
@@ -58,15 +58,15 @@ def test_a_pendulum_bounces_at_its_lowest(scene_of: Make, formulation: str, rest
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_bounces_that_die_out_end_in_contact(scene_of: Make, formulation: str) -> None:
-    """Of infinitely many bounces within finite time those are made that rise more than 1e-10; then the stop carries."""
+def test_decaying_bounces_end_in_contact(scene_of: Make, formulation: str) -> None:
+    """Infinitely many bounces take a finite time. Contact begins after those higher than 1e-10 of the drop."""
     scene = scene_of(
         slide("x", "base", "ball", 2.0, 0.0), "gravity = [-9.81, 0, 0]\n" + stop("x", 0.5), "q = {x = 1.0}\n", 3.0
     )
     run = simulate(scene, {"solver.rtol": 1e-10, "formulation": formulation})
     flight = np.sqrt(2 / G)
     ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 60)])
-    found = bounces(run)
+    found = bounce_times(run)
     assert_close(found, ends[: len(found)], 1e-10)
     rise = 0.25 ** (len(found) + 1)
     assert rise < 1e-10 < 4 * rise
@@ -80,8 +80,8 @@ def test_bounces_that_die_out_end_in_contact(scene_of: Make, formulation: str) -
     assert without.events == []
 
 
-def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
-    """A block on a stop, pulled by a spring whose other end swings away: contact ends when its force is zero."""
+def test_contact_ends_when_its_force_is_zero(scene_of: Make) -> None:
+    """A block on a stop is pulled by a spring whose other end swings away."""
     urdf = slide("x", "base", "block", 1.0, 0.0) + slide("far", "base", "swing", 50.0)
     mechanism = (
         '[[spring]]\nframe_a = "block"\nframe_b = {link = "swing", xyz = [10.0, 0.0, 0.0]}\nrest_length = 10.0\n'
@@ -94,8 +94,8 @@ def test_a_stop_lets_go_when_it_is_pulled_off(scene_of: Make) -> None:
     assert_close(run.events[1]["t"], np.arcsin(4.0 / 20.0 / 0.5 * rate) / rate, 1e-10)
 
 
-def test_what_goes_on_sticking_says_so_once(scene_of: Make) -> None:
-    """One block sticks all the time, another one bounces beside it."""
+def test_a_joint_that_keeps_sticking_has_one_event(scene_of: Make) -> None:
+    """One block sticks all the time while another one bounces."""
     urdf = slide("a", "base", "one", 1.0) + slide("b", "base", "two", 1.0, 0.0)
     mechanism = 'gravity = [-9.81, 0, 0]\n[[joint]]\nname = "a"\nfriction = 20.0\n' + stop("b", 0.5)
     run = simulate(scene_of(urdf, mechanism, "q = {a = 0.0, b = 1.0}\n", 3.0), TIGHT)
@@ -113,8 +113,8 @@ def test_a_start_beyond_a_stop_is_refused(scene_of: Make) -> None:
     assert simulate(scene, {"initial.q.x": 0.0}).status == "done"
 
 
-def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
-    """Newton's cradle on two stops: three blocks whose gaps are joints, thrown at a wall together."""
+def test_simultaneous_impacts_lose_energy_without_penetration(scene_of: Make) -> None:
+    """Three blocks in contact, whose gaps are joints, hit a wall together."""
     urdf = (
         slide("a", "base", "one", 1.0, 0.0) + slide("b", "one", "two", 1.0, 0.0) + slide("c", "two", "three", 1.0, 0.0)
     )
@@ -129,12 +129,12 @@ def test_impacts_at_once_take_energy_and_open_nothing(scene_of: Make) -> None:
     # the stack meets the wall at t = 1; gaps' rates are differences of the blocks' velocities
     gaps = np.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
     after = run.v_tree[run.t > 1.0][0]
-    assert_close(after, reflected(gaps @ gaps.T, np.array([-1.0, 0.0, 0.0]), 0.6), 1e-12)
+    assert_close(after, reflect_gap_rates(gaps @ gaps.T, np.array([-1.0, 0.0, 0.0]), 0.6), 1e-12)
     assert np.all(after >= 0.0)
 
 
-def reflected(A: np.ndarray[Any, Any], g: np.ndarray[Any, Any], e: float) -> np.ndarray[Any, Any]:
-    """Gap rates after rounds that reflect all approaching ones together, by Lawson and Hanson's NNLS."""
+def reflect_gap_rates(A: np.ndarray[Any, Any], g: np.ndarray[Any, Any], e: float) -> np.ndarray[Any, Any]:
+    """Return gap rates after rounds that reflect all approaching gaps together, by Lawson and Hanson's NNLS."""
     while np.any(g < -1e-13):
         at = np.flatnonzero(g < -1e-13)
         root = np.linalg.cholesky(A[np.ix_(at, at)])
@@ -144,7 +144,7 @@ def reflected(A: np.ndarray[Any, Any], g: np.ndarray[Any, Any], e: float) -> np.
 
 
 def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
-    """The guess closes with theta_2 at 0.248: beyond either pair of stops, in reach of them or not."""
+    """Without stops theta_2 would assemble at 0.248, which is beyond either pair of stops."""
     joints, free = {"theta_2": {"stops": True}}, load("five_bar")
     for lower, upper in [(0.4, 2.0), (-2.0, -0.3)]:
         folder = with_joints("five_bar", joints, {"theta_2": (lower, upper)})
@@ -154,7 +154,7 @@ def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
         assert np.abs(FIVE_BAR.phi(there)).max() < 1e-12
         assert any("theta_2 = " in said and "without them 0.2478" in said for said in bar.warnings)
         if lower > 0:
-            # as near as can be: no further off than from there along theta_2 alone, the others following
+            # The assembled configuration is the one nearest to the guess.
             assert np.linalg.norm(there - free.tree.to_coordinates(free.q_tree)) < 0.5
         run = simulate(folder / "swing.scene.toml", {"initial": {"at": "assembled"}, "t_end": 0.1})
         assert run.status == "done"
@@ -163,7 +163,7 @@ def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
         assert lower - 1e-10 < column.min() <= column.max() < upper + 1e-10
 
 
-def test_stops_that_the_loops_cannot_keep_are_left(with_joints: Make) -> None:
+def test_stops_that_cannot_be_assembled_are_reported_by_a_run(with_joints: Make) -> None:
     folder = with_joints("delta", {"swing_1a": {"stops": True}, "arm_1": {"stops": True}}, {
         "swing_1a": (2.5, 2.6), "arm_1": (1.5, 1.6),
     })  # fmt: skip
@@ -180,10 +180,10 @@ HINGE = """<joint name="{name}" type="revolute"><parent link="{on}"/><child link
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6])
-def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path, restitution: float) -> None:
-    """Without it the joint would fall off its stop: it is by what holds the other one that it comes back.
+def test_bounces_decay_while_another_joint_rests_on_its_stop(tmp_path: Path, restitution: float) -> None:
+    """Only the contact force of the other joint makes the bouncing joint return.
 
-    Without restitution the other one stays; else it is thrown off its stop by each bounce, and comes back.
+    Without restitution the other joint stays at its stop. With restitution each bounce throws it off, and it returns.
     """
     parts = '<link name="ground"/>' + LINK.format(name="upper", x=0.365, y=-0.055, m=1.624)
     parts += LINK.format(name="lower", x=0.264, y=-0.075, m=0.995)
@@ -211,8 +211,8 @@ def test_bounces_die_out_while_another_joint_rests_on_its_stop(tmp_path: Path, r
         assert np.diff(times)[-3:] / np.diff(times)[-4:-1] == pytest.approx([0.3] * 3, rel=1e-2)
 
 
-def test_stops_of_a_run_at_contacts_name_joints_and_forces() -> None:
-    """The reasons themselves do not come about by any known scene; what they say is taken from the loop."""
+def test_stop_reasons_at_contacts_name_joints_and_forces() -> None:
+    """No known scene ends for these reasons, so the messages are tested with a stand-in for the loop."""
     bar = load("five_bar")
     loop = SimpleNamespace(
         t=0.5, trouble=lambda: ("none", "", np.zeros(2), 1.0, 1.0, bar.q_tree, [0, 2], [1, 3]),
@@ -229,8 +229,8 @@ def test_stops_of_a_run_at_contacts_name_joints_and_forces() -> None:
     assert "theta_3 has passed its stop within a step; a solver.max_step shorter than" in beyond
 
 
-def test_joints_that_loops_hold_still_have_no_events(tmp_path: Path) -> None:
-    """A triangle of rods whose pins cannot turn; at a dead centre a joint rests for an instant only."""
+def test_joints_fixed_by_loops_have_no_events(tmp_path: Path) -> None:
+    """The pins of a triangle of rods cannot turn. A joint at a dead centre, which rests for an instant only, can."""
     parts = LINK.format(name="a", x=0.1, y=0.0, m=1.0) + LINK.format(name="b", x=0.1, y=0.0, m=1.0)
     parts = '<link name="ground"/>' + LINK.format(name="wheel", x=0.2, y=0.0, m=1.0) + parts
     parts += HINGE.format(name="turn", on="ground", to="wheel", x=0.0, low=-9, high=9)
