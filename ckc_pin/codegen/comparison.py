@@ -21,7 +21,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["CompiledFunctions", "require_equal_terms"]
 
-STATES = 25  # compared on the closure, and as many off it
+STATES = 25  # compared on the constraint manifold, and as many off it
 STATE_SPREAD = 0.5  # rad, or times the mechanism's size: distance of the states from the assembled configuration
 TERMS_TOLERANCE = 1e-11  # relative to the largest entry
 DERIVATIVES_TOLERANCE = 1e-6  # derivatives against differences, relative
@@ -77,7 +77,7 @@ class CompiledFunctions:
 
 
 def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
-    """Compare compiled terms with Pinocchio's at random states, on the closure and off it.
+    """Compare compiled terms with Pinocchio's at random states, on the constraint manifold and off it.
 
     Raises
     ------

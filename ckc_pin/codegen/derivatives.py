@@ -53,34 +53,41 @@ def derivative_functions(
     """
     import casadi as cs
 
-    state_symbols, (step, v, more, varied) = [*state.values()], direction.values()
+    state_symbols, (step, v, more, parameter_direction) = [*state.values()], direction.values()
     motion = cs.vertcat(step, v, more)
     derivatives = cs.cse(cs.vertcat(expressions["change"], expressions["by_arguments"]))
     derivatives, extracted, extracted_values = cs.extract_parametric(derivatives, cs.vertcat(*state_symbols))
     derivatives = cs.cse(derivatives)
-    known = cs.vertcat(*extracted, *_symbols_in(derivatives, state_symbols))
-    known_values = cs.substitute(known, cs.vertcat(*extracted), cs.vertcat(*extracted_values))
-    pivots = _find_divisors(cs.Function("change", [known, motion, varied], [derivatives]))
-    derivatives = cs.substitute(derivatives, known[pivots], 1 / known[pivots])  # pivots are inverted once a state
-    known_values[pivots] = 1 / known_values[pivots]
+    state_values = cs.vertcat(*extracted, *_symbols_in(derivatives, state_symbols))
+    state_expressions = cs.substitute(state_values, cs.vertcat(*extracted), cs.vertcat(*extracted_values))
+    pivots = _find_divisors(cs.Function("change", [state_values, motion, parameter_direction], [derivatives]))
+    derivatives = cs.substitute(
+        derivatives, state_values[pivots], 1 / state_values[pivots]
+    )  # pivots are inverted once a state
+    state_expressions[pivots] = 1 / state_expressions[pivots]
 
-    def state_function(known_values: Any) -> Any:
-        results = (known_values, expressions["acceleration_of_u"], expressions["sound"])
+    def state_function(state_expressions: Any) -> Any:
+        results = (state_expressions, expressions["acceleration_of_u"], expressions["sound"])
         parts = split_column(cs.cse(cs.vertcat(*results)), [x.numel() for x in results])
         return cs.Function("state", state_symbols, parts, [*state], ["known", "acceleration", "sound"])
 
-    order = _order_for_vectors(known.numel(), trace_result_lanes(state_function(known_values), "known", lanes))
-    known = cs.vertcat(*(cs.SX.sym("unread") if k is None else known[k] for k in order))
-    known_values = cs.vertcat(*(cs.SX(np.nan) if k is None else known_values[k] for k in order))
+    order = _order_for_vectors(
+        state_values.numel(), trace_result_lanes(state_function(state_expressions), "known", lanes)
+    )
+    state_values = cs.vertcat(*(cs.SX.sym("unread") if k is None else state_values[k] for k in order))
+    state_expressions = cs.vertcat(*(cs.SX(np.nan) if k is None else state_expressions[k] for k in order))
     change, *by_arguments = split_column(derivatives, [expressions["change"].numel(), *[more.numel()] * len(groups)])
-    one = cs.Function("change", [known, motion], [change], ["known", "direction"], ["change"])
-    sums = [cs.sum1(cs.fabs(varied[group])) for group in groups]
+    one = cs.Function("change", [state_values, motion], [change], ["known", "direction"], ["change"])
+    sums = [cs.sum1(cs.fabs(parameter_direction[group])) for group in groups]
     functions = {
-        "state": state_function(known_values),
+        "state": state_function(state_expressions),
         "change": one,
-        "groups": cs.Function("groups", [varied], [cs.vertcat(*sums)]),
+        "groups": cs.Function("groups", [parameter_direction], [cs.vertcat(*sums)]),
     }
-    functions |= {f"varied_{k}": cs.Function(f"varied_{k}", [known, varied], [x]) for k, x in enumerate(by_arguments)}
+    functions |= {
+        f"varied_{k}": cs.Function(f"varied_{k}", [state_values, parameter_direction], [x])
+        for k, x in enumerate(by_arguments)
+    }
     starts = {0: lanes["v"], step.numel(): lanes["v"], step.numel() + v.numel(): lanes["u"]}
     new_lanes: dict[str, Lanes] = {
         "direction": {start + k: x for start, places in starts.items() for k, x in places.items()},
@@ -95,10 +102,10 @@ def _several_directions(one: Any) -> tuple[Any, Lanes]:
     """Return the function of several directions at a time, and the lanes of the directions' entries."""
     import casadi as cs
 
-    known, direction = one.sx_in()
+    state_values, direction = one.sx_in()
     directions = cs.SX.sym("directions", DIRECTIONS, direction.numel())
-    results = cs.vertcat(*(one(known, directions[k, :].T).T for k in range(DIRECTIONS)))
-    arguments, names = [known, cs.vec(directions)], (["shared", "directions"], ["changes"])
+    results = cs.vertcat(*(one(state_values, directions[k, :].T).T for k in range(DIRECTIONS)))
+    arguments, names = [state_values, cs.vec(directions)], (["shared", "directions"], ["changes"])
     lanes = {k: ((DIRECTION_LANES, k % DIRECTIONS), k // DIRECTIONS) for k in range(directions.numel())}
     return cs.Function("changes", arguments, [cs.vec(results)], *names), lanes
 

@@ -148,12 +148,12 @@ class SymmetricFactor:
         self._order, self._n, self._place = tuple(order), n, {k: place for place, k in enumerate(order)}
         self._inverses: dict[int, Any] = {}  # a division costs as much as ten products
         self._l: dict[int, dict[int, Any]] = {}  # L's columns, without signs
-        own: dict[int, Entries] = defaultdict(dict)
+        own_entries: dict[int, Entries] = defaultdict(dict)
         for (i, j), x in entries.items():
-            own[min(i, j, key=self._place.__getitem__)][("sum", i) if i == j else ("entry", i, j)] = x
+            own_entries[min(i, j, key=self._place.__getitem__)][("sum", i) if i == j else ("entry", i, j)] = x
         passed_on: dict[int | None, list[Entries]] = defaultdict(list)
         for k in order:
-            rest = _sum([own[k], *passed_on[k]])
+            rest = _sum([own_entries[k], *passed_on[k]])
             total = rest.pop(("sum", k), cs.SX(0))
             pivot = total - rest.pop(("reduction", k)) if ("reduction", k) in rest else total
             self._inverses[k] = inverse = 1 / pivot

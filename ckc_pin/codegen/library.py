@@ -1,7 +1,7 @@
 """Compiled terms as shared libraries: looked up in the user's cache, or compiled, checked and stored there.
 
 A cached file is called KEY-COMPILER-CONTENT.so, three hashes: of everything that enters the code, of the compiler with
-its flags, and of the file itself. A file whose content has another hash is compiled anew instead of loaded. Two
+its flags, and of the file itself. A file whose content has another hash is compiled again instead of loaded. Two
 processes may write the same file at the same time: the later one replaces the earlier one.
 """
 
@@ -32,7 +32,7 @@ from ckc_pin.mechanism.rows import RelativeLog
 __all__ = ["Library", "cache_folder", "compile_terms", "explain_too_large", "find_compiled_terms"]
 
 COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, measured in docs/theory/generated.md
-# Limits of a tree whose terms are compiled, so that the compiler takes at most two minutes. The second one limits the
+# Limits of the size of a tree, so that the compiler takes at most two minutes. The second one limits the
 # number of (coordinate, moved joint) pairs: a single branch reaches it with 40 joints.
 MAX_COORDINATES, MAX_MOVED_JOINTS = 130, 820
 
@@ -71,16 +71,16 @@ def explain_too_large(mechanism: Mechanism) -> str:
 
 
 def find_compiled_terms(
-    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
+    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, directional_derivatives: bool = False
 ) -> Library | None:
     """Return a mechanism's compiled terms if the cache has them and the file is intact; otherwise None.
 
-    `which` and `changes` as in `compile_terms`.
+    `which` and `directional_derivatives` as in `compile_terms`.
     """
     folder = cache_folder()
     if explain_too_large(mechanism) or not folder.is_dir():
         return None
-    return _look_up(_Subject.of(mechanism, which, changes), folder)
+    return _look_up(_Subject.of(mechanism, which, directional_derivatives), folder)
 
 
 def compile_terms(
@@ -88,7 +88,7 @@ def compile_terms(
     which: Mapping[str, BoolArray] | None = None,
     on_written: Callable[[float], None] | None = None,
     *,
-    changes: bool = False,
+    directional_derivatives: bool = False,
     limited: bool = True,
 ) -> Library:
     """Return a mechanism's compiled terms, from the cache or compiled now.
@@ -101,7 +101,7 @@ def compile_terms(
         parameter may vary from zero.
     on_written : callable, optional
         Called once before the compiler starts, with the seconds that it may take.
-    changes : bool
+    directional_derivatives : bool
         Whether to add directional derivatives of the acceleration, which takes longer to compile.
     limited : bool
         Whether to refuse a tree that is too large. The compiler's only other limit is its timeout.
@@ -114,11 +114,11 @@ def compile_terms(
     """
     if limited and (reason := explain_too_large(mechanism)):
         raise InputError(reason)
-    subject = _Subject.of(mechanism, which, changes)
+    subject = _Subject.of(mechanism, which, directional_derivatives)
     library = _look_up(subject, cache_folder())
     if library is not None:
         return library
-    compiler = find_compiler(subject.changes)
+    compiler = find_compiler(subject.directional_derivatives)
     if compiler is None:
         raise InputError("compiled terms need a C compiler: `cc` was not found on PATH")
     return _make(_with_numbers_of_files(mechanism, subject), subject, compiler, on_written)
@@ -131,13 +131,18 @@ class _Subject:
     key: str
     parameters: Array
     which: Mapping[str, BoolArray]
-    changes: bool
+    directional_derivatives: bool
 
     @classmethod
-    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, changes: bool) -> _Subject:
+    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, directional_derivatives: bool) -> _Subject:
         mechanism_numbers = model_numbers(mechanism)
         which = which or present(mechanism_numbers)
-        return cls(_key(mechanism, which, changes), values(mechanism_numbers, which), which, changes)
+        return cls(
+            _key(mechanism, which, directional_derivatives),
+            values(mechanism_numbers, which),
+            which,
+            directional_derivatives,
+        )
 
 
 def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism:
@@ -152,10 +157,10 @@ def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism
         unchanged = build(sources.texts[MECHANISM_FILE], Sources(sources.name, sources.folder, sources.texts))
     except (InputError, MechanismError):  # the files' numbers may not assemble
         return mechanism
-    return unchanged if _key(unchanged, subject.which, subject.changes) == subject.key else mechanism
+    return unchanged if _key(unchanged, subject.which, subject.directional_derivatives) == subject.key else mechanism
 
 
-def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], changes: bool) -> str:
+def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_derivatives: bool) -> str:
     """Return the hash of everything that enters the code: this package, the tree, the rows, which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
     model = tree.model
@@ -183,7 +188,7 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], changes: bool) ->
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
     arguments = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
-    kind = (mechanism.redundant, changes, platform.machine())
+    kind = (mechanism.redundant, directional_derivatives, platform.machine())
     return hash_of((_package_hash(), joints, groups, table, arguments, springs, *kind))[:32]
 
 
@@ -204,7 +209,7 @@ def _look_up(subject: _Subject, folder: Path) -> Library | None:
         paths = sorted(folder.glob(f"{subject.key}-*-*.so"))
         if not paths or not _is_usable(folder):
             return None
-        compiler = find_compiler(subject.changes)
+        compiler = find_compiler(subject.directional_derivatives)
         for path in paths:
             _, compiler_key, content = path.stem.rsplit("-", 2)
             is_of_compiler = compiler is None or compiler_key == compiler.key
@@ -258,7 +263,9 @@ def _write_c_source(mechanism: Mechanism, subject: _Subject) -> str:
     try:
         from ckc_pin.codegen.term_functions import TermFunctions
 
-        return TermFunctions.of(mechanism, subject.which, changes=subject.changes).c_source()
+        return TermFunctions.of(
+            mechanism, subject.which, directional_derivatives=subject.directional_derivatives
+        ).c_source()
     except ModuleNotFoundError as error:
         message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(message) from error

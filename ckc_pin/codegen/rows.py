@@ -89,8 +89,8 @@ class _Point:
         R = self.body.axes.rotation_to(body.axes)
         carried = multiply(R, self.body.carried_jacobian(self.motion.value, n))
         carried = multiply(body.R.T, subtract(carried, body.carried_jacobian(here.value, n)))
-        own = self.body.own_jacobian(multiply(body.R.T, multiply(R, self.body.R)), self.local, n)
-        jacobian = carried + sign * own - sign * body.own_jacobian(cs.SX.eye(3), sign * value, n)
+        own_columns = self.body.own_jacobian(multiply(body.R.T, multiply(R, self.body.R)), self.local, n)
+        jacobian = carried + sign * own_columns - sign * body.own_jacobian(cs.SX.eye(3), sign * value, n)
         return _MovingVector(value, rate, acceleration, jacobian)
 
 

@@ -56,7 +56,7 @@ class Symbolic(HasSummary):
     q_dot : casadi.Function
         Of (q, v): the rate of q, (nq).
     v_dot : casadi.Function
-        Of (q, v, u, p): eq. 1's acceleration, (n), on the closure and off it, where J has full rank.
+        Of (q, v, u, p): eq. 1's acceleration, (n), on and off the constraint manifold, where J has full rank.
     """
 
     coordinates: tuple[str, ...]

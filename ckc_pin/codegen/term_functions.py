@@ -43,7 +43,7 @@ class TermFunctions:
     - `FUNCTIONS` are the terms. `coriolis` is left out of a tree with a free root, whose twist has several C'.
       `jacobian` is left out where it would take too long to compile.
 
-    With `changes`, there are also directional derivatives of the acceleration:
+    With `directional_derivatives`, there are also directional derivatives of the acceleration:
 
     - `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it
       is accurate.
@@ -66,7 +66,11 @@ class TermFunctions:
 
     @classmethod
     def of(
-        cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, changes: bool = False
+        cls,
+        mechanism: Mechanism,
+        which: Mapping[str, BoolArray] | None = None,
+        *,
+        directional_derivatives: bool = False,
     ) -> TermFunctions:
         """Derive a mechanism's functions.
 
@@ -75,7 +79,7 @@ class TermFunctions:
         mechanism : Mechanism
         which : mapping, optional
             Numbers that are arguments (`arguments.present`).
-        changes : bool
+        directional_derivatives : bool
             Whether to add directional derivatives.
         """
         import casadi as cs
@@ -97,7 +101,7 @@ class TermFunctions:
             "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
             "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
         }
-        results = _results(terms, symbols, direction if changes else None)
+        results = _results(terms, symbols, direction if directional_derivatives else None)
         column, numbers, functions, lanes["numbers"] = _extract_numbers(mechanism, terms, results, lanes)
         parts = dict(zip(results, split_column(column, [x.numel() for x in results.values()]), strict=True))
         for name, (arguments, outputs) in FUNCTIONS.items():
@@ -107,7 +111,7 @@ class TermFunctions:
             outputs_column = cs.cse(cs.vertcat(*(parts[x] for x in outputs)))
             values = split_column(outputs_column, [results[x].numel() for x in outputs])
             functions[name] = cs.Function(name, [*inputs.values()], values, [*inputs], list(outputs))
-        if changes:
+        if directional_derivatives:
             state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": numbers}
             groups = terms.arguments.groups
             derivatives, new_lanes = derivative_functions(parts, state, direction, groups, lanes)
@@ -132,15 +136,17 @@ def _extract_numbers(
     import casadi as cs
 
     arguments, rotations = terms.arguments.vector, terms.rotations
-    own = cs.vertcat(arguments, *rotations.symbols)
-    column, extracted, definitions = cs.extract_parametric(cs.vertcat(*(cs.vec(x) for x in results.values())), own)
-    values = cs.vertcat(own, *definitions)
-    numbers = cs.Function("numbers", [own], [values], ["own"], ["numbers"])
+    all_numbers = cs.vertcat(arguments, *rotations.symbols)
+    column, extracted, definitions = cs.extract_parametric(
+        cs.vertcat(*(cs.vec(x) for x in results.values())), all_numbers
+    )
+    values = cs.vertcat(all_numbers, *definitions)
+    numbers = cs.Function("numbers", [all_numbers], [values], ["own"], ["numbers"])
     argument_lanes = assign_argument_lanes(mechanism, terms.arguments, rotations, lanes)
     number_lanes = trace_result_lanes(numbers, "numbers", {"own": argument_lanes})
     values = cs.substitute(values, cs.vertcat(*rotations.symbols), cs.DM(rotations.values))
     functions = {"numbers": cs.Function("numbers", [arguments], [values])}
-    return column, cs.vertcat(own, *extracted), functions, number_lanes
+    return column, cs.vertcat(all_numbers, *extracted), functions, number_lanes
 
 
 def _results(terms: TermExpressions, symbols: dict[str, Any], direction: dict[str, Any] | None) -> dict[str, Any]:
@@ -172,8 +178,8 @@ def _results(terms: TermExpressions, symbols: dict[str, Any], direction: dict[st
         return {name: cs.densify(x) for name, x in results.items()}
     uncorrected = cs.SX(rows.phi.numel(), 1)
     results["acceleration_of_u"] = inertia.acceleration(symbols["u"], uncorrected)[0]
-    step, v, more, varied = direction.values()
+    step, v, more, parameter_direction = direction.values()
     q_change = cs.substitute(terms.q_dot, terms.v, step)
     results["change"] = inertia.directional_derivative(symbols["u"], q_change, v, more)
-    results["by_arguments"] = inertia.argument_derivative(symbols["u"], varied)
+    results["by_arguments"] = inertia.argument_derivative(symbols["u"], parameter_direction)
     return {name: cs.densify(x) for name, x in results.items()}

@@ -44,7 +44,9 @@ def select_derivative_library(
     """
     if arguments is None or terms == "pinocchio":
         return None
-    return (compile_terms if terms == "generated" else find_compiled_terms)(mechanism, arguments, changes=True)
+    return (compile_terms if terms == "generated" else find_compiled_terms)(
+        mechanism, arguments, directional_derivatives=True
+    )
 
 
 def compile_during_run(mechanism: Mechanism, loop: Any, missing_arguments: Mapping[str, BoolArray] | None) -> None:
@@ -58,5 +60,5 @@ def compile_during_run(mechanism: Mechanism, loop: Any, missing_arguments: Mappi
         Arguments that the library needs for parameter derivatives, as of `select_derivative_library`.
     """
     with suppress(InputError):
-        library = compile_terms(mechanism, missing_arguments, changes=missing_arguments is not None)
+        library = compile_terms(mechanism, missing_arguments, directional_derivatives=missing_arguments is not None)
         loop.write((library.path, library.parameters))

@@ -58,22 +58,22 @@ def mechanism(folder: Path) -> Mechanism:
 
 def states() -> list[tuple[Array, Array, Array]]:
     """Return closed configurations, velocities q_dot and torques."""
-    random, found = np.random.default_rng(11), []
+    random, samples = np.random.default_rng(11), []
     for _ in range(20):
         q_tree = GEARED.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.4, 0.4, 2))
-        found.append((q_tree, random.uniform(-3, 3, 2), random.uniform(-2, 2, 2)))
-    return found
+        samples.append((q_tree, random.uniform(-3, 3, 2), random.uniform(-2, 2, 2)))
+    return samples
 
 
 def test_terms_include_rotor_inertia(mechanism: Mechanism) -> None:
     for q_tree, q_dot, _ in states():
         v_tree = GEARED.rho(q_tree) @ q_dot
-        found = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
-        assert_close(found.D_tree, GEARED.D_tree(q_tree), EXACT)
-        assert_close(found.D, GEARED.D(q_tree), EXACT)
-        assert_close(found.C_times(q_dot), GEARED.C(q_tree, v_tree) @ q_dot, 1e-11)
-        assert_close(found.bias_tree, GEARED.C_tree(q_tree, v_tree) @ v_tree + GEARED.h_tree(q_tree), 1e-11)
-        assert_close(found.energy, GEARED.energy(q_tree, v_tree), 1e-11)
+        ours = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
+        assert_close(ours.D_tree, GEARED.D_tree(q_tree), EXACT)
+        assert_close(ours.D, GEARED.D(q_tree), EXACT)
+        assert_close(ours.C_times(q_dot), GEARED.C(q_tree, v_tree) @ q_dot, 1e-11)
+        assert_close(ours.bias_tree, GEARED.C_tree(q_tree, v_tree) @ v_tree + GEARED.h_tree(q_tree), 1e-11)
+        assert_close(ours.energy, GEARED.energy(q_tree, v_tree), 1e-11)
 
 
 def test_accelerations_include_rotor_inertia(mechanism: Mechanism) -> None:
@@ -82,17 +82,17 @@ def test_accelerations_include_rotor_inertia(mechanism: Mechanism) -> None:
     expressions = symbolic(mechanism)
     for q_tree, q_dot, u in states():
         v_tree = GEARED.rho(q_tree) @ q_dot
-        wanted, _ = GEARED.acceleration_and_multipliers(q_tree, v_tree, u)
-        tolerance = 1e-10 * np.abs(wanted).max()
+        expected, _ = GEARED.acceleration_and_multipliers(q_tree, v_tree, u)
+        tolerance = 1e-10 * np.abs(expected).max()
         at = terms(mechanism, dict(zip(NAMES, q_tree, strict=True)), dict(zip(NAMES, v_tree, strict=True)))
-        assert_close(dae_acceleration(at, E @ u), wanted, tolerance)
-        assert_close(reduced_acceleration(at, E @ u), wanted[[0, 2]], tolerance)
+        assert_close(dae_acceleration(at, E @ u), expected, tolerance)
+        assert_close(reduced_acceleration(at, E @ u), expected[[0, 2]], tolerance)
         for core in cores:
-            assert_close(core.dae_acceleration(q_tree, v_tree, E @ u, np.zeros(2)), wanted, tolerance)
-            assert_close(core.reduced_acceleration(q_tree, q_dot, v_tree, E @ u, False), wanted[[0, 2]], tolerance)
+            assert_close(core.dae_acceleration(q_tree, v_tree, E @ u, np.zeros(2)), expected, tolerance)
+            assert_close(core.reduced_acceleration(q_tree, q_dot, v_tree, E @ u, False), expected[[0, 2]], tolerance)
             assert_close(core.terms(q_tree, v_tree)["D_tree"], GEARED.D_tree(q_tree), EXACT)
         v_dot = expressions.v_dot(q_tree, v_tree, E @ u, expressions.values)
-        assert_close(v_dot.full()[:, 0], wanted, tolerance)
+        assert_close(v_dot.full()[:, 0], expected, tolerance)
         kinetic = v_tree @ GEARED.D_tree(q_tree) @ v_tree / 2
         assert_close(float(expressions.kinetic(q_tree, v_tree, expressions.values)), kinetic, EXACT * max(1, kinetic))
 
@@ -110,9 +110,9 @@ def integrate_appendix(five_bar: FiveBar) -> Array:
 @pytest.fixture(scope="module")
 def end_of_swing() -> Array:
     """Return q and q_dot at t = 1 s with rotors, which differ from those without."""
-    found = integrate_appendix(GEARED)
-    assert np.abs(integrate_appendix(FIVE_BAR) - found).max() > 0.1
-    return found
+    end = integrate_appendix(GEARED)
+    assert np.abs(integrate_appendix(FIVE_BAR) - end).max() > 0.1
+    return end
 
 
 @pytest.mark.parametrize("generated", [False, True])
@@ -131,7 +131,7 @@ def test_swing_with_rotors_is_that_of_the_appendix(
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
 def test_reference_formulations_include_rotor_inertia(formulation: str, folder: Path, end_of_swing: Array) -> None:
     problem = as_ivp(folder, {"formulation": formulation})
-    found = solve_ivp(problem.f, problem.t_span, problem.y0, "DOP853", rtol=1e-10, atol=1e-12)
-    at = problem.terms(1.0, found.y[:, -1])
+    solution = solve_ivp(problem.f, problem.t_span, problem.y0, "DOP853", rtol=1e-10, atol=1e-12)
+    at = problem.terms(1.0, solution.y[:, -1])
     assert_close(at.q, end_of_swing[:2], 1e-8)
     assert_close(at.q_dot, end_of_swing[2:], 1e-8)

@@ -115,24 +115,24 @@ def count_vectors(terms: TermFunctions, name: str) -> int:
 
 def test_derivatives_along_several_directions_are_fully_vectorized() -> None:
     """Everything that does not depend on the direction is computed in `state`."""
-    terms = TermFunctions.of(load("five_bar"), changes=True)
+    terms = TermFunctions.of(load("five_bar"), directional_derivatives=True)
     assert count_vectors(terms, "changes") * DIRECTIONS == count_instructions(terms.functions["changes"])
 
 
 def test_several_directions_are_written_only_if_branches_leave_vectors_half_empty() -> None:
     """Three arms fill three of four lanes along one direction. Four directions would be more than twice the source."""
-    delta = TermFunctions.of(load("delta"), changes=True)
+    delta = TermFunctions.of(load("delta"), directional_derivatives=True)
     assert "changes" not in delta.functions
     change = delta.functions["change"]
     assert 2 * count_statements(change, delta.lanes) < count_instructions(change)
-    five_bar = TermFunctions.of(load("five_bar"), changes=True)
+    five_bar = TermFunctions.of(load("five_bar"), directional_derivatives=True)
     assert count_statements(five_bar.functions["changes"], five_bar.lanes) == count_vectors(five_bar, "changes")
 
 
 def test_derivatives_along_one_direction_vectorize_identical_branches() -> None:
     """The number of operations is small because eq. 1 is differentiated as inverse dynamics."""
     for name, max_operations in (("five_bar", 330), ("delta", 7300)):
-        terms = TermFunctions.of(load(name), changes=True)
+        terms = TermFunctions.of(load(name), directional_derivatives=True)
         change = terms.functions["change"]
         branches = 2 if name == "five_bar" else 3
         assert count_instructions(change) <= max_operations
@@ -142,7 +142,7 @@ def test_derivatives_along_one_direction_vectorize_identical_branches() -> None:
 
 def test_pivots_are_inverted_once_a_state() -> None:
     """A division takes as long as ten products: one for each of the delta's 39 pivots, none along a direction."""
-    functions = TermFunctions.of(load("delta"), changes=True).functions
+    functions = TermFunctions.of(load("delta"), directional_derivatives=True).functions
     divisions = {cs.OP_DIV, cs.OP_INV}
     for name, max_divisions in (("state", 39), ("change", 0)):
         graph = Graph.from_function(functions[name])
@@ -152,7 +152,7 @@ def test_pivots_are_inverted_once_a_state() -> None:
 
 def test_an_arm_in_the_worlds_axes_is_vectorized_with_rotated_arms() -> None:
     """One of the delta's arms stands in the world's axes: its rotation has zeros and ones where others have not."""
-    terms = TermFunctions.of(load("delta"), changes=True)
+    terms = TermFunctions.of(load("delta"), directional_derivatives=True)
     for name in ("place", "acceleration", "closing_step", "state"):
         assert count_vectors(terms, name) * 3 > 0.8 * count_instructions(terms.functions[name]), name
 
@@ -161,7 +161,7 @@ def test_a_bodys_numbers_are_one_group_with_an_additive_derivative() -> None:
     """The group of one body takes few operations."""
     mechanism = load("five_bar")
     mechanism_numbers = model_numbers(mechanism)
-    functions = TermFunctions.of(mechanism, changes=True).functions
+    functions = TermFunctions.of(mechanism, directional_derivatives=True).functions
     which = present(mechanism_numbers)
     parameters, random = values(mechanism_numbers, which), np.random.default_rng(0)
     heavier = mechanism_numbers | {
@@ -169,11 +169,11 @@ def test_a_bodys_numbers_are_one_group_with_an_additive_derivative() -> None:
         "centre": mechanism_numbers["centre"] * [[1], [1], [1.1], [1], [1]],
     }
     (changed_group,) = np.flatnonzero(functions["groups"](values(heavier, which) - parameters).full())
-    known = random.uniform(-1, 1, functions["change"].numel_in(0))
+    state_values = random.uniform(-1, 1, functions["change"].numel_in(0))
     directions = random.uniform(-1, 1, (2, len(parameters)))
     names = [name for name in functions if name.startswith("varied_")]
     assert len(names) == functions["groups"].numel_out(0)
     for name in names:
-        first, second, both = (functions[name](known, x).full() for x in (*directions, directions.sum(axis=0)))
+        first, second, both = (functions[name](state_values, x).full() for x in (*directions, directions.sum(axis=0)))
         np.testing.assert_allclose(first + second, both, rtol=1e-13, atol=1e-13)
     assert count_instructions(functions[f"varied_{changed_group}"]) < 0.2 * count_instructions(functions["change"])

@@ -24,7 +24,7 @@ FREE, COUPLED = 18, 14
 
 
 def assert_equal_terms(mechanism: Mechanism, count: int = 20) -> None:
-    """Compare all terms and accelerations of two cores at random states, on the closure and off it."""
+    """Compare all terms and accelerations of two cores at random states, on the manifold and off it."""
     ours, theirs = _core.Core(core_table(mechanism, compile_terms(mechanism))), _core.Core(core_table(mechanism))
     random, n = np.random.default_rng(7), mechanism.n
     for k in range(count):

@@ -50,8 +50,8 @@ def test_elimination_in_any_order_solves_the_system(order: tuple[int, ...]) -> N
 
 def test_a_cancelled_pivot_is_not_accurate() -> None:
     """Two rows are nearly equal."""
-    near = 1e-4
-    entries = {(0, 0): 2.0, (1, 1): 3.0, (2, 0): 1.0, (2, 1): 1.0, (3, 0): 1.0, (3, 1): 1.0 + near}
+    offset = 1e-4
+    entries = {(0, 0): 2.0, (1, 1): 3.0, (2, 0): 1.0, (2, 1): 1.0, (3, 0): 1.0, (3, 1): 1.0 + offset}
 
     def accurate_pivots() -> float:
         factor = SymmetricFactor({k: cs.SX(x) for k, x in entries.items()}, 2, (0, 1, 2, 3), 1e-4)

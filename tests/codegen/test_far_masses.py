@@ -47,8 +47,8 @@ def test_extreme_masses_take_as_many_steps_as_with_pinocchios_terms(scene: str, 
 
 @pytest.mark.parametrize("overrides", [LIGHT_LEG, STOPPED], ids=["light leg", "false reason"])
 def test_general_elimination_takes_over_and_is_counted(overrides: dict[str, float]) -> None:
-    wanted = {**overrides, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
-    theirs, ours = (simulate("stewart", {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated"))
+    settings = {**overrides, "formulation": "reduced", "controller": None, "t_end": 0.2, "solver.rtol": 1e-10}
+    theirs, ours = (simulate("stewart", {**settings, "solver.terms": x}) for x in ("pinocchio", "generated"))
     assert ours.status == theirs.status == "done"
     by_terms = ours.stats["rhs_by_terms"]
     assert by_terms["general"] > 0
@@ -65,8 +65,8 @@ def test_masses_of_the_files_need_no_general_elimination(scene: str) -> None:
 
 def test_acceleration_of_a_light_leg_has_twelve_digits() -> None:
     """The reference is the tests' own model with forty digits."""
-    wanted = {**LIGHT_LEG, "formulation": "dae", "controller": None, "solver.terms": "generated"}
-    ready = prepare(load_scene("stewart", wanted))
+    settings = {**LIGHT_LEG, "formulation": "dae", "controller": None, "solver.terms": "generated"}
+    ready = prepare(load_scene("stewart", settings))
     ready.begin()
     ready.loop.advance(0.01, True, 1.0, 10.0)
     y, nq, n = ready.loop.y, ready.mechanism.tree.nq, ready.mechanism.n
@@ -104,9 +104,10 @@ def test_general_elimination_is_chosen_per_ensemble_member() -> None:
 
 
 def test_sensitivities_with_far_masses_are_those_of_pinocchios_terms() -> None:
-    wanted = {**LIGHT_LEG, "formulation": "dae", "controller": None, "t_end": 0.1, "solver.rtol": 1e-8}
+    settings = {**LIGHT_LEG, "formulation": "dae", "controller": None, "t_end": 0.1, "solver.rtol": 1e-8}
     theirs, ours = (
-        sensitivities("stewart", ["link.plate.mass"], {**wanted, "solver.terms": x}) for x in ("pinocchio", "generated")
+        sensitivities("stewart", ["link.plate.mass"], {**settings, "solver.terms": x})
+        for x in ("pinocchio", "generated")
     )
     assert ours.run.status == theirs.run.status == "done"
     assert ours.run.stats["rhs"] == pytest.approx(theirs.run.stats["rhs"], rel=0.1)

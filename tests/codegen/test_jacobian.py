@@ -47,13 +47,13 @@ def test_jacobian_of_the_dae_is_that_of_the_appendix(controlled: bool) -> None:
         # u follows from the acceleration, which is linear in it
         D, J = FIVE_BAR.D_tree(y[:4]), FIVE_BAR.J(y[:4])
         u = _applied(D, J, rate[4:] - FIVE_BAR.acceleration_and_multipliers(y[:4], y[4:], np.zeros(2))[0])
-        wanted = np.zeros((8, 8))
-        wanted[:4, 4:] = np.eye(4)
+        expected = np.zeros((8, 8))
+        expected[:4, 4:] = np.eye(4)
         for k in range(8):
             moved = y + 1j * STEP * np.eye(8)[k]
             change = control(controlled, moved[[0, 2]], moved[[4, 6]]) - control(controlled, y[[0, 2]], y[[4, 6]])
-            wanted[4:, k] = FIVE_BAR.acceleration_and_multipliers(moved[:4], moved[4:], u + change)[0].imag / STEP
-        assert np.abs(loop.jacobian(0.0, y) - wanted).max() <= 1e-11 * np.abs(wanted).max()
+            expected[4:, k] = FIVE_BAR.acceleration_and_multipliers(moved[:4], moved[4:], u + change)[0].imag / STEP
+        assert np.abs(loop.jacobian(0.0, y) - expected).max() <= 1e-11 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("controlled", [False, True])
@@ -64,14 +64,14 @@ def test_jacobian_of_the_reduced_model_is_that_of_the_appendix(controlled: bool)
         y = np.concatenate([start + random.uniform(-0.2, 0.2, 2), random.uniform(-3, 3, 2)])
         here = FIVE_BAR.sigma(y[:2])
         u = FIVE_BAR.D(here) @ (loop.rhs(0.0, y)[2:] - FIVE_BAR.acceleration(here, y[2:], np.zeros(2)))
-        wanted = np.zeros((4, 4))
-        wanted[:2, 2:] = np.eye(2)
+        expected = np.zeros((4, 4))
+        expected[:2, 2:] = np.eye(2)
         for k in range(4):
             dq, dv = 1j * STEP * np.eye(4)[k, :2], 1j * STEP * np.eye(4)[k, 2:]
             change = control(controlled, dq, dv)
             moved = here + FIVE_BAR.rho(here) @ dq  # to first order, which a complex step makes exact
-            wanted[2:, k] = FIVE_BAR.acceleration(moved, y[2:] + dv, u + change).imag / STEP
-        assert np.abs(loop.jacobian(0.0, y) - wanted).max() <= 1e-10 * np.abs(wanted).max()
+            expected[2:, k] = FIVE_BAR.acceleration(moved, y[2:] + dv, u + change).imag / STEP
+        assert np.abs(loop.jacobian(0.0, y) - expected).max() <= 1e-10 * np.abs(expected).max()
 
 
 def _applied(D: Any, J: Any, a: Any) -> Any:
@@ -90,25 +90,25 @@ def test_jacobians_of_other_daes_agree_with_differences(name: str | int, tmp_pat
     ours, theirs = (dae(folder, terms, tmp_path) for terms in ("generated", "pinocchio"))
     J = mechanism.assembled.J
     free = np.eye(tree.n) - np.linalg.pinv(J, rcond=1e-9) @ J
-    v = free @ random.uniform(-1, 1, tree.n)  # redundant rows contradict each other off the closure
-    found, general = (loop.jacobian(0.0, np.concatenate([mechanism.q_tree, v])) for loop in (ours, theirs))
+    v = free @ random.uniform(-1, 1, tree.n)  # redundant rows contradict each other off the manifold
+    compiled, general = (loop.jacobian(0.0, np.concatenate([mechanism.q_tree, v])) for loop in (ours, theirs))
     for _ in range(6):
         step, dv = free @ random.uniform(-1, 1, tree.n), free @ random.uniform(-1, 1, tree.n)
 
         def difference(h: float, step: Any = step, dv: Any = dv) -> Any:
-            ahead, behind = (
+            forward, backward = (
                 theirs.rhs(0.0, np.concatenate([tree.integrate(mechanism.q_tree, s * h * step), v + s * h * dv]))
                 for s in (1, -1)
             )
-            return (ahead - behind) / (2 * h)
+            return (forward - backward) / (2 * h)
 
         h = 4e-3
         one, two, four = difference(h), difference(h / 2), difference(h / 4)
         first, second = (4 * two - one) / 3, (4 * four - two) / 3
-        wanted = (16 * second - first) / 15
+        expected = (16 * second - first) / 15
         along = np.concatenate([tree.configuration_rate(mechanism.q_tree, step), dv])
-        assert np.abs(found @ along - general @ along).max() <= 1e-11 * np.abs(wanted).max()
-        assert np.abs(found @ along - wanted).max() <= 1e-8 * np.abs(wanted).max()
+        assert np.abs(compiled @ along - general @ along).max() <= 1e-11 * np.abs(expected).max()
+        assert np.abs(compiled @ along - expected).max() <= 1e-8 * np.abs(expected).max()
 
 
 def dae(mechanism: str, terms: str, folder: Path) -> Any:

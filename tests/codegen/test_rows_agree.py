@@ -32,7 +32,7 @@ def test_the_cases_have_all_types_of_rows() -> None:
 
 @pytest.mark.parametrize(("kind", "rows_in"), CASES)
 def test_three_implementations_agree(kind: LoopType, rows_in: RowsIn) -> None:
-    """phi, J and J_dot v off the closure, near it and far from it, with a free root."""
+    """phi, J and J_dot v near the manifold and far from it, with a free root."""
     mechanism = closed_mechanism(kind, 1, rows_in=rows_in).mechanism
     core, functions, random = _core.Core(core_table(mechanism)), symbolic(mechanism), np.random.default_rng(2)
     for spread in np.geomspace(1e-3, 1.0, STATES):

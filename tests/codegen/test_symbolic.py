@@ -14,50 +14,50 @@ from tests.conftest import assert_close
 
 @pytest.mark.parametrize("name", ["five_bar", "slider_crank_spatial", "flyball", "stewart"])
 def test_symbolic_functions_evaluate_to_the_terms(name: str) -> None:
-    mechanism, found, random = load(name), symbolic(name), np.random.default_rng(5)
-    n, p = mechanism.n, found.values
-    assert (found.coordinates, len(found.parameters)) == (mechanism.coordinates, len(p))
+    mechanism, functions, random = load(name), symbolic(name), np.random.default_rng(5)
+    n, p = mechanism.n, functions.values
+    assert (functions.coordinates, len(functions.parameters)) == (mechanism.coordinates, len(p))
     for _ in range(5):
         q = mechanism.tree.integrate(mechanism.q_tree, 0.2 * random.uniform(-1, 1, n))
         v, u = random.uniform(-2, 2, n), random.uniform(-1, 1, n)
         terms = Terms(mechanism, mechanism.kinematics(q), v)
         D = np.triu(terms.D_tree) + np.triu(terms.D_tree, 1).T
         for ours, theirs in (
-            (found.phi(q, p), terms.phi[:, None]),
-            (found.J(q, p), terms.at.J),
-            (found.J_dot_v(q, v, p), (terms.J_dot @ v)[:, None]),
-            (found.D_tree(q, p), D),
-            (found.bias_tree(q, v, p), terms.bias_tree[:, None]),
-            (found.damping(q, v, p), terms.damping_force[:, None]),
-            (found.kinetic(q, v, p) + found.potential(q, p), terms.energy),
-            (found.q_dot(q, v), mechanism.tree.configuration_rate(q, v)[:, None]),
-            (found.v_dot(q, v, u, p), dae_acceleration(terms, u)[:, None]),
+            (functions.phi(q, p), terms.phi[:, None]),
+            (functions.J(q, p), terms.at.J),
+            (functions.J_dot_v(q, v, p), (terms.J_dot @ v)[:, None]),
+            (functions.D_tree(q, p), D),
+            (functions.bias_tree(q, v, p), terms.bias_tree[:, None]),
+            (functions.damping(q, v, p), terms.damping_force[:, None]),
+            (functions.kinetic(q, v, p) + functions.potential(q, p), terms.energy),
+            (functions.q_dot(q, v), mechanism.tree.configuration_rate(q, v)[:, None]),
+            (functions.v_dot(q, v, u, p), dae_acceleration(terms, u)[:, None]),
         ):
             assert_close(np.array(ours), theirs, 1e-10 * max(1.0, float(np.abs(theirs).max(initial=0.0))))
 
 
 def test_casadi_derivatives_of_symbolic_functions_are_consistent() -> None:
     """J is the Jacobian of phi, and the force of gravity is the gradient of the potential energy."""
-    found = symbolic("five_bar")
+    functions = symbolic("five_bar")
     q = cs.SX.sym("q", 4)
-    gradient = cs.Function("gradient", [q], [cs.jacobian(found.phi(q, found.values), q)])
+    gradient = cs.Function("gradient", [q], [cs.jacobian(functions.phi(q, functions.values), q)])
     at = np.array([-1.2, 0.3, -1.9, -0.4])
-    assert_close(np.array(gradient(at)), np.array(found.J(at, found.values)), 1e-14)
-    h = cs.Function("h", [q], [cs.gradient(found.potential(q, found.values), q)])
-    assert_close(np.array(h(at)), np.array(found.bias_tree(at, np.zeros(4), found.values)), 1e-12)
+    assert_close(np.array(gradient(at)), np.array(functions.J(at, functions.values)), 1e-14)
+    h = cs.Function("h", [q], [cs.gradient(functions.potential(q, functions.values), q)])
+    assert_close(np.array(h(at)), np.array(functions.bias_tree(at, np.zeros(4), functions.values)), 1e-12)
 
 
 def test_parameters_are_named_arguments() -> None:
-    found = symbolic("five_bar")
-    named = dict(zip(found.parameters, found.values, strict=True))
+    functions = symbolic("five_bar")
+    named = dict(zip(functions.parameters, functions.values, strict=True))
     mechanism = load("five_bar")
     k = mechanism.tree.model.getJointId("theta_2")
     assert named["link.link_2.mass"] == mechanism.tree.model.inertias[k].mass
     assert named["gravity.y"] == -9.81
-    light = np.array(found.values)
-    light[[name.endswith(".mass") for name in found.parameters]] = 0.0
+    light = np.array(functions.values)
+    light[[name.endswith(".mass") for name in functions.parameters]] = 0.0
     at = np.array(mechanism.q_tree)
-    assert float(found.potential(at, light)) == 0.0 != float(found.potential(at, found.values))
+    assert float(functions.potential(at, light)) == 0.0 != float(functions.potential(at, functions.values))
 
 
 def test_symbolic_without_casadi_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

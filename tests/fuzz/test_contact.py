@@ -97,9 +97,9 @@ def test_reference_of_slides_agrees_with_closed_forms() -> None:
     history = Slides(model, {"x0": Contact(lower=0.0, restitution=0.5)}).run(np.array([1.0]), np.zeros(1), 2.0)
     flight = np.sqrt(2 / G)
     ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 30)])
-    found = [t for t, _ in history.impacts]
-    assert len(found) > 10
-    assert_close(found, ends[: len(found)], 1e-12)
+    times = [t for t, _ in history.impacts]
+    assert len(times) > 10
+    assert_close(times, ends[: len(times)], 1e-12)
     rubbing = Slides(model, {"x0": Contact(friction=30.0)}).run(np.zeros(1), np.array([3.0]), 2.0)
     stops_after = 3.0 / (G + 15.0)  # 30 N on 2 kg, which then sticks
     q, v = rubbing.at(np.array([stops_after + 0.1]))
@@ -180,7 +180,7 @@ def test_a_seed_always_draws_the_same_case() -> None:
         assert draw(seed) == draw(seed)
 
 
-def test_table_names_the_seeds_with_findings() -> None:
+def test_table_names_the_seeds_of_wrong_runs() -> None:
     record = Record(17, "stack", runs=3, compared=True)
     record.add("grown", "dae", "energy grows by 0.1 of the largest")
     text = table([record, Record(18, "stack", runs=3, compared=True)])

@@ -34,9 +34,9 @@ def follow(judge: Judge, q: Array, v: Array, times: Array, substeps: int = 4) ->
     """Integrate one motion piece by piece with a fixed step size."""
     q, v = q[None], v[None]
     for dt in np.diff(times):
-        near = q + dt * v
-        end, _ = judge.integrate(state(judge.model, q, v), near, np.array([dt]), substeps)
-        q, v = coordinates(judge.model, end, near)
+        predicted = q + dt * v
+        end, _ = judge.integrate(state(judge.model, q, v), predicted, np.array([dt]), substeps)
+        q, v = coordinates(judge.model, end, predicted)
     return q[0], v[0]
 
 

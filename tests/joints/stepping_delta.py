@@ -78,14 +78,14 @@ class SteppingDelta:
 
     def run(self, arms: Array, duration: float, steps: int, seen: int) -> Array:
         """Return the arms' angles after their release at `seen` equidistant instants, (seen, 3)."""
-        h, q, v, found = duration / steps, self.start(arms), np.zeros(self.model.nv), []
+        h, q, v, angles = duration / steps, self.start(arms), np.zeros(self.model.nv), []
         for step in range(1, steps + 1):
             middle = pin.integrate(self.model, q, 0.5 * h * v)
             v = self.stepped(middle, v, h)
             q = self.closed(pin.integrate(self.model, middle, 0.5 * h * v))
             if step % (steps // seen) == 0:
-                found.append(q[self.arms_q])
-        return np.array(found)
+                angles.append(q[self.arms_q])
+        return np.array(angles)
 
     def stepped(self, q: Array, v: Array, h: float) -> Array:
         """Return the velocity after a step with midpoint q."""

@@ -39,12 +39,12 @@ def step_through(scene: Path, overrides: Table, t_end: float, events: list[Event
     return simulator.events
 
 
-def events_by_caller(scene: Path, overrides: Table, t_end: float, own: list[Event]) -> list[list[Table]]:
+def events_by_caller(scene: Path, overrides: Table, t_end: float, functions: list[Event]) -> list[list[Table]]:
     """The events that `simulate`, a `Simulator` and `sensitivities` report."""
     return [
-        simulate(scene, overrides, events=own).events,
-        step_through(scene, overrides, t_end, own),
-        sensitivities(scene, ["link.block.mass"], overrides, events=own).run.events,
+        simulate(scene, overrides, events=functions).events,
+        step_through(scene, overrides, t_end, functions),
+        sensitivities(scene, ["link.block.mass"], overrides, events=functions).run.events,
     ]
 
 
@@ -60,15 +60,15 @@ def test_an_event_whose_value_an_impact_skips_occurs_at_the_impact(scene_of: Mak
     value, beyond = float(random.uniform(-v, e * v)), 1.1 * v
     scene = slider(scene_of, x, -v, f"stops = true\nrestitution = {e!r}\n", 2 * x / v)
     events = [rate_event(value), rate_event(value, -1), rate_event(beyond), rate_event(-beyond)]
-    own = [Event(lambda t, terms: terms.q_dot[0] ** 3 - value**3, name="own")]
+    functions = [Event(lambda t, terms: terms.q_dot[0] ** 3 - value**3, name="own")]
     for max_step in (10.0, 0.3 * x / v):
         overrides = {"formulation": formulation, "event": events, "solver.max_step": max_step}
-        for found in events_by_caller(scene, overrides, 2 * x / v, own):
+        for events_found in events_by_caller(scene, overrides, 2 * x / v, functions):
             hit = (pytest.approx(x / v, abs=1e-10), 1)
-            assert occurrences(found, f"x's rate = {value:g}") == [hit], "rising, once"
-            assert occurrences(found, "own") == [hit]
-            assert not occurrences(found, f"x's rate = {beyond:g}")
-            assert not occurrences(found, f"x's rate = {-beyond:g}")
+            assert occurrences(events_found, f"x's rate = {value:g}") == [hit], "rising, once"
+            assert occurrences(events_found, "own") == [hit]
+            assert not occurrences(events_found, f"x's rate = {beyond:g}")
+            assert not occurrences(events_found, f"x's rate = {-beyond:g}")
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -76,21 +76,24 @@ def test_an_event_whose_value_an_impact_skips_occurs_at_the_impact(scene_of: Mak
 def test_a_run_stopped_by_an_impact_ends_with_the_state_after_it(scene_of: Make, formulation: str, x: float) -> None:
     """Also if the run starts with an impact."""
     scene = slider(scene_of, x, -2.0, "stops = true\nrestitution = 0.5\n", 1.0)
-    for event, own in (([rate_event(0.3, 1, True)], []), ([], [Event(lambda t, y: y.q_dot[0] - 0.3, 1, True, "own")])):
+    for event, functions in (
+        ([rate_event(0.3, 1, True)], []),
+        ([], [Event(lambda t, y: y.q_dot[0] - 0.3, 1, True, "own")]),
+    ):
         overrides = {"formulation": formulation, "event": event}
-        run = simulate(scene, overrides, events=own)
-        varied = sensitivities(scene, ["initial.q_dot.x", "joint.x.restitution"], overrides, events=own)
-        for one in (run, varied.run):
+        run = simulate(scene, overrides, events=functions)
+        sensitivity = sensitivities(scene, ["initial.q_dot.x", "joint.x.restitution"], overrides, events=functions)
+        for one in (run, sensitivity.run):
             assert one.message.startswith("stopped by the event")
             assert one.t[-1] == pytest.approx(x / 2.0, abs=1e-11)
             assert np.all(np.diff(one.t) > 0.0)
             assert one.v_tree[-1] == pytest.approx([1.0])
-        simulator = Simulator(scene, overrides, events=own)
+        simulator = Simulator(scene, overrides, events=functions)
         assert simulator.step(None, 0.9).v_tree == pytest.approx([1.0])
         assert simulator.state.t == pytest.approx(x / 2.0, abs=1e-11)
         assert simulator.step(None, 0.5).t == pytest.approx(x / 2.0 + 0.5), "the event does not occur again"
         if event:
-            assert varied.end_time == pytest.approx([x / 4.0, 0.0], abs=1e-9)
+            assert sensitivity.end_time == pytest.approx([x / 4.0, 0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -101,25 +104,28 @@ def test_an_impact_while_another_joint_begins_to_stick(scene_of: Make, formulati
     start = "q = {x = 1.0, y = 0.0}\nq_dot = {x = -1.0, y = 0.5}\n"
     scene = scene_of(urdf, "gravity = [0, 0, 0]\n" + joints, start, 3.0)
     overrides = {"formulation": formulation, "event": [rate_event(0.2), rate_event(0.0, joint="y")]}
-    own = [Event(lambda t, terms: terms.q_dot[0] + terms.q_dot[1] - 0.2, name="own")]
-    for found in (simulate(scene, overrides, events=own).events, step_through(scene, overrides, 3.0, own)):
-        assert occurrences(found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
-        assert occurrences(found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
-        assert occurrences(found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
+    functions = [Event(lambda t, terms: terms.q_dot[0] + terms.q_dot[1] - 0.2, name="own")]
+    for events_found in (
+        simulate(scene, overrides, events=functions).events,
+        step_through(scene, overrides, 3.0, functions),
+    ):
+        assert occurrences(events_found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
+        assert occurrences(events_found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
+        assert occurrences(events_found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_bouncing_balls_rate_is_zero_at_each_impact_and_apex(scene_of: Make, formulation: str) -> None:
     e, fall = 0.4, np.sqrt(2.0 / G)
     scene = slider(scene_of, 1.0, 0.0, f"stops = true\nrestitution = {e}\n", 1.8, G)
-    own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
+    functions = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     flights = 2 * fall * e ** np.arange(1, 60)
     impacts, apexes = fall + np.r_[0.0, np.cumsum(flights)], fall + np.cumsum(flights) - flights / 2
     overrides = {"formulation": formulation, "event": [rate_event(0.0)], "solver.rtol": 1e-10}
-    for found in events_by_caller(scene, overrides, 1.8, own):
-        bounces = sum(event["name"] == "x bounces" for event in found)
+    for events_found in events_by_caller(scene, overrides, 1.8, functions):
+        bounces = sum(event["name"] == "x bounces" for event in events_found)
         for name in ("own", "x's rate = 0"):
-            here = occurrences(found, name)
+            here = occurrences(events_found, name)
             assert [direction for _, direction in here] == [1, -1] * bounces + [1], (
                 "the last one is where contact begins"
             )
@@ -132,11 +138,11 @@ def test_a_body_that_transfers_all_momentum_comes_to_rest_once(scene_of: Make) -
     urdf = slide("a", "base", "one", 1.0) + slide("b", "one", "two", 1.0, 0.0)
     joints = 'gravity = [0, 0, 0]\n[[joint]]\nname = "b"\nstops = true\nrestitution = 1.0\n'
     scene = scene_of(urdf, joints, "q = {a = 0.0, b = 1.0}\nq_dot = {a = 1.0, b = -1.0}\n", 3.0)
-    own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
+    functions = [Event(lambda t, terms: terms.q_dot[0], name="own")]
     for formulation in FORMULATIONS:
         for t_end in (1.5, 2.0, 3.3):
             overrides = {"formulation": formulation, "t_end": t_end, "event": [rate_event(0.0, joint="a")]}
-            run = simulate(scene, overrides, events=own)
+            run = simulate(scene, overrides, events=functions)
             assert (
                 occurrences(run.events, "a's rate = 0")
                 == occurrences(run.events, "own")
@@ -153,11 +159,11 @@ def test_a_joint_that_stays_at_its_stop_comes_to_rest_once(scene_of: Make, formu
     """At 1 s it hits its stop with e = 0 and stays: its rate becomes zero, and its coordinate is at the stop."""
     scene = slider(scene_of, 1.0, -1.0, "stops = true\nrestitution = 0.0\n", t_end)
     events = [rate_event(0.0), rate_event(0.0, of="q"), rate_event(-0.5), {"of": "limit", "coordinate": "x"}]
-    own = [Event(lambda t, y: y.q_dot[0], name="rate"), Event(lambda t, y: y.q[0], name="place")]
+    functions = [Event(lambda t, y: y.q_dot[0], name="rate"), Event(lambda t, y: y.q[0], name="place")]
     once = {"x's rate = 0": 1, "x = 0": -1, "x's rate = -0.5": 1, "x at its lower limit": 1, "rate": 1, "place": -1}
-    for found in events_by_caller(scene, {"formulation": formulation, "event": events}, t_end, own):
+    for events_found in events_by_caller(scene, {"formulation": formulation, "event": events}, t_end, functions):
         for name, direction in once.items():
-            assert occurrences(found, name) == [(pytest.approx(1.0, abs=1e-10), direction)], name
+            assert occurrences(events_found, name) == [(pytest.approx(1.0, abs=1e-10), direction)], name
     stopped = simulate(scene, {"formulation": formulation, "event": [rate_event(0.0, stop=True)]})
     assert stopped.t[-1] == pytest.approx(1.0, abs=1e-10)
     assert stopped.v_tree[-1] == pytest.approx([0.0], abs=1e-12)
@@ -168,8 +174,8 @@ def test_a_joint_that_stays_at_its_stop_comes_to_rest_once(scene_of: Make, formu
 def test_a_joint_that_sticks_comes_to_rest_once_and_moves_on(scene_of: Make, formulation: str, again: float) -> None:
     """Pushed for 1 s with twice its friction it slides until 2 s. Sliding again in either direction is no event."""
     scene = slider(scene_of, 5.0, 0.0, "friction = 0.5\n", 20.0)
-    own = [Event(lambda t, terms: terms.q_dot[0], name="own")]
-    simulator = Simulator(scene, {"formulation": formulation, "event": [rate_event(0.0)]}, events=own)
+    functions = [Event(lambda t, terms: terms.q_dot[0], name="own")]
+    simulator = Simulator(scene, {"formulation": formulation, "event": [rate_event(0.0)]}, events=functions)
     for push, dt in ((1.0, 1.0), (0.0, 1.7), (0.3, 1.3), (again, 1.0), (0.0, 3.0), (0.0, 2.0)):
         simulator.step([push], dt)
     for name in ("own", "x's rate = 0"):
@@ -181,7 +187,7 @@ def test_a_joint_that_sticks_comes_to_rest_once_and_moves_on(scene_of: Make, for
 def test_joints_locked_by_sticking_joints_come_to_rest_once(rtol: float) -> None:
     """Friction in two joints of the five-bar stops all four after an impact."""
     names = [f"theta_{k}" for k in (1, 2, 3, 4)]
-    own = [Event(lambda t, terms, k=k: terms.v_tree[k], name=name) for k, name in enumerate(names)]  # type: ignore[misc]
+    functions = [Event(lambda t, terms, k=k: terms.v_tree[k], name=name) for k, name in enumerate(names)]  # type: ignore[misc]
     overrides = {
         "controller": None,
         "t_end": 1.0,
@@ -191,7 +197,7 @@ def test_joints_locked_by_sticking_joints_come_to_rest_once(rtol: float) -> None
     }
     counts = {"theta_1": [1, -1], "theta_2": [-1, 1], "theta_3": [1], "theta_4": [1, -1]}
     for formulation in FORMULATIONS:
-        run = simulate("five_bar/friction", {**overrides, "formulation": formulation}, events=own)
+        run = simulate("five_bar/friction", {**overrides, "formulation": formulation}, events=functions)
         assert np.abs(run.v_tree[-1]).max() < 1e-12
         impact = next(event["t"] for event in run.events if event["name"] == "theta_1 bounces")
         rest = next(event["t"] for event in run.events if event["name"] == "theta_1 sticks")
@@ -216,9 +222,9 @@ def test_events_do_not_change_a_motion_with_sticking_and_impacts(formulation: st
     assert monitored.stats["rhs"] == plain.stats["rhs"]
     assert_close(monitored.q_tree, plain.q_tree, 1e-9)  # as closely as the loops close
     for name in names:
-        own, of_scene = occurrences(monitored.events, name), occurrences(monitored.events, f"{name}'s rate = 0")
-        assert [direction for _, direction in own] == [direction for _, direction in of_scene]
-        assert [t for t, _ in own] == pytest.approx([t for t, _ in of_scene], abs=1e-8)
+        functions, of_scene = occurrences(monitored.events, name), occurrences(monitored.events, f"{name}'s rate = 0")
+        assert [direction for _, direction in functions] == [direction for _, direction in of_scene]
+        assert [t for t, _ in functions] == pytest.approx([t for t, _ in of_scene], abs=1e-8)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -86,13 +86,13 @@ def belt_phases(m: float, M: float, k: float, F: float, speed: float, t_end: flo
     while True:
         together = np.sqrt(k / (m + M))  # sticking: one body on the spring, until the friction force reaches F
         size, phase = np.hypot(x, v / together), np.arctan2(v / together, x)
-        most = F * (m + M) / (k * M)
-        if size <= most:
+        max_stretch = F * (m + M) / (k * M)
+        if size <= max_stretch:
             return slips, sticks
-        wait = (phase - np.arccos(most / size)) / together
-        if x > most or wait < 0:
+        wait = (phase - np.arccos(max_stretch / size)) / together
+        if x > max_stretch or wait < 0:
             raise AssertionError("the phases do not alternate as this test assumes")
-        t, x, v = t + wait, most, -size * together * np.sin(together * wait - phase)
+        t, x, v = t + wait, max_stretch, -size * together * np.sin(together * wait - phase)
         if t > t_end:
             return slips, sticks
         slips.append(t)
@@ -144,14 +144,14 @@ def test_dissipated_energy_is_not_reported_with_smoothed_friction(with_joints: C
     limits = {"theta_1": (-2.0, 2.0)}
     folder = with_joints("five_bar", {"theta_1": {"friction": 0.02, "stops": True}}, limits)
     scene = folder / "swing.scene.toml"
-    found = ensemble(
+    results = ensemble(
         scene, {"friction_smoothing": [0.1]}, {"end": "dissipated", "most": {"of": "dissipated", "reduce": "max"},
         "path": {"of": "dissipated", "reduce": "trajectory"}}, overrides={"t_end": 0.01}, progress=False,
     )  # fmt: skip
     assert simulate(scene, {"t_end": 0.01}).dissipated is not None
     assert simulate(scene, {"t_end": 0.01, "friction_smoothing": 0.1}).dissipated is None
-    assert found["status"].to_numpy().tolist() == [1]
-    assert all(np.isnan(found[name].to_numpy()).all() for name in ("end", "most", "path"))
+    assert results["status"].to_numpy().tolist() == [1]
+    assert all(np.isnan(results[name].to_numpy()).all() for name in ("end", "most", "path"))
 
 
 def test_motion_is_unique_where_friction_forces_are_not(with_joints: Callable[..., Path]) -> None:
@@ -179,12 +179,12 @@ def test_motion_is_unique_where_friction_forces_are_not(with_joints: Callable[..
     def load_factor(t: float) -> float:
         """Return the smallest fraction of all friction forces that is in equilibrium."""
         needed = t * push - terms.rho.T @ terms.h_tree
-        found = linprog(
+        program = linprog(
             [0, 0, 0, 0, 1],
             A_ub=np.vstack([np.c_[np.eye(4), -friction], np.c_[-np.eye(4), -friction]]), b_ub=np.zeros(8),
             A_eq=np.c_[terms.rho.T, np.zeros(2)], b_eq=-needed, bounds=[(None, None)] * 4 + [(0, None)],
         )  # fmt: skip
-        return float(found.x[4])
+        return float(program.x[4])
 
     assert load_factor(0.0) < 1.0
     assert_close(run.events[4]["t"], brentq(lambda t: load_factor(t) - 1.0, 0.0, 0.8, xtol=1e-12), 1e-8)

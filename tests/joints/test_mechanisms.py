@@ -76,8 +76,10 @@ def time_stepping(q_tree: Array, duration: float, steps: int) -> Array:
         free = q_dot - h * np.linalg.solve(D, FIVE_BAR.C(there, rho @ q_dot) @ q_dot + FIVE_BAR.h(there))
         # the impulses within their bounds that minimize the kinetic energy: joints stick if they can
         root = np.linalg.cholesky(np.linalg.inv(D))
-        found = lsq_linear(root.T @ rho.T, -np.linalg.solve(root, free), (-h * FRICTION, h * FRICTION), method="bvls")
-        q_dot = free + np.linalg.solve(D, rho.T @ found.x)
+        impulses = lsq_linear(
+            root.T @ rho.T, -np.linalg.solve(root, free), (-h * FRICTION, h * FRICTION), method="bvls"
+        )
+        q_dot = free + np.linalg.solve(D, rho.T @ impulses.x)
         q = q + h * q_dot
     return np.asarray(FIVE_BAR.sigma(q))
 

@@ -44,14 +44,14 @@ def test_times_of_a_bouncing_pendulum(scene_of: Make, formulation: str, restitut
     run = simulate(scene, {**TIGHT, "formulation": formulation})
     rate = np.sqrt(1.7 * G * 0.6 / (0.08 + 1.7 * 0.36))
     k = np.sin(start / 2)
-    t, wanted = ellipk(k**2) / rate, []
-    while t < 6.0 and len(wanted) < 12:
-        wanted.append(t)
+    t, expected = ellipk(k**2) / rate, []
+    while t < 6.0 and len(expected) < 12:
+        expected.append(t)
         k *= restitution
         t += 2 * ellipk(k**2) / rate
-    found = bounce_times(run)[: len(wanted)]
-    assert len(found) >= 5
-    assert_close(found, wanted[: len(found)], 1e-10)
+    times = bounce_times(run)[: len(expected)]
+    assert len(times) >= 5
+    assert_close(times, expected[: len(times)], 1e-10)
     assert run.dissipated is not None
     assert_close(run.energy + run.dissipated, np.full(len(run.t), run.energy[0]), 1e-9)
     assert run.q_tree.min() > -1e-11
@@ -66,13 +66,13 @@ def test_decaying_bounces_end_in_contact(scene_of: Make, formulation: str) -> No
     run = simulate(scene, {"solver.rtol": 1e-10, "formulation": formulation})
     flight = np.sqrt(2 / G)
     ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 60)])
-    found = bounce_times(run)
-    assert_close(found, ends[: len(found)], 1e-10)
-    rise = 0.25 ** (len(found) + 1)
+    times = bounce_times(run)
+    assert_close(times, ends[: len(times)], 1e-10)
+    rise = 0.25 ** (len(times) + 1)
     assert rise < 1e-10 < 4 * rise
     touches = [event for event in run.events if event["name"] == "x touches"]
     assert len(touches) == 1
-    assert ends[len(found) - 1] < touches[0]["t"] < ends[-1]
+    assert ends[len(times) - 1] < touches[0]["t"] < ends[-1]
     resting = run.t > touches[0]["t"]
     assert_close(run.q_tree[resting], np.zeros((resting.sum(), 1)), 1e-12)
     assert run.stats["rhs"] < 1000
