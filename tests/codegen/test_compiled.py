@@ -121,7 +121,7 @@ def test_simulator_steps_with_compiled_terms() -> None:
 def test_a_long_run_compiles_its_terms_on_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Terms are compiled when the run has cost as much as compiling; the motion is the same."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(SIMULATE, "REPAYS", 300)
+    monkeypatch.setattr(SIMULATE, "COMPILE_AFTER_RHS", 300)
     scene, overrides = "five_bar/set_point", {"formulation": "reduced", "solver.rtol": 1e-9}
     reference = simulate(scene, {**overrides, "solver.terms": "pinocchio"})
     assert reference.stats["rhs_by_terms"] == {"pinocchio": reference.stats["rhs"]}
@@ -141,11 +141,11 @@ def test_a_run_that_is_nearly_done_does_not_compile(tmp_path: Path, monkeypatch:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     overrides = {"formulation": "reduced", "solver.rtol": 1e-9}
     reference = simulate("five_bar/set_point", overrides)
-    monkeypatch.setattr(SIMULATE, "REPAYS", reference.stats["rhs"] - 30)
+    monkeypatch.setattr(SIMULATE, "COMPILE_AFTER_RHS", reference.stats["rhs"] - 30)
     late = simulate("five_bar/set_point", overrides)
     assert late.stats["rhs_by_terms"] == reference.stats["rhs_by_terms"]
     assert np.array_equal(late.q_tree, reference.q_tree)
-    monkeypatch.setattr(SIMULATE, "REPAYS", 300)
+    monkeypatch.setattr(SIMULATE, "COMPILE_AFTER_RHS", 300)
     monkeypatch.setattr("ckc_pin.codegen.library.find_compiler", lambda fuses: None)
     late = simulate("five_bar/set_point", overrides)
     assert np.array_equal(late.q_tree, reference.q_tree)

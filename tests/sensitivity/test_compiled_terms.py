@@ -100,7 +100,7 @@ def test_terms_compiled_during_a_run_take_over(
 ) -> None:
     """Also if the terms of the motion alone were compiled before."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(sys.modules["ckc_pin.run.simulate"], "REPAYS", 300)
+    monkeypatch.setattr(sys.modules["ckc_pin.run.simulate"], "COMPILE_AFTER_RHS", 300)
     scene, names = write_four_bar(tmp_path), ["link.crank.mass", "joint.b.armature", "initial.q.a"]
     if has_library:
         compile_terms(load(tmp_path / "bars.toml"))
