@@ -23,6 +23,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.assembly import close_loops
+from ckc_pin.kinematics.continuation import MAX_NEWTON_STEP
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -35,7 +36,6 @@ __all__ = ["Kind", "SingularPoint", "SingularSystem", "classify", "find_singular
 Kind = Literal["locked", "fold", "serial", "rank loss"]
 
 EXACT = 1e-12  # residual of the equations above (m, rad and pure numbers) that counts as solved
-MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step is not local any more
 PROBE = 0.1  # rad or m: how far a locked mechanism is moved to see that q really stands still
 
 
@@ -139,7 +139,7 @@ class SingularSystem:
             if np.abs(residual).max() <= tolerance:
                 break
             step = -np.linalg.lstsq(self.jacobian(at, v), residual, rcond=1e-10)[0]
-            scale = min(1.0, MAX_STEP / np.abs(step / np.tile(at.tree.step_scale, 2)).max())
+            scale = min(1.0, MAX_NEWTON_STEP / np.abs(step / np.tile(at.tree.step_scale, 2)).max())
             while scale > 1e-6:
                 trial, v_trial = at.integrate(scale * step[: self.mechanism.n]), v + scale * step[self.mechanism.n :]
                 left = self.residual(trial, v_trial)

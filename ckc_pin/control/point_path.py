@@ -226,7 +226,7 @@ class PointPath:
             nodes = np.array([node.q_tree for node in coarse[first : first + count]])
             steps = difference_many(tree, np.tile(at.q_tree, (count, 1)), nodes)
             guesses.append(integrate_many(tree, np.tile(at.q_tree, (STRIDE, 1)), weights[k - first] @ steps))
-        return self.point.meet(np.concatenate(guesses), self.path(self.times)[0], self.start)
+        return self.point.invert_path(np.concatenate(guesses), self.path(self.times)[0], self.start)
 
     def _follow_all(self) -> Array:
         """Follow the path from knot to knot. If it leaves the workspace, the last knot is at the exit."""
@@ -255,7 +255,9 @@ class PointPath:
     def _follow(self, at: Kinematics, t: float) -> Kinematics | None:
         """Return the configuration at t, or None if the inverse kinematics or the chart q fails on the way."""
         moved = self.point.follow(at, self.path(t)[0])
-        return moved if moved is not None and self.point.side(at.J) * self.point.side(moved.J) > 0 else None
+        return (
+            moved if moved is not None and self.point.branch_sign(at.J) * self.point.branch_sign(moved.J) > 0 else None
+        )
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
         """Return q_d, its rate and its acceleration at time t (s), each of shape (d,).

@@ -1,4 +1,4 @@
-"""Configurations of a mechanism: sigma, assembly, continuation, branches, charts, and points as the tool."""
+"""Configurations of a mechanism: sigma, assembly, continuation, branches, charts, and points as tools."""
 
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.point import Point

@@ -1,7 +1,7 @@
-"""Numbers for q: joint coordinates as they are; a free root's place by its position and a rotation vector.
+"""Charts of the independent coordinates: joint coordinates, and position and rotation vector of a free root.
 
-The rotation vector is relative to a reference orientation, so that it stays small when the reference
-follows the motion: no chart of rotations is good everywhere.
+No chart of rotations is regular everywhere. The rotation vector is therefore relative to a reference orientation that
+follows the motion, so that it stays small.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ class Chart:
     ----------
     tree : Tree
     independent : (d,) int array
-        Tangent coordinates; those of a free root all or none.
+        Places of the independent coordinates; of a free root all six or none.
     q_tree : (nq,) array
-        Its orientations of free roots are the references.
+        The configuration whose orientations of free roots are the references.
 
     Attributes
     ----------
-    plain : bool
-        No free root among them: the numbers are joint coordinates and their rates are q_dot.
+    is_trivial : bool
+        There is no free root, so that the numbers are joint coordinates and their rates are q_dot.
     """
 
     def __init__(self, tree: Tree, independent: IntArray, q_tree: Array) -> None:
         self._tree = tree
         self._independent = independent
         self._place = tree.q_index[independent]
-        inside = set(independent.tolist())
+        members = set(independent.tolist())
         self._roots = [
             (q_at, [int(np.flatnonzero(independent == v_at + k)[0]) for k in range(6)], _rotation(q_tree, q_at))
             for q_at, v_at in tree.free_roots
-            if v_at in inside
+            if v_at in members
         ]
-        self.plain = not self._roots
+        self.is_trivial = not self._roots
 
     def numbers(self, q_tree: Array) -> Array:
-        """Chart of a configuration, shape (d,)."""
+        """Return the chart numbers of a configuration, shape (d,)."""
         numbers = np.array(q_tree[self._place])
         for q_at, at, reference in self._roots:
             numbers[at[:3]] = q_tree[q_at : q_at + 3]
@@ -53,7 +53,7 @@ class Chart:
         return numbers
 
     def step(self, q_tree: Array, numbers: Array) -> Array:
-        """Tangent step of the independent coordinates from a configuration to chart numbers, shape (d,)."""
+        """Return the tangent step of the independent coordinates from a configuration to chart numbers, shape (d,)."""
         step = numbers - q_tree[self._place]
         for q_at, at, reference in self._roots:
             start = pin.SE3(_rotation(q_tree, q_at), q_tree[q_at : q_at + 3])
@@ -62,14 +62,14 @@ class Chart:
         return step
 
     def steps(self, q_trees: Array, numbers: Array) -> Array:
-        """`step` from several configurations, shape (k, d); rotations as differences of numbers, to compare sizes."""
-        if self.plain:
+        """Return steps from several configurations, shape (k, d), with differences of chart numbers for rotations."""
+        if self.is_trivial:
             return np.asarray(numbers - q_trees[:, self._place])
         return np.array([numbers - self.numbers(q_tree) for q_tree in q_trees])
 
     def rate(self, q_tree: Array, q_dot: Array) -> Array:
-        """Rate of the chart numbers at tangent velocity q_dot, shape (d,)."""
-        if self.plain:
+        """Return the rate of the chart numbers at the tangent velocity q_dot, shape (d,)."""
+        if self.is_trivial:
             return q_dot
         rate = np.array(q_dot)
         for q_at, at, reference in self._roots:

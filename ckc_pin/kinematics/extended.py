@@ -1,8 +1,8 @@
-"""The closure with more rows: what the independent coordinates are, and where a point of the mechanism is.
+"""The closure extended by rows for the independent coordinates and for the position of a point.
 
-Eq. 3 stacks phi(q') and S q' - q to say that q determines q'. A point's coordinates p(q') can stand where S q'
-does: then they determine q', and following them is inverse kinematics. `Extended` has all these rows in one closure;
-`Task` selects those whose values are given, on the level set phi = 0, S q' = q or p(q') = x.
+Eq. 3 stacks phi(q') and S q' - q, so that q determines q'. A point's coordinates p(q') can take the place of S q': then
+they determine q', and solving for q' is inverse kinematics. `ExtendedClosure` has all these rows. `Task` selects d rows
+whose values are prescribed: S q' = q, or p(q') = x.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from ckc_pin.mechanism.rank import RANK_TOLERANCE
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
-__all__ = ["Extended", "Task", "extend_closure", "find_point"]
+__all__ = ["ExtendedClosure", "Task", "extend_closure", "find_point"]
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
-class Extended:
+class ExtendedClosure:
     """The rows [phi; S q'; p; log R] of a mechanism and one of its points.
 
     Attributes
@@ -40,13 +40,13 @@ class Extended:
     point : str or None
     closure : Closure
     loops, joints, place : int arrays
-        Which rows they are: of phi; the independent coordinates in their order; the point's position in the world,
-        three rows or none, and where that does not tell the configuration three for the turn of its frame from how
-        it is assembled.
+        Numbers of the rows: of phi, of the independent coordinates in their order, and of the point. The point has
+        three rows for its position in the world, and three more for the rotation of its frame from the assembled
+        configuration if the position does not determine the configuration. Without a point there are none.
     free : int array
-        The rows of phi without the redundant ones.
+        Rows of phi without the redundant ones.
     fixing : int array
-        d rows of `place` that determine the configuration: positions first, turns where those leave freedoms.
+        d rows of `place` that determine the configuration: positions first, then rotations if necessary.
     """
 
     mechanism: Mechanism
@@ -59,76 +59,76 @@ class Extended:
     fixing: IntArray
 
     def kinematics(self, q_tree: Array) -> Kinematics:
-        """Return all rows at a configuration; every coordinate counts as dependent."""
-        none, every = np.zeros(0, np.intp), np.arange(self.mechanism.n)
-        return Kinematics(self.mechanism.tree, self.closure, Partition(none, every), q_tree)
+        """Return all rows at a configuration, with all coordinates as dependent ones."""
+        partition = Partition(np.zeros(0, np.intp), np.arange(self.mechanism.n))
+        return Kinematics(self.mechanism.tree, self.closure, partition, q_tree)
 
     def axis(self, row: int) -> str:
-        """Name a row of `place`: x, y, z, or a turn rx, ry, rz."""
+        """Return the name of a row of `place`: x, y, z, rx, ry or rz."""
         return AXES[row - int(self.place[0])]
 
 
 @dataclass(frozen=True)
 class Task:
-    """d rows whose values are given, and with phi = 0 determine the configuration: Psi of eq. 3.
+    """d rows with prescribed values, which together with phi = 0 determine the configuration: Psi of eq. 3.
 
     Attributes
     ----------
-    extended : Extended
+    extended : ExtendedClosure
     rows : (d,) int array
     """
 
-    extended: Extended
+    extended: ExtendedClosure
     rows: IntArray
 
     @property
-    def every(self) -> IntArray:
-        """The rows of Psi, n of them: those of phi that are not redundant, then the given ones."""
+    def psi_rows(self) -> IntArray:
+        """The n rows of Psi: the rows of phi that are not redundant, then the prescribed rows."""
         return np.concatenate([self.extended.free, self.rows])
 
-    def level(self, given: Array) -> Array:
-        """Psi's wanted values (count, n) from the given ones (count, d)."""
-        return np.hstack([np.zeros((len(given), len(self.extended.free))), given])
+    def psi_values(self, values: Array) -> Array:
+        """Return the values of Psi, shape (count, n), for prescribed values (count, d)."""
+        return np.hstack([np.zeros((len(values), len(self.extended.free))), values])
 
     def evaluate(self, q_tree: Array) -> tuple[Array, Array]:
-        """All rows and their Jacobians at configurations (count, nq)."""
+        """Return all rows, shape (count, rows), and their Jacobians (count, rows, n) at configurations (count, nq)."""
         return evaluate_closure(self.extended.mechanism.tree, self.extended.closure, q_tree)
 
 
 def find_point(mechanism: Mechanism, name: str | None = None) -> str:
-    """Return the name of a point, the first one unless given.
+    """Return the name of a point of a mechanism. Default: the first one.
 
     Raises
     ------
     InputError
-        There is no such point.
+        There is no such point, or no point at all.
     """
     if not mechanism.points:
         raise InputError(
-            f"{mechanism.name}: it has no point; name one in its mechanism.toml: [[point]], name = ..., frame = ..."
+            f"{mechanism.name}: it has no point; add one to its mechanism.toml: [[point]], name = ..., frame = ..."
         )
     if name is not None and name not in mechanism.points:
         raise InputError(f"no point {name!r} in {mechanism.name}; there are {', '.join(mechanism.points)}")
     return name or next(iter(mechanism.points))
 
 
-def extend_closure(mechanism: Mechanism, point: str | None = None) -> Extended:
-    """Add the rows of the independent coordinates, and those of a point where one is named.
+def extend_closure(mechanism: Mechanism, point: str | None = None) -> ExtendedClosure:
+    """Return the closure extended by the independent coordinates, and by a point if one is named.
 
     Raises
     ------
     InputError
-        No such point, or one that does not tell the configuration.
+        There is no such point, or its position and rotation do not determine the configuration.
     """
-    single = [k for k in mechanism.partition.q if mechanism.coordinates[k] not in mechanism.tree.free_coordinates]
-    closure = join_closures(mechanism.closure, _joint_rows(mechanism, single))
+    of_joints = [k for k in mechanism.partition.q if mechanism.coordinates[k] not in mechanism.tree.free_coordinates]
+    closure = join_closures(mechanism.closure, _joint_rows(mechanism, of_joints))
     rows, with_joints = mechanism.closure.rows, closure.rows
-    chosen = np.zeros(0, np.intp)
+    fixing = np.zeros(0, np.intp)
     if point is not None:
-        chosen = _fixing(mechanism, point)
-        closure = join_closures(closure, _point_rows(mechanism, point, "weld" if np.any(chosen >= 3) else "point"))
+        fixing = _choose_rows(mechanism, point)
+        closure = join_closures(closure, _point_rows(mechanism, point, "weld" if np.any(fixing >= 3) else "point"))
     names = [".".join(name) for name in mechanism.closure.names]
-    return Extended(
+    return ExtendedClosure(
         mechanism=mechanism,
         point=point,
         closure=closure,
@@ -136,52 +136,52 @@ def extend_closure(mechanism: Mechanism, point: str | None = None) -> Extended:
         joints=np.arange(rows, with_joints),
         place=np.arange(with_joints, closure.rows),
         free=np.array([k for k, name in enumerate(names) if name not in mechanism.redundant], np.intp),
-        fixing=with_joints + chosen,
+        fixing=with_joints + fixing,
     )
 
 
 def _joint_rows(mechanism: Mechanism, at: Sequence[int]) -> Closure:
-    nowhere = Anchors(np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros((0, 3)))
+    anchors = Anchors(np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros((0, 3)))
     select = np.zeros((len(at), mechanism.n))
     select[np.arange(len(at)), at] = 1.0
     names = tuple((mechanism.coordinates[k], "q") for k in at)
-    return Closure(nowhere, (Affine(np.arange(len(at)), select, np.zeros(len(at))),), names, ())
+    return Closure(anchors, (Affine(np.arange(len(at)), select, np.zeros(len(at))),), names, ())
 
 
 def _point_rows(mechanism: Mechanism, name: str, kind: Literal["point", "weld"]) -> Closure:
-    """Return a loop from the point's frame to the world: its rows are where the point, or its frame, is."""
+    """Return a loop from the point's frame to the world, whose rows are the position, or pose, of the frame."""
     frame = next(p.frame for p in mechanism.spec.point if p.name == name)
-    found = mechanism.points[name]
-    if found.joint == 0:
+    placed = mechanism.points[name]
+    if placed.joint == 0:
         raise InputError(f"point {name!r} of {mechanism.name} is fixed in the world: it cannot be moved")
-    turned = mechanism.assembled.pose.rotation[found.joint] @ found.rotation
-    roll_pitch_yaw = tuple(float(x) for x in pin.rpy.matrixToRpy(turned))
+    rotation = mechanism.assembled.pose.rotation[placed.joint] @ placed.rotation
+    roll_pitch_yaw = tuple(float(x) for x in pin.rpy.matrixToRpy(rotation))
     builder = ClosureBuilder(mechanism.tree, mechanism.frames)
     world = FrameSpec(link="world", rpy=roll_pitch_yaw)  # type: ignore[arg-type]
     builder.add_loop(LoopSpec(name=name, type=kind, frame_a=frame, frame_b=world, rows_in="world"))
     return builder.build()
 
 
-def _fixing(mechanism: Mechanism, point: str) -> IntArray:
-    """Choose d of the six rows of a place, each the one that adds most; turns only when positions add nothing."""
+def _choose_rows(mechanism: Mechanism, point: str) -> IntArray:
+    """Choose d of the six rows of a point's pose by pivoting; rotations only if positions do not add to the rank."""
     at = mechanism.assembled
     frame = Kinematics(mechanism.tree, _point_rows(mechanism, point, "weld"), at.partition, mechanism.q_tree)
     moves = frame.J @ at.rho * mechanism.tree.step_scale[at.partition.q]
     moves[:3] /= mechanism.size
-    least = RANK_TOLERANCE * max(1.0, float(np.abs(moves).max(initial=0.0)))
+    threshold = RANK_TOLERANCE * max(1.0, float(np.abs(moves).max(initial=0.0)))
     chosen: list[int] = []
     for block in (range(3), range(3, 6)):
         while len(chosen) < mechanism.d:
             sizes = np.array([np.linalg.norm(moves[k]) if k in block else 0.0 for k in range(6)])
-            best = int(np.argmax(np.round(sizes / least)))  # of equals the first
-            if sizes[best] <= least:
+            best = int(np.argmax(np.round(sizes / threshold)))  # of equal sizes the first
+            if sizes[best] <= threshold:
                 break
-            along = moves[best] / sizes[best]
-            moves = moves - np.outer(moves @ along, along)
+            direction = moves[best] / sizes[best]
+            moves = moves - np.outer(moves @ direction, direction)
             chosen.append(best)
     if len(chosen) < mechanism.d:
         raise InputError(
-            f"{mechanism.name}: place and orientation of the point {point!r} fix {len(chosen)} of its {mechanism.d} "
-            "freedoms; name a point of a body that all of them move"
+            f"{mechanism.name}: position and orientation of the point {point!r} determine {len(chosen)} of its "
+            f"{mechanism.d} freedoms; name a point of a body that all freedoms move"
         )
     return np.sort(np.array(chosen, np.intp))

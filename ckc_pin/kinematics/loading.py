@@ -1,9 +1,9 @@
-"""Mechanisms by shipped name or by path, assembled."""
+"""Load mechanisms by shipped name or path, assembled, with a cache of the mechanisms loaded lately."""
 
 from __future__ import annotations
 
 import sys
-from copy import deepcopy
+from collections.abc import Hashable
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -20,12 +20,48 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec
 
-__all__ = ["as_mechanism", "build", "load"]
+__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "load"]
 
-MOST_KEPT = 32  # of the mechanisms built
 
-_built: dict[Any, Mechanism] = {}  # never handed out, only copied
-_building = Lock()
+class MechanismCache:
+    """A cache of assembled mechanisms, safe to use from several threads.
+
+    It hands out copies and keeps its own mechanisms unchanged. The oldest mechanism is dropped first.
+
+    Parameters
+    ----------
+    capacity : int
+        Largest number of mechanisms.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._lock = Lock()
+        self._mechanisms: dict[Hashable, Mechanism] = {}
+
+    def values(self) -> list[Mechanism]:
+        """Return the mechanisms themselves, oldest first. They must not be changed."""
+        with self._lock:
+            return list(self._mechanisms.values())
+
+    def find(self, key: Hashable, sources: Sources) -> Mechanism | None:
+        """Return a copy of a mechanism whose files still have the same texts, with `sources`; None if there is none."""
+        with self._lock:
+            mechanism = self._mechanisms.get(key)
+        if mechanism is None or any(sources.text(file) != text for file, text in mechanism.sources.texts.items()):
+            return None
+        return mechanism.copy(sources)
+
+    def add(self, key: Hashable, mechanism: Mechanism) -> None:
+        """Store a copy of a mechanism."""
+        stored = mechanism.copy(mechanism.sources)
+        with self._lock:
+            self._mechanisms[key] = stored
+            while len(self._mechanisms) > self.capacity:
+                self._mechanisms.pop(next(iter(self._mechanisms)))
+
+
+cache = MechanismCache(capacity=32)
 
 
 def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -> Mechanism:
@@ -34,68 +70,69 @@ def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -
     Parameters
     ----------
     name : str, Path or GeneratorSpec
-        For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``; ``"n_four_bar"`` is made with its
-        usual number of links.
+        For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``. ``"n_four_bar"`` is generated with its default
+        number of links.
     overrides : mapping, optional
-        Numbers that are other ones, by name, e.g. ``{"link.link_2.mass": 0.3}``.
+        Parameter values by name that replace those of the files, such as ``{"link.link_2.mass": 0.3}``.
+
+    Returns
+    -------
+    Mechanism
+        Independent of every other one. Mechanisms loaded lately are copied from a cache.
 
     Raises
     ------
     InputError
-        A file that is missing, malformed, or has an unknown key.
+        A file is missing or malformed, or has an unknown key.
     MechanismError
-        A mechanism that cannot exist as described.
+        The mechanism cannot exist as described.
     """
     require_type(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*read_mechanism_texts(name), None if overrides is None else _as_read(overrides))
+    return build(*read_mechanism_texts(name), None if overrides is None else _check_overrides(overrides))
 
 
-def _as_read(overrides: Any) -> Overrides:
-    """Return numbers by name as a file has them: Python's, three of them as a tuple (InputError)."""
-    takes = 'a table of numbers by name, three of a vector, as {"link.link_2.mass": 0.3}'
-    require_table(overrides, "load: overrides", takes)
-    found: dict[str, Any] = {}
-    for name, given in overrides.items():
-        value = given.tolist() if isinstance(given, np.generic | np.ndarray) else given
-        several = isinstance(value, list | tuple)
-        for x in value if several else (value,):
+def _check_overrides(overrides: Any) -> Overrides:
+    """Return overrides with Python floats, and vectors as tuples of three."""
+    expected = 'a table of numbers by name, three of a vector, as {"link.link_2.mass": 0.3}'
+    require_table(overrides, "load: overrides", expected)
+    checked: dict[str, Any] = {}
+    for name, override in overrides.items():
+        value = override.tolist() if isinstance(override, np.generic | np.ndarray) else override
+        is_vector = isinstance(value, list | tuple)
+        for x in value if is_vector else (value,):
             if not is_number(x) or not abs(x) <= sys.float_info.max:
-                raise InputError(f"load: overrides: {name} = {given!r:.80}: expected {takes}")
-        found[name] = tuple(map(float, value)) if several else float(value)
-        if several and len(value) != 3:
-            raise InputError(f"load: overrides: {name}: {len(value)} numbers were given; a vector has three")
-    return found
+                raise InputError(f"load: overrides: {name} = {override!r:.80}: expected {expected}")
+        checked[name] = tuple(map(float, value)) if is_vector else float(value)
+        if is_vector and len(value) != 3:
+            raise InputError(f"load: overrides: {name}: expected 3 numbers, got {len(value)}")
+    return checked
 
 
-def as_mechanism(given: Any, who: str) -> Mechanism:
-    """Return the mechanism that a public function was given: as it is, or loaded by name or path.
+def as_mechanism(mechanism: Any, function: str) -> Mechanism:
+    """Return the mechanism that a public function got: as it is, or loaded by name or path.
 
     Raises
     ------
     InputError, MechanismError
-        No mechanism; what `load` raises.
+        It is not a mechanism; what `load` raises.
     """
-    takes = "a mechanism: itself, its shipped name or its path"
-    require_type(given, (Mechanism, str, Path, GeneratorSpec), f"{who}: mechanism", takes)
-    return given if isinstance(given, Mechanism) else load(given)
+    expected = "a mechanism: itself, its shipped name or its path"
+    require_type(mechanism, (Mechanism, str, Path, GeneratorSpec), f"{function}: mechanism", expected)
+    return mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
 
 
 def build(text: str, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
-    """Build a mechanism from the text of its file; the text is kept among its sources.
+    """Return the assembled mechanism of a mechanism file. The text of the file is added to its sources.
 
-    One that was built of the same texts before is copied: parsing, assembling and counting freedoms take longer than
-    many a run.
+    Parsing, assembly and the rank computation take longer than many runs. A mechanism that was built from the same
+    texts is therefore copied from `cache`.
     """
     sources.texts[MECHANISM_FILE] = text
     key = (text, sources.name, sources.folder, tuple(sorted((overrides or {}).items())))
-    built = _built.get(key)
-    if built is not None and all(sources.text(file) == known for file, known in built.sources.texts.items()):
-        return deepcopy(built, {id(built.sources): sources})
-    mechanism = _build(text, sources, overrides)
-    with _building:
-        _built[key] = deepcopy(mechanism)
-        while len(_built) > MOST_KEPT:
-            _built.pop(next(iter(_built)))
+    mechanism = cache.find(key, sources)
+    if mechanism is None:
+        mechanism = _build(text, sources, overrides)
+        cache.add(key, mechanism)
     return mechanism
 
 

@@ -1,8 +1,8 @@
-"""The map q' = sigma(q) of eq. 4, by Newton with step control, on any level set phi = w.
+"""The map q' = sigma(q) of eq. 4 by Newton's method with step control, on any level set phi = w; assembly branches.
 
-Two uses. Inside an integration a good prediction is at hand: `newton` alone, one or two iterations.
-From anywhere else: `sigma` follows the straight line from a closed configuration to the wanted q and
-says how that ended, `move` the same for a step of q.
+An integrator has a good initial guess, from which `newton` converges in one or two iterations. From anywhere else,
+`sigma` follows the straight line from a closed configuration to q and reports how that ended. `follow_sigma` does the
+same for a step of q.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.continuation import follow, same_branch
+from ckc_pin.kinematics.continuation import MAX_SEARCH_STEP, follow, is_local, same_branch
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
@@ -34,21 +34,34 @@ __all__ = [
 
 Verdict = Literal["converged", "out of reach", "singular"]
 
-MAX_STEP = 0.5  # rad, or of the mechanism's size: a longer Newton step in one coordinate is not local any more
-MAX_ITERATIONS = 12
-LOOSE = 1e-10  # of the mechanism's size: a tolerance beyond that is what contradicting rows leave open, not rounding
-GAINS = 0.1  # with such a one, Newton's method goes on while a step leaves no more
-FAR = 500  # Newton steps, a hundred radians or more: no step of a motion is so long, but a trial of one may be
-FARTHEST = 5000  # the same for a q that somebody asks for; what is further is looked for without the way there
-SMALLEST_PIECE = 1e-9  # of the straight line in q
-NEARLY = 1e5  # tolerances: as closed as Newton's method makes a singular configuration
-STARTS = 20  # of z, when the line does not lead to q
-ROUNDING = 1e-9  # of |J|: below that, phi_z is singular to working precision
+MAX_ITERATIONS = 12  # of Newton's method
+INEXACT_TOLERANCE = 1e-10  # mechanism sizes: a larger tolerance means that redundant rows contradict each other
+POLISH_RATIO = 0.1  # then Newton's method goes on while each step reduces the residual at least so much
+MAX_PATH_ITERATIONS = 500  # Newton steps to follow a step of a motion: a hundred radians or more
+MAX_SEARCH_ITERATIONS = 5000  # Newton steps to follow the line to a q that a user asks for
+MIN_PIECE = 1e-9  # of the straight line in q
+SINGULAR_CLOSURE_FACTOR = 1e5  # tolerances: how well Newton's method closes a singular configuration
+RANDOM_STARTS = 20  # values of z from which q is searched if the line does not lead there
+SINGULAR_MARGIN = 1e-9  # of `Kinematics.margin`: below it phi_z is singular to working precision
+SINGULAR_ON_PATH_MARGIN = 1e-3  # the same where a path ends
+SINGULAR_IN_SEARCH_MARGIN = 1e-6  # the same where a search ends
+MAX_SEARCH_STEPS = 60  # Newton steps from a random start to a branch
+BRANCH_STARTS = 400  # random values of z from which assembly branches are searched
+MAX_BRANCH_COORDINATES = 12  # dependent coordinates; with more, random starts would miss most branches
+BRANCH_DISTANCE = 1e-6  # rad or m: configurations closer than this are the same branch
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Outcome of Newton's iteration on z: the last iterate, how many corrections, whether it closed."""
+    """Outcome of Newton's method on z.
+
+    Attributes
+    ----------
+    at : Kinematics
+        The last iterate.
+    iterations : int
+    converged : bool
+    """
 
     at: Kinematics
     iterations: int
@@ -57,22 +70,22 @@ class Newton:
 
 @dataclass(frozen=True)
 class Sigma:
-    """Outcome of following sigma to a wanted q.
+    """Outcome of the search for q' = sigma(q).
 
     Attributes
     ----------
     verdict : "converged", "out of reach" or "singular"
     at : Kinematics
-        At sigma(q) when converged, else at the last closed configuration of the way.
+        At sigma(q) if converged, otherwise the last closed configuration on the line to q.
     reached : float
-        How much of the straight line could be followed; less than 1 also for a q that was found converged
-        without the line, on the same branch by the sign of det phi_z alone.
+        Fraction of the straight line that could be followed. It is less than 1 also if sigma(q) was found by a search
+        from other starts, on the same branch according to the sign of det phi_z.
     miss : float
-        Largest |phi - w| that remains at q when out of reach, metres or radians.
+        Smallest value of the largest |phi - w| at q if out of reach, metres or radians; NaN if it was not computed.
     iterations : int
-        Newton corrections over the whole way.
+        Newton iterations in total.
     reason : str
-        The verdict as half a sentence.
+        Explanation of the verdict, for messages.
     """
 
     verdict: Verdict
@@ -91,7 +104,7 @@ def sigma(
     *,
     anywhere: bool = True,
 ) -> Sigma:
-    """Return q' = sigma(q), eq. 4, on the assembly branch of `start` (default: as assembled).
+    """Return q' = sigma(q), eq. 4, on the assembly branch of a closed configuration.
 
     Parameters
     ----------
@@ -99,16 +112,16 @@ def sigma(
     q : (d,) array
         The independent coordinates, rad or m.
     start : Kinematics, optional
-        Closed.
+        A closed configuration. Default: as assembled.
     w : (rows,) array or 0.0
-        The level set.
+        The level set phi = w.
     anywhere : bool
-        Where the straight way to q ends early, whether to look for q from other starts.
+        Whether to search for q from other starts if the straight line ends before q.
 
     Raises
     ------
     InputError
-        The loops constrain a free root in part: its place is no function of numbers q.
+        The loops constrain a free root in part, so the mechanism has no independent coordinates q.
     """
     if mechanism.splits_root:
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
@@ -123,30 +136,30 @@ def sigma(
 
 
 def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
-    """Close phi(q, z) = w by Newton on z from a start near the solution.
+    """Solve phi(q, z) = w for z by Newton's method, from a start near the solution.
 
     Parameters
     ----------
     start : Kinematics
-        Its q is kept, its z corrected.
+        Provides q and the initial z.
     w : (rows,) array or 0.0
-        The level set.
+        The level set phi = w.
     tolerance : float
-        Largest |phi - w| that counts as closed, where coordinates are not large (`Tree.coarseness`). Where it is loose
-        because rows contradict each other, what z can close is closed to rounding: of how far a start was off, nothing
-        stays.
+        Largest |phi - w| that counts as closed. It is increased for large coordinates (`Tree.tolerance_factor`). If it
+        is loose because redundant rows contradict each other, the iteration goes on until z closes the rows to
+        rounding, so that the result does not depend on the start.
 
     Returns
     -------
     Newton
-        Not converged when a step is not local, does not contract, or phi_z is singular.
+        Not converged if a step is too long (`is_local`), does not contract, or phi_z is singular.
     """
-    at, loose = start, tolerance > LOOSE * start.tree.size
+    at, is_inexact = start, tolerance > INEXACT_TOLERANCE * start.tree.size
     tolerance *= start.tree.tolerance_factor(start.q_tree)
     residual = at.phi - w
-    size = _unclosed(at, residual)
-    redundant = len(residual) > len(at.partition.z)
-    polish = redundant and loose and size > 0.0
+    size = _reducible_residual(at, residual)
+    has_redundant_rows = len(residual) > len(at.partition.z)
+    polish = has_redundant_rows and is_inexact and size > 0.0
     for iteration in range(MAX_ITERATIONS):
         closed = size <= tolerance
         if closed and not polish:
@@ -155,30 +168,30 @@ def newton(start: Kinematics, w: Array | float, tolerance: float) -> Newton:
             return Newton(at, iteration, closed)
         step = np.zeros(at.tree.n)
         step[at.partition.z] = -at.phi_z_factor.solve(residual)
-        if not np.abs(step / at.tree.step_scale).max() <= MAX_STEP:
+        if not is_local(at.tree, step):
             return Newton(at, iteration, False)
         at = at.integrate(step)
         residual = at.phi - w
-        previous, size = size, _unclosed(at, residual)
+        previous, size = size, _reducible_residual(at, residual)
         if not size <= max(0.5 * previous, tolerance):
             return Newton(at, iteration + 1, False)
-        polish = polish and size < GAINS * previous
+        polish = polish and size < POLISH_RATIO * previous
     return Newton(at, MAX_ITERATIONS, size <= tolerance)
 
 
-def project_onto_closure(start: Kinematics, rank: int, still: Sequence[int] | IntArray = ()) -> Kinematics:
-    """Close the loops by the shortest steps, q and z alike, as far as these lead.
+def project_onto_closure(start: Kinematics, rank: int, fixed: Sequence[int] | IntArray = ()) -> Kinematics:
+    """Project a configuration onto phi = 0 by minimum-norm Newton steps in all coordinates, until these do not improve.
 
     Parameters
     ----------
     start : Kinematics
-        Nearly closed.
+        A nearly closed configuration.
     rank : int
-        Of J and the rows of what stands still together.
-    still : sequence of int
+        Rank of J with a row for each fixed coordinate.
+    fixed : sequence of int
         Coordinates that do not move.
     """
-    at, rows = start, np.eye(start.tree.n)[list(still)]
+    at, rows = start, np.eye(start.tree.n)[list(fixed)]
     size, none = float(np.abs(at.phi).max(initial=0.0)), np.zeros(len(rows))
     for _ in range(MAX_ITERATIONS if size > 0.0 else 0):
         step = minimum_norm_step(np.vstack([at.J, rows]), rank, np.concatenate([at.phi, none]), at.tree.step_scale)
@@ -190,18 +203,18 @@ def project_onto_closure(start: Kinematics, rank: int, still: Sequence[int] | In
     return at
 
 
-def minimum_norm_step(rows: Array, rank: int, residual: Array, reach: Array) -> Array:
-    """Return the least x with rows x = -residual, radians and the mechanism's size being alike."""
-    u, values, v = np.linalg.svd(rows * reach, full_matrices=False)
-    along = (u[:, :rank].T @ residual) / np.maximum(values[:rank], 1e-300)
-    return np.asarray(-reach * (v[:rank].T @ along))
+def minimum_norm_step(rows: Array, rank: int, residual: Array, scale: Array) -> Array:
+    """Return the x of minimum norm with rows x = -residual. Norms are of x / scale, so lengths and angles compare."""
+    u, values, v = np.linalg.svd(rows * scale, full_matrices=False)
+    components = (u[:, :rank].T @ residual) / np.maximum(values[:rank], 1e-300)
+    return np.asarray(-scale * (v[:rank].T @ components))
 
 
-def _unclosed(at: Kinematics, residual: Array) -> float:
-    """Largest part of a residual that z could still close.
+def _reducible_residual(at: Kinematics, residual: Array) -> float:
+    """Return the largest entry of the part of a residual that a change of z can reduce.
 
-    With redundant rows some of it may be out of z's reach: where the numbers of a file are rounded the
-    rows contradict each other slightly, and no configuration closes them all.
+    Redundant rows contradict each other slightly if the numbers of a file are rounded. Then no configuration closes all
+    of them.
     """
     if len(residual) > len(at.partition.z) and np.all(np.isfinite(residual)) and not at.phi_z_factor.singular:
         residual = at.phi_z @ at.phi_z_factor.solve(residual)
@@ -209,7 +222,7 @@ def _unclosed(at: Kinematics, residual: Array) -> float:
 
 
 def predict(at: Kinematics, dq: Array, dw: Array | None = None) -> Kinematics:
-    """Move q by dq, the level by dw, and z along with them to first order, z + rho_z dq + phi_z^-1 dw."""
+    """Return the first-order prediction for a step dq and a change dw of the level: z + rho_z dq + phi_z^-1 dw."""
     step = at.rho @ dq
     if dw is not None:
         step[at.partition.z] += at.phi_z_factor.solve(dw)
@@ -217,76 +230,76 @@ def predict(at: Kinematics, dq: Array, dw: Array | None = None) -> Kinematics:
 
 
 def follow_sigma(start: Kinematics, dq: Array, w: Array | float, tolerance: float, *, anywhere: bool = True) -> Sigma:
-    """Follow q' = sigma(q) along the straight line from a closed configuration to q + dq, and from its level to w.
+    """Follow q' = sigma(q) along the straight line to q + dq, and from the level of the start to w.
 
-    Each piece is predicted along rho and corrected by Newton. Where the line ends early, q is looked for from other
-    starts, unless `anywhere` is False.
+    Each piece is predicted with rho and corrected by Newton's method. If the line ends early, q + dq is searched from
+    other starts, unless `anywhere` is False.
     """
-    dw, iterations, most = w - start.phi, 0, FARTHEST if anywhere else FAR
+    dw, iterations, max_iterations = w - start.phi, 0, MAX_SEARCH_ITERATIONS if anywhere else MAX_PATH_ITERATIONS
     between_levels = bool(np.abs(dw).max(initial=0.0) > tolerance)
 
     def advance(at: Kinematics, done: float, part: float) -> Kinematics | None:
         nonlocal iterations
-        if iterations > most or at.phi_z_factor.singular:
+        if iterations > max_iterations or at.phi_z_factor.singular:
             return None
         level = w - (1.0 - done - part) * dw if between_levels else w
         trial = newton(predict(at, part * dq, part * dw if between_levels else None), level, tolerance)
         iterations += trial.iterations
         return trial.at if trial.converged else None
 
-    at, done = follow(start, advance, SMALLEST_PIECE)
+    at, done = follow(start, advance, MIN_PIECE)
     if done < 1.0 and anywhere:
-        return _failure(at, (1.0 - done) * dq, w, tolerance, done, iterations)
-    if iterations > most:
-        return Sigma("out of reach", at, done, float("nan"), iterations, "that is too far away for one step")
+        return _search(at, (1.0 - done) * dq, w, tolerance, done, iterations)
+    if iterations > max_iterations:
+        return Sigma("out of reach", at, done, float("nan"), iterations, "it is too far away for one step")
     if done < 1.0:
         return _end_of_line(at, done, iterations)
-    if at.margin() <= ROUNDING:
+    if at.margin() <= SINGULAR_MARGIN:
         return Sigma("singular", at, 1.0, 0.0, iterations, "phi_z is singular there")
     return Sigma("converged", at, 1.0, 0.0, iterations)
 
 
 def _end_of_line(at: Kinematics, done: float, iterations: int) -> Sigma:
-    miss = float("nan")  # not looked for
-    if at.margin() <= 1e-3:
+    miss = float("nan")
+    if at.margin() <= SINGULAR_ON_PATH_MARGIN:
         return Sigma("singular", at, done, miss, iterations, "phi_z is singular on the way")
     return Sigma("out of reach", at, done, miss, iterations, "the loops cannot be kept closed on the way")
 
 
-def _failure(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
-    """Where the straight line ends, look at q itself: from z at its end, then from z anywhere.
+def _search(at: Kinematics, dq: Array, w: Array | float, tolerance: float, done: float, iterations: int) -> Sigma:
+    """Search for sigma(q) where the straight line to q ended: from z at its end, then from random z.
 
-    A q behind an unreachable region may still lie on this branch; known by the sign of det phi_z.
+    Beyond a region that is out of reach q may still be on this branch, which the sign of det phi_z shows.
     """
     target = np.zeros(at.tree.n)
     target[at.partition.q] = dq
     tolerance *= at.tree.tolerance_factor(at.integrate(target).q_tree)
     start, random = at.integrate(target), np.random.default_rng(0)
-    least, singular, other = np.inf, False, False
-    for attempt in range(STARTS):
+    smallest_miss, is_singular, on_other_branch = np.inf, False, False
+    for attempt in range(RANDOM_STARTS):
         spread = np.zeros(at.tree.n)
         spread[at.partition.z] = random.uniform(-np.pi, np.pi, len(at.partition.z)) if attempt else 0.0
         spread *= at.tree.step_scale
-        nearest = _least_squares(start.integrate(spread), w, tolerance)
-        miss = float(np.abs(nearest.phi - w).max(initial=0.0))
-        least = min(least, miss)
-        flat = nearest.margin() <= 1e-6
-        if miss <= tolerance and not flat:
-            if same_branch(at, nearest):
-                return Sigma("converged", nearest, done, 0.0, iterations)
-            other = True
-        singular = singular or (flat and miss <= NEARLY * tolerance)
-    if singular:
-        return Sigma("singular", at, done, least, iterations, "phi_z is singular there")
-    if other:
+        trial = _least_squares(start.integrate(spread), w, tolerance)
+        miss = float(np.abs(trial.phi - w).max(initial=0.0))
+        smallest_miss = min(smallest_miss, miss)
+        has_singular_phi_z = trial.margin() <= SINGULAR_IN_SEARCH_MARGIN
+        if miss <= tolerance and not has_singular_phi_z:
+            if same_branch(at, trial):
+                return Sigma("converged", trial, done, 0.0, iterations)
+            on_other_branch = True
+        is_singular = is_singular or (has_singular_phi_z and miss <= SINGULAR_CLOSURE_FACTOR * tolerance)
+    if is_singular:
+        return Sigma("singular", at, done, smallest_miss, iterations, "phi_z is singular there")
+    if on_other_branch:
         reason = "the loops close there on another assembly branch only, behind a singular configuration"
     else:
-        reason = f"the loops cannot close there (nearest miss {least:.3g})"
-    return Sigma("out of reach", at, done, least, iterations, reason)
+        reason = f"the loops cannot close there (nearest miss {smallest_miss:.3g})"
+    return Sigma("out of reach", at, done, smallest_miss, iterations, reason)
 
 
 def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinematics:
-    """Levenberg-Marquardt on |phi - w| over z, q kept."""
+    """Minimize |phi - w| over z by the Levenberg-Marquardt method."""
     damping, z = 1e-3, at.partition.z
     for _ in range(200):
         residual = at.phi - w
@@ -307,41 +320,40 @@ def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinema
     return at
 
 
-BRANCH_STARTS = 400
-LARGEST = 12  # dependent coordinates: beyond, random starts would miss most branches
+# --- assembly branches ---------------------------------------------------------------------------
 
 
 def assembly_branches(mechanism: Mechanism) -> list[Kinematics]:
-    """List the closed configurations at the assembled q, found from random z: the assembled one first.
+    """List the assembly branches at the assembled q, the assembled one first, by a search from random z.
 
     Raises
     ------
     InputError
-        The mechanism is too large for random starts to tell anything.
+        The mechanism is too large for a search from random starts.
     """
     at = mechanism.assembled
     z = mechanism.partition.z
-    if len(z) > LARGEST or not mechanism.tree.is_euclidean:
+    if len(z) > MAX_BRANCH_COORDINATES or not mechanism.tree.is_euclidean:
         raise InputError(
-            f"{mechanism.name}: branches are listed for mechanisms with at most {LARGEST} dependent joints; "
-            f"this one has {len(z)}"
+            f"{mechanism.name}: branches are listed for mechanisms with at most {MAX_BRANCH_COORDINATES} dependent "
+            f"joints; this one has {len(z)}"
         )
     random = np.random.default_rng(0)
-    reach = np.where(mechanism.tree.in_metres[z], mechanism.size, np.pi)
-    found = [at]
+    spread = np.where(mechanism.tree.in_metres[z], mechanism.size, np.pi)
+    branches = [at]
     for _ in range(BRANCH_STARTS if len(z) else 0):
         step = np.zeros(mechanism.n)
-        step[z] = random.uniform(-1.0, 1.0, len(z)) * reach
-        closed = _settle(at.integrate(step), mechanism.tolerance)
-        if closed is not None and all(_apart(mechanism, closed, other) for other in found):
-            found.append(closed)
-    return found
+        step[z] = random.uniform(-1.0, 1.0, len(z)) * spread
+        closed = _newton_from_afar(at.integrate(step), mechanism.tolerance)
+        if closed is not None and all(_are_distinct(mechanism, closed, other) for other in branches):
+            branches.append(closed)
+    return branches
 
 
-def _settle(start: Kinematics, tolerance: float) -> Kinematics | None:
-    """Newton with steps cut to what is local."""
+def _newton_from_afar(start: Kinematics, tolerance: float) -> Kinematics | None:
+    """Close the loops by Newton steps on z of limited length; return None if that fails."""
     at, z = start, start.partition.z
-    for _ in range(60):
+    for _ in range(MAX_SEARCH_STEPS):
         outcome = newton(at, 0.0, tolerance)
         if outcome.converged:
             return outcome.at
@@ -350,13 +362,13 @@ def _settle(start: Kinematics, tolerance: float) -> Kinematics | None:
         longest = np.abs(step).max()
         if not np.isfinite(longest) or longest == 0.0:
             return None
-        at = at.integrate(step * min(1.0, 0.3 / longest))
+        at = at.integrate(step * min(1.0, MAX_SEARCH_STEP / longest))
     return None
 
 
-def _apart(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> bool:
-    """Whether two configurations differ by more than whole turns."""
+def _are_distinct(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> bool:
+    """Whether two configurations differ by more than whole turns of joints."""
     gap: Array = a.q_tree - b.q_tree
     angles = ~mechanism.tree.in_metres
     gap[angles] = np.remainder(gap[angles] + np.pi, 2 * np.pi) - np.pi
-    return bool(np.abs(gap).max() > 1e-6)
+    return bool(np.abs(gap).max() > BRANCH_DISTANCE)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
+from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
@@ -100,6 +102,12 @@ class Mechanism(HasSummary):
         rows += [("points", list(self.points))] if self.points else []
         rows += [("warning", warning) for warning in self.warnings]
         return Summary(f"Mechanism {self.name}: {self.n} coordinates, {self.d} freedoms", rows)
+
+    def copy(self, sources: Sources) -> Mechanism:
+        """Return an independent copy of the mechanism with other sources."""
+        twin = deepcopy(self)
+        twin.sources = sources
+        return twin
 
     # --- one configuration -----------------------------------------------------------------------
 

@@ -115,8 +115,8 @@ def test_orientation_is_kept_where_the_place_leaves_it_open():
 @pytest.mark.parametrize(
     ("x", "says"),
     [
-        ([0.1, 0.1], "three finite numbers needed"),
-        ([0.1, np.nan, 0.0], "three finite numbers needed"),
+        ([0.1, 0.1], "expected three finite numbers"),
+        ([0.1, np.nan, 0.0], "expected three finite numbers"),
         ([5.0, 0.0, 0.0], "cannot be at"),
         ([0.15, -0.5, 0.1], "cannot be at"),  # out of the plane
         ({"w": 0.1}, "there are x, y, z"),

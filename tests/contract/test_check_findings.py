@@ -234,7 +234,7 @@ def test_an_assembly_that_stops_have_moved_is_named(bar: Path) -> None:
     limit(bar, "theta_1", -1.0, -0.5)
     add(bar, '[[joint]]\nname = "theta_1"\nstops = true')
     found = warnings("bar")
-    assert found[0].startswith("q_guess leads beyond joints' stops; assembled within them: theta_1 = -0.99")
+    assert found[0].startswith("q_guess leads beyond stops of joints; assembled within the stops: theta_1 = -0.99")
 
 
 def test_at_a_limit_is_inside(bar: Path) -> None:

@@ -143,7 +143,7 @@ def test_reference_pose_outside_ranges_is_assembled_inside(tmp_path: Path) -> No
     )
     mechanism = model(tmp_path, bodies).build_mechanism()
     assert_close(mechanism.q_tree, [-1.0, 0.0], EXACT)
-    assert has_note(mechanism.warnings, "beyond joints' stops", "j0 = -1 (without them 0)")
+    assert has_note(mechanism.warnings, "beyond stops of joints", "j0 = -1 (without stops 0)")
 
 
 @pytest.mark.parametrize("flag", ["frictionloss='disable'", "limit='disable'", "constraint='disable'"])

@@ -75,7 +75,7 @@ def test_copies_have_separate_workspaces() -> None:
 def test_workspace_is_allocated_on_demand() -> None:
     """It has some n^3 numbers, and what is kept to be copied needs none."""
     load("delta")
-    assert all("data" not in vars(kept.tree) for kept in loading._built.values())
+    assert all("data" not in vars(kept.tree) for kept in loading.cache.values())
     again = load("delta")
     assert "data" not in vars(again.tree)
     again.tree.kinematics(again.q_tree)
@@ -84,7 +84,7 @@ def test_workspace_is_allocated_on_demand() -> None:
 
 def test_cache_has_a_limited_size(tmp_path: Path, monkeypatch) -> None:
     """What was loaded long ago is built again, what was loaded lately is copied."""
-    paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.MOST_KEPT + 3)]
+    paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.cache.capacity + 3)]
     for path in paths:
         load(path)
     built, assemble_mechanism = [], loading.assemble_mechanism

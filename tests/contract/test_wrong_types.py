@@ -149,7 +149,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "load with a flag": (lambda: load("five_bar", {MASS: True}), "load: overrides: link.link_2.mass = True: expected"),
     "load with no number": (lambda: load("five_bar", {MASS: np.nan}), "load: overrides: link.link_2.mass = nan: expe"),
     "load beyond numbers": (lambda: load("five_bar", {MASS: 10**400}), "load: overrides: link.link_2.mass = 1000"),
-    "load half a vector": (lambda: load("five_bar", {"gravity": [0, 0]}), "gravity: 2 numbers were given; a vector"),
+    "load half a vector": (lambda: load("five_bar", {"gravity": [0, 0]}), "gravity: expected 3 numbers, got 2"),
     "load a number": (lambda: load("five_bar", 3), "load: overrides: expected a table of numbers by name.*, got 3"),
     "load by number": (lambda: load("five_bar", {3: 1.0}), "load: overrides, a key: expected .*, got 3"),
     "torques in words": (lambda: Simulator(SWING).step(None, 0.01, tau={"theta_1": "0.5"}), "tau: .* is no table of"),

@@ -152,7 +152,7 @@ def test_a_mechanism_is_assembled_within_its_stops(with_joints: Make) -> None:
         there = bar.tree.to_coordinates(bar.q_tree)
         assert lower - 1e-9 < there[1] < upper + 1e-9
         assert np.abs(FIVE_BAR.phi(there)).max() < 1e-12
-        assert any("theta_2 = " in said and "without them 0.2478" in said for said in bar.warnings)
+        assert any("theta_2 = " in said and "without stops 0.2478" in said for said in bar.warnings)
         if lower > 0:
             # The assembled configuration is the one nearest to the guess.
             assert np.linalg.norm(there - free.tree.to_coordinates(free.q_tree)) < 0.5

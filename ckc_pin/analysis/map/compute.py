@@ -16,7 +16,7 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.validation import require_callable, require_type
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.extended import Extended, Task, extend_closure, find_point
+from ckc_pin.kinematics.extended import ExtendedClosure, Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Aspect, Axis, Locus, Path, SingularityMap, Space
 from ckc_pin.kinematics.nodes import find_solutions, nodes_at
@@ -127,7 +127,7 @@ def _branches(task: Task) -> tuple[Array, bool]:
     mechanism = task.extended.mechanism
     if not mechanism.tree.is_euclidean or len(mechanism.dependent) > LARGEST:
         return mechanism.q_tree[None], True
-    found = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).given[0], MOST + 1)
+    found = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).values[0], MOST + 1)
     return found[:MOST], len(found) > MOST
 
 
@@ -137,7 +137,7 @@ def _scene(mechanism: str | FilePath, scene: str | FilePath) -> Scene:
     return load_scene(f"{mechanism}/{scene}" if plain and isinstance(mechanism, str) else scene)
 
 
-def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tuple[Extended, tuple[str, ...]]:
+def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tuple[ExtendedClosure, tuple[str, ...]]:
     """Add the point's rows; where it is not needed a point that will not do is a note."""
     try:
         return extend_closure(mechanism, find_point(mechanism, point)), ()
@@ -147,7 +147,7 @@ def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tup
         return extend_closure(mechanism), (f"no serial singularities: {error}",)
 
 
-def _task(extended: Extended, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
+def _task(extended: ExtendedClosure, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
     """Choose the given rows and which of them are the axes."""
     mechanism = extended.mechanism
     if (root := mechanism.independent_root_coordinates) and not cartesian:
@@ -188,7 +188,7 @@ def _joints(task: Task, chosen: IntArray, names: Sequence[str], cells: int) -> D
 
 def _window(task: Task, chosen: IntArray, names: Sequence[str], starts: Array, cells: int) -> Domain:
     """Return the Cartesian window that the branches reach: looked at in ever smaller ones that still hold them."""
-    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).given[0][chosen]
+    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).values[0][chosen]
     low, high = middle - reach(task), middle + reach(task)
     for _ in range(6):
         domain = _box(task, chosen, names, low, high, FIRST_LOOK)
@@ -219,7 +219,7 @@ def _box(task: Task, chosen: IntArray, names: Sequence[str], low: Array, high: A
 
 
 def map_value(
-    extended: Extended,
+    extended: ExtendedClosure,
     space: Space,
     grids: Sequence[Grid],
     loci: Sequence[Locus],
@@ -258,7 +258,7 @@ def name_of(task: Task, k: int) -> str:
     return extended.mechanism.independent[k]
 
 
-def _aspect(extended: Extended, grid: Grid, square: bool) -> Aspect:
+def _aspect(extended: ExtendedClosure, grid: Grid, square: bool) -> Aspect:
     mechanism, shape = extended.mechanism, grid.domain.shape
     inside = np.flatnonzero(grid.reached)
     phi_z = grid.J[inside][:, : len(extended.loops)][:, :, mechanism.partition.z]
@@ -275,7 +275,7 @@ def _aspect(extended: Extended, grid: Grid, square: bool) -> Aspect:
     )
 
 
-def _positions(extended: Extended, q_tree: Array) -> Array:
+def _positions(extended: ExtendedClosure, q_tree: Array) -> Array:
     """World positions of the point at configurations (count, nq), shape (count, 3)."""
     mechanism = extended.mechanism
     frame = mechanism.points[str(extended.point)]
@@ -285,7 +285,7 @@ def _positions(extended: Extended, q_tree: Array) -> Array:
     return np.asarray(rotation @ frame.translation + pose.translation.reshape(-1, joints, 3)[:, frame.joint])
 
 
-def located(extended: Extended, locus: Locus) -> Locus:
+def located(extended: ExtendedClosure, locus: Locus) -> Locus:
     """Say where the point is along a locus."""
     return locus if extended.point is None else replace(locus, point=_positions(extended, locus.q_tree))
 

@@ -11,7 +11,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.kinematics.extended import Task
 from ckc_pin.kinematics.mapped import Axis
-from ckc_pin.kinematics.nodes import SHORTEST, Nodes, follow, nodes_at
+from ckc_pin.kinematics.nodes import MIN_PIECE, Nodes, follow, nodes_at
 
 __all__ = ["CORNERS", "HURRIED", "SIDES", "Domain", "Grid", "Progress", "Steps", "fill", "flood", "joint_axis", "reach"]
 
@@ -136,17 +136,17 @@ class Grid:
     def put(self, numbers: IntArray, nodes: Nodes) -> None:
         """Mark cells as reached."""
         self.reached[numbers] = True
-        self.q_tree[numbers], self.given[numbers] = nodes.q_tree, nodes.given
+        self.q_tree[numbers], self.given[numbers] = nodes.q_tree, nodes.values
         self.J[numbers], self.det[numbers] = nodes.J, nodes.det
 
 
-def fill(domain: Domain, start: Array, shortest: float = SHORTEST) -> Grid:
+def fill(domain: Domain, start: Array, shortest: float = MIN_PIECE) -> Grid:
     """Reach what can be reached from a configuration (nq,), in pieces of the way to a cell down to the shortest."""
     grid = Grid(domain)
     stride = _stride(domain.shape)
     first = nodes_at(domain.task, start[None])
     near = _cells(domain.shape, stride)
-    here = first.given[:, domain.over]
+    here = first.values[:, domain.over]
     way = domain.change(np.repeat(here, len(near), axis=0), domain.values(near))
     spacing = np.array([stride * (axis.high - axis.low) / len(axis.values) for axis in domain.axes])
     close = np.all(np.abs(way) <= 1.5 * spacing, axis=1)
@@ -207,7 +207,7 @@ def _spread(grid: Grid, cells: IntArray, direction: IntArray, shortest: float) -
     if not len(cells):
         return cells
     start = grid.nodes(grid.flat(cells))
-    way = domain.change(start.given[:, domain.over], domain.values(target))
+    way = domain.change(start.values[:, domain.over], domain.values(target))
     nodes, arrived = follow(domain.task, start, domain.change_of_all(way), shortest)
     grid.put(grid.flat(target[arrived]), nodes[arrived])
     return target[arrived]

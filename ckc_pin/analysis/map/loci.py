@@ -16,7 +16,7 @@ from ckc_pin.analysis.map.grid import Domain, Grid, Steps
 from ckc_pin.analysis.singular_curve import SingularCurve, trace
 from ckc_pin.analysis.singularities import EXACT, SingularSystem, classify
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
-from ckc_pin.kinematics.extended import Extended
+from ckc_pin.kinematics.extended import ExtendedClosure
 from ckc_pin.kinematics.mapped import Kind, Locus
 from ckc_pin.kinematics.nodes import shape_points
 from ckc_pin.mechanism.batch import evaluate_closure
@@ -41,15 +41,15 @@ class LocusSystem(SingularSystem):
 
     Parameters
     ----------
-    extended : Extended
+    extended : ExtendedClosure
     serial : bool
-        Whether the point (its frame, where `Extended.place` has turns) stands still, or the independent coordinates.
+        Whether the rows of the point stand still, or those of the independent coordinates.
     fixed : (k,) int array
         Rows of the extended closure that keep the values (k,) given.
     values : (k,) array
     """
 
-    def __init__(self, extended: Extended, serial: bool, fixed: IntArray, values: Array) -> None:
+    def __init__(self, extended: ExtendedClosure, serial: bool, fixed: IntArray, values: Array) -> None:
         super().__init__(extended.mechanism)
         self.extended = extended
         self._still = np.concatenate([extended.loops, extended.place if serial else extended.joints])
@@ -100,13 +100,13 @@ class _Found:
 
 
 def find_loci(
-    extended: Extended, domain: Domain, grids: Sequence[Grid], cartesian: bool, steps: Steps | None = None
+    extended: ExtendedClosure, domain: Domain, grids: Sequence[Grid], cartesian: bool, steps: Steps | None = None
 ) -> list[Locus]:
     """Find the singular configurations that the aspects of a map show.
 
     Parameters
     ----------
-    extended : Extended
+    extended : ExtendedClosure
         With the rows of the point whose serial singularities are wanted; without, there are none.
     domain : Domain
     grids : sequence of Grid
@@ -139,7 +139,7 @@ def find_loci(
     ]
 
 
-def _fixed(extended: Extended, domain: Domain, grid: Grid) -> tuple[IntArray, Array]:
+def _fixed(extended: ExtendedClosure, domain: Domain, grid: Grid) -> tuple[IntArray, Array]:
     """Return the fixed rows of a domain's task as rows of the closure extended by the point, and their values."""
     names = [extended.closure.names.index(domain.task.extended.closure.names[k]) for k in domain.task.rows]
     fixed = np.array(names, np.intp)[domain.fixed]

@@ -34,7 +34,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
-from ckc_pin.kinematics.nodes import SHORTEST, follow, nodes_at
+from ckc_pin.kinematics.nodes import MIN_PIECE, follow, nodes_at
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["Stack", "workspace_sections"]
@@ -119,7 +119,7 @@ class Stack:
         self.over = np.array([NAMES.index(name) for name in over], np.intp)
         self.third = int(np.setdiff1d(np.arange(3), self.over)[0])
         self.start = mechanism.q_tree
-        self.middle = nodes_at(self.task, self.start[None]).given[0]
+        self.middle = nodes_at(self.task, self.start[None]).values[0]
         self.steps = steps or Steps(None, 1)
 
     def sections(self, count: int, cells: int) -> list[Grid]:
@@ -190,7 +190,7 @@ class Stack:
             way[:, self.over] = grid.domain.values(target) - layer.given[near][:, self.over]
             nodes, arrived = follow(self.task, layer.nodes(near), way, HURRIED)
             grid.put(grid.flat(target[arrived]), nodes[arrived])
-        flood(grid, 1, SHORTEST, ways=AROUND)  # pieces may be narrower than a cell
+        flood(grid, 1, MIN_PIECE, ways=AROUND)  # pieces may be narrower than a cell
         self.steps.step()
         return grid
 
