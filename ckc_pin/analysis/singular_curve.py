@@ -1,8 +1,8 @@
-"""The curve of singular configurations through one of them, by continuation.
+"""Trace the curve of singular configurations through one of them, by continuation.
 
-A mechanism of two freedoms has curves of them in (q', v). Steps go along the curve's tangent, Newton brings
-each back to the equations of `ckc_pin.analysis.singularities`, and the curve is closed when every body is
-where it was at the start, whatever the joints have turned meanwhile.
+In a mechanism with two freedoms, singular configurations form curves in (q', v). Each step predicts along the curve's
+tangent and corrects by Newton's method on the equations of `ckc_pin.analysis.singularities`. The curve is closed when
+every body is where it was at the start, regardless of full turns of the joints.
 """
 
 from __future__ import annotations
@@ -11,18 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.singularities import EXACT, SingularPoint, SingularSystem
+from ckc_pin.analysis.singularities import RESIDUAL_TOLERANCE, SingularPoint, SingularSystem
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["SingularCurve", "trace", "trace_singular"]
+__all__ = ["SingularCurve", "trace_curve", "trace_singular"]
 
-SHORTEST = 1e-6  # of the step wanted: where shorter ones would be needed the curve ends, or branches
-BEND = 0.95  # cosine of the angle that the tangent may turn in one step: a closed curve has twenty of them or more
-FLAT = 1e-9  # of the largest singular value: along such directions the equations stay solved
-FEWEST = 10  # points before the start can come back
+MIN_STEP = 1e-6  # of the longest step; if a shorter one is needed, the curve ends or branches
+MAX_STEP_GROWTH = 1.5
+MIN_TANGENT_COSINE = 0.95  # between two points; a closed curve has at least twenty points
+MIN_PROGRESS = 0.5  # of the step size; a corrected point must not fall behind
+RANK_TOLERANCE = 1e-9  # of the largest singular value of the Jacobian
+MIN_CLOSED_POINTS = 10  # before the curve can return to its start
+CORRECTOR_ITERATIONS = 6
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class SingularCurve:
     q_tree : (m, nq) array
         Pinocchio's q.
     null : (m, n) array
-        The velocity that is lost sight of, |v| = 1, as in `SingularPoint`.
+        The null velocity, |v| = 1, as in `SingularPoint`.
     closed : bool
         Whether the last point is the first one again.
     residual : float
@@ -48,7 +51,7 @@ class SingularCurve:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _CurvePoint:
     at: Kinematics
     null: Array
     tangent: Array
@@ -58,45 +61,45 @@ class _Place:
 def trace_singular(
     mechanism: Mechanism, start: SingularPoint, step: float = 0.05, point: str | None = None, max_points: int = 5000
 ) -> SingularCurve:
-    """Follow the curve of singular configurations through one of them.
+    """Trace the curve of singular configurations through one of them.
 
     Parameters
     ----------
     mechanism : Mechanism
-        Of two freedoms.
+        With two freedoms.
     start : SingularPoint
         From `find_singular`, for the same `point`.
     step : float
-        Longest step along the curve in (q', v), rad or m; shorter ones are taken where it bends.
+        Longest step along the curve in (q', v), rad or m. Steps are shorter where the curve bends.
     point : str, optional
         As in `find_singular`.
     max_points : int
-        Where to end a curve that does not close, in each direction.
+        Largest number of points in each direction, for a curve that does not close.
 
     Raises
     ------
     InputError
-        Not two freedoms, a step that is not positive.
+        The mechanism does not have two freedoms, or the step is not positive.
     """
     if mechanism.d != 2:
         raise InputError(
-            f"{mechanism.name}: singular configurations form a curve where d = 2, here d = {mechanism.d}; "
-            "sample them with search_singular"
+            f"{mechanism.name}: singular configurations form a curve if d = 2, got d = {mechanism.d}; sample them with "
+            "search_singular"
         )
     if not 0 < step < np.inf:
         raise InputError(f"step = {step}: expected a positive number")
-    return trace(SingularSystem(mechanism, point), start.at, start.null, step, max_points)
+    return trace_curve(SingularSystem(mechanism, point), start.at, start.null, step, max_points)
 
 
-def trace(
+def trace_curve(
     system: SingularSystem, at: Kinematics, null: Array, step: float = 0.05, max_points: int = 5000
 ) -> SingularCurve:
-    """Follow the curve of solutions (q', v) of a system through one of them; what `trace_singular` does.
+    """Trace the curve of solutions (q', v) of a system through one of them.
 
     Parameters
     ----------
     system : SingularSystem
-        With curves of solutions.
+        Whose solutions form curves.
     at : Kinematics
     null : (n,) array
         The solution to start from.
@@ -104,67 +107,70 @@ def trace(
         As in `trace_singular`.
     """
     tangent = _tangent(system, at, null)
-    first = _Place(at, null, tangent, float(np.abs(system.residual(at, null)).max()))
-    way, closed = _walk(system, first, step, max_points)
+    first = _CurvePoint(at, null, tangent, float(np.abs(system.residual(at, null)).max()))
+    points, closed = _follow_tangent(system, first, step, max_points)
     if not closed:
-        back, _ = _walk(system, _Place(first.at, first.null, -tangent, first.residual), step, max_points)
-        way = [*reversed(back), *way[1:]]
+        reverse = _CurvePoint(first.at, first.null, -tangent, first.residual)
+        other_half, _ = _follow_tangent(system, reverse, step, max_points)
+        points = [*reversed(other_half), *points[1:]]
     return SingularCurve(
-        q_tree=np.array([place.at.q_tree for place in way]),
-        null=np.array([place.null for place in way]),
+        q_tree=np.array([point.at.q_tree for point in points]),
+        null=np.array([point.null for point in points]),
         closed=closed,
-        residual=max(place.residual for place in way),
+        residual=max(point.residual for point in points),
     )
 
 
-def _walk(system: SingularSystem, first: _Place, step: float, max_points: int) -> tuple[list[_Place], bool]:
-    """Follow the tangent until the curve closes or ends."""
-    way, length = [first], step
-    while len(way) < max_points:
-        ahead = _advance(system, way[-1], length)
-        if ahead is not None:
-            if len(way) > FEWEST and _lies_between(first, way[-1], ahead):
-                return [*way, first], True
-            way.append(ahead)
-            length = min(1.5 * length, step)
-        elif length < SHORTEST * step:
+def _follow_tangent(
+    system: SingularSystem, first: _CurvePoint, max_step: float, max_points: int
+) -> tuple[list[_CurvePoint], bool]:
+    """Follow the tangent until the curve closes or ends; return its points and whether it is closed."""
+    points, step = [first], max_step
+    while len(points) < max_points:
+        next_point = _take_step(system, points[-1], step)
+        if next_point is not None:
+            if len(points) > MIN_CLOSED_POINTS and _lies_between(first, points[-1], next_point):
+                return [*points, first], True
+            points.append(next_point)
+            step = min(MAX_STEP_GROWTH * step, max_step)
+        elif step < MIN_STEP * max_step:
             break
         else:
-            length /= 2
-    return way, False
+            step /= 2
+    return points, False
 
 
-def _advance(system: SingularSystem, place: _Place, length: float) -> _Place | None:
-    """Predict along the tangent and correct; None where that is no local step."""
+def _take_step(system: SingularSystem, point: _CurvePoint, step: float) -> _CurvePoint | None:
+    """Predict along the tangent and correct; return None if the result is not the next point of the same curve."""
     n = system.mechanism.n
-    guess = place.at.integrate(length * place.tangent[:n])
-    at, null, residual = system.solve(guess, place.null + length * place.tangent[n:], iterations=6)
-    if residual > max(EXACT, system.mechanism.tolerance):
+    guess = point.at.integrate(step * point.tangent[:n])
+    at, null, residual = system.solve(guess, point.null + step * point.tangent[n:], iterations=CORRECTOR_ITERATIONS)
+    if residual > max(RESIDUAL_TOLERANCE, system.mechanism.tolerance):
         return None
     tangent = _tangent(system, at, null)
-    tangent = tangent * np.sign(tangent @ place.tangent)
-    went = np.concatenate([at.tree.difference(place.at.q_tree, at.q_tree), null - place.null])
-    if tangent @ place.tangent < BEND or went @ place.tangent < 0.5 * length:
+    tangent = tangent * np.sign(tangent @ point.tangent)
+    displacement = np.concatenate([at.tree.difference(point.at.q_tree, at.q_tree), null - point.null])
+    if tangent @ point.tangent < MIN_TANGENT_COSINE or displacement @ point.tangent < MIN_PROGRESS * step:
         return None
-    return _Place(at, null, tangent, residual)
+    return _CurvePoint(at, null, tangent, residual)
 
 
 def _tangent(system: SingularSystem, at: Kinematics, null: Array) -> Array:
-    """Return the direction of the curve; where v is not unique, the one that moves the mechanism most."""
+    """Return the unit tangent of the curve. If v is not unique, choose the direction with the most motion in q'."""
     _, sizes, directions = np.linalg.svd(system.jacobian(at, null))
-    along = directions[min(int(np.sum(sizes > FLAT * sizes[0])), len(directions) - 1) :]
-    mixed = np.linalg.svd(along[:, : system.mechanism.n], full_matrices=False)[0][:, 0]
-    return np.asarray(mixed @ along)
+    null_space = directions[min(int(np.sum(sizes > RANK_TOLERANCE * sizes[0])), len(directions) - 1) :]
+    weights = np.linalg.svd(null_space[:, : system.mechanism.n], full_matrices=False)[0][:, 0]
+    return np.asarray(weights @ null_space)
 
 
-def _lies_between(place: _Place, before: _Place, after: _Place) -> bool:
-    """Whether a place of the curve lies between two neighbours, as far as one step can tell."""
-    stride = _apart(before, after)
-    return _apart(before, place) <= stride and _apart(after, place) <= stride
+def _lies_between(point: _CurvePoint, before: _CurvePoint, after: _CurvePoint) -> bool:
+    """Whether a point of the curve lies between two neighbours, to the accuracy of one step."""
+    stride = _distance(before, after)
+    return _distance(before, point) <= stride and _distance(after, point) <= stride
 
 
-def _apart(a: _Place, b: _Place) -> float:
-    """How far apart all bodies and the null vectors (whose sign means nothing) are; full turns do not count."""
+def _distance(a: _CurvePoint, b: _CurvePoint) -> float:
+    """Return the distance of all bodies and of the null vectors, whose sign has no meaning. Full turns do not count."""
     null = min(np.abs(a.null - b.null).max(), np.abs(a.null + b.null).max())
     return float(np.sqrt(np.sum((_placements(a.at) - _placements(b.at)) ** 2) + null**2))
 

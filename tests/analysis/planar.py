@@ -1,4 +1,4 @@
-"""Planar linkages with links along +x, for tests: chains of revolute joints about z, tips joined pairwise."""
+"""Planar linkages for tests: chains of revolute joints about z with links along +x, whose tips are joined."""
 
 from __future__ import annotations
 
@@ -18,9 +18,17 @@ def linkage(
     independent: Sequence[str],
     loop: LoopType = "point_2d",
 ) -> Mechanism:
-    """Chains given by where they start on the x axis and their lengths; joints a1, a2, ..., b1, ...
+    """Return a linkage with joints a1, a2, ..., b1, ...
 
-    All tips are joined to the first chain's, which is the point "tip".
+    Parameters
+    ----------
+    chains : sequence of (float, sequence of float)
+        Start on the x axis and lengths of the links of each chain, m.
+    guess : sequence of float
+        Angles at which assembly starts, rad.
+    independent : sequence of str
+    loop : str
+        Type of the loops that join each tip to the first chain's tip, which is the point "tip".
     """
     links, joints, names = ['<link name="base"/>'], [], []
     for letter, (start, lengths) in zip("abc", chains, strict=False):

@@ -1,6 +1,6 @@
-"""A table hung on two equal rods, written into a folder as a user would, and the pendulum that it is.
+"""A table that hangs on two equal rods, as a user's folder, and the equivalent pendulum.
 
-The table is carried along without turning, so that one angle tells all: alpha = gamma = -beta = theta, with
+The table moves without turning, so one angle is enough: alpha = gamma = -beta = theta, with
 (2 (I + m l^2 / 4) + M l^2) theta_ddot = -(m + M) g l sin(theta).
 """
 
@@ -71,6 +71,6 @@ def pendulum(t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
     def f(_: float, y: NDArray[np.float64]) -> list[float]:
         return [y[1], -stiffness / inertia * np.sin(y[0])]
 
-    found = solve_ivp(f, (0.0, t[-1]), [START, 0.0], "DOP853", t_eval=t, rtol=3e-14, atol=1e-15)
+    solution = solve_ivp(f, (0.0, t[-1]), [START, 0.0], "DOP853", t_eval=t, rtol=3e-14, atol=1e-15)
     signs = np.array([1.0, -1.0, 1.0])
-    return np.outer(found.y[0], signs), np.outer(found.y[1], signs)
+    return np.outer(solution.y[0], signs), np.outer(solution.y[1], signs)

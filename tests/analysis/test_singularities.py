@@ -14,7 +14,7 @@ from tests.analysis.planar import linkage
 from tests.analytic.five_bar import Array, FiveBar
 from tests.conftest import Pair, assert_close
 
-EXACT = 1e-8
+TOLERANCE = 1e-8
 
 
 @pytest.fixture(scope="module")
@@ -24,57 +24,57 @@ def singular(pair: Pair) -> list[SingularPoint]:
 
 
 def elbows(model: FiveBar, q_tree: Array) -> Array:
-    """Vector from the left to the right elbow, (..., 2), from nothing but lengths and angles."""
+    """Return the vector (..., 2) from the left to the right elbow, from lengths and angles only."""
     one, three = q_tree[..., 0], q_tree[..., 2]
     x = model.base + model.l[2] * np.cos(three) - model.l[0] * np.cos(one)
     return np.stack([x, model.l[2] * np.sin(three) - model.l[0] * np.sin(one)], axis=-1)
 
 
 def coincident_elbows(model: FiveBar) -> Array:
-    """The upper point where the elbows coincide: the apex of a triangle on the base."""
+    """Return the angles at which the elbows coincide above the base: the apex of a triangle."""
     l1, l3, base = model.l[0], model.l[2], model.base
     x = (base**2 + l1**2 - l3**2) / (2 * base)
     y = np.sqrt(l1**2 - x**2)
     return np.array([np.arctan2(y, x), np.arctan2(y, x - base)])
 
 
-def wrapped(angle: Array) -> Array:
+def wrap(angle: Array) -> Array:
     return np.angle(np.exp(1j * angle))
 
 
-def test_both_type_1_points_and_nothing_else_locks_the_angles(five_bar: Pair) -> None:
+def test_locked_points_are_the_two_type_1_points(five_bar: Pair) -> None:
     mechanism, model = five_bar
     apex = coincident_elbows(model)
     assert_close(apex, [0.993865, 2.147728], 1e-6)
-    found = [p for p in search_singular(mechanism, 30) if p.kind == "locked"]
-    q = wrapped(np.array([p.at.q_tree[[0, 2]] for p in found]))
+    locked = [p for p in search_singular(mechanism, 30) if p.kind == "locked"]
+    q = wrap(np.array([p.at.q_tree[[0, 2]] for p in locked]))
     assert {tuple(sign) for sign in np.sign(q)} == {(1.0, 1.0), (-1.0, -1.0)}
-    assert_close(np.abs(q), np.broadcast_to(apex, q.shape), EXACT)
-    assert_close(np.array([p.fold for p in found]), 0.0, EXACT)
+    assert_close(np.abs(q), np.broadcast_to(apex, q.shape), TOLERANCE)
+    assert_close(np.array([p.fold for p in locked]), 0.0, TOLERANCE)
 
 
-def test_every_singular_point_is_one_in_the_closed_form(pair: Pair, singular: list[SingularPoint]) -> None:
+def test_singular_points_satisfy_the_closed_form(pair: Pair, singular: list[SingularPoint]) -> None:
     _, model = pair
     l2, l4 = model.l[1], model.l[3]
     for point in singular:
         q_tree = point.at.q_tree
-        assert_close(model.phi(q_tree), 0.0, EXACT)
-        assert_close(model.phi_z(q_tree) @ point.null[[1, 3]], 0.0, EXACT)
-        assert_close(model.s(q_tree), 0.0, EXACT)
+        assert_close(model.phi(q_tree), 0.0, TOLERANCE)
+        assert_close(model.phi_z(q_tree) @ point.null[[1, 3]], 0.0, TOLERANCE)
+        assert_close(model.s(q_tree), 0.0, TOLERANCE)
         distance = np.linalg.norm(elbows(model, q_tree))
-        assert min(abs(distance - l2 - l4), abs(distance - abs(l2 - l4))) < EXACT
+        assert min(abs(distance - l2 - l4), abs(distance - abs(l2 - l4))) < TOLERANCE
         # y . d2phi[v, v] of two circles that touch from outside or from inside
         touching = l4 if distance > l2 else -l4
-        assert_close(abs(point.fold), l2 * l4 * abs(l2 + touching) / (l2**2 + l4**2), EXACT)
+        assert_close(abs(point.fold), l2 * l4 * abs(l2 + touching) / (l2**2 + l4**2), TOLERANCE)
 
 
-def test_printed_links_lock_nowhere(pair: Pair, singular: list[SingularPoint]) -> None:
+def test_links_of_different_lengths_are_never_locked(pair: Pair, singular: list[SingularPoint]) -> None:
     _, model = pair
     kinds = {p.kind for p in singular}
     assert kinds == ({"locked", "fold"} if model.l[1] == model.l[3] else {"fold"})
 
 
-def test_two_freedoms_stay_by_the_rank_of_J(pair: Pair, singular: list[SingularPoint]) -> None:
+def test_rank_of_J_and_freedoms_are_kept_at_singular_phi_z(pair: Pair, singular: list[SingularPoint]) -> None:
     mechanism, model = pair
     for point in singular:
         values = np.linalg.svd(model.J(point.at.q_tree), compute_uv=False)
@@ -83,9 +83,9 @@ def test_two_freedoms_stay_by_the_rank_of_J(pair: Pair, singular: list[SingularP
         assert point.rank_J == point.freedoms == 2
         assert point.q_rank == 1
         others = [k for k, name in enumerate(mechanism.coordinates) if name not in point.chart]
-        least = np.linalg.svd(model.J(point.at.q_tree)[:, others], compute_uv=False)[-1]
-        assert_close(point.chart_sigma_min, least, 1e-12)
-        assert least > 0.1
+        smallest = np.linalg.svd(model.J(point.at.q_tree)[:, others], compute_uv=False)[-1]
+        assert_close(point.chart_sigma_min, smallest, 1e-12)
+        assert smallest > 0.1
 
 
 def test_type_2_is_a_closed_curve(pair: Pair, singular: list[SingularPoint]) -> None:
@@ -94,18 +94,18 @@ def test_type_2_is_a_closed_curve(pair: Pair, singular: list[SingularPoint]) -> 
     stretched = next(p for p in singular if np.linalg.norm(elbows(model, p.at.q_tree)) > 0.5)
     curve = trace_singular(mechanism, stretched)
     assert curve.closed
-    assert_close(np.linalg.norm(elbows(model, curve.q_tree), axis=1), reach, EXACT)
-    # it is the whole curve: closed around the unreachable region, next points near each other
+    assert_close(np.linalg.norm(elbows(model, curve.q_tree), axis=1), reach, TOLERANCE)
+    # the curve is complete: closed around the unreachable region, with small steps
     q = curve.q_tree[:, [0, 2]]
-    assert_close(wrapped(q[-1] - q[0]), 0.0, EXACT)
-    assert np.abs(wrapped(np.diff(q, axis=0))).max() < 0.1
+    assert_close(wrap(q[-1] - q[0]), 0.0, TOLERANCE)
+    assert np.abs(wrap(np.diff(q, axis=0))).max() < 0.1
     theta_3 = np.linspace(-np.pi, np.pi, 2001)
-    rim = [t for t in theta_3 if _beyond(model, t, reach)]
+    rim = [t for t in theta_3 if _is_out_of_reach(model, t, reach)]
     assert_close(np.ptp(curve.q_tree[:, 2]), np.ptp(rim), 0.02)
 
 
-def _beyond(model: FiveBar, theta_3: float, reach: float) -> bool:
-    """Whether the elbows can be farther apart than the links reach at this theta_3."""
+def _is_out_of_reach(model: FiveBar, theta_3: float, reach: float) -> bool:
+    """Whether some theta_1 moves the elbows farther apart than the links reach at this theta_3."""
     right = np.array([model.base + model.l[2] * np.cos(theta_3), model.l[2] * np.sin(theta_3)])
     return bool(np.linalg.norm(right) + model.l[0] > reach)
 
@@ -115,11 +115,11 @@ def test_type_1_is_a_circle_of_configurations_over_one_point(five_bar: Pair) -> 
     locked = next(p for p in search_singular(mechanism, 30) if p.kind == "locked")
     curve = trace_singular(mechanism, locked)
     assert curve.closed
-    assert_close(np.ptp(curve.q_tree[:, [0, 2]], axis=0), 0.0, EXACT)
-    assert_close(np.abs(wrapped(np.diff(curve.q_tree[:, 1]))).sum(), 2 * np.pi, EXACT)
+    assert_close(np.ptp(curve.q_tree[:, [0, 2]], axis=0), 0.0, TOLERANCE)
+    assert_close(np.abs(wrap(np.diff(curve.q_tree[:, 1]))).sum(), 2 * np.pi, TOLERANCE)
 
 
-def test_loci_of_both_readings(pair: Pair) -> None:
+def test_loci_of_both_five_bars(pair: Pair) -> None:
     mechanism, model = pair
     names = [locus.name for locus in loci(mechanism, 30)]
     small = "type 1" if model.l[1] == model.l[3] else "type 1, opened"
@@ -132,13 +132,13 @@ def test_serial_singularities_stretch_or_fold_a_chain(pair: Pair) -> None:
         q_tree = point.at.q_tree
         assert point.kind == "serial"
         assert np.isnan(point.fold)
-        assert_close(np.sin(q_tree[[1, 3]]).prod(), 0.0, EXACT)
+        assert_close(np.sin(q_tree[[1, 3]]).prod(), 0.0, TOLERANCE)
         curve = trace_singular(mechanism, point, point="tip")
         assert curve.closed
-        assert_close(np.sin(curve.q_tree[:, [1, 3]]).prod(axis=1), 0.0, EXACT)
+        assert_close(np.sin(curve.q_tree[:, [1, 3]]).prod(axis=1), 0.0, TOLERANCE)
 
 
-def test_residual_is_differentiated_right(pair: Pair) -> None:
+def test_jacobian_equals_finite_differences_of_the_residual(pair: Pair) -> None:
     mechanism, _ = pair
     random = np.random.default_rng(1)
     for point in (None, "tip"):
@@ -146,69 +146,69 @@ def test_residual_is_differentiated_right(pair: Pair) -> None:
         at, v = mechanism.kinematics(random.uniform(-1, 1, 4)), random.uniform(-1, 1, 4)
         h, columns = 1e-6, []
         for step in h * np.eye(8):
-            ahead, behind = (
+            after, before = (
                 system.residual(at.integrate(sign * step[:4]), v + sign * step[4:]) for sign in (1.0, -1.0)
             )
-            columns.append((ahead - behind) / (2 * h))
+            columns.append((after - before) / (2 * h))
         assert_close(system.jacobian(at, v), np.array(columns).T, 1e-8)
 
 
-def test_a_four_bar_stops_where_crank_and_coupler_are_in_line() -> None:
+def test_four_bar_turns_back_where_crank_and_coupler_are_in_line() -> None:
     """A crank-rocker driven by its rocker: the rocker turns back at |l1 - l2| and at l1 + l2."""
     base, crank, coupler, rocker = 0.4, 0.1, 0.35, 0.3
     mechanism = linkage([(0.0, [crank, coupler]), (base, [rocker])], [1.0, -0.5, 2.0], ["b1"])
     assert mechanism.d == 1
     cosines = [(base**2 + rocker**2 - x**2) / (2 * base * rocker) for x in (coupler - crank, coupler + crank)]
     limits = np.pi - np.arccos(cosines)
-    found = search_singular(mechanism, 20)
-    reached = np.unique(np.round(np.abs(wrapped(np.array([p.at.q_tree[2] for p in found]))), 7))
+    points = search_singular(mechanism, 20)
+    reached = np.unique(np.round(np.abs(wrap(np.array([p.at.q_tree[2] for p in points]))), 7))
     assert_close(reached, np.sort(limits), 1e-7)
-    for point in found:
+    for point in points:
         assert point.kind == "fold"
         assert point.freedoms == 1
-        assert_close(np.abs(wrapped(point.at.q_tree[2])) - limits[np.argmin(
-            np.abs(np.abs(wrapped(point.at.q_tree[2])) - limits))], 0.0, EXACT)  # fmt: skip
+        assert_close(np.abs(wrap(point.at.q_tree[2])) - limits[np.argmin(
+            np.abs(np.abs(wrap(point.at.q_tree[2])) - limits))], 0.0, TOLERANCE)  # fmt: skip
     with pytest.raises(InputError, match="d = 1"):
-        trace_singular(mechanism, found[0])
+        trace_singular(mechanism, points[0])
 
 
-def test_a_flat_parallelogram_gains_a_freedom() -> None:
+def test_flat_parallelogram_gains_a_freedom() -> None:
     mechanism = linkage([(0.0, [0.2, 0.5]), (0.5, [0.2])], [1.0, -1.0, 1.0], ["a1"])
     flat = find_singular(mechanism, np.array([0.05, -0.06, 0.07]))
     assert flat.kind == "rank loss"
     assert (flat.rank_J, flat.freedoms, mechanism.d) == (1, 2, 1)
-    assert_close(flat.at.q_tree, 0.0, 1e-5)  # two curves of configurations meet: a double root of phi, closed to 1e-12
+    assert_close(flat.at.q_tree, 0.0, 1e-5)  # a double root of phi limits the accuracy
 
 
-def test_redundant_rows_do_no_harm(five_bar: Pair) -> None:
-    """The same five-bar closed with point instead of point_2d: its third row is implied."""
+def test_redundant_rows_do_not_change_singular_points(five_bar: Pair) -> None:
+    """The same five-bar with point instead of point_2d, whose third row is redundant."""
     _, model = five_bar
     l1, l2, l3, l4 = model.l
     chains = [(0.0, [l1, l2]), (model.base, [l3, l4])]
     mechanism = linkage(chains, [-1.434, 0.248, -1.707, -0.248], ["a1", "b1"], loop="point")
     assert mechanism.closure.rows == 3
-    found = search_singular(mechanism, 15)
-    assert {p.kind for p in found} == {"locked", "fold"}
-    for point in found:
-        assert_close(model.s(point.at.q_tree), 0.0, EXACT)
+    points = search_singular(mechanism, 15)
+    assert {p.kind for p in points} == {"locked", "fold"}
+    for point in points:
+        assert_close(model.s(point.at.q_tree), 0.0, TOLERANCE)
         assert (point.rank_J, point.freedoms) == (2, 2)
 
 
-def test_more_freedoms_are_sampled() -> None:
-    """Two chains of three links: the z chosen here is singular where its two links are in line."""
+def test_singular_surfaces_are_sampled_for_three_freedoms() -> None:
+    """Chains of three and two links: phi_z is singular where the two links of z are in line."""
     chains = [(0.0, [0.3, 0.3, 0.2]), (0.4, [0.3, 0.3])]
     mechanism = linkage(chains, [2.2, -1.0, -0.8, 1.0, 0.9], ["a1", "a2", "b1"])
     assert mechanism.d == 3
-    found = search_singular(mechanism, 10)
-    assert len(found) > 5
-    for point in found:
+    points = search_singular(mechanism, 10)
+    assert len(points) > 5
+    for point in points:
         angle_a, angle_b = point.at.q_tree[:3].sum(), point.at.q_tree[3:].sum()
-        assert_close(np.sin(angle_a - angle_b), 0.0, EXACT)
+        assert_close(np.sin(angle_a - angle_b), 0.0, TOLERANCE)
     with pytest.raises(InputError, match="search_singular"):
-        trace_singular(mechanism, found[0])
+        trace_singular(mechanism, points[0])
 
 
-def test_the_free_mechanism_goes_through(pair: Pair, singular: list[SingularPoint]) -> None:
+def test_dae_passes_through_type_2(pair: Pair, singular: list[SingularPoint]) -> None:
     mechanism, model = pair
     for point in singular[:4]:
         crossing = cross(mechanism, point)
@@ -220,19 +220,19 @@ def test_the_free_mechanism_goes_through(pair: Pair, singular: list[SingularPoin
         assert np.abs(crossing.det_phi_z).max() <= model.l[1] * model.l[3]
 
 
-def test_bad_input_is_named(five_bar: Pair) -> None:
+def test_invalid_arguments_are_named(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     with pytest.raises(InputError, match="there are tip"):
         find_singular(mechanism, point="elbow")
-    with pytest.raises(InputError, match="4 finite numbers"):
+    with pytest.raises(InputError, match="expected 4 finite numbers"):
         find_singular(mechanism, np.zeros(3))
     point = find_singular(mechanism)
     with pytest.raises(InputError, match="step = 0"):
         trace_singular(mechanism, point, step=0.0)
 
 
-def test_none_found_is_said() -> None:
-    """A four-bar with q = crank that never lines up coupler and rocker (Grashof): phi_z is regular everywhere."""
+def test_regular_mechanism_has_no_singular_point() -> None:
+    """In a four-bar with q = crank, coupler and rocker are never in line (Grashof), so phi_z is regular everywhere."""
     mechanism = linkage([(0.0, [0.1, 0.35]), (0.4, [0.3])], [1.0, -0.5, 2.0], ["a1"])
     assert search_singular(mechanism, 10) == []
     with pytest.raises(NumericalError, match="no singular configuration"):

@@ -275,12 +275,12 @@ def test_advised_setting_is_the_fastest_within_the_error(result: WorkPrecision) 
     for advice in result.advice:
         assert advice.row is not None
         assert advice.row.wall_s is not None
-        met = [
+        wall_times = [
             row.wall_s
             for row in result.rows
             if row.program == "ckc_pin" and row.error is not None and row.error + accuracy <= advice.target
         ]
-        assert advice.row.wall_s <= 1.1 * min(x for x in met if x is not None)
+        assert advice.row.wall_s <= 1.1 * min(x for x in wall_times if x is not None)
 
 
 def test_no_advice_below_the_accuracy_of_the_reference(result: WorkPrecision) -> None:

@@ -29,48 +29,48 @@ def elbows(model, theta_1, theta_3):
     return model.l[0] * np.exp(1j * theta_1), model.base + model.l[2] * np.exp(1j * theta_3)
 
 
-def wrapped(angle):
+def wrap(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def of_kind(found, kind):
-    return [locus for locus in found.loci if locus.kind == kind]
+def loci_of_kind(result, kind):
+    return [locus for locus in result.loci if locus.kind == kind]
 
 
-def test_reached_is_where_two_circles_meet(joint):
-    found, model = joint
-    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in found.axes), indexing="ij"))
+def test_reached_cells_are_where_two_circles_meet(joint):
+    result, model = joint
+    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in result.axes), indexing="ij"))
     distance, (_, l2, _, l4) = abs(left - right), model.l
     inside = (distance <= l2 + l4) & (distance >= abs(l2 - l4))
     sure = np.minimum(abs(distance - l2 - l4), abs(distance - abs(l2 - l4))) > 1e-3
-    assert len(found.aspects) == 2
-    for aspect in found.aspects:
+    assert len(result.aspects) == 2
+    for aspect in result.aspects:
         assert np.array_equal(aspect.reached[sure], inside[sure])
         assert np.mean(aspect.reached != inside) < 2e-3
 
 
-def test_det_phi_z_is_twice_the_triangle_of_the_distal_links(joint):
-    found, model = joint
-    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in found.axes), indexing="ij"))
+def test_det_phi_z_is_twice_the_area_of_the_distal_links_triangle(joint):
+    result, model = joint
+    left, right = elbows(model, *np.meshgrid(*(axis.values for axis in result.axes), indexing="ij"))
     a, b, c = abs(left - right), model.l[1], model.l[3]
     heron = np.maximum((a + b + c) * (b + c - a) * (a + c - b) * (a + b - c), 0.0) ** 0.5 / 2
     signs = []
-    for aspect in found.aspects:
+    for aspect in result.aspects:
         there = aspect.reached
         assert_close(abs(aspect.det_phi_z[there]), heron[there], 1e-8)
         signs += set(np.sign(aspect.det_phi_z[there]))
     assert sorted(signs) == [-1.0, 1.0]  # one on each branch
 
 
-def test_type_1_points_exist_on_one_reading_only(joint):
-    found, model = joint
-    points = of_kind(found, "locked")
+def test_type_1_points_exist_for_equal_links_only(joint):
+    result, model = joint
+    points = loci_of_kind(result, "locked")
     if model is AS_PRINTED:
         assert points == []
         return
-    at = sorted(wrapped(locus.at[0]).tolist() for locus in points)
-    assert_close(at, [[-0.993865, -2.147728], [0.993865, 2.147728]], 5e-7)  # as printed with six digits
-    # elbows at one place, halfway between the bases
+    at = sorted(wrap(locus.at[0]).tolist() for locus in points)
+    assert_close(at, [[-0.993865, -2.147728], [0.993865, 2.147728]], 5e-7)  # the paper prints six digits
+    # the elbows coincide, halfway between the bases
     x = np.arccos(model.base / 2 / model.l[0])
     assert_close(at, [[-x, x - np.pi], [x, np.pi - x]], 1e-8)
     for locus in points:
@@ -79,27 +79,27 @@ def test_type_1_points_exist_on_one_reading_only(joint):
 
 
 def test_type_2_curves_are_where_the_distal_links_are_in_line(joint):
-    found, model = joint
+    result, model = joint
     stretched = [
         locus
-        for locus in of_kind(found, "fold")
+        for locus in loci_of_kind(result, "fold")
         if abs(np.subtract(*elbows(model, *locus.at[0]))) > max(model.l[1], model.l[3])
     ]
-    folded = [locus for locus in of_kind(found, "fold") if not any(locus is other for other in stretched)]
+    folded = [locus for locus in loci_of_kind(result, "fold") if not any(locus is other for other in stretched)]
     assert len(stretched) == 1
-    assert len(folded) == (2 if model is AS_PRINTED else 0)  # the type 1 points of links that differ, opened
-    for loci, wanted in ((stretched, model.l[1] + model.l[3]), (folded, abs(model.l[1] - model.l[3]))):
+    assert len(folded) == (2 if model is AS_PRINTED else 0)  # instead of the type 1 points
+    for loci, expected in ((stretched, model.l[1] + model.l[3]), (folded, abs(model.l[1] - model.l[3]))):
         for locus in loci:
             assert locus.closed
-            assert_close(abs(np.subtract(*elbows(model, *locus.at.T))), wanted, 1e-8)
-    # the whole of it: the stretched curve goes once round in theta_1 - theta_3
+            assert_close(abs(np.subtract(*elbows(model, *locus.at.T))), expected, 1e-8)
+    # the curve is complete: it goes once around in the plane of theta_1 and theta_3
     angle = np.unwrap(np.angle(stretched[0].at @ [1, 1j] - stretched[0].at.mean(axis=0) @ [1, 1j]))
     assert_close(abs(angle[-1] - angle[0]), 2 * np.pi, 1e-6)
 
 
-def test_serial_loci_are_chains_stretched_or_folded(joint):
-    found, model = joint
-    loci = of_kind(found, "serial")
+def test_serial_loci_are_stretched_or_folded_chains(joint):
+    result, model = joint
+    loci = loci_of_kind(result, "serial")
     seen = set()
     for locus in loci:
         assert locus.closed
@@ -113,29 +113,29 @@ def test_serial_loci_are_chains_stretched_or_folded(joint):
     assert seen == {(0, False), (0, True), (1, False), (1, True)}
 
 
-def test_the_trajectory_of_eq_21(joint):
-    found, model = joint
+def test_closest_approach_of_the_trajectory_of_eq_21(joint):
+    result, model = joint
     t = np.linspace(0.0, 9.5, 200001)
     q = np.array([np.pi / 3 * np.sin(t), np.pi / 4 * (1 - np.cos(t))])
     distance = abs(np.subtract(*elbows(model, *q)))
     if model is AS_PRINTED:
         first = t[np.argmax(distance > model.l[1] + model.l[3])]
-        assert found.path.leaves_at == pytest.approx(first, abs=1e-4)
-        assert found.path.leaves_at == pytest.approx(4.39313, abs=1e-5)
+        assert result.path.leaves_at == pytest.approx(first, abs=1e-4)
+        assert result.path.leaves_at == pytest.approx(4.39313, abs=1e-5)
         return
-    assert found.path.leaves_at is None
-    # to type 2: the least distance to the curve, drawn densely from its own closed form
-    curve = of_kind(found, "fold")[0]
-    number = next(k for k, locus in enumerate(found.loci) if locus is curve)
-    approach = next(a for a in found.path.approaches if a.locus == number)
+    assert result.path.leaves_at is None
+    # to type 2: the distance to densely sampled points of the curve's closed form
+    curve = loci_of_kind(result, "fold")[0]
+    number = next(k for k, locus in enumerate(result.loci) if locus is curve)
+    approach = next(a for a in result.path.approaches if a.locus == number)
     theta_1 = np.linspace(-1.5, -1.0, 200001)
     theta_3 = crossing(model, theta_1)
     near = np.nanmin([np.nanmin(np.hypot(x - theta_1, y - theta_3)) for x, y in q[:, 90000:110000:40].T])
     assert approach.distance == pytest.approx(near, abs=2e-6)
     # to type 1: a point
-    for number, locus in enumerate(found.loci[:2]):
-        approach = next(a for a in found.path.approaches if a.locus == number)
-        x = wrapped(q.T - locus.at[0])
+    for number, locus in enumerate(result.loci[:2]):
+        approach = next(a for a in result.path.approaches if a.locus == number)
+        x = wrap(q.T - locus.at[0])
         assert approach.distance == pytest.approx(np.hypot(*x.T).min(), abs=1e-8)
 
 
@@ -144,22 +144,22 @@ def crossing(model, theta_1):
     way = model.l[0] * np.exp(1j * theta_1) - model.base
     cosine = (abs(way) ** 2 + model.l[2] ** 2 - (model.l[1] + model.l[3]) ** 2) / (2 * abs(way) * model.l[2])
     with np.errstate(invalid="ignore"):
-        both = [wrapped(np.angle(way) + sign * np.arccos(cosine)) for sign in (1, -1)]
+        both = [wrap(np.angle(way) + sign * np.arccos(cosine)) for sign in (1, -1)]
     near = [np.where(abs(angle - 0.8) < 0.7, angle, np.nan) for angle in both]
     return np.where(np.isnan(near[0]), near[1], near[0])
 
 
-def test_cartesian_workspace_is_two_rings_met(cartesian):
-    found, model = cartesian
-    x, y = np.meshgrid(*(axis.values for axis in found.axes), indexing="ij")
+def test_cartesian_workspace_is_the_intersection_of_two_rings(cartesian):
+    result, model = cartesian
+    x, y = np.meshgrid(*(axis.values for axis in result.axes), indexing="ij")
     inside, sure = np.ones(x.shape, bool), np.ones(x.shape, bool)
     for base, (l, m) in ((0.0, model.l[:2]), (model.base, model.l[2:])):
         reach = abs(x - base + 1j * y)
         inside &= (reach <= l + m) & (reach >= abs(l - m))
         sure &= (abs(reach - l - m) > 1e-4) & (abs(reach - abs(l - m)) > 1e-4)
-    assert len(found.aspects) == 4
+    assert len(result.aspects) == 4
     modes = set()
-    for aspect in found.aspects:
+    for aspect in result.aspects:
         assert np.array_equal(aspect.reached[sure], inside[sure])
         elbow = np.sign(np.sin(aspect.q_tree[aspect.reached][:, [1, 3]]))
         assert_close(elbow, np.tile(elbow[0], (len(elbow), 1)), 0.0)  # one working mode throughout
@@ -169,9 +169,9 @@ def test_cartesian_workspace_is_two_rings_met(cartesian):
     assert len(modes) == 4
 
 
-def test_cartesian_type_1_is_a_circle_round_the_elbows(cartesian):
-    found, model = cartesian
-    circles = of_kind(found, "locked")
+def test_cartesian_type_1_is_a_circle_around_the_elbows(cartesian):
+    result, model = cartesian
+    circles = loci_of_kind(result, "locked")
     assert len(circles) == 2
     height = np.sqrt(model.l[0] ** 2 - model.base**2 / 4)
     for locus in circles:
@@ -180,8 +180,8 @@ def test_cartesian_type_1_is_a_circle_round_the_elbows(cartesian):
 
 
 @pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "stewart"])
-def test_second_derivatives_in_either_order(name):
-    """The Jacobian of the equations against finite differences, also where a free root turns."""
+def test_jacobian_of_the_equations_equals_finite_differences(name):
+    """Also for a free root, whose velocities are in rotating axes."""
     mechanism = load(name)
     extended = extend_closure(mechanism, next(iter(mechanism.points)))
     random = np.random.default_rng(5)
@@ -197,10 +197,10 @@ def test_second_derivatives_in_either_order(name):
         assert_close(system.jacobian(at, v)[:, : mechanism.n] @ e, numeric, 1e-7 * max(1.0, abs(numeric).max()))
 
 
-def test_one_freedom_and_fixed_ones():
+def test_maps_over_one_coordinate_and_with_fixed_coordinates():
     crank = singularity_map("slider_crank", cells=32)
     assert crank.aspects[0].reached.all()
-    assert sorted(round(abs(wrapped(locus.at[0, 0] + 1e-9)), 6) for locus in crank.loci) == [0, 0, 3.141593, 3.141593]
+    assert sorted(round(abs(wrap(locus.at[0, 0] + 1e-9)), 6) for locus in crank.loci) == [0, 0, 3.141593, 3.141593]
     fixed = singularity_map("three_rrr", over=["a_3", "a_1"], cells=16)
     assert [axis.name for axis in fixed.axes] == ["a_3", "a_1"]
     assert fixed.fixed == {"a_2": pytest.approx(1.419)}
@@ -215,30 +215,30 @@ def test_one_freedom_and_fixed_ones():
     assert {locus.kind for locus in fixed.loci} == {"fold", "serial"}
 
 
-def test_numbers_of_a_map_are_plain(joint):
-    found, _ = joint
-    plain = found.to_dict()
-    assert plain["axes"][0] == {"name": "theta_1", "unit": "rad", "low": -np.pi, "high": np.pi, "cells": CELLS}
-    assert plain["desired"]["leaves_at"] == found.path.leaves_at
-    assert [locus["kind"] for locus in plain["loci"]] == [locus.kind for locus in found.loci]
+def test_map_serializes_to_a_dict(joint):
+    result, _ = joint
+    data = result.to_dict()
+    assert data["axes"][0] == {"name": "theta_1", "unit": "rad", "low": -np.pi, "high": np.pi, "cells": CELLS}
+    assert data["desired"]["leaves_at"] == result.path.leaves_at
+    assert [locus["kind"] for locus in data["loci"]] == [locus.kind for locus in result.loci]
 
 
 @pytest.mark.parametrize(
     ("name", "options", "says"),
     [
-        ("five_bar", {"over": ["theta_2"]}, "no coordinate 'theta_2' to map over; there are theta_1, theta_3"),
+        ("five_bar", {"over": ["theta_2"]}, "unknown coordinate 'theta_2'; expected one or two of theta_1, theta_3"),
         ("five_bar", {"over": ["theta_1", "theta_1"]}, "one or two different names"),
-        ("five_bar", {"space": "polar"}, "joint or cartesian"),
+        ("five_bar", {"space": "polar"}, "expected joint or cartesian"),
         ("five_bar", {"point": "elbow"}, "no point 'elbow' in five_bar; there are tip"),
-        ("five_bar", {"cells": 5}, "from 16 to 2000"),
-        ("five_bar", {"scene": "swing"}, "it has no controller"),
-        ("five_bar", {"scene": "three_rrr/circle"}, "it is of three_rrr, the map of five_bar"),
+        ("five_bar", {"cells": 5}, "expected 16 to 2000"),
+        ("five_bar", {"scene": "swing"}, "it has no desired trajectory"),
+        ("five_bar", {"scene": "three_rrr/circle"}, "its mechanism is three_rrr, the map's is five_bar"),
         ("andrews", {"space": "cartesian", "point": "nowhere"}, "no point 'nowhere' in andrews"),
-        ("three_rrr", {"space": "cartesian", "over": ["x", "rz"]}, "there are x, y"),
-        ("delta", {"cells": 2000}, "takes at most"),
+        ("three_rrr", {"space": "cartesian", "over": ["x", "rz"]}, "one or two of x, y"),
+        ("delta", {"cells": 2000}, "may have at most"),
     ],
 )
-def test_what_cannot_be_mapped_is_said_in_one_sentence(name, options, says):
+def test_invalid_maps_are_refused_in_one_sentence(name, options, says):
     with pytest.raises(InputError, match=says) as error:
         singularity_map(name, **options)
     assert "\n" not in str(error.value)

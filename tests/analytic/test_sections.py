@@ -1,4 +1,4 @@
-"""Sections of the delta's workspace against the closed form: each arm's circle meets a sphere round the plate."""
+"""Sections of the delta's workspace against the closed form: each arm's circle meets a sphere around the plate."""
 
 from __future__ import annotations
 
@@ -7,64 +7,64 @@ import pytest
 
 import ckc_pin
 from ckc_pin.analysis.map import loci, workspace_sections
-from ckc_pin.analysis.map.sections import Stack
+from ckc_pin.analysis.map.sections import SectionStack
 from ckc_pin.view.map_figures import draw_sections
 
 BASE, PLATE, ARM, ROD = 0.25, 0.04, 0.18, 0.45  # m, of the delta
 
 
-def slack(place: np.ndarray) -> np.ndarray:
-    """Least over the arms of how far a place (..., 3) of the plate is from where an arm is in line with its rods.
+def distance_to_singular(place: np.ndarray) -> np.ndarray:
+    """Return the smallest distance of a place (..., 3) of the plate from where an arm is in line with its rods.
 
-    With X outwards from the motor, |(X - a cos) , Y, z + a sin| = rod has an angle as long as
+    With X outwards from the motor, |(X - a cos), Y, z + a sin| = rod has a solution for the angle if
     |X² + Y² + z² + a² - rod²| < 2 a sqrt(X² + z²).
     """
-    found = []
+    margins = []
     for turn in 2 * np.pi / 3 * np.arange(3):
         x = place[..., 0] * np.cos(turn) + place[..., 1] * np.sin(turn) + PLATE - BASE
         y = place[..., 1] * np.cos(turn) - place[..., 0] * np.sin(turn)
         z = place[..., 2]
-        found.append(2 * ARM * np.hypot(x, z) - np.abs(x**2 + y**2 + z**2 + ARM**2 - ROD**2))
-    return np.min(found, axis=0)
+        margins.append(2 * ARM * np.hypot(x, z) - np.abs(x**2 + y**2 + z**2 + ARM**2 - ROD**2))
+    return np.min(margins, axis=0)
 
 
 @pytest.fixture(scope="module")
 def stack():
     done = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loci, "STEP", 0.15)  # curves of fewer points, as exact
-        found = workspace_sections("delta", count=2, cells=16, progress=done.append)
+        patch.setattr(loci, "CURVE_STEP", 0.15)  # fewer points, which are as accurate
+        sections = workspace_sections("delta", count=2, cells=16, progress=done.append)
     assert (done[0], done[-1]) == (0.0, 1.0)
     assert done == sorted(done)
-    return found
+    return sections
 
 
-def test_sections_reach_what_the_closed_form_does():
-    """Also three corners at the top that hang together only below."""
-    sections = Stack(ckc_pin.load("delta"), None, ("x", "y")).sections(4, 16)
+def test_sections_reach_the_workspace_of_the_closed_form():
+    """Including three corners at the top that are connected only below."""
+    sections = SectionStack(ckc_pin.load("delta"), None, ("x", "y")).fill_sections(4, 16)
     for grid in sections:
         x, y = np.meshgrid(*(axis.values for axis in grid.domain.axes), indexing="ij")
-        (height,) = np.unique(grid.given[grid.reached, 2].round(12))
+        (height,) = np.unique(grid.values[grid.reached, 2].round(12))
         place = np.stack([x, y, np.full(x.shape, height)], axis=-1).reshape(-1, 3)
-        room, reached = slack(place), grid.reached
+        room, reached = distance_to_singular(place), grid.reached
         np.testing.assert_array_equal(reached, room > 0)
-        np.testing.assert_allclose(grid.given[reached], place[reached], atol=1e-9)
+        np.testing.assert_allclose(grid.values[reached], place[reached], atol=1e-9)
         frame = np.abs(place[:, :2]).max(axis=1) > 0.97 * np.abs(place[:, :2]).max()
-        assert room[frame].max() < 0  # the window cuts nothing off
-    assert sections[-1].given[sections[-1].reached, 2].max() > -0.18
+        assert room[frame].max() < 0  # the workspace ends inside the window
+    assert sections[-1].values[sections[-1].reached, 2].max() > -0.18
 
 
-def test_the_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
+def test_serial_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
     for one in stack:
         assert {locus.kind for locus in one.loci} == {"serial"}
         for locus in one.loci:
             assert locus.residual < 1e-8
             shown = locus.point[np.any(locus.on, axis=0)]
             np.testing.assert_allclose(shown[:, 2], one.fixed["z"], atol=1e-9)
-            np.testing.assert_allclose(slack(shown), 0.0, atol=1e-8)
+            np.testing.assert_allclose(distance_to_singular(shown), 0.0, atol=1e-8)
 
 
-def test_the_figure_has_a_panel_for_each_section(stack):
+def test_figure_has_a_panel_for_each_section(stack):
     figure = draw_sections(stack)
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
     assert [title.split(":")[0] for title in titles] == [f"$z$ = {one.fixed['z']:.3f} m" for one in stack]
@@ -73,21 +73,21 @@ def test_the_figure_has_a_panel_for_each_section(stack):
 @pytest.mark.parametrize(
     ("name", "options", "says"),
     [
-        ("five_bar", {}, "sections are of a mechanism of three freedoms"),
-        ("three_rrr", {}, "sections are of a mechanism of three freedoms"),
-        ("delta", {"count": 1}, "sections = 1: from 2 to 24"),
-        ("delta", {"cells": 2000}, "cells = 2000: from 16 to 400"),
+        ("five_bar", {}, "sections need three freedoms"),
+        ("three_rrr", {}, "sections need three freedoms"),
+        ("delta", {"count": 1}, "sections = 1: expected 2 to 24"),
+        ("delta", {"cells": 2000}, "cells = 2000: expected 16 to 400"),
         ("delta", {"over": ("x", "x")}, "two of x, y, z"),
         ("delta", {"over": ("x", "w")}, "two of x, y, z"),
         ("delta", {"point": "tip"}, "no point 'tip' in delta; there are plate"),
     ],
 )
-def test_what_has_no_sections_is_said(name, options, says):
+def test_invalid_sections_are_refused(name, options, says):
     with pytest.raises(ckc_pin.InputError, match=says):
         workspace_sections(name, **options)
 
 
-def test_the_map_and_the_point_are_part_of_the_promise():
-    found = ckc_pin.singularity_map("four_bar", cells=16)
-    assert found.mechanism == "four_bar"
+def test_map_and_point_are_public():
+    result = ckc_pin.singularity_map("four_bar", cells=16)
+    assert result.mechanism == "four_bar"
     assert ckc_pin.Point(ckc_pin.load("five_bar"), "tip").name == "tip"

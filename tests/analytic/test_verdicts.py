@@ -179,7 +179,7 @@ def test_stability_of_a_scene_that_cannot_run_is_unknown(tmp_path: Path) -> None
     folder = copy_five_bar(tmp_path, ('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'))
     result = check_stability("five_bar/set_point", {"mechanism": str(folder / "mechanism.toml")})
     assert result.stable is None
-    assert "a run does not begin: actuated: theta_1 cannot drive every freedom" in str(result.reason)
+    assert "a run cannot start: actuated: theta_1 cannot drive every freedom" in str(result.reason)
 
 
 def start_on_motion(overrides: dict[str, Any], t_end: float) -> tuple[dict[str, Any], Tracking]:

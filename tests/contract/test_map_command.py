@@ -1,4 +1,4 @@
-"""`ckc map`: its JSON, its figures, and one message with exit code 2 for what cannot be mapped."""
+"""`ckc map`: JSON, figures, and one message with exit code 2 for a mechanism that cannot be mapped."""
 
 import numpy as np
 import pytest
@@ -11,11 +11,11 @@ KEYS = {
 }  # fmt: skip
 
 
-def test_numbers_and_figures(tmp_path):
-    found = ckc("map", "four_bar", "--cells", "16", "--out", str(tmp_path / "new"), "--json")
-    assert found.code == 0
-    assert set(found.json) >= KEYS
-    assert [branch["reached"] for branch in found.json["branches"]] == [1.0, 1.0]  # its crank turns
+def test_json_and_figures_are_written(tmp_path):
+    result = ckc("map", "four_bar", "--cells", "16", "--out", str(tmp_path / "new"), "--json")
+    assert result.code == 0
+    assert set(result.json) >= KEYS
+    assert [branch["reached"] for branch in result.json["branches"]] == [1.0, 1.0]  # its crank turns
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["map_joint.png", "map_joint.svg"]
     place = ckc("map", "four_bar", "--cells", "16", "--space", "cartesian", "--out", str(tmp_path))
     assert place.code == 0
@@ -23,14 +23,14 @@ def test_numbers_and_figures(tmp_path):
     assert "place of coupler" in place.out
 
 
-def test_of_two_freedoms_for_people(tmp_path):
-    found = ckc("map", "five_bar", "--cells", "16", "--scene", "set_point", "--out", str(tmp_path))
-    assert found.code == 0
-    assert found.err == ""  # no progress in a pipe
-    assert "0.993864982" in found.out
-    assert f"{np.pi - 0.993864982:.9f}" in found.out
-    assert "type 2, closed" in found.out
-    assert "desired, five_bar/set_point" in found.out
+def test_terminal_output_has_loci_and_desired_trajectory(tmp_path):
+    result = ckc("map", "five_bar", "--cells", "16", "--scene", "set_point", "--out", str(tmp_path))
+    assert result.code == 0
+    assert result.err == ""  # no progress in a pipe
+    assert "0.993864982" in result.out
+    assert f"{np.pi - 0.993864982:.9f}" in result.out
+    assert "type 2, closed" in result.out
+    assert "desired, five_bar/set_point" in result.out
     assert (tmp_path / "map_joint.svg").read_text(encoding="utf-8").startswith("<?xml")
 
 
@@ -47,17 +47,17 @@ LOCKED = NO_LOOP + '[[loop]]\nname = "bolt"\ntype = "weld"\nframe_a = "a"\nframe
     ("text", "options", "says"),
     [
         (LOCKED, (), "d = 0"),
-        (NO_LOOP, (), "it has no loops"),
-        (NO_LOOP, ("--space", "cartesian"), "it has no loops"),
+        (NO_LOOP, (), "without loops"),
+        (NO_LOOP, ("--space", "cartesian"), "without loops"),
     ],
 )
-def test_mechanisms_that_have_no_map(tmp_path, text, options, says):
+def test_mechanism_without_freedoms_or_loops_is_refused(tmp_path, text, options, says):
     (tmp_path / "arm.urdf").write_text(ARM, encoding="utf-8")
     (tmp_path / "mechanism.toml").write_text(text, encoding="utf-8")
-    found = ckc("map", str(tmp_path / "mechanism.toml"), *options, "--json")
-    assert found.code == 2
-    assert found.json["status"] == "error"
-    assert says in found.json["message"]
+    result = ckc("map", str(tmp_path / "mechanism.toml"), *options, "--json")
+    assert result.code == 2
+    assert result.json["status"] == "error"
+    assert says in result.json["message"]
 
 
 @pytest.mark.parametrize(
@@ -65,25 +65,25 @@ def test_mechanisms_that_have_no_map(tmp_path, text, options, says):
     [
         (["delta", "--sections", "4"], "--sections goes with --space cartesian"),
         (["delta", "--space", "cartesian", "--sections", "4", "--scene", "circle"], "and without --scene"),
-        (["delta", "--space", "cartesian", "--sections", "99"], "sections = 99: from 2 to 24"),
+        (["delta", "--space", "cartesian", "--sections", "99"], "sections = 99: expected 2 to 24"),
         (["five_bar", "--space", "cartesian", "--sections", "4"], "map two coordinates instead"),
     ],
 )
-def test_sections_that_cannot_be(words, says):
-    found = ckc("map", *words)
-    assert (found.code, found.out) == (2, "")
-    assert says in found.err
+def test_invalid_sections_are_refused(words, says):
+    result = ckc("map", *words)
+    assert (result.code, result.out) == (2, "")
+    assert says in result.err
 
 
-def test_no_point_for_the_cartesian_space():
-    found = ckc("map", "n_four_bar", "--space", "cartesian", "--point", "nowhere")
-    assert found.code == 2
-    assert found.out == ""
-    assert found.err.count("\n") == 1
+def test_unknown_point_is_refused():
+    result = ckc("map", "n_four_bar", "--space", "cartesian", "--point", "nowhere")
+    assert result.code == 2
+    assert result.out == ""
+    assert result.err.count("\n") == 1
 
 
-def test_a_folder_that_cannot_be_written(tmp_path):
+def test_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("", encoding="utf-8")
-    found = ckc("map", "five_bar", "--out", str(tmp_path / "file"))
-    assert found.code == 2
-    assert "no folder that can be written to" in found.err
+    result = ckc("map", "five_bar", "--out", str(tmp_path / "file"))
+    assert result.code == 2
+    assert "no folder that can be written to" in result.err

@@ -42,7 +42,7 @@ FORMS = {f"{word}{end}": word for word in WORDS for end in ("", "s", "ed", "er",
 del FORMS["trailing"]  # as a newline is
 
 # classes of the experiments that have the name of another class
-TWICE = {"Approach", "Case", "Crossing", "Frame", "Locus", "Motion", "Record", "Reference", "Setting", "Steps",
+TWICE = {"Approach", "Case", "Crossing", "Frame", "Locus", "Motion", "Record", "Reference", "Setting",
          "Track", "Tree"}  # fmt: skip
 
 

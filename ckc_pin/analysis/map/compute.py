@@ -1,4 +1,7 @@
-"""`singularity_map`: aspects, loci and a trajectory over two coordinates, joints or those of a point."""
+"""Compute the singularity map of a mechanism: aspects, singular curves and a desired trajectory over two coordinates.
+
+The axes are independent coordinates, or coordinates of a point.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,18 @@ from time import perf_counter
 
 import numpy as np
 
-from ckc_pin.analysis.map.approach import add_path, read_wanted
-from ckc_pin.analysis.map.grid import HURRIED, Domain, Grid, Progress, Steps, fill, joint_axis, middles, reach
+from ckc_pin.analysis.map.desired_path import add_path, read_desired
+from ckc_pin.analysis.map.grid import (
+    COARSE_FRACTION,
+    Domain,
+    Grid,
+    Progress,
+    ProgressCounter,
+    cell_centres,
+    fill_grid,
+    make_joint_axis,
+    max_distance,
+)
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
@@ -24,16 +37,18 @@ from ckc_pin.mechanism.batch import ManyPoses
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.scene import EXPECTED_SCENE, Scene, load_scene
 
-__all__ = ["located", "map_value", "name_of", "singularity_map"]
+__all__ = ["add_positions", "make_map", "singularity_map"]
 
-
-MOST = 4  # branches drawn
-LARGEST = 12  # dependent coordinates: of larger mechanisms, and of free bodies, the assembled branch alone is mapped
-MULTIPLE = 8  # of cells along an axis, so that coarse grids lie on the fine one
-MARGIN = 3.0  # cells of a first look around what it finds: thin corners fall between cells
-FIRST_LOOK = 48  # cells along an axis while a Cartesian window is looked for
-CELLS = (16, 2000)
-MEMORY = 1.5e9  # bytes that the Jacobians of one aspect may take
+MAX_BRANCHES = 4
+MAX_DEPENDENT = 12  # coordinates; of larger mechanisms, and of free bodies, only the assembled branch is mapped
+CELL_MULTIPLE = 8  # cells along an axis, so that coarse grids lie on the fine one
+MIN_CELLS, MAX_CELLS = 16, 2000  # along an axis
+WINDOW_CELLS = 48  # along an axis, while a Cartesian window is searched for
+WINDOW_MARGIN = 3.0  # of these cells; thin corners of the workspace fall between cells
+WINDOW_SEARCHES = 6
+WINDOW_SHRINKAGE = 0.7  # the search ends if the next window is not smaller by this factor
+MAX_JACOBIAN_BYTES = 1.5e9  # of one aspect
+ROUNDED_DIGITS = 12  # of fixed values
 
 
 def singularity_map(
@@ -57,88 +72,82 @@ def singularity_map(
     space : "joint" or "cartesian"
         Over independent coordinates, or over the place of a point.
     over : one or two names, optional
-        The axes: independent coordinates, or of x, y, z. All others are fixed as assembled. Default: the first two.
+        The axes: independent coordinates, or of x, y, z. The others are fixed as assembled. Default: the first two.
     point : str, optional
-        The point whose serial singularities are wanted, default the first one. Without any [[point]] there are none.
+        The point whose serial singularities are searched for. Default: the first one; none without any [[point]].
     cells : int
         Along each axis; rounded up to a multiple of 8.
     progress : callable, optional
-        Called as progress(part done).
+        Called as progress(fraction), from 0 to 1.
 
     Raises
     ------
     InputError
-        d = 0, no loops, no point for the Cartesian space, unknown names, a scene without a desired trajectory.
+        d = 0, no loops, no point for the Cartesian space, an unknown name, or a scene without a desired trajectory.
     """
-    found = as_mechanism(mechanism, "singularity_map")
+    name = mechanism if isinstance(mechanism, str | FilePath) else None
+    mechanism = as_mechanism(mechanism, "singularity_map")
     if scene is not None:
         require_type(scene, (Scene, str, FilePath), "singularity_map: scene", EXPECTED_SCENE)
     require_type(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
         raise InputError(f"singularity_map: over: expected one or two names, as [{over!r}], got {over!r}")
-    require_callable(progress, "singularity_map: progress", "a function of the part that is done", 1)
-    named = mechanism if isinstance(mechanism, str | FilePath) else mechanism.name
-    mechanism = found
+    require_callable(progress, "singularity_map: progress", "a function of the completed fraction", 1)
     if mechanism.d == 0:
-        raise InputError(
-            f"{mechanism.name}: d = 0, the loops leave no freedom, there is nothing to map; leave out a loop"
-        )
+        raise InputError(f"{mechanism.name}: d = 0, so there is nothing to map; leave out a loop")
     if not mechanism.dependent:
-        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere; map one that has")
-    if not CELLS[0] <= cells <= CELLS[1]:
-        raise InputError(f"cells = {cells}: from {CELLS[0]} to {CELLS[1]} along an axis")
+        raise InputError(f"{mechanism.name}: without loops the mechanism is never singular; map one with loops")
+    if not MIN_CELLS <= cells <= MAX_CELLS:
+        raise InputError(f"cells = {cells}: expected {MIN_CELLS} to {MAX_CELLS} along an axis")
     if space not in ("joint", "cartesian"):
-        raise InputError(f"space {space!r}: joint or cartesian")
-    loaded = None if scene is None else scene if isinstance(scene, Scene) else _scene(named, scene)
-    wanted = None if loaded is None else read_wanted(loaded, mechanism)
-    cells = -(-cells // MULTIPLE) * MULTIPLE
-    cartesian = space == "cartesian"
+        raise InputError(f"space = {space!r}: expected joint or cartesian")
+    if scene is not None and not isinstance(scene, Scene):
+        scene = _load_scene(mechanism.name if name is None else name, scene)
+    desired = None if scene is None else read_desired(scene, mechanism)
+    cells = -(-cells // CELL_MULTIPLE) * CELL_MULTIPLE
+    is_cartesian = space == "cartesian"
     with one_blas_thread():
-        began = perf_counter()
-        extended, notes = _with_point(mechanism, point, needed=cartesian or point is not None)
-        planar = cartesian and mechanism.d > 1  # of one freedom: its point's path over the joint
-        task, chosen, names = _task(extended, over, planar)
-        _refuse_large(task, cells, len(chosen))
-        starts, more = _branches(task)
-        steps = Steps(progress, 1 + len(starts) * 3)
-        domain = _window(task, chosen, names, starts, cells) if planar else _joints(task, chosen, names, cells)
-        steps.step()
-        grids = [steps.after(fill(domain, start)) for start in starts]
+        start = perf_counter()
+        extended, notes = _extend_by_point(mechanism, point, needed=is_cartesian or point is not None)
+        over_place = is_cartesian and mechanism.d > 1  # with one freedom, the point's path is drawn over the joint
+        task, positions, names = _choose_axes(extended, over, over_place)
+        _check_size(task, cells, len(positions))
+        branches, has_more = _find_branches(task)
+        steps = ProgressCounter(progress, 1 + len(branches) * 3)
+        if over_place:
+            domain = _cartesian_domain(task, positions, names, branches, cells)
+        else:
+            domain = _joint_domain(task, positions, names, cells)
+        steps.add()
+        grids = [steps.add_after(fill_grid(domain, branch)) for branch in branches]
         grids = [grid for grid in grids if grid.reached.any()]
         if not grids:
-            raise InputError(f"{mechanism.name}: no cell of the map is reached from where it is assembled")
-        seconds = perf_counter() - began
-        loci = [located(extended, locus) for locus in find_loci(extended, domain, grids, planar, steps)]
-        path = None if wanted is None else add_path(wanted, mechanism, grids, loci, planar)
-        return map_value(
+            raise InputError(f"{mechanism.name}: no cell of the map is reached from the assembled configuration")
+        seconds = perf_counter() - start
+        loci = [add_positions(extended, locus) for locus in find_loci(extended, domain, grids, over_place, steps)]
+        path = None if desired is None else add_path(desired, mechanism, grids, loci, over_place)
+        return make_map(
             extended,
-            "cartesian" if cartesian else "joint",
+            "cartesian" if is_cartesian else "joint",
             grids,
             loci,
             path=path,
-            more_branches=more,
+            more_branches=has_more,
             seconds=seconds,
             notes=notes,
         )
 
 
-def _branches(task: Task) -> tuple[Array, bool]:
-    """Return a configuration of each branch to be mapped, and whether there are or may be more."""
-    mechanism = task.extended.mechanism
-    if not mechanism.tree.is_euclidean or len(mechanism.dependent) > LARGEST:
-        return mechanism.q_tree[None], True
-    found = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).values[0], MOST + 1)
-    return found[:MOST], len(found) > MOST
+def _load_scene(mechanism: str | FilePath, scene: str | FilePath) -> Scene:
+    """Load a scene. A bare name such as tracking is a scene of the mechanism, such as five_bar/tracking."""
+    is_bare = isinstance(scene, str) and "/" not in scene and not scene.endswith(".toml")
+    return load_scene(f"{mechanism}/{scene}" if is_bare and isinstance(mechanism, str) else scene)
 
 
-def _scene(mechanism: str | FilePath, scene: str | FilePath) -> Scene:
-    """Load a scene: tracking of five_bar is five_bar/tracking."""
-    plain = isinstance(scene, str) and "/" not in scene and not scene.endswith(".toml")
-    return load_scene(f"{mechanism}/{scene}" if plain and isinstance(mechanism, str) else scene)
-
-
-def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tuple[ExtendedClosure, tuple[str, ...]]:
-    """Add the point's rows; where it is not needed a point that will not do is a note."""
+def _extend_by_point(
+    mechanism: Mechanism, point: str | None, *, needed: bool
+) -> tuple[ExtendedClosure, tuple[str, ...]]:
+    """Extend the closure by the point's rows, or return a note if the point is unsuitable and not needed."""
     try:
         return extend_closure(mechanism, find_point(mechanism, point)), ()
     except InputError as error:
@@ -147,78 +156,97 @@ def _with_point(mechanism: Mechanism, point: str | None, *, needed: bool) -> tup
         return extend_closure(mechanism), (f"no serial singularities: {error}",)
 
 
-def _task(extended: ExtendedClosure, over: Sequence[str] | None, cartesian: bool) -> tuple[Task, IntArray, list[str]]:
-    """Choose the given rows and which of them are the axes."""
+def _choose_axes(
+    extended: ExtendedClosure, over: Sequence[str] | None, over_place: bool
+) -> tuple[Task, IntArray, list[str]]:
+    """Return the task, the positions of the axes in its rows, and their names."""
     mechanism = extended.mechanism
-    if (root := mechanism.independent_root_coordinates) and not cartesian:
+    if mechanism.independent_root_coordinates and not over_place:
         raise InputError(
-            f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, and a map needs joint "
-            "coordinates; choose joints as independent coordinates"
+            f"{mechanism.name}: {mechanism.independent_root_coordinates[0]} belongs to a free root, which has no chart "
+            "to draw a map over; choose joints as independent coordinates"
         )
-    if cartesian:
+    if over_place:
         task = Task(extended, extended.fixing)
-        valid = [name_of(task, k) for k in range(mechanism.d) if extended.fixing[k] < extended.place[0] + 3]
+        valid = [_row_name(task, k) for k in range(mechanism.d) if extended.fixing[k] < extended.place[0] + 3]
         if not valid:
-            raise InputError(f"{mechanism.name}: the point {extended.point!r} stands still as assembled; name another")
+            raise InputError(
+                f"{mechanism.name}: the point {extended.point!r} cannot move as assembled; name another point"
+            )
     else:
         task = Task(extend_closure(mechanism), extended.joints)
         valid = list(mechanism.independent)
     names = valid[:2] if over is None else list(over)
     unknown = [name for name in names if name not in valid]
     if unknown:
-        raise InputError(f"over: no coordinate {unknown[0]!r} to map over; there are {', '.join(valid)}")
+        raise InputError(f"over: unknown coordinate {unknown[0]!r}; expected one or two of {', '.join(valid)}")
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
-        raise InputError(f"over: one or two different names of {', '.join(valid)}")
-    labels = [name_of(task, k) for k in range(mechanism.d)]
+        raise InputError(f"over: expected one or two different names of {', '.join(valid)}")
+    labels = [_row_name(task, k) for k in range(mechanism.d)]
     return task, np.array([labels.index(name) for name in names], np.intp), names
 
 
-def _refuse_large(task: Task, cells: int, axes: int) -> None:
+def _check_size(task: Task, cells: int, axes: int) -> None:
+    """Raise InputError if the Jacobians of one aspect need too much memory."""
     mechanism = task.extended.mechanism
-    size = 8.0 * cells**axes * task.extended.closure.rows * mechanism.n
-    if size > MEMORY:
-        most = int((MEMORY / (size / cells**axes)) ** (1 / axes))
-        raise InputError(f"cells = {cells}: a map of {mechanism.name} takes at most {most} along an axis")
+    bytes_per_cell = 8.0 * task.extended.closure.rows * mechanism.n
+    if bytes_per_cell * cells**axes > MAX_JACOBIAN_BYTES:
+        limit = int((MAX_JACOBIAN_BYTES / bytes_per_cell) ** (1 / axes))
+        raise InputError(f"cells = {cells}: a map of {mechanism.name} may have at most {limit} along an axis")
 
 
-def _joints(task: Task, chosen: IntArray, names: Sequence[str], cells: int) -> Domain:
-    return Domain(task, chosen, tuple(joint_axis(task, int(k), name, cells) for k, name in zip(chosen, names,
-                                                                                             strict=True)))  # fmt: skip
+def _find_branches(task: Task) -> tuple[Array, bool]:
+    """Return a configuration of each branch to map, shape (branches, nq), and whether there are or may be more."""
+    mechanism = task.extended.mechanism
+    if not mechanism.tree.is_euclidean or len(mechanism.dependent) > MAX_DEPENDENT:
+        return mechanism.q_tree[None], True
+    solutions = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).values[0], MAX_BRANCHES + 1)
+    return solutions[:MAX_BRANCHES], len(solutions) > MAX_BRANCHES
 
 
-def _window(task: Task, chosen: IntArray, names: Sequence[str], starts: Array, cells: int) -> Domain:
-    """Return the Cartesian window that the branches reach: looked at in ever smaller ones that still hold them."""
-    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).values[0][chosen]
-    low, high = middle - reach(task), middle + reach(task)
-    for _ in range(6):
-        domain = _box(task, chosen, names, low, high, FIRST_LOOK)
-        reached = np.array([fill(domain, start, HURRIED).reached for start in starts]).any(axis=0).reshape(domain.shape)
-        cell = (high - low) / FIRST_LOOK
-        tight_low, tight_high = middle.copy(), middle.copy()
+# --- windows -------------------------------------------------------------------------------------------------------
+
+
+def _joint_domain(task: Task, positions: IntArray, names: Sequence[str], cells: int) -> Domain:
+    axes = tuple(make_joint_axis(task, int(k), name, cells) for k, name in zip(positions, names, strict=True))
+    return Domain(task, positions, axes)
+
+
+def _cartesian_domain(task: Task, positions: IntArray, names: Sequence[str], branches: Array, cells: int) -> Domain:
+    """Return the Cartesian window that the branches reach, found by filling ever smaller windows coarsely."""
+    middle = nodes_at(task, task.extended.mechanism.q_tree[None]).values[0][positions]
+    low, high = middle - max_distance(task), middle + max_distance(task)
+    for _ in range(WINDOW_SEARCHES):
+        domain = _box_domain(task, positions, names, low, high, WINDOW_CELLS)
+        reached = np.array([fill_grid(domain, branch, COARSE_FRACTION).reached for branch in branches]).any(axis=0)
+        reached = reached.reshape(domain.shape)
+        cell = (high - low) / WINDOW_CELLS
+        new_low, new_high = middle.copy(), middle.copy()
         for k, axis in enumerate(domain.axes):
-            inside = axis.values[np.any(reached, axis=1 - k)]
-            tight_low[k] = min(middle[k], *inside) if len(inside) else middle[k]
-            tight_high[k] = max(middle[k], *inside) if len(inside) else middle[k]
-        tight_low, tight_high = np.maximum(tight_low - MARGIN * cell, low), np.minimum(tight_high + MARGIN * cell, high)
-        shrinks = np.any(tight_high - tight_low < 0.7 * (high - low))
-        low, high = tight_low, tight_high
-        if not shrinks:
+            values = axis.values[np.any(reached, axis=1 - k)]
+            new_low[k] = min(middle[k], *values) if len(values) else middle[k]
+            new_high[k] = max(middle[k], *values) if len(values) else middle[k]
+        new_low = np.maximum(new_low - WINDOW_MARGIN * cell, low)
+        new_high = np.minimum(new_high + WINDOW_MARGIN * cell, high)
+        has_shrunk = np.any(new_high - new_low < WINDOW_SHRINKAGE * (high - low))
+        low, high = new_low, new_high
+        if not has_shrunk:
             break
-    return _box(task, chosen, names, low, high, cells)
+    return _box_domain(task, positions, names, low, high, cells)
 
 
-def _box(task: Task, chosen: IntArray, names: Sequence[str], low: Array, high: Array, cells: int) -> Domain:
+def _box_domain(task: Task, positions: IntArray, names: Sequence[str], low: Array, high: Array, cells: int) -> Domain:
     axes = tuple(
-        Axis(name, "m", float(a), float(b), False, middles(float(a), float(b), cells))
+        Axis(name, "m", float(a), float(b), False, cell_centres(float(a), float(b), cells))
         for name, a, b in zip(names, low, high, strict=True)
     )
-    return Domain(task, chosen, axes)
+    return Domain(task, positions, axes)
 
 
-# --- What has been computed as the plain value `SingularityMap`.
+# --- results -------------------------------------------------------------------------------------------------------
 
 
-def map_value(
+def make_map(
     extended: ExtendedClosure,
     space: Space,
     grids: Sequence[Grid],
@@ -229,19 +257,19 @@ def map_value(
     seconds: float,
     notes: tuple[str, ...] = (),
 ) -> SingularityMap:
-    """Put aspects that reach something, their loci and a trajectory together."""
+    """Return the map of aspects, each of which reaches at least one cell, with their loci and a trajectory."""
     mechanism, domain = extended.mechanism, grids[0].domain
-    square = mechanism.assembled.phi_z.shape[0] == mechanism.assembled.phi_z.shape[1]
-    start = grids[0].given[np.flatnonzero(grids[0].reached)[0]]
+    is_square = mechanism.assembled.phi_z.shape[0] == mechanism.assembled.phi_z.shape[1]
+    values = grids[0].values[np.flatnonzero(grids[0].reached)[0]]
     return SingularityMap(
         mechanism=mechanism.name,
         space=space,
         point=extended.point,
         axes=domain.axes,
-        fixed={name_of(domain.task, k): float(np.round(start[k], 12)) + 0.0 for k in domain.fixed},
-        measure="det phi_z" if square else "sigma_min(phi_z)",
-        measure_unit=_unit(mechanism) if square else "",
-        aspects=tuple(_aspect(extended, grid, square) for grid in grids),
+        fixed={_row_name(domain.task, k): float(np.round(values[k], ROUNDED_DIGITS)) + 0.0 for k in domain.fixed},
+        measure="det phi_z" if is_square else "sigma_min(phi_z)",
+        measure_unit=_determinant_unit(mechanism) if is_square else "",
+        aspects=tuple(_make_aspect(extended, grid, is_square) for grid in grids),
         more_branches=more_branches,
         loci=tuple(loci),
         path=path,
@@ -250,33 +278,38 @@ def map_value(
     )
 
 
-def name_of(task: Task, k: int) -> str:
-    """Name a given row of a task."""
+def add_positions(extended: ExtendedClosure, locus: Locus) -> Locus:
+    """Return a locus with the positions of the point along it."""
+    return locus if extended.point is None else replace(locus, point=_point_positions(extended, locus.q_tree))
+
+
+def _row_name(task: Task, k: int) -> str:
+    """Return the name of a row of a task: a coordinate, or an axis of the point."""
     extended, row = task.extended, int(task.rows[k])
     if len(extended.place) and row >= extended.place[0]:
         return extended.axis(row)
     return extended.mechanism.independent[k]
 
 
-def _aspect(extended: ExtendedClosure, grid: Grid, square: bool) -> Aspect:
+def _make_aspect(extended: ExtendedClosure, grid: Grid, is_square: bool) -> Aspect:
     mechanism, shape = extended.mechanism, grid.domain.shape
     inside = np.flatnonzero(grid.reached)
     phi_z = grid.J[inside][:, : len(extended.loops)][:, :, mechanism.partition.z]
     det = np.full(len(grid.reached), np.nan)
-    det[inside] = np.linalg.det(phi_z) if square else np.linalg.svd(phi_z, compute_uv=False)[:, -1]
-    place = np.full((len(grid.reached), 3), np.nan)
+    det[inside] = np.linalg.det(phi_z) if is_square else np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+    positions = np.full((len(grid.reached), 3), np.nan)
     if extended.point is not None:
-        place[inside] = _positions(extended, grid.q_tree[inside])
+        positions[inside] = _point_positions(extended, grid.q_tree[inside])
     return Aspect(
         reached=grid.reached.reshape(shape),
         det_phi_z=det.reshape(shape),
         q_tree=grid.q_tree.reshape(*shape, -1),
-        point=None if extended.point is None else place.reshape(*shape, 3),
+        point=None if extended.point is None else positions.reshape(*shape, 3),
     )
 
 
-def _positions(extended: ExtendedClosure, q_tree: Array) -> Array:
-    """World positions of the point at configurations (count, nq), shape (count, 3)."""
+def _point_positions(extended: ExtendedClosure, q_tree: Array) -> Array:
+    """Return the world positions (count, 3) of the point at configurations (count, nq)."""
     mechanism = extended.mechanism
     frame = mechanism.points[str(extended.point)]
     pose = ManyPoses(mechanism.tree, mechanism.closure.anchors, q_tree)
@@ -285,13 +318,8 @@ def _positions(extended: ExtendedClosure, q_tree: Array) -> Array:
     return np.asarray(rotation @ frame.translation + pose.translation.reshape(-1, joints, 3)[:, frame.joint])
 
 
-def located(extended: ExtendedClosure, locus: Locus) -> Locus:
-    """Say where the point is along a locus."""
-    return locus if extended.point is None else replace(locus, point=_positions(extended, locus.q_tree))
-
-
-def _unit(mechanism: Mechanism) -> str:
-    """The unit of det phi_z: metres for each row that is a length, over those of the columns that are."""
+def _determinant_unit(mechanism: Mechanism) -> str:
+    """Return the unit of det phi_z: a power of metres, that of its rows less that of its columns."""
     power = int(np.sum(mechanism.closure.in_metres(mechanism.tree)))
     power -= int(np.sum(mechanism.tree.in_metres[mechanism.partition.z]))
     return "" if power == 0 else "m" if power == 1 else f"m^{power}"

@@ -1,8 +1,8 @@
-"""A workspace of three dimensions in sections: maps at several heights, each reached from the ones beside it.
+"""Sections of a three-dimensional workspace: maps at several heights, each reached from the sections next to it.
 
-A section alone may consist of pieces that only hang together above or below it. So a coarse stack of sections is filled
-first, up and down until nothing new is reached, and what it reaches next to a section is where that begins. A piece
-that is narrower than a cell of that stack, a thirtieth of the window, may be missed.
+A section may consist of pieces that are connected only above or below it. A coarse stack of sections is therefore
+filled first, up and down until nothing new is reached. A section then starts from what the stack reaches next to it. A
+piece that is narrower than a cell of the stack, a thirtieth of the window, may be missed.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from time import perf_counter
 
 import numpy as np
 
-from ckc_pin.analysis.map.compute import located, map_value
+from ckc_pin.analysis.map.compute import add_positions, make_map
 from ckc_pin.analysis.map.grid import (
+    COARSE_FRACTION,
     CORNERS,
-    HURRIED,
     SIDES,
     Domain,
     Grid,
     Progress,
-    Steps,
-    fill,
-    flood,
-    middles,
-    reach,
+    ProgressCounter,
+    cell_centres,
+    fill_grid,
+    flood_grid,
+    max_distance,
 )
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.base.arrays import Array, BoolArray
@@ -37,16 +37,17 @@ from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import MIN_PIECE, follow, nodes_at
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Stack", "workspace_sections"]
+__all__ = ["SectionStack", "workspace_sections"]
 
-NAMES = ("x", "y", "z")
-COUNTS = (2, 24)
-CELLS = (16, 400)
-LOOK = 32  # cells along each direction while the window is looked for
-MARGIN = 1.5  # such cells around what was found
-LOOKS = 6
-AROUND = (*SIDES, *CORNERS)
-NEAR = 2.5  # such cells above and below a section: where it begins
+AXIS_NAMES = ("x", "y", "z")
+MIN_SECTIONS, MAX_SECTIONS = 2, 24
+MIN_CELLS, MAX_CELLS = 16, 400  # along an axis of a section
+COARSE_CELLS = 32  # along each direction of the coarse stack
+BOX_MARGIN = 1.5  # coarse cells around what is reached
+BOX_SEARCHES = 6
+BOX_SHRINKAGE = 0.8  # the search ends if the next box is not smaller by this factor
+START_DISTANCE = 2.5  # coarse sections; above and below a section, configurations so near are its starts
+ALL_DIRECTIONS = (*SIDES, *CORNERS)
 
 
 def workspace_sections(
@@ -58,7 +59,7 @@ def workspace_sections(
     cells: int = 120,
     progress: Progress | None = None,
 ) -> tuple[SingularityMap, ...]:
-    """Map where a point can go in three dimensions, in sections at equal distances, on the working mode as assembled.
+    """Map the three-dimensional workspace of a point in equidistant sections, on the assembled working mode.
 
     Parameters
     ----------
@@ -66,148 +67,159 @@ def workspace_sections(
     point : str, optional
         Default: the first one.
     over : two of "x", "y", "z"
-        The sections' plane.
+        The plane of the sections.
     count : int
-        Of sections; those that nothing is reached of are left out.
+        Number of sections. Those of which nothing is reached are left out.
     cells : int
         Along each axis of a section.
     progress : callable, optional
-        Called as progress(part done).
+        Called as progress(fraction), from 0 to 1.
 
     Returns
     -------
     tuple of SingularityMap
-        From the lowest; all over the same window.
+        From the lowest, all over the same window.
 
     Raises
     ------
     InputError
-        No loops, no such point, or one whose three coordinates do not tell the configuration.
+        No loops, an unknown point, or a point whose three coordinates do not determine the configuration.
     """
     mechanism = as_mechanism(mechanism, "workspace_sections")
     if not mechanism.dependent:
-        raise InputError(f"{mechanism.name}: it has no loops, so it can go anywhere; map one that has")
-    for name, value, (least, most) in (("sections", count, COUNTS), ("cells", cells, CELLS)):
-        if not least <= value <= most:
-            raise InputError(f"{name} = {value}: from {least} to {most}")
-    if len(over) != 2 or len(set(over)) < 2 or not set(over) <= set(NAMES):
-        raise InputError(f"over: the plane of sections is two of {', '.join(NAMES)}")
+        raise InputError(f"{mechanism.name}: without loops the mechanism is never singular; map one with loops")
+    for name, value, smallest, largest in (
+        ("sections", count, MIN_SECTIONS, MAX_SECTIONS),
+        ("cells", cells, MIN_CELLS, MAX_CELLS),
+    ):
+        if not smallest <= value <= largest:
+            raise InputError(f"{name} = {value}: expected {smallest} to {largest}")
+    if len(over) != 2 or len(set(over)) < 2 or not set(over) <= set(AXIS_NAMES):
+        raise InputError(f"over: expected two of {', '.join(AXIS_NAMES)} as the plane of the sections")
     with one_blas_thread():
-        began = perf_counter()
-        stack = Stack(mechanism, point, over, Steps(progress, LOOKS + 2 * count))
-        grids = [grid for grid in stack.sections(count, cells) if grid.reached.any()]
+        start = perf_counter()
+        stack = SectionStack(mechanism, point, over, ProgressCounter(progress, BOX_SEARCHES + 2 * count))
+        grids = [grid for grid in stack.fill_sections(count, cells) if grid.reached.any()]
         if not grids:
-            raise InputError(f"{mechanism.name}: none of {count} sections is reached; ask for more")
-        seconds = perf_counter() - began
-        return tuple(stack.value(grid, seconds) for grid in grids)
+            raise InputError(f"{mechanism.name}: none of {count} sections is reached; ask for more sections")
+        seconds = perf_counter() - start
+        return tuple(stack.make_section(grid, seconds) for grid in grids)
 
 
-class Stack:
-    """Sections of the place of a point."""
+class SectionStack:
+    """Sections of the workspace of a point.
+
+    Raises
+    ------
+    InputError
+        The mechanism does not have three freedoms, or the point's position does not determine the configuration.
+    """
 
     def __init__(
-        self, mechanism: Mechanism, point: str | None, over: Sequence[str], steps: Steps | None = None
+        self, mechanism: Mechanism, point: str | None, over: Sequence[str], progress: ProgressCounter | None = None
     ) -> None:
         self.extended = extend_closure(mechanism, find_point(mechanism, point))
         fixing = self.extended.fixing - self.extended.place[0]
         if mechanism.d != 3 or fixing.tolist() != [0, 1, 2]:
             raise InputError(
-                f"{mechanism.name}: sections are of a mechanism of three freedoms that x, y, z of its point tell; map "
-                "two coordinates instead"
+                f"{mechanism.name}: sections need three freedoms that x, y and z of the point determine; map two "
+                "coordinates instead"
             )
         self.task = Task(self.extended, self.extended.fixing)
-        self.over = np.array([NAMES.index(name) for name in over], np.intp)
-        self.third = int(np.setdiff1d(np.arange(3), self.over)[0])
+        self.over = np.array([AXIS_NAMES.index(name) for name in over], np.intp)
+        self.normal = int(np.setdiff1d(np.arange(3), self.over)[0])
         self.start = mechanism.q_tree
         self.middle = nodes_at(self.task, self.start[None]).values[0]
-        self.steps = steps or Steps(None, 1)
+        self.progress = progress or ProgressCounter(None, 1)
 
-    def sections(self, count: int, cells: int) -> list[Grid]:
-        """Reach what can be reached of so many sections, from the lowest."""
-        low, high, coarse = self.look()
-        heights = middles(float(low[self.third]), float(high[self.third]), count)
-        return [self.section(low, high, cells, float(height), coarse) for height in heights]
+    def fill_sections(self, count: int, cells: int) -> list[Grid]:
+        """Reach what can be reached of equidistant sections, from the lowest."""
+        low, high, coarse = self.find_box()
+        heights = cell_centres(float(low[self.normal]), float(high[self.normal]), count)
+        return [self._fill_section(low, high, cells, float(height), coarse) for height in heights]
 
-    def look(self) -> tuple[Array, Array, list[Grid]]:
-        """Return the box (3,), (3,) that is reached, and what a coarse stack of sections reaches in it.
+    def find_box(self) -> tuple[Array, Array, list[Grid]]:
+        """Return the box (3,), (3,) that is reached, and the coarse stack of sections in it.
 
-        It is looked at in ever smaller boxes that still hold it.
+        The box is found by filling ever smaller boxes coarsely.
         """
-        low, high = self.middle - reach(self.task), self.middle + reach(self.task)
-        for look in range(LOOKS):
-            found = self._fill_coarse(low, high)
-            self.steps.step()
-            places = np.concatenate([self.middle[None], *(grid.given[grid.reached] for grid in found)])
-            room = MARGIN * (high - low) / LOOK
-            tight_low = np.maximum(places.min(axis=0) - room, low)
-            tight_high = np.minimum(places.max(axis=0) + room, high)
-            shrinks = np.any(tight_high - tight_low < 0.8 * (high - low))
-            low, high = tight_low, tight_high
-            if not shrinks:
-                self.steps.step(LOOKS - 1 - look)
+        low, high = self.middle - max_distance(self.task), self.middle + max_distance(self.task)
+        for search in range(BOX_SEARCHES):
+            layers = self._fill_coarse(low, high)
+            self.progress.add()
+            places = np.concatenate([self.middle[None], *(grid.values[grid.reached] for grid in layers)])
+            margin = BOX_MARGIN * (high - low) / COARSE_CELLS
+            new_low = np.maximum(places.min(axis=0) - margin, low)
+            new_high = np.minimum(places.max(axis=0) + margin, high)
+            has_shrunk = np.any(new_high - new_low < BOX_SHRINKAGE * (high - low))
+            low, high = new_low, new_high
+            if not has_shrunk:
+                self.progress.add(BOX_SEARCHES - 1 - search)
                 break
-        return low, high, found
+        return low, high, layers
 
     def _fill_coarse(self, low: Array, high: Array) -> list[Grid]:
-        """Reach what can be reached in a box, beginning at the nearest section that is straight above or below."""
-        heights = middles(float(low[self.third]), float(high[self.third]), LOOK)
+        """Reach what can be reached in a box, from the nearest section straight above or below the start."""
+        heights = cell_centres(float(low[self.normal]), float(high[self.normal]), COARSE_CELLS)
         self.spacing = float(heights[1] - heights[0])
-        layers = [self._grid(low, high, LOOK) for _ in heights]
+        layers = [self._make_grid(low, high, COARSE_CELLS) for _ in heights]
         start = nodes_at(self.task, self.start[None])
-        for first in np.argsort(np.abs(heights - self.middle[self.third])):
-            begun, arrived = follow(self.task, start, self._up(heights[first] - self.middle[self.third], 1))
+        for first in np.argsort(np.abs(heights - self.middle[self.normal])):
+            nodes, arrived = follow(self.task, start, self._normal_step(heights[first] - self.middle[self.normal], 1))
             if arrived[0]:
-                layers[first] = fill(layers[first].domain, begun.q_tree[0], HURRIED)
+                layers[first] = fill_grid(layers[first].domain, nodes.q_tree[0], COARSE_FRACTION)
                 break
-        tried, more = np.zeros((LOOK, 2, LOOK**2), bool), True
-        while more:  # up, then down
-            more = False
-            for side, upward in enumerate((1, -1)):
-                for k in range(LOOK - 1)[::upward]:
-                    source, target = (k, k + 1) if upward > 0 else (k + 1, k)
-                    way = heights[target] - heights[source]
-                    more |= self._pass_on(layers[source], layers[target], way, tried[source, side])
+        tried, has_new = np.zeros((COARSE_CELLS, 2, COARSE_CELLS**2), bool), True
+        while has_new:
+            has_new = False
+            for side, order in enumerate((1, -1)):  # up, then down
+                for k in range(COARSE_CELLS - 1)[::order]:
+                    source, target = (k, k + 1) if order > 0 else (k + 1, k)
+                    step = heights[target] - heights[source]
+                    has_new |= self._reach_next_layer(layers[source], layers[target], step, tried[source, side])
         return layers
 
-    def _pass_on(self, source: Grid, target: Grid, way: float, tried: BoolArray) -> bool:
-        """Reach cells of a section straight from the one beside it, then from there; say whether there were any."""
-        open_ = np.flatnonzero(source.reached & ~target.reached & ~tried)
-        if not len(open_):
+    def _reach_next_layer(self, source: Grid, target: Grid, step: float, tried: BoolArray) -> bool:
+        """Reach cells of a section straight from the section next to it, then their neighbours; return if any were."""
+        cells = np.flatnonzero(source.reached & ~target.reached & ~tried)
+        if not len(cells):
             return False
-        tried[open_] = True
-        nodes, arrived = follow(self.task, source.nodes(open_), self._up(way, len(open_)), HURRIED)
-        target.put(open_[arrived], nodes[arrived])
-        flood(target, 1, HURRIED, open_[arrived], AROUND)
+        tried[cells] = True
+        nodes, arrived = follow(self.task, source.nodes(cells), self._normal_step(step, len(cells)), COARSE_FRACTION)
+        target.store(cells[arrived], nodes[arrived])
+        flood_grid(target, 1, COARSE_FRACTION, cells[arrived], ALL_DIRECTIONS)
         return bool(np.any(arrived))
 
-    def section(self, low: Array, high: Array, cells: int, height: float, coarse: Sequence[Grid]) -> Grid:
-        """Reach what can be reached of a section, beginning from all that is reached right above and below it."""
-        grid = self._grid(low, high, cells)
+    def _fill_section(self, low: Array, high: Array, cells: int, height: float, coarse: Sequence[Grid]) -> Grid:
+        """Reach what can be reached of a section, starting from everything in the coarse stack just above and below."""
+        grid = self._make_grid(low, high, cells)
         for layer in coarse:
-            near = np.flatnonzero(layer.reached & (np.abs(layer.given[:, self.third] - height) <= NEAR * self.spacing))
-            target = grid.domain.nearest(layer.given[near][:, self.over])
-            way = self._up(height - layer.given[near, self.third], len(near))
-            way[:, self.over] = grid.domain.values(target) - layer.given[near][:, self.over]
-            nodes, arrived = follow(self.task, layer.nodes(near), way, HURRIED)
-            grid.put(grid.flat(target[arrived]), nodes[arrived])
-        flood(grid, 1, MIN_PIECE, ways=AROUND)  # pieces may be narrower than a cell
-        self.steps.step()
+            distance = np.abs(layer.values[:, self.normal] - height)
+            starts = np.flatnonzero(layer.reached & (distance <= START_DISTANCE * self.spacing))
+            target = grid.domain.nearest_cells(layer.values[starts][:, self.over])
+            way = self._normal_step(height - layer.values[starts, self.normal], len(starts))
+            way[:, self.over] = grid.domain.values(target) - layer.values[starts][:, self.over]
+            nodes, arrived = follow(self.task, layer.nodes(starts), way, COARSE_FRACTION)
+            grid.store(grid.numbers(target[arrived]), nodes[arrived])
+        # Diagonal neighbours are tried, too, because pieces may be narrower than a cell.
+        flood_grid(grid, 1, MIN_PIECE, directions=ALL_DIRECTIONS)
+        self.progress.add()
         return grid
 
-    def _grid(self, low: Array, high: Array, cells: int) -> Grid:
-        axes = tuple(
-            Axis(NAMES[k], "m", float(low[k]), float(high[k]), False, middles(float(low[k]), float(high[k]), cells))
-            for k in self.over
-        )
+    def _make_grid(self, low: Array, high: Array, cells: int) -> Grid:
+        ends = [(AXIS_NAMES[k], float(low[k]), float(high[k])) for k in self.over]
+        axes = tuple(Axis(name, "m", a, b, False, cell_centres(a, b, cells)) for name, a, b in ends)
         return Grid(Domain(self.task, self.over, axes))
 
-    def _up(self, way: float | Array, count: int) -> Array:
-        change = np.zeros((count, 3))
-        change[:, self.third] = way
-        return change
+    def _normal_step(self, step: float | Array, count: int) -> Array:
+        """Return a step (count, 3) of the point across the sections."""
+        steps = np.zeros((count, 3))
+        steps[:, self.normal] = step
+        return steps
 
-    def value(self, grid: Grid, seconds: float) -> SingularityMap:
-        """Trace a section's loci and return it as a map."""
-        loci = [located(self.extended, locus) for locus in find_loci(self.extended, grid.domain, [grid], True)]
-        self.steps.step()
-        return map_value(self.extended, "cartesian", [grid], loci, more_branches=True, seconds=seconds)
+    def make_section(self, grid: Grid, seconds: float) -> SingularityMap:
+        """Trace the loci of a filled section, and return it as a map."""
+        loci = find_loci(self.extended, grid.domain, [grid], is_cartesian=True)
+        self.progress.add()
+        loci = [add_positions(self.extended, locus) for locus in loci]
+        return make_map(self.extended, "cartesian", [grid], loci, more_branches=True, seconds=seconds)

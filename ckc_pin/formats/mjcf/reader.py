@@ -50,7 +50,7 @@ def read_mjcf(text: str, path: Path) -> Draft:
     name = choose_name(path, document.root.get("model", ""))
     tree.robot.set("name", name)
     has_medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
-    disabled = _disabled_effects(compiled)
+    disabled = _disabled_features(compiled)
     return Draft(
         name,
         f"{path.name}, a MuJoCo model",
@@ -73,13 +73,17 @@ def read_mjcf(text: str, path: Path) -> Draft:
             *actuators.left_out,
             *document.left_out,
             *(["forces of the medium (wind, density, viscosity)"] if has_medium else []),
-            *(f"the model's flag that disables {effect}: they act here" for effect in disabled if effect != "gravity"),
+            *(
+                f"the model's flag that disables {feature}: they act here"
+                for feature in disabled
+                if feature != "gravity"
+            ),
         ],
     )
 
 
-def _disabled_effects(compiled: Compiled) -> list[str]:
-    """Return the effects that flags of the model disable and that a mechanism has."""
+def _disabled_features(compiled: Compiled) -> list[str]:
+    """Return the features of a mechanism that flags of the model disable."""
     bits = compiled.mujoco.mjtDisableBit
     flags = {
         "gravity": bits.mjDSBL_GRAVITY,
@@ -89,7 +93,7 @@ def _disabled_effects(compiled: Compiled) -> list[str]:
         "dry friction": bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_CONSTRAINT,
         "ranges of joints": bits.mjDSBL_LIMIT | bits.mjDSBL_CONSTRAINT,
     }
-    return [effect for effect, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]
+    return [feature for feature, bit in flags.items() if compiled.model.opt.disableflags & int(bit)]
 
 
 # --- actuators -----------------------------------------------------------------------------------------------------
@@ -130,8 +134,8 @@ class _Actuators:
                     motors.append(_motor(compiled, k, compiled.joints[joint]))
                 with_gains += [] if _is_direct_drive(compiled, k) else [compiled.joints[joint]]
         has_duplicate_names = len({motor.name for motor in motors}) < len(motors)
-        all_plain = all(motor.ratio == 1.0 and motor.torque_limit is None for motor in motors)
-        self.motors = [] if has_duplicate_names or all_plain else motors
+        all_direct = all(motor.ratio == 1.0 and motor.torque_limit is None for motor in motors)
+        self.motors = [] if has_duplicate_names or all_direct else motors
         if with_gains:
             joints = list_names(list(dict.fromkeys(with_gains)))
             self.left_out.append(f"gains and curves of actuators, whose joints have motors instead: {joints}")

@@ -135,7 +135,7 @@ class _Joint:
         )
 
     @property
-    def effects(self) -> list[str]:
+    def nonzero_properties(self) -> list[str]:
         """MuJoCo's names of the properties that produce forces or inertia at the joint."""
         values = {
             "damping": self.damping,
@@ -161,7 +161,7 @@ def _is_free_root(joints: Sequence[_Joint]) -> bool:
     """
     if [joint.kind for joint in joints] != ["slide", "slide", "slide", "ball"] or joints[3].position.any():
         return False
-    if any(set(joint.effects) - {"range"} for joint in joints):
+    if any(set(joint.nonzero_properties) - {"range"} for joint in joints):
         return False
     axes = np.array([joint.axis for joint in joints[:3]])
     return bool(np.abs(axes @ axes.T - np.eye(3)).max() < ORTHOGONAL_TOLERANCE)
@@ -262,8 +262,8 @@ class MjcfTree:
         joints = [_Joint.read(self.compiled, first + k) for k in range(model.body_jntnum[number])]
         on_world = model.body_parentid[number] == 0
         if [joint.kind for joint in joints] == ["free"]:
-            if joints[0].effects:
-                self.left_out.append(f"{', '.join(joints[0].effects)} of free joint {joints[0].name}")
+            if joints[0].nonzero_properties:
+                self.left_out.append(f"{', '.join(joints[0].nonzero_properties)} of free joint {joints[0].name}")
             qpos = self._start[joints[0].qpos_index :]
             pose = self._add_free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
         elif on_world and _is_free_root(joints) and not self.used_joints & {joint.number for joint in joints}:
@@ -353,8 +353,8 @@ class MjcfTree:
         self.guessed.append(
             f"ball joint {joint.name} is three hinges, {', '.join(names)}: singular where {names[1]} is +-90 degrees"
         )
-        if joint.effects:
-            self.left_out.append(f"{', '.join(joint.effects)} of ball joint {joint.name}")
+        if joint.nonzero_properties:
+            self.left_out.append(f"{', '.join(joint.nonzero_properties)} of ball joint {joint.name}")
 
     def _set_guess(self, labels: Iterable[str], values: Iterable[Any]) -> None:
         rounded = {label: round_number(float(x)) for label, x in zip(labels, values, strict=True)}
