@@ -1,4 +1,4 @@
-"""Terms at one state, and the formulations as functions of them."""
+"""Terms of the equations of motion at one state, the formulations as functions of them, equilibria, and wrenches."""
 
 from ckc_pin.dynamics.equilibrium import h_gradient, stable_equilibrium
 from ckc_pin.dynamics.formulations import (

@@ -1,6 +1,6 @@
-"""The three formulations as functions of `Terms`: the DAE (eq. 1), the reduced model (eq. 6), the SPF (eq. 8).
+"""The three formulations as functions of `Terms`: the DAE (eq. 1), the reduced model (eq. 6) and the SPF (eq. 8).
 
-In every one of them u' is the generalized force of the actuators on the tree; u = rho^T u'.
+In all of them u' is the generalized force of the actuators on the tree, and u = rho^T u'.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = [
     "dae_acceleration",
     "multipliers",
     "reduced_acceleration",
-    "refuse_massless",
+    "require_mass",
     "spf_terms",
     "spf_z_dot",
     "tangent_basis",
@@ -30,20 +30,22 @@ __all__ = [
 
 CoriolisVelocity = Literal["rho", "actual"]
 
-SINGULAR = 1e-12  # relative size of the last pivot of J^T at which its rank counts as lost
+MIN_PIVOT = 1e-12  # of the largest pivot of J: below it J has lost rank
+MIN_INERTIA_RATIO = 1e-12  # of the largest root of a diagonal entry of D: below it the coordinate moves no mass
+MIN_INERTIA_EIGENVALUE = 1e-13  # of D with ones on its diagonal: below it a motion moves no mass
 
 
 def reduced_acceleration(terms: Terms, u_tree: Array, q_dot: Array | None = None) -> Array:
-    """Solve eq. 6 (and the first line of eq. 8) for the acceleration of q.
+    """Return the acceleration of q from the reduced model, eq. 6, or from the first line of the SPF, eq. 8.
 
     Parameters
     ----------
     terms : Terms
-        At v' = rho q_dot; or, with `q_dot` given, at any v' that C is to be evaluated at.
+        At v' = rho q_dot. If `q_dot` is given, at the velocity at which C is evaluated.
     u_tree : (n,) array
         Generalized forces of the actuators.
     q_dot : (d,) array, optional
-        Needed when v' is not rho q_dot (the SPF off its manifold, eq. 16's convention).
+        Required if v' is not rho q_dot: for the SPF off its manifold with the convention of eq. 16.
 
     Returns
     -------
@@ -51,7 +53,7 @@ def reduced_acceleration(terms: Terms, u_tree: Array, q_dot: Array | None = None
     """
     force = u_tree - terms.bias_tree
     if q_dot is None:
-        # rho^T (D' rho_dot q_dot + C' v' + h') needs neither C' nor the matrix rho_dot
+        # rho^T (D' rho_dot q_dot + C' v' + h') requires neither C' nor the matrix rho_dot.
         force -= terms.D_tree @ terms.rho_dot_times(terms.q_dot)
         right = terms.rho.T @ force
     else:
@@ -62,17 +64,17 @@ def reduced_acceleration(terms: Terms, u_tree: Array, q_dot: Array | None = None
 
 
 def spf_z_dot(at: Kinematics, q_dot: Array, epsilon: float, w: Array) -> Array:
-    """Second line of eq. 8: z_dot = -phi_z^-1 (phi_q q_dot + w / epsilon), shape (n - d,)."""
+    """Return z_dot of the SPF, second line of eq. 8: -phi_z^-1 (phi_q q_dot + w / epsilon), shape (n - d,)."""
     return at.rho[at.partition.z] @ q_dot - at.phi_z_factor.solve(w) / epsilon
 
 
 def spf_terms(
     mechanism: Mechanism, at: Kinematics, q_dot: Array, epsilon: float, w: Array, convention: CoriolisVelocity
 ) -> Terms:
-    """Terms of the SPF at (q, z, q_dot).
+    """Return the terms of the SPF at (q, z, q_dot).
 
-    Eq. 8 writes C(q, z, q_dot): the velocity inside C is rho q_dot ("rho"). Eq. 16 writes
-    C(q, q_dot, z, z_dot), with the actual z_dot ("actual"), which contains w / epsilon.
+    Eq. 8 has C(q, z, q_dot), with the velocity rho q_dot in C ("rho"). Eq. 16 has C(q, q_dot, z, z_dot), with the
+    actual z_dot ("actual"), which contains w / epsilon.
     """
     v_tree = at.rho @ q_dot
     if convention == "actual":
@@ -81,19 +83,19 @@ def spf_terms(
 
 
 def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
-    """Split the tangent space and meet a condition on J.
+    """Return a basis of the null space of J and a solution of J x = -residual.
 
     Parameters
     ----------
     residual : (rows,) array, or (rows, k)
-        For example J_dot v'; with redundant rows consistent, as every motion makes it.
+        For example J_dot v'. Consistent if rows of J are redundant, as for every motion.
 
     Returns
     -------
     tangent : (n, d) array
         Basis of the velocities that the loops allow.
     particular : (n,) array, or (n, k)
-        An x with J x = -residual.
+        A solution x of J x = -residual.
 
     Raises
     ------
@@ -102,7 +104,7 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     """
     mechanism = terms.mechanism
     tangent, particular, pivots = null_space(terms.at.J, mechanism.rank, residual)
-    if mechanism.rank and not pivots[-1] > SINGULAR * pivots[0]:
+    if mechanism.rank and not pivots[-1] > MIN_PIVOT * pivots[0]:
         raise NumericalError(
             "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
             q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.q_tree)),
@@ -111,11 +113,11 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
 
 
 def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
-    """Solve eq. 1 with its closure differentiated twice, J a + J_dot v' + correction = 0, for a = dv'/dt, shape (n,).
+    """Return the acceleration dv'/dt of the DAE, eq. 1 with J a + J_dot v' + correction = 0, shape (n,).
 
-    The motion is projected on the tangent space of the closure, so no choice of q is involved,
-    redundant rows do no harm, and massless links do none as long as D' is regular on that space.
-    `correction`, shape (rows,), is what Baumgarte's stabilisation adds.
+    The equations are projected onto the null space of J. Redundant rows and massless links are therefore allowed, as
+    long as D' is regular on that space, and no choice of q is involved. `correction`, shape (rows,), is the term of
+    Baumgarte's stabilisation.
 
     Raises
     ------
@@ -132,24 +134,24 @@ def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.
 
 
 def multipliers(terms: Terms, u_tree: Array, acceleration: Array) -> Array:
-    """Multipliers of eq. 1, D' a + C' v' + h' = u' + J^T lambda, of minimum norm, shape (rows,).
+    """Return the minimum-norm multipliers of eq. 1, D' a + C' v' + h' = u' + J^T lambda, shape (rows,).
 
-    For point rows they are the force that the loop exerts on frame A, in newtons.
+    For point rows they are the force of the loop on frame A, in newtons.
     """
     force = tree_force(terms, acceleration) - u_tree
     return np.asarray(np.linalg.lstsq(terms.at.J.T, force, rcond=1e-9)[0])
 
 
 def tree_force(terms: Terms, acceleration: Array) -> Array:
-    """What actuators and loops together must do to the tree, D' a + C' v' + h' less what dampers do: shape (n,)."""
+    """Return the force of actuators and loops for an acceleration, D' a + C' v' + h' minus damping, shape (n,)."""
     force = terms.D_tree @ acceleration + terms.bias_tree
     return force - terms.damping_force if terms.mechanism.springs.any_damping else force
 
 
-def refuse_massless(terms: Terms, tangent: Array, among: IntArray) -> None:
-    """Refuse motions that move no mass. Massless links are fine as long as every motion moves some.
+def require_mass(terms: Terms, tangent: Array, among: IntArray) -> None:
+    """Require that every motion moves mass. Massless links are allowed if every motion also moves a link with mass.
 
-    Judged on the inertia with its diagonal scaled to one, so that neither units nor ratios of masses matter.
+    The inertia is scaled to a diagonal of ones, so that units and ratios of masses do not matter.
 
     Parameters
     ----------
@@ -157,22 +159,23 @@ def refuse_massless(terms: Terms, tangent: Array, among: IntArray) -> None:
     tangent : (n, d) array
         Basis of the motions.
     among : int array
-        Coordinates that the motion is named by.
+        Coordinates by which the message names a motion.
 
     Raises
     ------
     InputError
+        A motion moves no mass.
     """
     D = tangent.T @ terms.D_tree @ tangent
     scale = np.sqrt(np.maximum(np.diagonal(D), 0.0))
     motion = np.eye(len(D))[int(np.argmin(scale))]
-    if scale.min() > 1e-12 * scale.max():
+    if scale.min() > MIN_INERTIA_RATIO * scale.max():
         values, directions = np.linalg.eigh(D / np.outer(scale, scale))
-        if values[0] > 1e-13:
+        if values[0] > MIN_INERTIA_EIGENVALUE:
             return
         motion = directions[:, 0] / scale
-    most = among[int(np.argmax(np.abs(tangent @ motion / terms.mechanism.tree.step_scale)[among]))]
+    largest = among[int(np.argmax(np.abs(tangent @ motion / terms.mechanism.tree.step_scale)[among]))]
     raise InputError(
-        f"{terms.mechanism.name}: the motion along {terms.mechanism.coordinates[most]} moves no mass, so no force can "
-        "tell its acceleration; give the links it moves a mass and an inertia, or make the joint fixed"
+        f"{terms.mechanism.name}: the motion along {terms.mechanism.coordinates[largest]} moves no mass, so its "
+        "acceleration is not determined; give the links it moves a mass and an inertia, or make the joint fixed"
     )

@@ -1,8 +1,8 @@
-"""All terms at one state, each computed when first asked for.
+"""Terms of the equations of motion at one state, each computed at its first use.
 
-Everything that the formulations, the controllers and the monitors need at one state (q', v') is a
-property here under the paper's name. An acceleration asks for D', the bias and J, never for C'; a
-controller that needs C' asks for it, and it is computed then.
+All quantities that formulations, controllers and monitors need at a state (q', v') are properties of `Terms`, under
+the paper's names. An acceleration requires D', the bias and J, but not the matrix C', so C' is computed only for a
+controller that uses it.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ SERIALIZED_TERMS = ("D_tree", "C_tree", "h_tree", "phi", "rho", "rho_dot", "D", 
 
 
 class Terms(HasSummary):
-    """Dynamics of a mechanism at one state.
+    """Terms of the equations of motion of a mechanism at one state.
 
     Parameters
     ----------
     mechanism : Mechanism
     at : Kinematics
-        The closure's terms at q'.
+        The constraint terms at q'.
     v_tree : (n,) array
-        Velocity v' in tangent coordinates; what C', rho_dot and the bias are evaluated at.
+        Velocity v' in tangent coordinates, at which C', rho_dot and the bias are evaluated.
 
     Notes
     -----
-    Pinocchio's workspace is shared, so results are copied (`Tree.evaluate`). Units are SI; D' is (n, n), D is (d, d).
+    Units are SI. Results are copies, since Pinocchio's workspace is shared (`Tree.evaluate`).
     """
 
     def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array) -> None:
@@ -52,7 +52,7 @@ class Terms(HasSummary):
         self.v_tree = v_tree
 
     def summary(self) -> Summary:
-        """Return what there is to see of it: the state, and what it can be asked for."""
+        """Return the state, energy and closure error, and the names and shapes of the terms."""
         mechanism, tree = self.mechanism, self.mechanism.tree
         names, n, d = mechanism.coordinates, mechanism.n, mechanism.d
         rows: list[Row] = [
@@ -63,7 +63,7 @@ class Terms(HasSummary):
             ("of the tree", [f"D_tree {n, n}", f"C_tree {n, n}", f"h_tree ({n},)"]),
             ("reduced", [f"D {d, d}", f"C {d, d}", f"h ({d},)", f"rho {n, d}", f"rho_dot {n, d}"]),
         ]
-        return Summary(f"Terms of {mechanism.name} at a state, each computed when first asked for", rows)
+        return Summary(f"Terms of {mechanism.name} at a state, each computed at its first use", rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return state and terms as JSON-ready data; this computes all of them."""
@@ -83,45 +83,45 @@ class Terms(HasSummary):
 
     @lazy
     def D_tree(self) -> Array:
-        """D', inertia of the open chains, shape (n, n)."""
+        """Inertia matrix D' of the tree, shape (n, n)."""
         return self.mechanism.tree.evaluate(pin.crba, self.q_tree)
 
     @lazy
     def C_tree(self) -> Array:
-        """C', the Christoffel matrix, shape (n, n)."""
+        """Coriolis matrix C' of the tree from Christoffel symbols, shape (n, n)."""
         return self.mechanism.tree.evaluate(pin.computeCoriolisMatrix, self.q_tree, self.v_tree)
 
     @lazy
     def h_tree(self) -> Array:
-        """h', gravity of the tree and its springs, whatever has a potential: shape (n,)."""
+        """Generalized gravity h' of the tree, including springs and constant forces, shape (n,)."""
         h = self.mechanism.tree.evaluate(pin.computeGeneralizedGravity, self.q_tree)
         return h - self.spring_force if self.mechanism.springs.any else h
 
     @lazy
     def bias_tree(self) -> Array:
-        """C' v' + h' without the matrix C', shape (n,)."""
+        """C' v' + h', computed without the matrix C', shape (n,)."""
         bias = self.mechanism.tree.evaluate(pin.nonLinearEffects, self.q_tree, self.v_tree)
         return bias - self.spring_force if self.mechanism.springs.any else bias
 
     @lazy
     def spring_force(self) -> Array:
-        """Generalized force of the springs, shape (n,)."""
+        """Generalized force of springs and constant forces, shape (n,)."""
         return self.mechanism.springs.elastic_force(self.q_tree)
 
     @lazy
     def damping_force(self) -> Array:
-        """Generalized force of dampers and of the URDF's viscous joint damping, shape (n,)."""
+        """Generalized force of dampers and viscous joint damping, shape (n,)."""
         return self.mechanism.springs.damping_force(self.q_tree, self.v_tree)
 
     @lazy
     def energy(self) -> float:
-        """Kinetic energy of the tree at v', potential energy and what springs store, joules."""
+        """Kinetic energy at v' plus potential energy, joules."""
         kinetic = 0.5 * float(self.v_tree @ self.D_tree @ self.v_tree)
         return kinetic + self.potential_energy
 
     @lazy
     def potential_energy(self) -> float:
-        """V(q'), joules, zero at the world's origin."""
+        """Potential energy of gravity, springs and constant forces, joules; gravity's is zero at the world's origin."""
         gravity = float(self.mechanism.tree.evaluate(pin.computePotentialEnergy, self.q_tree))
         return gravity + self.mechanism.springs.energy(self.q_tree)
 
@@ -132,7 +132,7 @@ class Terms(HasSummary):
 
     @lazy
     def q_dot(self) -> Array:
-        """Their rates, shape (d,)."""
+        """Independent velocities q_dot, shape (d,)."""
         return self.v_tree[self.at.partition.q]
 
     # --- the closure, eqs. 1 to 5 ----------------------------------------------------------------
@@ -144,7 +144,7 @@ class Terms(HasSummary):
 
     @property
     def rho(self) -> Array:
-        """Rho of eq. 5, shape (n, d)."""
+        """Rho of eq. 5, shape (n, d): v' = rho q_dot."""
         return self.at.rho
 
     @lazy
@@ -154,13 +154,13 @@ class Terms(HasSummary):
 
     @lazy
     def rho_dot(self) -> Array:
-        """Time derivative of rho along v', shape (n, d): J rho = 0 gives phi_z rho_dot_z = -J_dot rho."""
+        """Time derivative of rho along v', shape (n, d), from J rho = 0: phi_z rho_dot_z = -J_dot rho."""
         rho_dot = np.zeros_like(self.rho)
         rho_dot[self.at.partition.z] = -self.at.phi_z_factor.solve(self.J_dot @ self.rho)
         return rho_dot
 
     def rho_dot_times(self, x: Array) -> Array:
-        """Return rho_dot x, shape (n,), without the matrix."""
+        """Return rho_dot x, shape (n,), without computing the matrix rho_dot."""
         product = np.zeros(len(self.rho))
         product[self.at.partition.z] = -self.at.phi_z_factor.solve(self.J_dot @ (self.rho @ x))
         return product
@@ -169,7 +169,7 @@ class Terms(HasSummary):
 
     @lazy
     def D(self) -> Array:
-        """Inertia of the reduced model, rho^T D' rho, shape (d, d)."""
+        """Inertia matrix of the reduced model, D = rho^T D' rho, shape (d, d)."""
         return self.rho.T @ self.D_tree @ self.rho
 
     @lazy
@@ -179,37 +179,37 @@ class Terms(HasSummary):
 
     @lazy
     def C(self) -> Array:
-        """C = rho^T (D' rho_dot + C' rho), shape (d, d)."""
+        """Coriolis matrix of the reduced model, C = rho^T (D' rho_dot + C' rho), shape (d, d)."""
         return self.rho.T @ (self.D_tree @ self.rho_dot + self.C_tree @ self.rho)
 
     @lazy
     def h(self) -> Array:
-        """Reduced gravity vector, rho^T h', shape (d,)."""
+        """Gravity vector of the reduced model, h = rho^T h', shape (d,)."""
         return self.rho.T @ self.h_tree
 
     def C_times(self, x: Array) -> Array:
-        """Return C x, shape (d,), without the matrix C."""
+        """Return C x, shape (d,), without computing the matrix C."""
         return self.rho.T @ (self.D_tree @ self.rho_dot_times(x) + self.C_tree @ (self.rho @ x))
 
 
 def terms(mechanism: Mechanism | str | Path, q: Mapping[str, float], v: Mapping[str, float] | None = None) -> Terms:
-    """Return all terms at one state.
+    """Return the terms of the equations of motion at one state.
 
     Parameters
     ----------
     mechanism : Mechanism, or a name or path as for `load`
     q : {coordinate: value}
-        The independent coordinates alone: sigma closes the loops, on the assembled branch. All
-        coordinates: taken as they are, on the closure or off it.
+        Either the independent coordinates: sigma closes the loops, on the assembled branch. Or all coordinates: they
+        are used as they are, whether they close the loops or not.
     v : {coordinate: value}, optional
-        The independent rates alone (absent ones are zero): v' = rho q_dot. All: as they are.
+        Either independent velocities, zero by default: v' = rho q_dot. Or all velocities, used as they are.
 
     Raises
     ------
     InputError
-        Unknown or missing coordinates, values that are not finite, q out of reach.
+        Unknown or missing coordinates, values that are not finite numbers, or q out of reach.
     NumericalError
-        q is singular.
+        The configuration is singular.
     """
     mechanism = as_mechanism(mechanism, "terms")
     v = {} if v is None else v
@@ -228,17 +228,17 @@ def _kinematics_at(mechanism: Mechanism, q: Mapping[str, float]) -> Kinematics:
     if set(q) >= set(mechanism.coordinates):
         numbers = mechanism.vector(q, mechanism.coordinates, "q")
         return mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-    partly = [name for name in q if name in mechanism.dependent]
-    if partly:
+    dependent = [name for name in q if name in mechanism.dependent]
+    if dependent:
         raise InputError(
-            f"q: give the independent coordinates alone ({', '.join(mechanism.independent)}) or all of them "
-            f"({', '.join(mechanism.coordinates)}); {partly[0]!r} alone does not fit"
+            f"q: expected the independent coordinates ({', '.join(mechanism.independent)}) or all coordinates "
+            f"({', '.join(mechanism.coordinates)}), got {dependent[0]!r} without the others"
         )
-    wanted = mechanism.vector(q, mechanism.independent, "q")
-    found = sigma(mechanism, wanted)
-    if found.verdict == "converged":
-        return found.at
-    where = ", ".join(f"{name} = {x:g}" for name, x in zip(mechanism.independent, wanted, strict=True))
-    if found.verdict == "singular":
-        raise NumericalError(f"q: {where} is singular: {found.reason}", q_tree=dict(q))
-    raise InputError(f"q: {where} is out of reach: {found.reason}")
+    values = mechanism.vector(q, mechanism.independent, "q")
+    solution = sigma(mechanism, values)
+    if solution.verdict == "converged":
+        return solution.at
+    where = ", ".join(f"{name} = {x:g}" for name, x in zip(mechanism.independent, values, strict=True))
+    if solution.verdict == "singular":
+        raise NumericalError(f"q: {where} is singular: {solution.reason}", q_tree=dict(q))
+    raise InputError(f"q: {where} is out of reach: {solution.reason}")

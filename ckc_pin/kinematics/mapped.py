@@ -1,4 +1,4 @@
-"""A singularity map as a plain value: what an analysis computes and a figure draws."""
+"""The singularity map of a mechanism as data: workspace, branches and curves of singular configurations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Kind = Literal["locked", "fold", "rank loss", "serial"]
 
 POINT_TOLERANCE = 1e-9  # rad or m; a locus of a smaller extent in the map is a point
 
-# In the paper's terms and in those of parallel robots.
+# Types of singular configurations, in the paper's terms and in those of parallel robots.
 LABELS: dict[Kind, str] = {
     "locked": "type 1: parallel (second kind), q locked",
     "fold": "type 2: parallel (second kind), two branches meet",
@@ -28,7 +28,7 @@ LABELS: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Axis:
-    """One direction of a map.
+    """One axis of a map.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class Axis:
     unit : "rad" or "m"
     low, high : float
     turns : bool
-        Whether both ends are the same, a full turn apart.
+        Whether the axis is a full turn, so that both ends are the same.
     values : (count,) array
-        The middles of the cells.
+        Centres of the cells.
     """
 
     name: str
@@ -52,20 +52,20 @@ class Axis:
 
 @dataclass(frozen=True)
 class Aspect:
-    """What one branch reaches without a singular configuration on the way.
+    """The region that one branch reaches without passing a singular configuration.
 
-    In the joint space an assembly branch; in the Cartesian space a working mode.
+    A branch is an assembly branch in joint space, and a working mode in Cartesian space.
 
     Attributes
     ----------
     reached : (n_1, n_2) array of bool
         n_2 = 1 in a map over one coordinate.
     det_phi_z : (n_1, n_2) array
-        NaN where not reached. The smallest singular value where phi_z is not square.
+        NaN where not reached. The smallest singular value if phi_z is not square.
     q_tree : (n_1, n_2, nq) array
         The configurations, NaN where not reached.
     point : (n_1, n_2, 3) array or None
-        Where the mechanism's point is, metres.
+        Position of the mechanism's point, metres.
     """
 
     reached: BoolArray
@@ -76,21 +76,21 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Locus:
-    """A curve of singular configurations, a point of the map where q is locked or the map has one axis.
+    """A curve of singular configurations; a point where q is locked, or in a map over one axis.
 
     Attributes
     ----------
     kind : "locked" (type 1), "fold" (type 2), "rank loss" or "serial"
     q_tree : (m, nq) array
-        Along the curve.
+        Configurations along the curve.
     at : (m, axes) array
-        Its place in the map, angles not wrapped.
+        Coordinates in the map; angles are not wrapped.
     point : (m, 3) array or None
     on : (aspects, m) array of bool
-        Which parts of it are seen from which aspect.
+        Whether each aspect borders on each point of the curve.
     closed : bool
     residual : float
-        Largest residual of the equations solved, m and rad.
+        Largest residual of the singularity equations, m and rad.
     """
 
     kind: Kind
@@ -109,15 +109,15 @@ class Locus:
 
 @dataclass(frozen=True)
 class Approach:
-    """Where a trajectory comes closest to a locus, in the map's units.
+    """The closest approach of a trajectory to a locus, in the units of the map.
 
     Attributes
     ----------
     locus : int
-        Its number.
+        Number of the locus.
     distance, t : float
     at, to : (axes,) arrays
-        Places of the trajectory and of the locus.
+        Nearest points of the trajectory and of the locus.
     """
 
     locus: int
@@ -129,21 +129,21 @@ class Approach:
 
 @dataclass(frozen=True)
 class Path:
-    """A scene's desired trajectory in the map.
+    """The desired trajectory of a scene in the map.
 
     Attributes
     ----------
     name : str
     t : (m,) array
-        Seconds; in the Cartesian space as far as it can be followed.
+        Seconds; in Cartesian space until the trajectory cannot be followed further.
     at : (m, axes) array
     on : (aspects, m) array of bool
-        Which parts of it are on which aspect.
+        Whether each aspect contains each point of the trajectory.
     leaves_at : float or None
     closest_t, sigma_min : float
-        When it comes closest to a singular phi_z, and its smallest singular value then.
+        Time at which phi_z is closest to singular, and its smallest singular value then.
     approaches : tuple of Approach
-        To each locus, the nearest first.
+        The closest approach to each locus, the nearest first.
     """
 
     name: str
@@ -158,28 +158,28 @@ class Path:
 
 @dataclass(frozen=True, repr=False)
 class SingularityMap(HasSummary):
-    """Fig. 2 of any mechanism.
+    """Workspace, branches and singular configurations of a mechanism, as in Fig. 2 of the paper.
 
     Attributes
     ----------
     mechanism : str
     space : "joint" or "cartesian"
     point : str or None
-        Whose serial singularities and places these are.
+        The point for serial singularities and for Cartesian space.
     axes : tuple of Axis
         One or two.
     fixed : dict of str to float
-        The other given values.
+        Values of the coordinates that are not axes.
     measure : "det phi_z" or "sigma_min(phi_z)"
     measure_unit : str
     aspects : tuple of Aspect
-        The assembled one first.
+        The assembled branch first.
     more_branches : bool
-        Whether there are branches beyond those shown.
+        Whether the mechanism has further branches.
     loci : tuple of Locus
     path : Path or None
     seconds : float
-        What the aspects took to compute.
+        Computing time of the aspects, s.
     notes : tuple of str
     """
 
@@ -198,7 +198,7 @@ class SingularityMap(HasSummary):
     notes: tuple[str, ...] = field(default=())
 
     def summary(self) -> Summary:
-        """Return what there is to see of it."""
+        """Return axes, fixed coordinates, branches, loci, the desired trajectory and notes."""
         rows: list[Row] = [(a.name, f"{a.low:.4g} to {a.high:.4g} {a.unit}, {len(a.values)} cells") for a in self.axes]
         rows += (
             [("fixed", format_quantities(list(self.fixed), np.array(list(self.fixed.values()))))] if self.fixed else []
@@ -269,5 +269,5 @@ class SingularityMap(HasSummary):
 
     @property
     def counts(self) -> IntArray:
-        """How many aspects reach each cell, shape (n_1, n_2)."""
+        """Number of aspects that reach each cell, shape (n_1, n_2)."""
         return np.sum([aspect.reached for aspect in self.aspects], axis=0, dtype=np.intp)

@@ -17,7 +17,7 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
-from ckc_pin.dynamics.formulations import refuse_massless
+from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.linear.modes import MIN_DAMPING_RATIO, ComplexArray, Mode, compute_eigenvalues, compute_modes
@@ -330,7 +330,7 @@ def _require_mass(terms: Terms, locked: IntArray) -> None:
     tangent = compute_velocity_basis(terms)
     tangent = tangent @ orthonormal_null_space(tangent[locked] / terms.mechanism.tree.step_scale[locked, None])
     if tangent.shape[1]:
-        refuse_massless(terms, tangent, np.arange(terms.mechanism.n))
+        require_mass(terms, tangent, np.arange(terms.mechanism.n))
 
 
 def _explain_locked(mechanism: Mechanism, locked: IntArray) -> str:

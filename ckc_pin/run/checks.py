@@ -16,7 +16,7 @@ from ckc_pin.control.controllers import (
 )
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
-from ckc_pin.dynamics.formulations import refuse_massless
+from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.sigma import sigma
@@ -65,7 +65,7 @@ def require_runnable(
     with scene.sources.prefix_errors():
         if beyond := describe_stop_violation(mechanism, start.at.q_tree):
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within the stops")
-    refuse_massless(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
+    require_mass(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not is_torque_controller(law):
         require_chart(mechanism, start)
