@@ -1,4 +1,4 @@
-"""Scenes with something wrong in them: exit 2 and one message with the place, the value and what is needed."""
+"""Invalid scenes: exit code 2 and one message with the place, the value and the expected one."""
 
 from __future__ import annotations
 

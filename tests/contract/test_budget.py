@@ -1,4 +1,4 @@
-"""What ends a run early leaves a run: budgets, NaN from a controller, signals at every stage; and bombs."""
+"""Runs that end early keep their results: budgets, NaN of a controller, signals; and decompression bombs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.contract.helpers.under_way import under_way
 
 
 class NanAfter:
-    """No force, and NaN after a time."""
+    """A controller without force that returns NaN after a time."""
 
     def __init__(self, t: float) -> None:
         self.t = t
@@ -46,7 +46,7 @@ def test_nan_of_a_controller_keeps_earlier_results(formulation: str, tmp_path: P
 
 
 def test_step_below_min_step_stops_the_run() -> None:
-    """Where theta_1, theta_3 stop to determine the rest, steps become as short as you like."""
+    """Where theta_1 and theta_3 do not determine the other coordinates, the step size tends to zero."""
 
     class Push:
         def u(self, t: float, terms: Terms) -> Any:
@@ -155,7 +155,7 @@ ckc_pin.cli.main()
 def test_signals_while_saving_leave_a_complete_file(
     t_end: str, first: list[signal.Signals], meanwhile: list[signal.Signals], code: int, status: str, tmp_path: Path
 ) -> None:
-    """Ctrl-C twice at once, or not at all; then more of them while the run is written."""
+    """Two immediate Ctrl-C or none, and more of them while the run is written."""
     words = ["run", "five_bar/swing", "--json", "--out", str(tmp_path), "--set", f"t_end={t_end}"]
     with under_way(CKC, *words) as process:
         assert process.stderr is not None

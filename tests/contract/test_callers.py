@@ -1,4 +1,4 @@
-"""A caller's own functions in the step loop: what they are given, how often, and what becomes of what they raise."""
+"""Controllers and event functions of the caller: arguments, number of calls, and exceptions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NAMES = ("D_tree", "C_tree", "h_tree", "bias_tree", "phi", "J_dot", "rho", "rho_
 
 
 class Own:
-    """The scene's controller as a caller's, who looks at what is given."""
+    """The scene's controller, wrapped by a caller that checks its arguments."""
 
     def __init__(self, inner: Any) -> None:
         self.inner, self.calls, self.kept = inner, 0, []
@@ -144,7 +144,7 @@ def test_event_function_is_called_a_few_times_per_step():
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_simulators_in_threads_are_independent(formulation: str):
-    """Four mechanisms, eight simulators, each with its own u: bit for bit what they do one after the other."""
+    """Eight simulators of four mechanisms give bit for bit the results of sequential execution."""
 
     def walk(number: int) -> Any:
         name = ("five_bar/swing", "delta/default", "four_bar/default", "three_rrr/default")[number % 4]

@@ -1,4 +1,4 @@
-"""What a scene can ask of a run: events, limits, trajectories, controllers from Python, progress, budgets."""
+"""Runs of scenes: events, limits, trajectories, controllers in Python, progress and budgets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EVENTS = [{"coordinate": "theta_2", "value": LEVEL}, {"coordinate": "theta_3", "
 
 @pytest.fixture(scope="module")
 def crossings() -> tuple[list[float], list[float]]:
-    """When theta_2 is LEVEL and when theta_3 turns in `swing`: the appendix in numpy, located by SciPy."""
+    """Times at which theta_2 is LEVEL and theta_3 reverses in `swing`, by SciPy on the appendix in NumPy."""
     start = load_scene("five_bar/swing").spec.initial.q
 
     def rate(t: float, y: Array) -> Array:
@@ -57,7 +57,7 @@ def test_events_are_located(formulation: str, crossings: tuple[list[float], list
 
 @pytest.mark.parametrize("direction", [-1, 1])
 def test_events_of_one_direction(direction: int, crossings: tuple[list[float], list[float]]) -> None:
-    """theta_2 swings back and forth through LEVEL: every other crossing rises, and one does not know the next."""
+    """theta_2 oscillates through LEVEL, so every other crossing rises."""
     event = {"coordinate": "theta_2", "value": LEVEL, "direction": direction}
     found = simulate("five_bar/swing", {"event": [event]})
     first = simulate("five_bar/swing", {"t_end": crossings[0][0] + 0.01})
@@ -94,7 +94,7 @@ def test_torque_limit_clips_tau_and_u(run: Callable[..., Run]) -> None:
 
 
 def test_torque_limit_of_distal_motors(bar: Path) -> None:
-    """The motors on the distal joints: tau is theirs, u = rho^T tau with rho from the appendix."""
+    """With motors on the distal joints, u = rho^T tau with rho from the appendix."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     old = 'actuated = ["theta_1", "theta_3"]'
     assert old in text
@@ -111,7 +111,7 @@ def test_torque_limit_of_distal_motors(bar: Path) -> None:
 
 
 class ByHand:
-    """Eq. 14 with h of the appendix."""
+    """Eq. 14 with the h of the appendix."""
 
     def __init__(self, q_d: Array) -> None:
         self.q_d, self.h = q_d, FIVE_BAR.h(FIVE_BAR.sigma(q_d))
@@ -131,7 +131,7 @@ def test_python_controller_replaces_the_scenes_controller(run: Callable[..., Run
 
 
 def test_desired_trajectory_may_be_a_function(run: Callable[..., Run]) -> None:
-    """Eq. 21 as a Python function against the scene's harmonics, by the same steps: their Jacobians differ."""
+    """Eq. 21 as a Python function compared with the scene's harmonics, with equal steps because Jacobians differ."""
     shipped = run("five_bar/tracking", t_end=0.3, solver__method="DOP853")
     law = Tracking(np.eye(2), 10.0 * np.eye(2), desired)
     own = simulate("five_bar/tracking", {"t_end": 0.3, "solver.method": "DOP853"}, controller=law)
@@ -140,7 +140,7 @@ def test_desired_trajectory_may_be_a_function(run: Callable[..., Run]) -> None:
 
 
 def test_trajectory_file_gives_the_same_run(bar: Path, run: Callable[..., Run]) -> None:
-    """Eq. 21 sampled at 20 ms; columns in another order, blank lines, spaces."""
+    """Eq. 21 sampled at 20 ms, with reordered columns, blank lines and spaces."""
     t = np.arange(0.0, 1.01, 0.02)
     rows = [f"{q[1]!r}, {x!r} ,{q[0]!r}" for x, q in ((float(x), desired(float(x))[0].tolist()) for x in t)]
     (bar / "way.csv").write_text("\n".join(["theta_3,t, theta_1", "", *rows, ""]), encoding="utf-8")

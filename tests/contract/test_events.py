@@ -1,4 +1,4 @@
-"""Events: found however they lie in a step, located on the motion that numpy and SciPy compute."""
+"""Events: all crossings within a step are located, compared with NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_end_on_zero_is_decided_by_the_next_step() -> None:
 
 @pytest.mark.parametrize(("root", "slope"), [(0.3, 1.0), (0.3, -40.0), (0.0007, 1.0), (0.9995, 3.0)])
 def test_root_search_uses_the_cheap_function_first(root: float, slope: float) -> None:
-    """In a function that is off by 1e-7, and then in the right one, which is asked little more than once."""
+    """The root of a function with an error of 1e-7 is refined with the exact function in few evaluations."""
     asked: list[float] = []
 
     def exact(t: float) -> float:
@@ -93,7 +93,7 @@ def test_root_search_uses_the_cheap_function_first(root: float, slope: float) ->
 
 @pytest.mark.parametrize("off", [1e-7, -1e-7])
 def test_exact_function_decides_between_nearly_equal_roots(off: float) -> None:
-    """What costs less crosses twice where the right function does not, or does not where that crosses twice."""
+    """The cheap function has two roots where the exact one has none, or vice versa."""
     for depth in (0.5e-7, -0.5e-7):
         found, _, _ = _core.walk(
             lambda t, depth=depth: (t - 0.3) ** 2 - depth + off, 0.0, 1.0, 0, 0.0,
@@ -109,7 +109,7 @@ def test_exact_function_decides_between_nearly_equal_roots(off: float) -> None:
 
 @pytest.fixture(scope="module")
 def motion() -> Callable[[float], Array]:
-    """(q', v') of `swing` at any time, to some 1e-13."""
+    """(q', v') of `swing` at any time, accurate to about 1e-13."""
     start = load_scene("five_bar/swing").spec.initial.q
 
     def rate(t: float, y: Array) -> Array:
@@ -126,7 +126,7 @@ def motion() -> Callable[[float], Array]:
 
 
 def _roots(function: Callable[[float], float]) -> list[float]:
-    """Sign changes on a fine grid, each closed in by halving."""
+    """Sign changes on a fine grid, refined by bisection."""
     grid = np.linspace(1e-4, T_END, 301)
     values = np.array([function(t) for t in grid])
     roots = []
@@ -145,7 +145,7 @@ def _times(run: Run, **label: Any) -> list[float]:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_two_crossings_in_one_step(formulation: str, motion: Callable[[float], Array]) -> None:
-    """theta_2 turns just beyond the value: loose steps pass over both crossings."""
+    """theta_2 reverses just beyond the value, so large steps contain both crossings."""
     turn = next(t for t in _roots(lambda t: float(motion(t)[5])) if t > 0.05)
     value = float(motion(turn)[1]) - np.sign(motion(turn)[1] - motion(turn - 0.02)[1]) * 2e-4
     wanted = [t for t in _roots(lambda t: float(motion(t)[1] - value)) if abs(t - turn) < 0.02]
@@ -206,7 +206,7 @@ def test_events_do_not_change_the_motion() -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_distant_events_cost_no_evaluations(formulation: str, either_terms: str) -> None:
-    """A coordinate's value is ruled out by what a step knows already: after the first no state in between is closed."""
+    """The step's own data exclude a crossing, so no intermediate state is projected after the first."""
     overrides: dict[str, Any] = {"formulation": formulation, "t_end": 1.0, "solver.output_dt": 1.0}
     plain = simulate("five_bar/swing", overrides, profile=True)
     far = [{"coordinate": "theta_2", "value": 50.0}, {"coordinate": "theta_1", "of": "q_dot", "value": 1e3}]
@@ -263,7 +263,7 @@ def test_event_of_missing_limits_is_rejected(bar: Path) -> None:
 
 
 def test_start_on_the_value_is_no_event() -> None:
-    """From rest: every rate starts at zero; theta_1 starts at the value, and comes back to it once a swing."""
+    """The run starts at rest and theta_1 starts on the value, which it crosses once per swing."""
     start = load_scene("five_bar/swing").spec.initial.q
     observed = [{"coordinate": c, "of": "q_dot"} for c in ("theta_1", "theta_2")]
     run = simulate(
@@ -325,7 +325,7 @@ def test_events_are_in_json_and_in_the_run_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_simulator_reports_events_within_its_steps(formulation: str) -> None:
-    """One that stops ends the step early, and does not happen again at once."""
+    """A stopping event ends the step early and is not repeated at once."""
     overrides = {
         "solver.rtol": 1e-10,
         "formulation": formulation,

@@ -1,4 +1,4 @@
-"""Events that cannot be are refused, each in one message."""
+"""Invalid events are rejected with one message."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_event_function_must_return_a_number(value: Any) -> None:
 
 @pytest.mark.parametrize("kind", [bool, np.bool_], ids=["Python's", "NumPy's"])
 def test_event_function_must_not_return_a_bool(kind: Any) -> None:
-    """From False to True no sign changes: it would never be met."""
+    """A bool has no sign change, so the event would never occur."""
     with pytest.raises(InputError, match=r"the event 'late' gave False; a number that changes sign .* t - 0\.5"):
         simulate("five_bar/swing", {"t_end": 0.1}, events=[Event(lambda t, terms: kind(t > 0.5), name="late")])
 

@@ -1,4 +1,4 @@
-"""What `ckc inverse` promises: keys and shapes, the table, files, where a motion ends, and what it refuses."""
+"""`ckc inverse`: keys and shapes, table, files, end of a motion, and rejected input."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ LINE = (
 
 
 def test_work_along_a_point_path_equals_the_energy() -> None:
-    """Forces do the work that the energy tells."""
+    """The work of the motors equals the change of energy."""
     found = inverse_dynamics("five_bar/tracking", {"controller.desired": {
         "point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 2.0}
     }, "t_end": 1.0, "solver.output_dt": 0.001})  # fmt: skip
@@ -226,7 +226,7 @@ def test_run_with_open_loops_is_rejected() -> None:
 
 
 def test_passive_run_needs_no_motors(bar: Path) -> None:
-    """Nothing is asked of them: loop and joint forces alone are to be told."""
+    """No torque is needed; only loop and joint forces are computed."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'))
     recorded = ckc_pin.simulate(bar / "swing.scene.toml", {"t_end": 0.3})
@@ -240,7 +240,7 @@ def test_passive_run_needs_no_motors(bar: Path) -> None:
 
 
 def test_free_root_needs_no_motor(tmp_path: Path) -> None:
-    """An arm turns on a body that floats: along the body's freedoms the forces are nothing, but for rounding."""
+    """An arm turns on a floating body. Generalized forces along the body's freedoms are zero up to rounding."""
     write(tmp_path, "free", "root.z = 0.5")
     text = (tmp_path / "mechanism.toml").read_text(encoding="utf-8")
     motor = text.replace("[[tree]]", 'actuated = ["turn"]\n[[tree]]')

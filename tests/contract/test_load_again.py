@@ -21,7 +21,7 @@ def mine(folder: Path, name: str = "five_bar") -> Path:
 
 def test_mechanism_is_built_once(tmp_path: Path, monkeypatch) -> None:
     built, assemble_mechanism = [], loading.assemble_mechanism
-    monkeypatch.setattr(loading, "assemble_mechanism", lambda *given: built.append(1) or assemble_mechanism(*given))
+    monkeypatch.setattr(loading, "assemble_mechanism", lambda *args: built.append(1) or assemble_mechanism(*args))
     path = mine(tmp_path)
     first, again = load(path), load(path)
     assert len(built) == 1
@@ -88,7 +88,7 @@ def test_cache_has_a_limited_size(tmp_path: Path, monkeypatch) -> None:
     for path in paths:
         load(path)
     built, assemble_mechanism = [], loading.assemble_mechanism
-    monkeypatch.setattr(loading, "assemble_mechanism", lambda *given: built.append(1) or assemble_mechanism(*given))
+    monkeypatch.setattr(loading, "assemble_mechanism", lambda *args: built.append(1) or assemble_mechanism(*args))
     load(paths[-1]), load(paths[3])
     assert not built
     load(paths[0])

@@ -1,4 +1,4 @@
-"""Files mutated key by key and byte by byte, from fixed seeds: each is used or refused in one line, nothing else."""
+"""Randomly mutated files, from fixed seeds: each is accepted or rejected with one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _places(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def mutated(r: random.Random, data: Any) -> Any:
-    """One value changed, scaled, taken away, doubled or called otherwise."""
+    """Change, scale, remove, duplicate or rename one value."""
     changed = deepcopy(data)
     *way, last = r.choice(list(_places(changed)))
     at = changed
@@ -60,7 +60,7 @@ def mutated(r: random.Random, data: Any) -> Any:
 
 
 def used_or_refused(use: Callable[..., Any], *given: Any) -> None:
-    """Whatever else is raised fails the test, with what was used in its traceback."""
+    """Any other exception fails the test, with the input in its traceback."""
     said = ""
     try:
         use(*given)
@@ -120,7 +120,7 @@ def test_bytes(file: str, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_run_files(tmp_path: Path) -> None:
-    """Key by key with the hashes made right, so that nothing but what is read of them can refuse them."""
+    """Mutate metadata and correct the hashes, so that only the checks of the content can reject them."""
     r, path = random.Random(4), tmp_path / "run.npz"
     event = [{"coordinate": "theta_1", "of": "q_dot"}]
     simulate("five_bar/set_point", {"t_end": 0.03, "event": event}, profile=True).save(path)

@@ -1,4 +1,4 @@
-"""What Python's values show of themselves, and how a run is asked for its parts and handed to other programs."""
+"""Summaries of results, and indexing and export of runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def swing() -> Run:
 
 
 def _values(name: str) -> list[Any]:
-    """What there is of a mechanism, and of its scene."""
+    """Return the results for a mechanism and its scene."""
     mechanism, scene = load(name), load_scene(name, {"t_end": 0.01})
     run, simulator = simulate(scene), Simulator(scene)
     return [mechanism, scene, check(mechanism), check(scene), run, simulator, simulator.state, simulator.state.terms]
@@ -122,7 +122,7 @@ def test_sel_returns_the_nearest_output(swing: Run) -> None:
 
 @pytest.mark.parametrize("velocity", ["rho", "actual"])
 def test_simulator_continues_from_a_state_of_a_run(velocity: str) -> None:
-    """Also off the manifold, where the velocity that C takes is another than the motion's."""
+    """Also off the manifold, where the velocity in C differs from the actual one."""
     overrides = {"formulation": "spf", "epsilon": 0.1, "initial.w": [0.01, -0.02], "coriolis_velocity": velocity,
                "t_end": 0.2, "solver.rtol": 1e-10, "solver.output_dt": 0.1}  # fmt: skip
     run = simulate(SWING, overrides)

@@ -1,4 +1,4 @@
-"""Numbers of a mechanism by name: what they change, what is refused, what a run records."""
+"""Parameters of a mechanism by name: effect, rejected values, and recording in runs."""
 
 from __future__ import annotations
 

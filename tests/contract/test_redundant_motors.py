@@ -1,4 +1,4 @@
-"""Two arms on one bar: twelve motors share what moves six freedoms, by least norm, weights, preload and limits."""
+"""Two arms on one bar: allocation of six forces to twelve motors by minimum norm, weights, preload and limits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def lift(**overrides: Any) -> Run:
 
 
 def transmission(mechanism: Mechanism, q_tree: Array) -> Array:
-    """u = T tau: columns are the motors' joints' rates by those of q, from J of the mechanism's rows."""
+    """Return T of u = T tau from J of the mechanism's rows."""
     at = mechanism.kinematics(mechanism.tree.from_coordinates(q_tree))
     rates = np.zeros((mechanism.n, mechanism.d))
     rates[mechanism.partition.q] = np.eye(mechanism.d)
@@ -50,7 +50,7 @@ def test_torques_have_minimum_norm(plain: Run, formulation: str) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_preload_does_not_change_the_motion(plain: Run, formulation: str) -> None:
-    """Tau differs by the preload's projection on the null space, the motion does not."""
+    """tau differs by the projection of the preload on the null space; the motion is the same."""
     without = plain if formulation == "spf" else lift(formulation=formulation)
     run = lift(controller__allocation__preload=PRELOAD, formulation=formulation)
     assert_close(run.q_tree, without.q_tree, 1e-9)
@@ -64,7 +64,7 @@ def test_preload_does_not_change_the_motion(plain: Run, formulation: str) -> Non
 
 
 def test_large_weights_reduce_torques(plain: Run) -> None:
-    """Torques that cost a thousand times as much are hardly used, and the motion is the same."""
+    """Torques with a weight of 1000 are hardly used, and the motion is the same."""
     tired = [name for name in plain.actuated if name.startswith("right")]
     run = lift(controller__allocation__weights=dict.fromkeys(tired, 1e3))
     assert_close(run.q_tree, plain.q_tree, 1e-9)
@@ -77,7 +77,7 @@ def test_large_weights_reduce_torques(plain: Run) -> None:
 
 @pytest.mark.parametrize("limit", [21.0, 18.0])
 def test_limited_torques_agree_with_the_reference(plain: Run, limit: float) -> None:
-    """As the reference in NumPy; while the other motors can take over what one has too much, nothing changes."""
+    """Compared with the NumPy reference; the motion is unchanged while other motors can compensate."""
     run = lift(controller__torque_limit=limit, controller__allocation__preload=PRELOAD)
     assert run.status == "done"
     assert np.abs(run.tau).max() == limit
@@ -93,7 +93,7 @@ def test_limited_torques_agree_with_the_reference(plain: Run, limit: float) -> N
 
 
 def test_unreachable_u_has_minimum_error() -> None:
-    """Where no tau within limits gives u: hardly further from it than any, each row measured by its size."""
+    """Where no tau within limits gives u, the scaled error is close to the minimum."""
     limit = 12.0
     overrides = {"t_end": 1e-3, "controller.torque_limit": limit}
     run, free = simulate("two_ur5/lift", overrides), simulate("two_ur5/lift", {"t_end": 1e-3})
@@ -109,7 +109,7 @@ def test_unreachable_u_has_minimum_error() -> None:
 
 
 def test_motor_table_limits_apply(tmp_path: Path) -> None:
-    """[[motor]] in the place of actuated: names, and limits below the controller's."""
+    """[[motor]] instead of actuated: names, and limits below the controller's."""
     text = (library() / "two_ur5" / "mechanism.toml").read_text("utf-8")
     before, _, rest = text.partition("actuated = [")
     names = [line.strip(' ",') for part in rest.partition("]")[0].split(",") for line in [part] if line.strip()]

@@ -1,4 +1,4 @@
-"""run.npz: what is in it, that it comes back equal, needs nothing else, and that strangers' files are refused."""
+"""Run files: content, loading, self-containedness, and rejection of damaged or malicious files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ARRAYS = {"t", "coordinates", "q_tree", "v_tree", "u", "tau", "phi", "energy"}
 
 @pytest.fixture(scope="session")
 def tracked() -> Run:
-    """A short controlled run with everything in it: Lyapunov function, events, a profile."""
+    """A short controlled run with a Lyapunov function, events and a profile."""
     return simulate(
         "five_bar/tracking",
         {
@@ -122,7 +122,7 @@ def test_run_file_contains_model_and_trajectory(bar: Path, tmp_path: Path) -> No
 
 
 def test_loop_forces_satisfy_eq_1(tracked: Run, saved: Path) -> None:
-    """D' v'_dot + C' v' + h' = u' + J^T lambda, with v'_dot from differences along a fine run."""
+    """Checks D' v'_dot + C' v' + h' = u' + J^T lambda with v'_dot from finite differences."""
     fine = simulate("five_bar/swing", {"t_end": 0.02, "solver.output_dt": 1e-3, "solver.rtol": 1e-11})
     forces = fine.loop_forces()
     assert list(forces) == ["elbow"]
@@ -182,7 +182,7 @@ Contents = dict[str, Any]
 
 
 def _meta(**overrides: Any) -> Callable[[Contents], None]:
-    """Change what the file says beside its arrays; None takes a key away."""
+    """Return an edit of the file's metadata; None removes a key."""
 
     def change(content: Contents) -> None:
         meta = json.loads(content["meta"].tobytes()) | overrides
@@ -205,7 +205,7 @@ def _without(name: str) -> Callable[[Contents], None]:
 
 
 class Payload:
-    """What a pickle could do on the reader's machine."""
+    """A pickle that would execute code on the reader's machine."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (pytest.fail, ("a pickle was executed",))
@@ -270,7 +270,7 @@ def test_truncated_file_is_rejected(length: int, saved: Path) -> None:
 
 
 def test_flipped_bytes_are_rejected_or_harmless(tracked: Run, saved: Path) -> None:
-    """Every byte of an npz is under a checksum but for a few of its containers' own."""
+    """Almost all bytes of an npz file are covered by checksums."""
     whole = saved.read_bytes()
     refused = 0
     positions = range(0, len(whole), len(whole) // 60)
@@ -295,7 +295,7 @@ def test_other_file_types_are_rejected(content: bytes, tmp_path: Path) -> None:
 
 
 def test_too_large_array_is_rejected_before_allocation(saved: Path) -> None:
-    """A header of a few bytes that promises 8 TB."""
+    """A header of a few bytes declares 8 TB."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
     with zipfile.ZipFile(saved) as archive:

@@ -1,4 +1,4 @@
-"""Sampled controllers against a loop in numpy and SciPy, and against the continuous ones as the sample time falls."""
+"""Sampled controllers compared with a NumPy and SciPy loop, and with continuous control for small sample times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ START = FIVE_BAR.equilibrium()[Q]
 
 
 def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Array, Array, Array]:
-    """Instants where u changes or is computed, (q, q_dot) there, and the u that acts from there on.
+    """Return instants at which u changes or is computed, (q, q_dot) there, and the u applied from then on.
 
     u acts at t with the newest k for which k period + delay <= t.
     """
@@ -89,7 +89,7 @@ def test_sampled_control_agrees_with_numpy(scene: str, period: float, delay: flo
 
 @pytest.mark.parametrize("scene", ["set_point", "tracking"])
 def test_sampled_control_converges_to_continuous_control(scene: str) -> None:
-    """First order: half the sample time and delay, half the difference."""
+    """First order: half the sample time and delay give half the difference."""
     t_end = 0.04 if scene == "set_point" else 0.02
     overrides = {"formulation": "reduced", "t_end": t_end, "solver.rtol": 1e-9, "solver.output_dt": 0.01}
     exact = simulate(f"five_bar/{scene}", overrides)

@@ -1,4 +1,4 @@
-"""Sensors and drives of sampled controllers against a loop in NumPy and SciPy, on the five-bar of the appendix."""
+"""Sensors and drives of sampled controllers compared with a NumPy and SciPy loop of the appendix's five-bar."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MASK = 2**64 - 1
 
 
 def uniforms(seed: int) -> Iterator[float]:
-    """SplitMix64."""
+    """The SplitMix64 generator."""
     state = seed
     while True:
         state = (state + 0x9E3779B97F4A7C15) & MASK
@@ -39,7 +39,7 @@ def uniforms(seed: int) -> Iterator[float]:
 
 
 def normals(seed: int) -> Iterator[float]:
-    """The polar method; of each pair the first."""
+    """Normal numbers by the polar method; the first of each pair."""
     draw = uniforms(seed)
     while True:
         x, y = 2 * next(draw) - 1, 2 * next(draw) - 1
@@ -49,7 +49,7 @@ def normals(seed: int) -> Iterator[float]:
 
 
 class Seen:
-    """The signals of a sensor, a sample at a time."""
+    """The signals of a sensor, sample by sample."""
 
     def __init__(self, period: float, **keys: Any) -> None:
         self.period, self.keys = period, keys
@@ -74,7 +74,7 @@ class Seen:
 
 
 def sent(tau: Array, last: Array, most: Any, step: Any) -> tuple[Array, Array]:
-    """(torques, what they were before they were quantised)."""
+    """Return (quantized torques, torques before quantization)."""
     last = last + np.clip(tau - last, np.negative(most), most)
     return (np.floor(last / step + 0.5) * step if np.any(step) else last), last
 
@@ -83,7 +83,7 @@ Law = Callable[[float, Array, Array], Array]
 
 
 def loop(law: Law, seen: Seen, count: int, late: int = 0, most: Any = np.inf, step: Any = 0.0) -> tuple[Array, Array]:
-    """(q, q_dot) and what acts from there, at `count` instants a quarter of a period apart; `late` so many of those."""
+    """Return (q, q_dot) and the applied torque at `count` instants, four per period; `late` is the delay."""
     y, last, waiting, acts = np.concatenate([START, np.zeros(2)]), np.zeros(2), [], np.zeros(2)
     states, torques = [], []
     quarter = seen.period / 4
@@ -114,7 +114,7 @@ def assert_is(run: Run, states: Array, torques: Array) -> None:
 
 
 def table(keys: dict[str, Any], coordinates: tuple[str, str] = ("theta_1", "theta_3")) -> dict[str, Any]:
-    """Arrays by coordinate, as a scene has them."""
+    """Return arrays as tables by coordinate."""
     return {k: dict(zip(coordinates, x, strict=True)) if isinstance(x, tuple) else x for k, x in keys.items()}
 
 
@@ -132,7 +132,7 @@ SENSORS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("scene", ["set_point", "tracking"])
 def test_sensors_agree_with_numpy(scene: str, name: str) -> None:
-    """Both laws see what is measured; terms are those where the loops close at it."""
+    """Both control laws use measured values; terms are evaluated at the configuration that closes the loops there."""
     keys, formulation = SENSORS[name], FORMULATIONS[len(name) % 3]
     period = 0.002 if scene == "set_point" else 0.0005
     overrides = {
@@ -184,7 +184,7 @@ def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
 
 
 class Own:
-    """A controller that looks at terms: gravity at what is measured, and a damper."""
+    """A controller that uses terms: gravity compensation at the measured configuration, and damping."""
 
     def u(self, t: float, terms: Terms) -> Array:
         return terms.h - terms.D @ (40.0 * (terms.q - START - 0.1) + 5.0 * terms.q_dot)
@@ -196,7 +196,7 @@ class Own:
 
 
 class OwnTorques:
-    """The same by motor."""
+    """The same controller with torques by motor."""
 
     def tau(self, t: float, terms: Terms) -> Array:
         return Own().u(t, terms)
@@ -224,7 +224,7 @@ def test_callers_controller_gets_measured_terms(formulation: str, controller: An
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
 def test_controllers_own_model_gets_measured_terms(tmp_path: Path, convention: str) -> None:
-    """Eq. 16 with links that are too heavy, at what coarse encoders say."""
+    """Eq. 16 with a too heavy model, at values of coarse encoders."""
     from tests.regression.test_control import heavy_model
 
     period, keys = 0.0005, {"resolution": 5e-3, "rate": "difference"}
@@ -242,7 +242,7 @@ def test_controllers_own_model_gets_measured_terms(tmp_path: Path, convention: s
 
 
 def test_noise_is_normal_and_reproducible() -> None:
-    """What a controller reads at rest: mean, deviation, fourth moment, and nothing from step to step."""
+    """Measured values at rest have the right mean, deviation and fourth moment, and are uncorrelated."""
 
     class Reads:
         def __init__(self) -> None:
@@ -276,7 +276,7 @@ def test_noise_is_normal_and_reproducible() -> None:
 
 
 def test_empty_sensor_table_has_no_effect() -> None:
-    """An empty table is no sensor: the same numbers, and as many right-hand sides."""
+    """An empty table gives the same results with the same number of right-hand sides."""
     overrides = {"t_end": 0.02, "controller.sample_time": 0.001}
     plain = simulate("five_bar/set_point", overrides)
     empty = simulate("five_bar/set_point", {**overrides, "controller.sensor": {}, "controller.drive": {}})

@@ -1,4 +1,4 @@
-"""The simulator against whole runs: same accuracy, same verdicts; and what it promises about states."""
+"""Simulator steps compared with runs: accuracy, stop reasons, and states."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_exhausted_budget_raises_numerical_error() -> None:
 
 
 def test_step_costs_one_extra_evaluation() -> None:
-    """One evaluation of a held u's motion more than the method's own: nothing is prepared again."""
+    """A step with constant u needs one evaluation more than the method."""
     scene = load_scene("five_bar/swing", {"formulation": "reduced"})
     simulator = Simulator(scene)
     for _ in range(3):  # until the method has found its length
@@ -162,7 +162,7 @@ def test_step_costs_one_extra_evaluation() -> None:
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 def test_constant_u_costs_hardly_more_than_the_run(formulation: str) -> None:
-    """Steps of the method reach beyond those of the caller while nothing changes."""
+    """Steps of the method may be longer than the caller's while u is constant."""
     overrides = {"formulation": formulation, "t_end": 1.0}
     simulator, u = Simulator("five_bar/swing", overrides), np.array([0.05, -0.02])
     for _ in range(1000):
@@ -173,7 +173,7 @@ def test_constant_u_costs_hardly_more_than_the_run(formulation: str) -> None:
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 @pytest.mark.parametrize("dt", [1e-3, 7e-3])
 def test_changing_u_agrees_with_scipy(formulation: str, dt: float) -> None:
-    """Against SciPy on the equations in NumPy, from change to change: what reached beyond a change is made again."""
+    """Compared with SciPy on the NumPy equations; steps beyond a change of u are rejected and repeated."""
     u, random = [0.0, 0.0], np.random.default_rng(5)
     simulator = Simulator("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-9})
     q = simulator.mechanism.partition.q
@@ -199,7 +199,7 @@ def test_changing_u_agrees_with_scipy(formulation: str, dt: float) -> None:
 @pytest.mark.parametrize("dt", [2e-3, 0.05])
 @pytest.mark.parametrize("changing", [False, True])
 def test_steps_over_rank_loss_agree_with_the_pendulum(dt: float, changing: bool) -> None:
-    """A row of parallelograms, flat three times, against its pendulum's equation; u none, or tiny and changing."""
+    """A row of parallelograms, flat three times, compared with a pendulum; u is zero, or tiny and changing."""
     simulator, random = Simulator("n_four_bar", {"mechanism.N": 7, "formulation": "dae"}), np.random.default_rng(3)
     for k in range(round(3.0 / dt)):
         if changing and k % 20 == 0:
@@ -322,7 +322,7 @@ def test_invalid_step_is_rejected_and_keeps_the_state(u: Any, dt: Any, says: str
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_copies_are_rejected_with_an_alternative(copied: Callable[[Simulator], Any]) -> None:
-    """A copy would share the loop: what one steps, the other would too."""
+    """A copy would share the native loop, so both would step."""
     simulator, other = Simulator("five_bar/swing", TIGHT), Simulator("five_bar/swing", TIGHT)
     _push_on(simulator, np.array([0.1, 0.2]), 10)
     with pytest.raises(InputError, match=r"make another simulator .* other\.reset\(simulator\.state\)"):

@@ -1,4 +1,4 @@
-"""Numbers, files, threads and functions that nobody meant: each is one line that was a wrong answer or a traceback."""
+"""Unusual numbers, files, threads and functions that once gave a wrong result or a traceback."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ckc_pin.kinematics.sigma import sigma
 
 @pytest.mark.parametrize(("t_end", "output_dt"), [(0.02, 1e10), (0.02, 0.03), (1e-300, 1.0), (5e-324, None)])
 def test_output_instants_include_zero_and_t_end_once(t_end: float, output_dt: float | None) -> None:
-    """The last instant took the place of the first where output_dt is far beyond t_end, or both were 501 times 0."""
+    """The last instant used to replace the first where output_dt exceeds t_end, or all 501 instants were 0."""
     run = simulate("five_bar/swing", {"t_end": t_end, "solver.output_dt": output_dt})
     assert run.t.tolist() == [0.0, t_end]
 
@@ -46,7 +46,7 @@ def test_scene_values_out_of_range_are_rejected(overrides: dict[str, Any], says:
 
 
 def test_too_large_integers_are_rejected() -> None:
-    """Where any value is taken they came as far as the scene's binary form."""
+    """Keys of any type used to accept them."""
     with pytest.raises(InputError, match=r"controller.desired.theta_1.offset = 10+: .*64 bits"):
         simulate("five_bar/tracking", {"controller.desired.theta_1.offset": 10**40})
 
@@ -57,7 +57,7 @@ def test_gains_whose_squares_overflow_are_rejected() -> None:
 
 
 def test_lengths_whose_squares_overflow_are_rejected(bar: Path) -> None:
-    """The singular values of such a closure do not exist."""
+    """The singular values of such a closure overflow."""
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(
         text.replace('frame_a = "tip_left"', 'frame_a = {link = "tip_left", xyz = [1e300, 0.0, 0.0]}', 1),
@@ -68,7 +68,7 @@ def test_lengths_whose_squares_overflow_are_rejected(bar: Path) -> None:
 
 
 def test_start_many_turns_away_is_assembled_directly() -> None:
-    """Newton's method went there step by step, whatever the number."""
+    """Newton's method used to follow the path step by step."""
     far = 2 * np.pi * 10**5 + load("four_bar").assembled.q_tree[0]
     assert sigma(load("four_bar"), np.array([far])).iterations < 6000
 
@@ -78,7 +78,7 @@ def test_start_many_turns_away_is_assembled_directly() -> None:
 
 @pytest.fixture
 def restless() -> Any:
-    """Threads that take turns at every chance."""
+    """Threads that switch as often as possible."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -86,7 +86,7 @@ def restless() -> Any:
 
 
 def test_mechanism_in_threads_gives_correct_terms(restless: Any) -> None:
-    """Pinocchio's workspace was read after another thread had written to it."""
+    """Another thread used to overwrite Pinocchio's workspace before it was read."""
     mechanism = load("five_bar")
     states = [({"theta_1": -1.2 + 1e-3 * k, "theta_3": -1.9}, {"theta_1": 0.01 * k}) for k in range(200)]
 
@@ -101,7 +101,7 @@ def test_mechanism_in_threads_gives_correct_terms(restless: Any) -> None:
 
 
 def test_simulator_in_threads_steps_or_rejects(restless: Any) -> None:
-    """Two steps at once moved one state."""
+    """Two simultaneous steps used to change the same state."""
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
 
     def step(_: int) -> str:
@@ -120,7 +120,7 @@ def test_simulator_in_threads_steps_or_rejects(restless: Any) -> None:
 
 
 def test_pickled_mechanism_is_equal() -> None:
-    """Its views of Pinocchio's workspace came back as arrays that nothing wrote to."""
+    """Its views of Pinocchio's workspace used to become separate arrays."""
     mechanism = load("five_bar")
     twin = pickle.loads(pickle.dumps(mechanism))
     q_tree = mechanism.q_tree + 0.1
@@ -155,7 +155,7 @@ def test_event_function_cannot_call_its_simulator(what: str) -> None:
 
 
 def test_output_callback_gets_a_copy() -> None:
-    """It was a view of what the run records."""
+    """The array used to be a view of the recorded data."""
     overrides = {"t_end": 0.02}
 
     def spoil(t: float, q_tree: Any) -> None:
@@ -173,7 +173,7 @@ def test_state_arrays_are_read_only() -> None:
 
 @pytest.mark.parametrize("u", [np.array([1j, 0.0]), ["1", "2"], np.array([b"1", b"2"]), [10**400, 0]], ids=str)
 def test_u_must_be_real_numbers(u: Any) -> None:
-    """A complex u lost its imaginary part, text was read."""
+    """A complex u used to lose its imaginary part, and text was converted."""
     simulator = Simulator("five_bar/swing", {"formulation": "reduced"})
     with pytest.raises(InputError, match="u: expected a vector of numbers, got"):
         simulator.step(u, 1e-3)
@@ -217,7 +217,7 @@ CHANGED: list[Callable[[dict[str, Any]], Any]] = [
 
 @pytest.mark.parametrize("change", CHANGED, ids=range(len(CHANGED)))
 def test_metadata_of_run_files_is_checked(change: Callable[..., Any], tmp_path: Path) -> None:
-    """Its hashes were right, and `ckc plot` ended in a KeyError."""
+    """With correct hashes, `ckc plot` used to end in a KeyError."""
     path = _saved(tmp_path)
     _with_meta(path, change)
     with pytest.raises(InputError, match=r"run\.npz: damaged: (scene|stats|events|profile): "):
@@ -238,7 +238,7 @@ def test_message_is_one_line_without_control_characters() -> None:
 
 @pytest.mark.parametrize("size", [0, 100, 2000])
 def test_full_disk_keeps_the_old_file(size: int, tmp_path: Path) -> None:
-    """With a limit on the size of files, which a process sets for itself, in the disk's place."""
+    """A file size limit of the process simulates the full disk."""
     before = _saved(tmp_path).read_bytes()
     program = f"""
 import resource, signal, ckc_pin

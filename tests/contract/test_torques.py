@@ -1,4 +1,4 @@
-"""Torques by motor: the five-bar's behind gears against SciPy on the appendix, from controllers, steps and files."""
+"""Torques by motor of the geared five-bar from controllers, steps and files, compared with SciPy on the appendix."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TURNS = np.array([[-20.0, 0.0, 0.0, 0.0], [0.0, 0.0, 4.0, -2.0]])
 
 @pytest.fixture
 def geared(bar: Path) -> Path:
-    """The five-bar's folder with these motors."""
+    """A folder of the five-bar with geared motors."""
     text = (bar / "mechanism.toml").read_text("utf-8")
     old = 'actuated = ["theta_1", "theta_3"]\n'
     assert old in text
@@ -48,7 +48,7 @@ def geared(bar: Path) -> Path:
 
 
 def u_of(tau: Array, q_tree: Array) -> Array:
-    """Eq. 6's force of torques, limited, with rho of the appendix."""
+    """Eq. 6's force of limited torques, with rho of the appendix."""
     return (TURNS @ FIVE_BAR.rho(q_tree)).T @ np.clip(tau, [-np.inf, -0.2], [np.inf, 0.2])
 
 
@@ -71,7 +71,7 @@ def start_of(run: Run) -> Array:
 
 
 class Spring:
-    """Torques that look at the state: as an array, or by name."""
+    """Torques that depend on the state, as an array or by name."""
 
     def __init__(self, named: bool) -> None:
         self.named = named
@@ -133,7 +133,7 @@ def test_steps_with_tau_agree_with_scipy(geared: Path, formulation: str) -> None
 
 
 def test_torques_need_no_chart(geared: Path) -> None:
-    """Where phi_z becomes singular the reduced model goes on in other coordinates, as the DAE does."""
+    """Where phi_z becomes singular, the reduced model continues in other coordinates and agrees with the DAE."""
     runs = []
     for formulation in ("reduced", "dae"):
         overrides = {
@@ -296,7 +296,7 @@ def test_invalid_allocation_is_rejected(allocation: dict[str, Any], says: str) -
 
 
 class Both(Spring):
-    """Neither the loop nor its reader knows what it means."""
+    """An unknown controller method is rejected."""
 
     def u(self, t: float, terms: Terms) -> Array:
         return np.zeros(2)

@@ -1,4 +1,4 @@
-"""Arguments of the wrong kind: every public function says, in one sentence, what it was given and what it takes."""
+"""Arguments of wrong types: public functions name the argument and the expected type in one sentence."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def test_numpy_numbers_and_lists_are_accepted() -> None:
 
 
 def test_function_and_object_controllers_give_the_same_run() -> None:
-    """Of itself, sampled, as a lambda, as an object that can be called: bit for bit the same motion."""
+    """A function, a lambda and a callable object, also sampled, give bit for bit the same motion."""
 
     class Called:
         def __call__(self, t: float, terms: Terms) -> Any:

@@ -1,4 +1,4 @@
-"""A loop's steps, one by one."""
+"""Advance a loop step by step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["steps_of"]
 
 
 def steps_of(loop: Any, begin: Callable[[], None], t_end: float) -> Array:
-    """The ends of its steps to t_end: with no time between pauses, it comes back after each."""
+    """Return the ends of the loop's steps to t_end; a pause of zero returns after each step."""
     begin()
     ends: list[float] = []
     while not ends or ends[-1] < t_end:

@@ -1,4 +1,4 @@
-"""Errors of the swing against an integration of the numpy five-bar: by tolerance, at steps and between."""
+"""Errors of the swing relative to an integration of the NumPy five-bar, at steps and between steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ formulations = pytest.mark.parametrize("formulation", ["reduced", "dae"])
 
 @pytest.fixture(scope="module")
 def exact() -> Exact:
-    """(q, q_dot) of the swing, to some 1e-14 at any time: eq. 6 on the closed-form sigma."""
+    """(q, q_dot) of the swing at any time, accurate to about 1e-14: eq. 6 with the closed-form sigma."""
 
     def rhs(t: float, y: Array) -> Array:
         return np.concatenate([y[2:], FIVE_BAR.acceleration(FIVE_BAR.sigma(y[:2]), y[2:], np.zeros(2))])
@@ -66,7 +66,7 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
 @formulations
 @pytest.mark.parametrize("method", ["DOP853", "Radau"])
 def test_errors_decrease_with_rtol(exact: Exact, formulation: str, method: str) -> None:
-    """At steps and between: by more than half the decades that rtol falls, and never far above rtol itself."""
+    """Errors decrease by more than half the decades of rtol and stay below a multiple of rtol, also between steps."""
     tolerances = np.array([1e-4, 1e-6, 1e-8, 1e-10])
     found = np.array([errors(exact, formulation, method=method, rtol=rtol) for rtol in tolerances])
     for of_q, of_q_dot in found.transpose(1, 2, 0):
@@ -78,7 +78,7 @@ def test_errors_decrease_with_rtol(exact: Exact, formulation: str, method: str) 
 
 @formulations
 def test_radau_outputs_between_steps_are_as_accurate_as_steps(exact: Exact, formulation: str) -> None:
-    """Its own interpolant is of the order of its stages, and would be off by more."""
+    """The interpolant of the stages has a lower order and would be less accurate."""
     at_steps, between = errors(exact, formulation, method="Radau", rtol=1e-8)
     assert np.all(between <= 15 * at_steps)
 

@@ -1,4 +1,4 @@
-"""The order of every method that has one: what halving the steps does to the error.
+"""Order of convergence of the integration methods: errors when the step size is halved.
 
 A gentle motion past the equilibrium, against an integration of the numpy five-bar.
 """
@@ -42,7 +42,7 @@ Exact = Callable[[float], Array]
 
 @pytest.fixture(scope="module")
 def exact() -> dict[bool, Exact]:
-    """(q, q_dot) on the manifold and off it, by eq. 6 on the closed-form sigma."""
+    """(q, q_dot) on the manifold and off it, by eq. 6 with the closed-form sigma."""
 
     def motion(off: bool) -> Exact:
         def rhs(t: float, y: Array) -> Array:
@@ -56,7 +56,7 @@ def exact() -> dict[bool, Exact]:
 
 
 def ready_at(formulation: str, **solver: Any) -> Prepared:
-    """A loop whose loops are closed to rounding, whatever rtol."""
+    """A native loop that closes the kinematic loops to rounding at every rtol."""
     overrides: dict[str, Any] = {"formulation": "spf" if OFF[formulation] else formulation, "epsilon": EPSILON}
     if OFF[formulation]:
         overrides |= {"initial.w": W.tolist(), "spf_coordinates": "z" if formulation == "eq. 8" else "w"}
@@ -93,7 +93,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
 @pytest.mark.parametrize("formulation", OFF)
 @pytest.mark.parametrize("method", METHODS)
 def test_method_has_its_order_of_convergence(exact: dict[bool, Exact], formulation: str, method: str) -> None:
-    """Neither projection nor Newton's iteration on z nor w changes an order."""
+    """Projection, the Newton iteration on z and w do not change the order."""
     name, rtol, order, order_between, steps = METHODS[method]
     coarse, fine = (errors(exact[OFF[formulation]], formulation, name, rtol, n) for n in (steps, 2 * steps))
     at_ends, between = np.log2(np.array(coarse) / np.array(fine))
@@ -103,7 +103,7 @@ def test_method_has_its_order_of_convergence(exact: dict[bool, Exact], formulati
 
 @pytest.mark.parametrize("stages", [2, 3])
 def test_collocation_step_has_its_order_of_convergence(exact: dict[bool, Exact], stages: int) -> None:
-    """The step across losses of rank: of order 2 s at its end, which one step shows as 2 s + 1."""
+    """The step across a loss of rank has order 2 s, so the error of one step has order 2 s + 1."""
     ready = ready_at("dae")
 
     def error(span: float) -> float:

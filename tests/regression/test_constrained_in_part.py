@@ -1,4 +1,4 @@
-"""A free root that the loops hold in part: a rigid body on a ball joint, against a pendulum and a spinning top."""
+"""A partly constrained free root: a rigid body on a ball joint, compared with a pendulum and a spinning top."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_check_reports_the_partly_constrained_root(top: Path) -> None:
 
 
 def test_free_root_rates_are_in_body_axes(top: Path) -> None:
-    """A quarter turn about z, thrown along its x and spun about its y: along the world's y, nose down."""
+    """After a quarter turn about z, motion along the body's x is motion along the world's y."""
     (top / "mechanism.toml").write_text(MECHANISM.partition("[[loop]]")[0])
     turned, thrown = {"root.rz": np.pi / 2}, {"root.x": 2.0, "root.ry": 0.3}
     start = {"q": {f"root.{k}": 0.0 for k in ("x", "y", "z", "rx", "ry", "rz")} | turned, "q_dot": thrown}

@@ -1,4 +1,4 @@
-"""Both control cases of the paper against the independent integration, the controller's model right and wrong."""
+"""Tracking and set-point control compared with an independent integration, with correct and wrong controller models."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_tracking(run: Callable[..., Run], formulation: str) -> None:
 
 @formulations
 def test_shipped_tracking_scene_matches_the_reference(run: Callable[..., Run], formulation: str) -> None:
-    """At its own rtol, 1e-8."""
+    """With the scene's rtol, 1e-8."""
     ours, reference = run("five_bar/tracking", formulation=formulation), trajectory("tracking")
     rows = reference.rows(ours)
     assert_close(ours.q_tree[rows], reference.q_tree, 1.1e-8)
@@ -48,14 +48,14 @@ def test_shipped_tracking_scene_matches_the_reference(run: Callable[..., Run], f
 
 @formulations
 def test_tracking_error_decays_exponentially(run: Callable[..., Run], formulation: str) -> None:
-    """The notes' figure; e^-t times the initial one."""
+    """The error is e^-t times the initial one, as in the notes."""
     ours = run("five_bar/tracking", formulation=formulation)
     assert ours.t[-1] == 9.5
     assert_close(ours.q_tree[-1, Q] - desired(9.5)[0], [-1.0775e-4, -1.281e-4], 6e-9)
 
 
 def test_tracking_from_consistent_start_does_not_depend_on_epsilon(run: Callable[..., Run]) -> None:
-    """From a consistent start the SPF is the reduced model whatever epsilon is."""
+    """From a consistent start the SPF equals the reduced model for every epsilon."""
     assert_follows(
         run("five_bar/tracking", formulation="spf", epsilon=1e-3, solver__rtol=TIGHT), trajectory("tracking")
     )
@@ -80,7 +80,7 @@ def test_set_point(run: Callable[..., Run], file: str, formulation: str) -> None
 
 @pytest.mark.parametrize("scene", ["five_bar/set_point", "five_bar/tracking"])
 def test_lyapunov_function_decreases_along_the_closed_loop(run: Callable[..., Run], scene: str) -> None:
-    """Eqs. 15 and 18: along the closed loop, to rounding."""
+    """The functions of eqs. 15 and 18 decrease to rounding."""
     lyapunov = run(scene, formulation="reduced").lyapunov
     assert lyapunov is not None
     assert np.all(lyapunov > -1e-12)
@@ -88,7 +88,7 @@ def test_lyapunov_function_decreases_along_the_closed_loop(run: Callable[..., Ru
 
 
 def heavy_model(folder: Path, attributes: str) -> str:
-    """The shipped mechanism with these attributes of every <inertial> 20 % too large."""
+    """The shipped mechanism with these attributes of each <inertial> increased by 20 %."""
     shipped = library() / "five_bar"
 
     def heavier(match: re.Match[str]) -> str:
@@ -133,7 +133,7 @@ def test_default_trajectory_stays_in_the_workspace() -> None:
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 def test_printed_trajectory_stops_at_the_singular_configuration(run: Callable[..., Run], formulation: str) -> None:
-    """As a DAE too: eq. 16's D grows without bound there."""
+    """The DAE stops too, because eq. 16's D grows without bound there."""
     ours = run("five_bar_as_printed/tracking", formulation=formulation, solver__rtol=1e-6)
     assert ours.status == "stopped"
     assert_close(ours.t[-1], 4.341, 1e-3)
@@ -146,7 +146,7 @@ def test_printed_trajectory_stops_at_the_singular_configuration(run: Callable[..
 
 @pytest.mark.parametrize("sampled", [{}, {"sample_time": 0.05, "delay": 0.02}], ids=["continuous", "sampled"])
 def test_set_point_control_changes_coordinates_where_phi_z_is_singular(sampled: dict[str, float]) -> None:
-    """It looks at q and q_dot alone, and u acts on their joints: as the DAE, which needs no q to go on."""
+    """The control law uses q and q_dot only, so the run agrees with the DAE, which needs no q."""
     names = ("theta_1", "theta_3")
     overrides = {
         "t_end": 1.0,

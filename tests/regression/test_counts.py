@@ -1,4 +1,4 @@
-"""What a run may cost, in evaluations: a regression shows here before anybody measures a time."""
+"""Numbers of evaluations of runs: regressions of performance without measuring times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LIMITS = {
 
 @pytest.mark.parametrize("name", RUNS)
 def test_evaluation_counts_match_the_recorded_ones(name: str) -> None:
-    """Within 2 %; `tests/regression/counts.py` says how to write the numbers anew."""
+    """Counts agree within 2 %; `tests/regression/counts.py` describes how to record new ones."""
     assert changed(measured(name), recorded()[name]) == {}
 
 
@@ -50,14 +50,14 @@ def test_number_of_evaluations_at_rtol_1e_8_is_bounded(run: Callable[..., Run], 
 
 
 def test_epsilon_does_not_change_the_cost_in_coordinates_of_eq_17(run: Callable[..., Run]) -> None:
-    """The stiff part is in closed form: from a consistent start the right-hand sides are the same for every epsilon."""
+    """The stiff part has a closed form, so from a consistent start the cost is the same for every epsilon."""
     counts = {run("five_bar/swing", formulation="spf", epsilon=epsilon).stats["rhs"] for epsilon in (1e-1, 1e-6, 1e-12)}
     assert len(counts) == 1
 
 
 @pytest.mark.parametrize("scene", ["five_bar/swing", "five_bar/tracking"])
 def test_epsilon_hardly_changes_the_cost_off_the_manifold(run: Callable[..., Run], scene: str) -> None:
-    """Against the reduced model at equal tolerance: three tenths more right-hand sides for any epsilon."""
+    """At most 30 % more right-hand sides than the reduced model at equal tolerance, for any epsilon."""
     reduced = run(scene, formulation="reduced").stats["rhs"]
     for epsilon in (1e-1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-9, 1e-12):
         off = run(scene, formulation="spf", epsilon=epsilon, initial__w=[0.01, -0.006])
@@ -75,7 +75,7 @@ def test_number_of_newton_corrections_is_bounded(run: Callable[..., Run], scene:
 
 @pytest.mark.parametrize(("scene", "rtol", "t_end"), [("andrews/default", 1e-13, 0.05), ("delta/default", 1e-12, 0.6)])
 def test_rounding_errors_do_not_reduce_the_step_size(scene: str, rtol: float, t_end: float) -> None:
-    """What y and its rates tell differently of the rest of the motion is rounding here, which no shorter step mends."""
+    """Here the difference between y and its rates is rounding, which shorter steps do not reduce."""
     rhs = {}
     for formulation in ("dae", "reduced"):
         run = simulate(scene, {"formulation": formulation, "solver.rtol": rtol, "t_end": t_end})
@@ -85,7 +85,7 @@ def test_rounding_errors_do_not_reduce_the_step_size(scene: str, rtol: float, t_
 
 
 def test_large_angles_do_not_reduce_the_step_size() -> None:
-    """After 16 turns the rod's angle, where it passes zero, is not known to 1e-13 of itself: no step can mend that."""
+    """After 16 turns the rod's angle near zero has a rounding error above 1e-13, which shorter steps do not reduce."""
     overrides = {"t_end": 5.0, "solver.output_dt": 0.5, "solver.method": "DOP853"}
     tight = simulate("slider_crank", {**overrides, "formulation": "reduced", "solver.rtol": 1e-13})
     assert (tight.status, tight.message) == ("done", "reached t_end")
@@ -105,14 +105,14 @@ def test_auto_costs_no_more_than_the_better_method_with_many_mode_transitions(sc
 
 
 def test_event_location_evaluates_few_terms() -> None:
-    """Joints that slide and stick are looked at by what the state shows, and by what a right-hand side has left."""
+    """Events of sliding and sticking joints use the state and the last right-hand side."""
     run = simulate("talos/default", profile=True)
     assert len(run.events) > 150
     assert run.profile["D_tree"]["calls"] <= 1.4 * run.stats["rhs"]
 
 
 def test_uncontrolled_run_evaluates_no_coriolis_matrix() -> None:
-    """An acceleration asks for D' and the bias, never for C', nor for the matrix rho_dot."""
+    """An acceleration needs D' and the bias, but neither C' nor the matrix rho_dot."""
     profile = simulate("five_bar/swing", {"formulation": "reduced", "t_end": 0.2}, profile=True).profile
     assert "D_tree" in profile
     assert not {"C_tree", "C", "rho_dot", "h_tree"} & set(profile)

@@ -1,4 +1,4 @@
-"""The DAE kept on its closure in three ways: projected, by Baumgarte's terms, by IDA's own iteration (GGL)."""
+"""The DAE with three stabilizations of its constraints: projection, Baumgarte, and IDA's iteration (GGL)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.regression.reference import trajectory
 
 
 def ida(scene: str, overrides: dict[str, Any], rtol: float, times: Array) -> tuple[Array, Array]:
-    """(q', v') at times, by SUNDIALS on the NumPy terms."""
+    """(q', v') at times, by SUNDIALS IDA with the NumPy terms."""
     problem = as_ivp(scene, overrides)
     assert isinstance(problem, Dae)
     form = Stabilised(problem)
@@ -78,7 +78,7 @@ def test_baumgarte_damps_drift_and_projection_removes_it(run: Callable[..., Run]
 
 
 def test_baumgarte_residual_decays_critically_damped() -> None:
-    """Off the closure by hand: phi follows phi_ddot + 2 alpha phi_dot + beta^2 phi = 0, critically damped."""
+    """An initial residual follows phi_ddot + 2 alpha phi_dot + beta^2 phi = 0, critically damped."""
     overrides = {"formulation": "dae", "solver.projection": False, "solver.baumgarte": [5.0, 5.0], "solver.rtol": 1e-11}
     ready = prepare(load_scene("five_bar/swing", overrides))
     q_tree = ready.start.at.q_tree + np.array([1e-4, 0.0, 0.0, 0.0])
@@ -114,7 +114,7 @@ def test_incompatible_dae_settings_are_rejected(overrides: dict[str, object], sa
 def test_energy_equals_work_of_constant_u_where_q_is_no_chart(
     q: tuple[float, float], q_dot: tuple[float, float]
 ) -> None:
-    """phi_z passes through singular configurations, where a velocity closed by z alone may be anything."""
+    """phi_z passes through singular configurations, where z does not determine the velocity."""
     names = ("theta_1", "theta_3")
     overrides = {
         "formulation": "dae",
@@ -143,7 +143,7 @@ IN_LINE = {"crank": 0.0, "rod": 0.0, "slider": 0.4}
 
 
 def by_slider(folder: Path, pin: str = 'type = "point_2d"\n') -> str:
-    """The slider-crank with the slider as q, which does not determine the crank where crank and rod are in line."""
+    """The slider-crank with the slider as q, which is no chart where crank and rod are in line."""
     for name, text in load("slider_crank").sources.texts.items():
         by_slider = text.replace('["crank"]', '["slider"]')
         (folder / name).write_text(by_slider.replace('type = "point_2d"\n', pin))
@@ -156,7 +156,7 @@ def by_slider(folder: Path, pin: str = 'type = "point_2d"\n') -> str:
     "pin", ['type = "point_2d"\n', 'type = "hinge"\naxis_a = [0.0, 0.0, 1.0]\n'], ids=["point", "hinge"]
 )
 def test_dae_starts_where_q_is_no_chart(tmp_path: Path, off: float, pin: str) -> None:
-    """From every coordinate, with redundant rows too; as the one whose q is the crank does."""
+    """The start gives every coordinate. The motion is that in the crank's coordinate, also with redundant rows."""
     scene = by_slider(tmp_path, pin)
     overrides = {
         "initial": {"q": {**IN_LINE, "rod": off}},

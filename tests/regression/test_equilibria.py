@@ -1,4 +1,4 @@
-"""Where mechanisms come to rest that fall far, and where rest is no place for their coordinates."""
+"""Equilibria reached from far configurations, and equilibria where q is no chart."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SLIDER_CRANK = library() / "slider_crank"
 def test_equilibrium_search_converges_from_far_configurations(
     name: str, trials: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Through where q is no chart (talos, two_ur5), along soft and stiff directions at once (flyball, talos)."""
+    """The path passes where q is no chart (talos, two_ur5) and has soft and stiff directions (flyball, talos)."""
     model, tried = load(name), []
 
     def counted(*args: Any) -> Any:
@@ -48,7 +48,7 @@ def test_equilibrium_search_converges_from_far_configurations(
 
 
 def test_equilibrium_where_q_is_no_chart_is_rejected(tmp_path: Path) -> None:
-    """Gravity along the rail: the crank hangs down in line with the rod, where the slider's place says nothing."""
+    """With gravity along the rail, the crank hangs in line with the rod, where the slider does not determine it."""
     text = (SLIDER_CRANK / "mechanism.toml").read_text()
     text = text.replace('["crank"]', '["slider"]').replace("[0.0, -9.81, 0.0]", "[9.81, 0.0, 0.0]")
     (tmp_path / "mechanism.toml").write_text(text)

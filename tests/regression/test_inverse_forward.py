@@ -1,4 +1,4 @@
-"""Inverse, then forward: the efforts of a motion give the motion back, at each instant and by integration."""
+"""Forces from inverse dynamics reproduce the motion, at each instant and in a forward run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROUNDED = 1e-9  # of the largest row of J: a row of zeros
 
 
 def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, Any]:
-    """Overrides of a scene: every independent coordinate swings about where the mechanism is assembled."""
+    """Overrides with which each independent coordinate oscillates about the assembled configuration."""
     numbers = mechanism.tree.named(mechanism.tree.to_coordinates(mechanism.q_tree))
     reach = mechanism.tree.named(mechanism.tree.step_scale)
     desired, rates = {}, {}
@@ -48,7 +48,7 @@ def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, A
 
 
 def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
-    """Eq. 1 and its closure, differentiated twice, as one linear system in a and lambda; rows of one size."""
+    """Solve eq. 1 and the twice differentiated closure as one scaled linear system for the acceleration and lambda."""
     J, n = terms.at.J, mechanism.n
     u_tree = mechanism.motors.force(tau)
     resting = np.abs(terms.v_tree) <= AT_REST * np.abs(terms.v_tree).max(initial=0.0)
@@ -64,7 +64,7 @@ def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
 
 
 def assert_gives_back(found: MotionForces) -> None:
-    """At every instant eq. 1 has the acceleration that the efforts were for."""
+    """Check that eq. 1 with the computed forces has the given acceleration at each instant."""
     mechanism = found.mechanism
     for q, v, a, tau in zip(found.q_tree, found.v_tree, found.a_tree, found.tau, strict=True):
         terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q)), v)
@@ -73,7 +73,7 @@ def assert_gives_back(found: MotionForces) -> None:
 
 
 class Prescribed:
-    """u of eq. 6 over time, whatever the state."""
+    """u of eq. 6 as a function of time only."""
 
     def __init__(self, found: MotionForces) -> None:
         mechanism, u = found.mechanism, []
@@ -87,7 +87,7 @@ class Prescribed:
 
 
 def assert_integrates_back(scene: str | Path, overrides: dict[str, Any], found: MotionForces) -> None:
-    """The run of those efforts, open loop, has the motion that was asked for."""
+    """Check that an open-loop run with the computed torques has the prescribed motion."""
     run = ckc_pin.simulate(scene, overrides, controller=Prescribed(found))
     assert run.status == "done", run.message
     assert_close(run.t, found.t, 0)
@@ -115,7 +115,7 @@ def test_inverse_dynamics_reproduces_motion_of_shipped_mechanisms(name: str) -> 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_inverse_dynamics_reproduces_motion_of_random_mechanisms(seed: int, tmp_path: Path) -> None:
-    """A free root that the loops leave free is held by no motor: refused, by name."""
+    """A free root that the loops leave free is moved by no motor and rejected by name."""
     scene = random_mechanism(seed).write(tmp_path / "random") / "default.scene.toml"
     mechanism = load_scene_mechanism(ckc_pin.load_scene(scene))
     overrides = waves(mechanism, 0.1)

@@ -1,4 +1,4 @@
-"""Inverse, then forward, for mechanisms that `ckc import` makes of URDFs and MuJoCo models."""
+"""Forces from inverse dynamics reproduce the motion of imported URDF and MuJoCo models."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GEARED = HINGE + "<actuator><motor joint='a' gear='20'/></actuator>"
 
 
 def free(draft: Draft) -> Draft:
-    """Drive every freedom, whatever the file has motors on."""
+    """Put a motor on each freedom, regardless of the file's motors."""
     return replace(draft, actuated=None)
 
 
@@ -87,7 +87,7 @@ def test_inverse_dynamics_reproduces_motion_of_package_robots(name: str, tmp_pat
 
 
 def test_published_robots_are_moved_along_all_driven_freedoms(tmp_path: Path) -> None:
-    """Their motion: of all freedoms, or on a free root of motors. Where nothing tells it, an error says so."""
+    """They are moved along all freedoms or, with a free root, along those of motors; otherwise an error says so."""
     assert given_back(MODELS["connects, friction, rotor and gear"](tmp_path)) < 1e-9
     pushed = model(tmp_path, FLOATING, "<actuator><motor joint='left'/><motor joint='right'/></actuator>")
     assert given_back(pushed) < 1e-9
@@ -102,7 +102,7 @@ def test_freedom_without_motor_is_named(tmp_path: Path) -> None:
 
 
 def test_massless_fingers_are_rejected(tmp_path: Path) -> None:
-    """Romeo's fingers and what they are geared to weigh nothing: torques leave their accelerations open."""
+    """Romeo's fingers and the links geared to them have no mass, so torques do not determine their accelerations."""
     scene = written(robot("romeo_description/urdf/romeo.urdf"), tmp_path)
     with pytest.raises((InputError, MechanismError), match="mass"):
         simulate(scene, waves(load(tmp_path / "mechanism.toml"), 0.1))

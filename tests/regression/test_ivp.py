@@ -1,4 +1,4 @@
-"""Runs against their equations in NumPy by SciPy's solvers at 1e-11: neither the step loop nor its C++ is shared."""
+"""Runs compared with the NumPy reference equations integrated by SciPy at 1e-11, which share no C++."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_run_agrees_with_its_equations_integrated_by_scipy(scene, overrides):
 
 
 def _near(found, wanted):
-    """Within a hundred times the tolerance of a step, which is what a run adds up to."""
+    """The global error of a run stays within a hundred times the tolerance of a step."""
     assert np.abs(found - wanted).max() <= 100 * 1e-8 * max(1.0, np.abs(wanted).max())
 
 
@@ -80,6 +80,6 @@ def test_overrides_need_a_name():
 
 
 def test_rate_is_nan_where_no_state_exists():
-    """As SciPy's solvers take it: the step is shortened."""
+    """SciPy's solvers then reduce the step size."""
     problem = as_ivp("five_bar/swing", REDUCED)
     assert np.isnan(problem.f(0.0, problem.y0 + np.array([1e3, 0.0, 0.0, 0.0]))).all()

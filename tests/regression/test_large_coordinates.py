@@ -1,4 +1,4 @@
-"""Coordinates that are large: a crank after many turns, and what is far from the origin, move as near zero."""
+"""Large coordinates: a crank after many turns and bodies far from the origin move like those near zero."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def falling(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("scene", ["slider_crank", "four_bar/turning"])
 def test_crank_turns_accurately_after_many_turns(scene: str, formulation: str) -> None:
-    """More than a hundred times: 1e-13 rad, near zero some rounding, is less than one at 512 rad."""
+    """After more than a hundred turns; rounding at 512 rad exceeds 1e-13 rad."""
     run = ckc_pin.simulate(scene, {"t_end": 90.0, "formulation": formulation, "solver.output_dt": 1.0})
     assert run.status == "done", run.message
     assert run["crank"][-1] > 800
@@ -75,7 +75,7 @@ def test_motion_does_not_depend_on_initial_turns(turns: int, formulation: str) -
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 def test_free_fall_does_not_depend_on_position(falling: str, formulation: str) -> None:
-    """The centre of mass falls as Galileo says, and what turns about it does not know where it is."""
+    """The centre of mass falls freely and the rotation about it does not depend on the position."""
     start = {"a": 1.0, "root.x": 0.0, "root.y": 0.0, "root.z": 0.0, "root.rx": 0.0, "root.ry": 0.0, "root.rz": 0.0}
     overrides = {
         "formulation": formulation,
@@ -97,7 +97,7 @@ def test_free_fall_does_not_depend_on_position(falling: str, formulation: str) -
 
 
 def test_too_large_angle_stops_the_run() -> None:
-    """One of 6e9 rad is known to 1e-6: no loop closes as it should."""
+    """An angle of 6e9 rad has a rounding error of 1e-6, so the loops do not close."""
     given = {"initial": {"q": {"crank": 2e9 * np.pi + np.pi / 2}, "q_dot": {"crank": 12.0}}, "t_end": 0.1}
     run = ckc_pin.simulate("four_bar/turning", given)
     assert run.status == "stopped"

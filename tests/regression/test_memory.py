@@ -1,4 +1,4 @@
-"""Memory does not grow with steps: what a run keeps is its output instants, what a simulator keeps is nothing."""
+"""Memory does not grow with steps: a run stores its output instants only, a simulator nothing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ALLOWED = 50  # bytes a step: the smallest array, kept at each, takes 130
 
 @pytest.mark.parametrize("name", RUNS)
 def test_memory_does_not_grow_with_steps(name: str) -> None:
-    """Python's own; that the loop in C++ allocates nothing a step, scripts/check_native counts."""
+    """Python's memory; scripts/check_native counts allocations of the native loop."""
     scene, overrides = RUNS[name]
     ready = prepare(load_scene(scene, {"t_end": 3.0, **overrides}))
     ready.begin()

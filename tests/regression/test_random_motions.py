@@ -1,4 +1,4 @@
-"""Motions that once ended wrong, or in a raw exception: each with its cause. All are conservative."""
+"""Conservative motions that once ended with a wrong result or an exception, each with its cause."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_energy_is_conserved_without_control(case: str) -> None:
 
 
 def test_three_formulations_conserve_energy_equally_well() -> None:
-    """Over random motions of the five-bar: medians of what the energy is off by, over rtol, within a factor of 30."""
+    """Medians of the energy errors over rtol in random motions of the five-bar agree within a factor of 30."""
     random = np.random.default_rng(18)
     off: dict[str, list[float]] = {"reduced": [], "spf": [], "dae": []}
     for _ in range(12):
@@ -102,7 +102,7 @@ def test_three_formulations_conserve_energy_equally_well() -> None:
 
 
 def test_reduced_run_stops_where_z_is_less_accurate_than_rtol() -> None:
-    """Towards the flat four-bars rounding is magnified by phi_z: it took 400,000 right-hand sides to say so."""
+    """Near the flat configuration phi_z amplifies rounding. The run used to need 400,000 right-hand sides."""
     overrides = {
         "formulation": "reduced", "t_end": 0.13, "solver.rtol": 4.5e-10,
         "initial": {"q": {"theta_0": 0.056536358472135895}, "q_dot": {"theta_0": 0.0}},
@@ -116,7 +116,7 @@ def test_reduced_run_stops_where_z_is_less_accurate_than_rtol() -> None:
 
 
 def test_diverging_motion_is_not_reported_as_singular() -> None:
-    """It said that phi_z's least singular value is nan: sampled velocity feedback that is too strong for its period."""
+    """Sampled velocity feedback with a too large gain. The message used to blame phi_z with a singular value of nan."""
     overrides = {
         "formulation": "dae", "t_end": 1.4, "solver.rtol": 2e-5,
         "initial": {"q": {"crank": 4.0}, "q_dot": {"crank": 0.0}},

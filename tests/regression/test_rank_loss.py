@@ -1,4 +1,4 @@
-"""Positions where J loses rank: crossed on their branch or stopped at, never left on another branch unnoticed."""
+"""Losses of rank of J are crossed on the same branch, or the run stops there."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_crossings_of_rank_loss_stay_on_the_branch(N: int, rtol: float) -> None:
 
 @pytest.mark.parametrize("N", [2, 7])
 def test_step_size_growth_is_limited(N: int) -> None:
-    """With SciPy's growth of a step, up to tenfold, one of these runs in ten is off by 1,000 to 12,000 times rtol."""
+    """With SciPy's step size growth of up to ten, one in ten of these runs has an error of 1,000 to 12,000 rtol."""
     wanted = [first_top_pin(N, float(t)) for t in range(11)]
     for rtol in np.geomspace(3e-9, 6e-8, 14).tolist():
         run = n_four_bar(N, rtol, solver__output_dt=1.0)
@@ -49,13 +49,13 @@ def test_run_may_end_before_at_or_after_a_crossing(t_end: float) -> None:
 
 @pytest.mark.parametrize(("rtol", "rhs"), [(1e-5, 48), (1e-7, 75)])
 def test_run_far_from_a_crossing_costs_no_extra_evaluations(rtol: float, rhs: int) -> None:
-    """The first is at 0.7085 s, of four squares at 0.7179 s; the numbers are the solver's own, with nobody watching."""
+    """The first crossing is at 0.7085 s, of four squares at 0.7179 s. Counts are those without the rank monitor."""
     for N in (1, 4):
         assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # of the interpolant
 
 
 def test_coarse_run_is_repeated_when_crossings_were_missed() -> None:
-    """At 1e-3 steps pass over three rank losses before the first is noticed."""
+    """At rtol = 1e-3, steps pass three losses of rank before the first is detected."""
     run = n_four_bar(4, 1e-3)
     assert run.status == "done", run.message
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(4, 10.0), abs=1e-4)
@@ -63,7 +63,7 @@ def test_coarse_run_is_repeated_when_crossings_were_missed() -> None:
 
 @pytest.mark.parametrize("rtol", [1e-2, 1e-3])
 def test_step_over_peak_and_zero_of_the_monitor_is_detected(rtol: float) -> None:
-    """Rising at both ends: with forty squares that went unseen all the way, and the pin ended 0.08 m off."""
+    """The monitor rises at both ends of the step. With forty squares the miss led to an error of 0.08 m."""
     run = n_four_bar(40, rtol)
     assert run.status == "done", run.message
     assert run.points["B0"][-1][:2] == pytest.approx(first_top_pin(40, 10.0), abs=1e-4)
@@ -91,7 +91,7 @@ def test_formulations_that_cannot_cross_rank_loss_stop(N: int, formulation: str,
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
 def test_start_where_J_loses_rank_is_rejected(formulation: str) -> None:
-    """No coordinates help there, so none are proposed."""
+    """No other coordinates help there, so the message proposes none."""
     with pytest.raises(NumericalError, match=r"the start theta_0 = 0 is singular: J loses rank.*; start elsewhere$"):
         simulate("n_four_bar", {"formulation": formulation, "initial.q": {"theta_0": 0.0}})
 
@@ -188,7 +188,7 @@ def test_change_point_four_bar_stays_on_its_branch(tmp_path: Path, rtol: float) 
 @pytest.mark.parametrize("excess", [1e-2, 1e-4])
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
 def test_near_miss_of_branches_is_not_a_crossing(tmp_path: Path, excess: float, rtol: float) -> None:
-    """With a longer rocker the rods are never in line, and its pin stays on the side where it was."""
+    """With a longer rocker the rods are never in line, and the pin stays on its side."""
 
     def near_miss(theta: float) -> one_freedom.State:
         return four_bar(theta, ROCKER + excess)
@@ -205,7 +205,7 @@ def test_near_miss_of_branches_is_not_a_crossing(tmp_path: Path, excess: float, 
 @pytest.mark.parametrize("scene", ["four_bar/turning", "five_bar/swing", "slider_crank"])
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_run_without_crossing_costs_no_extra_evaluations(scene: str, rtol: float) -> None:
-    """Three to begin, twelve a step, one where its end was put on the closure, three for the output inside the last."""
+    """Three evaluations at the start, twelve per step, one after projection, three for the last output."""
     overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.method": "DOP853", "t_end": 1.0}
     stats = simulate(scene, {**overrides, "solver.output_dt": 1.0}).stats
     tries = stats["steps"] + stats["rejected"]

@@ -1,4 +1,4 @@
-"""Cases whose answer is known without this program: published figures, closed forms, one-line integrals."""
+"""Cases with independent results: published values, closed forms and simple integrals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FORMULATIONS = ("dae", "reduced", "spf")
 
 
 def command(*words: str) -> dict[str, Any]:
-    """The JSON of `ckc run ...`, as another program would ask for it."""
+    """The JSON of `ckc run`, called as a separate program."""
     done = subprocess.run(
         [sys.executable, "-m", "ckc_pin.cli", "run", *words, "--json"], capture_output=True, text=True, check=False
     )
@@ -119,7 +119,7 @@ def test_stiff_flyball_governor(formulation: str) -> None:
 
 
 def first_top_pin(N: int, t: float) -> tuple[float, float]:
-    """All rods keep one angle: theta_ddot = -k cos(theta)."""
+    """All rods keep the same angle: theta_ddot = -k cos(theta)."""
     k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
     motion = solve_ivp(
         lambda _, y: (y[1], -k * np.cos(y[0])), (0, t), (np.pi / 2, -1.0), "DOP853", rtol=1e-13, atol=1e-14
@@ -170,7 +170,7 @@ CARRIAGE = """<robot name="carriage">
 
 
 def period(folder: Path, urdf: str, extra: str, start: str, coordinate: str, direction: int, formulation: str) -> Run:
-    """Run from rest until a rate vanishes the second time: one period."""
+    """Return the period: the run starts at rest and ends where a rate vanishes for the second time."""
     (folder / "m.urdf").write_text(urdf)
     (folder / "mechanism.toml").write_text(f'name = "m"\nurdf = "m.urdf"\ngravity = [0.0, -9.81, 0.0]\n{extra}')
     (folder / "default.scene.toml").write_text(
@@ -199,7 +199,7 @@ def test_pendulum_period(tmp_path: Path, formulation: str) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_geared_wheel_adds_its_reflected_inertia(tmp_path: Path, formulation: str) -> None:
-    """A wheel that turns three times as fast, backwards, adds 9 of its moments of inertia to m l^2."""
+    """A wheel geared by -3 adds 9 times its moment of inertia to m l^2."""
     izz = 0.05
     coupling = '[[coupling]]\njoint = "wheel_turn"\nother = "swing"\nratio = -3.0\noffset = 0.4\n'
     urdf = PENDULUM.format(wheel=WHEEL.format(izz=izz))
@@ -227,7 +227,7 @@ length = 1.0
 
 
 def test_far_trial_stages_are_rejected_without_following_sigma() -> None:
-    """At 1e-3 a step proposes stages 1e5 turns of the crank away: following sigma there took a minute."""
+    """At rtol = 1e-3 a trial step has stages 1e5 turns away. Following sigma there used to take a minute."""
     overrides = {"formulation": "reduced", "t_end": 5.0, "solver.method": "DOP853", "solver.rtol": 1e-3}
     run = simulate("slider_crank", overrides)
     assert run.status == "done"

@@ -1,4 +1,4 @@
-"""Numbers that are rounded, in files or by a machine: what a mechanism is does not hang on their last digits."""
+"""Rounded numbers in files: their last digits do not change the analysis of a mechanism."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def bennett(folder: Path, digits: int) -> Path:
 
 @pytest.mark.parametrize("digits", [8, 7, 6])
 def test_rounded_mechanism_assembles_like_the_exact_one(digits: int, tmp_path: Path) -> None:
-    """Not where another start happens to leave a little less open, here on the other side of a folded pose."""
+    """Another start with a slightly smaller residual lies on the other side of a folded configuration."""
     exact, found = load(bennett(tmp_path / "exact", 17)), load(bennett(tmp_path / "rounded", digits))
     assert np.abs(exact.assembled.phi).max() < 1e-12
     assert np.abs(exact.q_tree - GUESS).max() < 0.2
@@ -60,7 +60,7 @@ def test_rounded_mechanism_assembles_like_the_exact_one(digits: int, tmp_path: P
 
 
 def test_sigma_does_not_depend_on_the_path(tmp_path: Path) -> None:
-    """Within what is open, which is what counts as closed, z is the same from everywhere."""
+    """z is the same from every start, within the tolerance of the closure."""
     mechanism = load(bennett(tmp_path / "rounded", 6))
     assert np.abs(mechanism.assembled.phi).max() > 1e-9
     q = mechanism.q_tree[mechanism.partition.q]
@@ -69,7 +69,7 @@ def test_sigma_does_not_depend_on_the_path(tmp_path: Path) -> None:
 
 
 def test_inverse_dynamics_reproduces_the_motion_of_rounded_mechanism(tmp_path: Path) -> None:
-    """To rounding too, with loops that close to six digits."""
+    """Accurate to rounding, although the loops close to six digits only."""
     scene = bennett(tmp_path / "rounded", 6) / "default.scene.toml"
     scene.write_text('mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n')
     overrides = waves(load(scene.parent), 0.1)
@@ -77,7 +77,7 @@ def test_inverse_dynamics_reproduces_the_motion_of_rounded_mechanism(tmp_path: P
 
 
 def test_rounding_does_not_select_equivalent_coordinates() -> None:
-    """Two legs alike, each with a rod that spins between two joints, in axes turned at random."""
+    """Two identical legs, each with a rod that spins between two joints, in randomly rotated axes."""
     random = np.random.default_rng(1)
     leg = random.normal(size=(3, 4))
     leg[:, 3] = -leg[:, 2]  # the rod's other end spins the other way

@@ -1,4 +1,4 @@
-"""Every shipped mechanism: its known freedoms, every scene of it starts, and what moves freely keeps its energy."""
+"""Shipped mechanisms: freedoms, start of every scene, and energy conservation."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_shipped_scene_runs(scene: str) -> None:
 
 
 def drift(run: Run) -> float:
-    """Largest change of the energy, over the largest kinetic energy and the range of the potential one."""
+    """Largest change of the energy, relative to the largest kinetic energy and the range of the potential energy."""
     model = run.mechanism
     potential = np.array(
         [
@@ -183,7 +183,7 @@ axis_b = [1.0, 0.0, 0.0]
 
 @cache
 def crank_angle(scene: str | Path, formulation: str) -> float:
-    """Crank after most of a turn."""
+    """Angle of the crank after most of a turn."""
     run = simulate(scene, {"formulation": formulation, "t_end": 0.5, "solver.rtol": 1e-11, "solver.output_dt": 0.5})
     angle = float(run.q_tree[-1, run.column("crank")])
     assert angle > 3.0
@@ -191,7 +191,7 @@ def crank_angle(scene: str | Path, formulation: str) -> float:
 
 
 def assert_same_motion(folder: Path) -> None:
-    """The crank of a slider-crank in a folder turns as the shipped one's does."""
+    """Check that the crank of a slider-crank in a folder moves like the shipped one's."""
     scene = folder / "default.scene.toml"
     scene.write_text((SLIDER_CRANK / scene.name).read_text())
     for formulation in ("dae", "reduced"):
@@ -203,7 +203,7 @@ def assert_same_motion(folder: Path) -> None:
 def test_loop_cut_at_the_rail_gives_the_same_motion(
     tmp_path: Path, kind: str, rows: int, ends: tuple[str, str]
 ) -> None:
-    """The slider pinned to the rod in the tree, its rail a loop: redundant rows, the same motion."""
+    """The slider is attached to the rod in the tree and the rail is a loop with redundant rows."""
     tree = ElementTree.parse(SLIDER_CRANK / "slider_crank.urdf")
     joint = next(j for j in tree.getroot().findall("joint") if j.get("name") == "slider")
     joint.set("name", "pin")
@@ -228,7 +228,7 @@ OTHER_PINS = {
 
 @pytest.mark.parametrize(("loop", "rows"), OTHER_PINS.values(), ids=OTHER_PINS)
 def test_redundant_loop_types_give_the_same_motion(tmp_path: Path, loop: str, rows: int) -> None:
-    """What a planar pin is in space, told by a ball, a hinge, a universal joint."""
+    """A planar pin closed by a point, a hinge or a universal joint."""
     (tmp_path / "slider_crank.urdf").write_text((SLIDER_CRANK / "slider_crank.urdf").read_text())
     text = (SLIDER_CRANK / "mechanism.toml").read_text()
     (tmp_path / "mechanism.toml").write_text(text.replace('type = "point_2d"', loop))
@@ -248,7 +248,7 @@ def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
 
 
 def test_contradictory_w_of_redundant_rows_is_rejected() -> None:
-    """w of Bricard's hinge has four freedoms for five rows."""
+    """The five rows of Bricard's hinge have rank four."""
     overrides = {"formulation": "spf", "epsilon": 0.1, "t_end": 0.05}
     with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):
         simulate("bricard", {**overrides, "initial.w": [1e-3] * 5})

@@ -1,4 +1,4 @@
-"""The SPF off its manifold: eq. 8 as printed, eq. 17's coordinates, and where C takes its velocity."""
+"""The SPF off its manifold: eq. 8 as printed, the coordinates of eq. 17, and the velocity in C."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def eq_17(run: Callable[..., Run], epsilon: float, w: list[float]) -> Run:
 @starts
 @epsilons
 def test_eq_8_as_printed_agrees_with_eq_17(run: Callable[..., Run], epsilon: float, w: list[float]) -> None:
-    """All rates too: z_dot is reported with the exact w, not with phi, whose error epsilon would divide."""
+    """Rates agree too, because z_dot uses the exact w; the error of phi would be divided by epsilon."""
     printed, levels = eq_8(run, epsilon, w), eq_17(run, epsilon, w)
     assert printed.stats["method"] == "Radau"
     assert printed.stats["newton"] == 0  # no sigma anywhere: z is integrated
@@ -37,7 +37,7 @@ def test_eq_8_as_printed_agrees_with_eq_17(run: Callable[..., Run], epsilon: flo
 
 @starts
 def test_eq_8_as_printed_works_for_any_epsilon(run: Callable[..., Run], w: list[float]) -> None:
-    """Down to where epsilon divides rounding errors: a bounded number of right-hand sides, and outputs as good."""
+    """The number of right-hand sides is bounded even if epsilon amplifies rounding, and outputs are as accurate."""
     counts = []
     for epsilon in (1e-4, 1e-8, 1e-12):
         common = {"formulation": "spf", "epsilon": epsilon, "initial__w": w, "t_end": 0.5}
@@ -54,7 +54,7 @@ def test_eq_8_as_printed_works_for_any_epsilon(run: Callable[..., Run], w: list[
 @starts
 @epsilons
 def test_w_decays_exponentially(run: Callable[..., Run], epsilon: float, w: list[float]) -> None:
-    """w(t) = w(0) exp(-t / epsilon), by the numpy five-bar's phi along both."""
+    """w(t) = w(0) exp(-t / epsilon), evaluated with the phi of the NumPy five-bar."""
     for ours, tolerance in ((eq_8(run, epsilon, w), 1e-8), (eq_17(run, epsilon, w), 1e-12)):
         decay = np.array(w) * np.exp(-ours.t / epsilon)[:, None]
         assert_close([FIVE_BAR.phi(q) for q in ours.q_tree], decay, tolerance)
@@ -76,7 +76,7 @@ TABLE = [
 def test_coriolis_velocity_convention_has_the_expected_error(
     run: Callable[..., Run], convention: str, start: str, errors: dict[float, float]
 ) -> None:
-    """O(epsilon) from rest in both conventions, and from a moving start with rho q_dot; not with the actual z_dot."""
+    """The error is O(epsilon) from rest in both conventions and, from a moving start, with rho q_dot only."""
     q_dot = {"theta_1": 1.0, "theta_3": -2.0} if start == "moving" else {}
     common = {"t_end": 1.0, "solver__rtol": 1e-10, "solver__output_dt": 1.0, "initial__q_dot": q_dot}
     dae = run("five_bar/swing", formulation="dae", **common)

@@ -1,4 +1,4 @@
-"""Stiff closed loops: what `auto` takes, that the error along the whole run is the tolerance, and what that costs."""
+"""Stiff closed loops: choice of method, error along the run, and cost."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.analytic.five_bar import FIVE_BAR, Array, Q, tracking
 
 @pytest.fixture(scope="module")
 def exact() -> Callable[[float], Array]:
-    """(q, q_dot) of eq. 16's tracking by the numpy five-bar, to some 1e-12."""
+    """(q, q_dot) of tracking with eq. 16 by the NumPy five-bar, accurate to about 1e-12."""
     u = tracking(FIVE_BAR)
 
     def rhs(t: float, y: Array) -> Array:
@@ -49,7 +49,7 @@ def test_error_along_tracking_is_within_tolerance(
 def test_dae_error_along_tracking_is_within_tolerance(
     run: Callable[..., Run], exact: Callable[[float], Array], rtol: float, budget: int
 ) -> None:
-    """On its closure at every output, though no step is edited."""
+    """The loops are closed at every output, although steps are not projected."""
     ours = run("five_bar/tracking", formulation="dae", solver__rtol=rtol, solver__output_dt=0.01)
     assert ours.stats["method"] == "Radau"
     assert ours.stats["rhs"] <= budget
@@ -58,7 +58,7 @@ def test_dae_error_along_tracking_is_within_tolerance(
 
 
 def test_auto_detects_stiffness_during_the_run() -> None:
-    """A damper that grips while the spring beside it, stretched at the start, still pushes: at first modes grow."""
+    """A damper becomes effective while a stretched spring still pushes, so modes grow at first."""
     case = next(case for case in GROUPS["spring"]() if case.name == "line 1e+06 N/m, damped")
     longer = {**case.overrides, "t_end": 0.4, "solver.output_dt": 0.1}
     auto, explicit = run_case(replace(case, overrides=longer, how=(How("dae"), How("dae", "DOP853"))))
@@ -67,7 +67,7 @@ def test_auto_detects_stiffness_during_the_run() -> None:
 
 
 def test_callers_controller_costs_as_many_right_hand_sides() -> None:
-    """Its gradient is known to nobody: the Jacobian is made of differences, as with eq. 14's own."""
+    """Its gradient is unknown, so the Jacobian is computed by finite differences."""
     overrides = {"formulation": "reduced", "t_end": 3.0}
     known = simulate("five_bar/set_point", overrides)
 

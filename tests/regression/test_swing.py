@@ -1,4 +1,4 @@
-"""The uncontrolled swing: three formulations, one motion, and the one that was integrated apart from them."""
+"""The uncontrolled swing: three formulations agree with each other and with an independent integration."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_energy_is_conserved(run: Callable[..., Run], file: str, formulation: st
 @readings
 @formulations
 def test_loops_are_closed_at_every_output(run: Callable[..., Run], file: str, formulation: str) -> None:
-    """By the numpy five-bar's phi and J, not by what the run says of itself."""
+    """Checked with phi and J of the NumPy five-bar."""
     reference = trajectory(file)
     ours, model = run(reference.name, formulation=formulation, solver__rtol=1e-10), REFERENCES[reference.mechanism]
     assert_close([model.phi(q) for q in ours.q_tree], 0, 1e-12)
@@ -67,7 +67,7 @@ def test_loops_are_closed_at_every_output(run: Callable[..., Run], file: str, fo
 @readings
 @formulations
 def test_loop_forces_are_the_multipliers(run: Callable[..., Run], file: str, formulation: str) -> None:
-    """From any formulation, by loop name: the force on the left tip."""
+    """The multipliers by loop name are the force on the left tip in every formulation."""
     reference = trajectory(file)
     ours = run(reference.name, formulation=formulation, solver__rtol=1e-10)
     forces = ours.loop_forces()
