@@ -202,7 +202,7 @@ BOMBS: dict[str, tuple[dict[str, bytes], str]] = {
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def good_entries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The entries of a good run file."""
     path = simulate("five_bar/swing", {"t_end": 0.01}).save(tmp_path_factory.mktemp("run") / "run.npz")
     with zipfile.ZipFile(path) as archive:
@@ -218,10 +218,12 @@ def _zip(path: Path, entries: list[tuple[str, bytes]]) -> Path:
 
 @pytest.mark.parametrize("what", BOMBS)
 def test_decompression_bombs_are_not_expanded(
-    what: str, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: str, good_entries: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entries, says = BOMBS[what]
-    path = _zip(tmp_path / "run.npz", list((whole | {f"{name}.npy": data for name, data in entries.items()}).items()))
+    path = _zip(
+        tmp_path / "run.npz", list((good_entries | {f"{name}.npy": data for name, data in entries.items()}).items())
+    )
     monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was expanded"))
     with pytest.raises(InputError) as error:
         Run.load(path)
@@ -229,23 +231,23 @@ def test_decompression_bombs_are_not_expanded(
     assert says in str(error.value)
 
 
-def test_duplicate_entry_is_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_duplicate_entry_is_rejected(good_entries: dict[str, bytes], tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="Duplicate name"):
-        path = _zip(tmp_path / "run.npz", [*whole.items(), ("t.npy", whole["t.npy"])])
+        path = _zip(tmp_path / "run.npz", [*good_entries.items(), ("t.npy", good_entries["t.npy"])])
     with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 
-def test_entry_that_is_no_array_is_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_entry_that_is_no_array_is_rejected(good_entries: dict[str, bytes], tmp_path: Path) -> None:
     rename: Callable[[str], str] = lambda name: "t" if name == "t.npy" else name  # noqa: E731
-    path = _zip(tmp_path / "run.npz", [(rename(name), data) for name, data in whole.items()])
+    path = _zip(tmp_path / "run.npz", [(rename(name), data) for name, data in good_entries.items()])
     with pytest.raises(InputError, match="not a run file: it contains"):
         Run.load(path)
 
 
-def test_numeric_names_are_rejected(whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_numeric_names_are_rejected(good_entries: dict[str, bytes], tmp_path: Path) -> None:
     stream = io.BytesIO()
     np.save(stream, np.zeros(4))
-    path = _zip(tmp_path / "run.npz", [*(whole | {"coordinates.npy": stream.getvalue()}).items()])
+    path = _zip(tmp_path / "run.npz", [*(good_entries | {"coordinates.npy": stream.getvalue()}).items()])
     with pytest.raises(InputError, match=r"coordinates is \(4,\) float64, not names"):
         Run.load(path)

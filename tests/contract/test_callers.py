@@ -28,7 +28,7 @@ NAMES = ("D_tree", "C_tree", "h_tree", "bias_tree", "phi", "J_dot", "rho", "rho_
          "potential_energy", "q", "q_dot")  # fmt: skip
 
 
-class Own:
+class CustomController:
     """The scene's controller, wrapped by a caller that checks its arguments."""
 
     def __init__(self, inner: Any) -> None:
@@ -44,20 +44,22 @@ class Own:
 @pytest.mark.parametrize(("scene", "overrides"), SCENES, ids=str)
 def test_controller_is_called_once_per_evaluation_with_its_terms(scene, overrides):
     loaded = load_scene(scene, overrides)
-    own = Own(prepare(loaded).controller)
-    theirs, mine = simulate(loaded), simulate(loaded, controller=own)
+    custom = CustomController(prepare(loaded).controller)
+    theirs, mine = simulate(loaded), simulate(loaded, controller=custom)
     assert np.abs(mine.q_tree - theirs.q_tree).max() <= 1e-7
     assert theirs.stats["python_calls"] == 0
     outputs = len(mine.t)
-    assert mine.stats["python_calls"] == own.calls
-    assert mine.stats["rhs"] <= own.calls <= mine.stats["rhs"] + outputs + 1
+    assert mine.stats["python_calls"] == custom.calls
+    assert mine.stats["rhs"] <= custom.calls <= mine.stats["rhs"] + outputs + 1
     assert mine.stats["rhs"] == pytest.approx(theirs.stats["rhs"], rel=0.1)
-    assert len(own.kept) > 1
-    for terms, given in own.kept:
+    assert len(custom.kept) > 1
+    for terms, terms_seen in custom.kept:
         reference = Terms(mine.mechanism, terms.at, terms.v_tree)
-        for name, value in given.items():
-            wanted = np.asarray(getattr(reference, name))
-            assert np.abs(value - wanted).max(initial=0.0) <= 1e-11 * max(1.0, np.abs(wanted).max(initial=0.0)), name
+        for name, value in terms_seen.items():
+            expected = np.asarray(getattr(reference, name))
+            assert np.abs(value - expected).max(initial=0.0) <= 1e-11 * max(1.0, np.abs(expected).max(initial=0.0)), (
+                name
+            )
 
 
 def test_stored_terms_do_not_change():
@@ -165,12 +167,12 @@ def test_controllers_in_threads_get_their_own_terms():
     def run(number: int) -> Any:
         target = -0.5 - 0.05 * number
 
-        class Own:
+        class CustomController:
             def u(self, t: float, terms: Terms) -> Any:
                 return terms.h + terms.D @ (20.0 * (target - terms.q) - 5.0 * terms.q_dot)
 
         overrides = {"formulation": "reduced", "t_end": 0.3}
-        return simulate("five_bar/set_point", overrides, controller=Own()).q_tree
+        return simulate("five_bar/set_point", overrides, controller=CustomController()).q_tree
 
     alone = [run(number) for number in range(4)]
     with ThreadPoolExecutor(4) as pool:

@@ -41,42 +41,42 @@ def crossings() -> tuple[list[float], list[float]]:
         return float(y[3])
 
     y = [start["theta_1"], start["theta_3"], 0.0, 0.0]
-    found = solve_ivp(rate, (0, 2), y, "DOP853", rtol=1e-13, atol=1e-14, max_step=0.01, events=[level, turning])
-    assert found.status == 0
-    return found.t_events[0].tolist(), [t for t in found.t_events[1].tolist() if t > 1e-6]
+    result = solve_ivp(rate, (0, 2), y, "DOP853", rtol=1e-13, atol=1e-14, max_step=0.01, events=[level, turning])
+    assert result.status == 0
+    return result.t_events[0].tolist(), [t for t in result.t_events[1].tolist() if t > 1e-6]
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
 def test_events_are_located(formulation: str, crossings: tuple[list[float], list[float]]) -> None:
-    met = simulate("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-11, "event": EVENTS}).events
-    assert [event["t"] for event in met] == sorted(event["t"] for event in met)
-    assert_close([event["t"] for event in met if event["of"] == "q"], crossings[0], 1e-10)
-    assert_close([event["t"] for event in met if event["of"] == "q_dot"], crossings[1], 1e-10)
-    assert {event["coordinate"]: event["value"] for event in met} == {"theta_2": LEVEL, "theta_3": 0.0}
+    occurrences = simulate("five_bar/swing", {"formulation": formulation, "solver.rtol": 1e-11, "event": EVENTS}).events
+    assert [event["t"] for event in occurrences] == sorted(event["t"] for event in occurrences)
+    assert_close([event["t"] for event in occurrences if event["of"] == "q"], crossings[0], 1e-10)
+    assert_close([event["t"] for event in occurrences if event["of"] == "q_dot"], crossings[1], 1e-10)
+    assert {event["coordinate"]: event["value"] for event in occurrences} == {"theta_2": LEVEL, "theta_3": 0.0}
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
 def test_events_of_one_direction(direction: int, crossings: tuple[list[float], list[float]]) -> None:
     """theta_2 oscillates through LEVEL, so every other crossing rises."""
     event = {"coordinate": "theta_2", "value": LEVEL, "direction": direction}
-    found = simulate("five_bar/swing", {"event": [event]})
+    result = simulate("five_bar/swing", {"event": [event]})
     first = simulate("five_bar/swing", {"t_end": crossings[0][0] + 0.01})
     rises_first = first.v_tree[-1, first.column("theta_2")] > 0
-    wanted = crossings[0][0 if rises_first == (direction > 0) else 1 :: 2]
-    assert_close([event["t"] for event in found.events], wanted, 1e-7)
-    assert found.status == "done"
-    assert found.t[-1] == 2.0, "an event that does not stop the run does not"
+    expected = crossings[0][0 if rises_first == (direction > 0) else 1 :: 2]
+    assert_close([event["t"] for event in result.events], expected, 1e-7)
+    assert result.status == "done"
+    assert result.t[-1] == 2.0, "an event that does not stop the run does not"
 
 
 def test_stopping_event_is_the_last_instant(crossings: tuple[list[float], list[float]]) -> None:
     event = {"coordinate": "theta_2", "value": LEVEL, "stop": True}
-    found = simulate("five_bar/swing", {"solver.rtol": 1e-11, "event": [*EVENTS, event]})
-    assert found.status == "done"
-    assert found.message.startswith("stopped by the event at t = 0.2141212")
-    assert found.t[-1] == pytest.approx(crossings[0][0], abs=1e-10)
-    assert found.q_tree[-1, found.column("theta_2")] == pytest.approx(LEVEL, abs=1e-11)
-    assert [event["stop"] for event in found.events] == [False, True]
-    assert np.all(np.diff(found.t) > 0)
+    result = simulate("five_bar/swing", {"solver.rtol": 1e-11, "event": [*EVENTS, event]})
+    assert result.status == "done"
+    assert result.message.startswith("stopped by the event at t = 0.2141212")
+    assert result.t[-1] == pytest.approx(crossings[0][0], abs=1e-10)
+    assert result.q_tree[-1, result.column("theta_2")] == pytest.approx(LEVEL, abs=1e-11)
+    assert [event["stop"] for event in result.events] == [False, True]
+    assert np.all(np.diff(result.t) > 0)
 
 
 # --- limits and actuators --------------------------------------------------------------------------
@@ -100,11 +100,11 @@ def test_torque_limit_of_distal_motors(bar: Path) -> None:
     assert old in text
     (bar / "mechanism.toml").write_text(text.replace(old, 'actuated = ["theta_4", "theta_2"]'), encoding="utf-8")
     overrides = {"t_end": 0.1, "controller.torque_limit": 4.0}
-    found = simulate(bar / "tracking.scene.toml", overrides)
-    assert np.abs(found.tau).max() == 4.0
-    for k in range(len(found.t)):
-        rho = FIVE_BAR.rho(found.q_tree[k])
-        assert_close(found.u[k], rho[3] * found.tau[k, 0] + rho[1] * found.tau[k, 1], 1e-11)
+    result = simulate(bar / "tracking.scene.toml", overrides)
+    assert np.abs(result.tau).max() == 4.0
+    for k in range(len(result.t)):
+        rho = FIVE_BAR.rho(result.q_tree[k])
+        assert_close(result.u[k], rho[3] * result.tau[k, 0] + rho[1] * result.tau[k, 1], 1e-11)
 
 
 # --- controllers and trajectories ------------------------------------------------------------------
@@ -123,10 +123,10 @@ class ByHand:
 def test_python_controller_replaces_the_scenes_controller(run: Callable[..., Run]) -> None:
     q_d = np.full(2, np.pi / 4)
     shipped = run("five_bar/set_point", t_end=0.3)
-    own = simulate("five_bar/set_point", {"t_end": 0.3}, controller=ByHand(q_d))
-    assert_close(own.u, shipped.u, 1e-6)
-    assert_close(own.q_tree, shipped.q_tree, 1e-7)
-    assert own.lyapunov is None
+    custom = simulate("five_bar/set_point", {"t_end": 0.3}, controller=ByHand(q_d))
+    assert_close(custom.u, shipped.u, 1e-6)
+    assert_close(custom.q_tree, shipped.q_tree, 1e-7)
+    assert custom.lyapunov is None
     assert shipped.lyapunov is not None
 
 
@@ -134,9 +134,9 @@ def test_desired_trajectory_may_be_a_function(run: Callable[..., Run]) -> None:
     """Eq. 21 as a Python function compared with the scene's harmonics, with equal steps because Jacobians differ."""
     shipped = run("five_bar/tracking", t_end=0.3, solver__method="DOP853")
     law = Tracking(np.eye(2), 10.0 * np.eye(2), desired)
-    own = simulate("five_bar/tracking", {"t_end": 0.3, "solver.method": "DOP853"}, controller=law)
-    assert_close(own.q_tree, shipped.q_tree, 1e-9)
-    assert_close(own.u, shipped.u, 1e-9)
+    custom = simulate("five_bar/tracking", {"t_end": 0.3, "solver.method": "DOP853"}, controller=law)
+    assert_close(custom.q_tree, shipped.q_tree, 1e-9)
+    assert_close(custom.u, shipped.u, 1e-9)
 
 
 def test_trajectory_file_gives_the_same_run(bar: Path, run: Callable[..., Run]) -> None:
@@ -188,14 +188,14 @@ def test_progress_is_reported() -> None:
     [("max_rhs", 200, "max_rhs = 200 right-hand sides"), ("max_wall_s", 0.25, "max_wall_s = 0.25 s")],
 )
 def test_exhausted_budget_keeps_results(budget: str, value: float, says: str, tmp_path: Path) -> None:
-    found = simulate("five_bar/swing", {f"solver.{budget}": value, "t_end": 1000.0, "solver.output_dt": 0.001})
-    assert found.status == "stopped"
-    assert says in found.message
-    assert found.message.startswith("stopped at t = ")
-    assert len(found.t) > 10
-    assert_close(np.diff(found.t)[:-1], 0.001, 1e-12)
-    assert_close(found.energy, found.energy[0], 1e-6)
-    assert Run.load(found.save(tmp_path / "run.npz")).message == found.message
+    result = simulate("five_bar/swing", {f"solver.{budget}": value, "t_end": 1000.0, "solver.output_dt": 0.001})
+    assert result.status == "stopped"
+    assert says in result.message
+    assert result.message.startswith("stopped at t = ")
+    assert len(result.t) > 10
+    assert_close(np.diff(result.t)[:-1], 0.001, 1e-12)
+    assert_close(result.energy, result.energy[0], 1e-6)
+    assert Run.load(result.save(tmp_path / "run.npz")).message == result.message
 
 
 def test_interrupt_in_a_controller_keeps_results() -> None:
@@ -205,11 +205,11 @@ def test_interrupt_in_a_controller_keeps_results() -> None:
                 raise KeyboardInterrupt
             return np.zeros(2)
 
-    found = simulate("five_bar/swing", {"t_end": 1.0}, controller=Impatient())
-    assert found.status == "interrupted"
-    assert found.message.startswith("interrupted at t = 0.1") or found.message.startswith("interrupted at t = 0.2")
-    assert 0.1 < found.t[-1] <= 0.2
-    assert_close(found.energy, found.energy[0], 1e-7)
+    result = simulate("five_bar/swing", {"t_end": 1.0}, controller=Impatient())
+    assert result.status == "interrupted"
+    assert result.message.startswith("interrupted at t = 0.1") or result.message.startswith("interrupted at t = 0.2")
+    assert 0.1 < result.t[-1] <= 0.2
+    assert_close(result.energy, result.energy[0], 1e-7)
 
 
 def test_overrides_accept_numpy_values() -> None:
@@ -234,9 +234,9 @@ def test_overrides_beside_a_scene_are_rejected() -> None:
 
 @pytest.mark.parametrize("overrides", [{}, {"solver.output_dt": 0.3}, {"solver.output_dt": 7.0}, {"t_end": 1e-9}])
 def test_output_instants(overrides: dict[str, Any]) -> None:
-    found = simulate("five_bar/swing", {"t_end": 1.0, "formulation": "reduced", **overrides})
+    result = simulate("five_bar/swing", {"t_end": 1.0, "formulation": "reduced", **overrides})
     t_end, dt = overrides.get("t_end", 1.0), overrides.get("solver.output_dt", 0.01)
-    assert found.t[0] == 0.0
-    assert found.t[-1] == t_end
-    inner = found.t[:-1]
+    assert result.t[0] == 0.0
+    assert result.t[-1] == t_end
+    inner = result.t[:-1]
     assert_close(inner, dt * np.arange(len(inner)), 1e-15)

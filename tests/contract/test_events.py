@@ -60,10 +60,10 @@ R = 1e-4  # half the distance of two roots
          "jump", "touch", "touch at a node", "miss", "constant", "zero"],
 )  # fmt: skip
 def test_sign_changes_within_a_step(function: Callable[[float], float], roots: list[tuple[float, int]]) -> None:
-    found, _, _ = _walk(function)
-    assert [direction for _, direction in found] == [direction for _, direction in roots]
+    roots_found, _, _ = _walk(function)
+    assert [direction for _, direction in roots_found] == [direction for _, direction in roots]
     # near a double root its value's rounding moves it: 1e-16 over the slope
-    assert_close([t for t, _ in found], [t for t, _ in roots], 2e-12)
+    assert_close([t for t, _ in roots_found], [t for t, _ in roots], 2e-12)
 
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])
@@ -86,8 +86,10 @@ def test_root_search_uses_the_cheap_function_first(root: float, slope: float) ->
         asked.append(t)
         return float(slope * np.sinh(t - root))
 
-    found, _, _ = _core.walk(lambda t: float(slope * np.sinh(t - root) + 1e-7 * np.cos(5 * t)), 0.0, 1.0, 0, 0.0, exact)
-    assert_close([t for t, _ in found], [root], 2e-12)
+    roots_found, _, _ = _core.walk(
+        lambda t: float(slope * np.sinh(t - root) + 1e-7 * np.cos(5 * t)), 0.0, 1.0, 0, 0.0, exact
+    )
+    assert_close([t for t, _ in roots_found], [root], 2e-12)
     assert len(asked) <= 2
 
 
@@ -95,13 +97,13 @@ def test_root_search_uses_the_cheap_function_first(root: float, slope: float) ->
 def test_exact_function_decides_between_nearly_equal_roots(off: float) -> None:
     """The cheap function has two roots where the exact one has none, or vice versa."""
     for depth in (0.5e-7, -0.5e-7):
-        found, _, _ = _core.walk(
+        roots_found, _, _ = _core.walk(
             lambda t, depth=depth: (t - 0.3) ** 2 - depth + off, 0.0, 1.0, 0, 0.0,
             lambda t, depth=depth: (t - 0.3) ** 2 - depth,
         )  # fmt: skip
-        assert [direction for _, direction in found] == ([-1, 1] if depth > 0 else [])
+        assert [direction for _, direction in roots_found] == ([-1, 1] if depth > 0 else [])
         if depth > 0:
-            assert_close([t for t, _ in found], [0.3 - np.sqrt(depth), 0.3 + np.sqrt(depth)], 1e-8)
+            assert_close([t for t, _ in roots_found], [0.3 - np.sqrt(depth), 0.3 + np.sqrt(depth)], 1e-8)
 
 
 # --- against numpy and SciPy ---------------------------------------------------------------------
@@ -148,14 +150,14 @@ def test_two_crossings_in_one_step(formulation: str, motion: Callable[[float], A
     """theta_2 reverses just beyond the value, so large steps contain both crossings."""
     turn = next(t for t in _roots(lambda t: float(motion(t)[5])) if t > 0.05)
     value = float(motion(turn)[1]) - np.sign(motion(turn)[1] - motion(turn - 0.02)[1]) * 2e-4
-    wanted = [t for t in _roots(lambda t: float(motion(t)[1] - value)) if abs(t - turn) < 0.02]
-    assert len(wanted) == 2
+    expected = [t for t in _roots(lambda t: float(motion(t)[1] - value)) if abs(t - turn) < 0.02]
+    assert len(expected) == 2
     overrides = {"formulation": formulation, "t_end": T_END, "event": [{"coordinate": "theta_2", "value": value}]}
     loose = simulate("five_bar/swing", {**overrides, "solver.rtol": 1e-5, "solver.output_dt": T_END})
-    assert T_END / loose.stats["steps"] > 2 * (wanted[1] - wanted[0])
+    assert T_END / loose.stats["steps"] > 2 * (expected[1] - expected[0])
     assert len([t for t in _times(loose) if abs(t - turn) < 0.02]) == 2
     tight = simulate("five_bar/swing", {**overrides, **TIGHT})
-    assert_close([t for t in _times(tight) if abs(t - turn) < 0.02], wanted, 1e-9)  # 0.01 of slope: 1e-11 rad
+    assert_close([t for t in _times(tight) if abs(t - turn) < 0.02], expected, 1e-9)  # 0.01 of slope: 1e-11 rad
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -188,9 +190,9 @@ def test_singular_value_and_function_events_are_located(formulation: str, motion
     for of, function, value in zip(
         ("sigma_min_phi_z", "sigma_min_J", "function"), (margin, margin_of_j, energy), values, strict=True
     ):
-        wanted = _roots(lambda t, f=function, v=value: f(t) - v)
-        assert wanted, of
-        assert_close([t for t in _times(run, of=of) if t not in _times(run, name="clock")], wanted, 1e-10)
+        expected = _roots(lambda t, f=function, v=value: f(t) - v)
+        assert expected, of
+        assert_close([t for t in _times(run, of=of) if t not in _times(run, name="clock")], expected, 1e-10)
     assert _times(run, name="clock") == [pytest.approx(0.25, abs=1e-12)]
     assert {event["name"] for event in run.events} >= {"fallen", "clock", f"sigma_min_J = {values[1]:g}"}
     assert [event["t"] for event in run.events] == sorted(event["t"] for event in run.events)
@@ -235,9 +237,9 @@ def test_joint_limits_are_events_without_contact(formulation: str, bar: Path, mo
     run = simulate(scene, {**TIGHT, "formulation": formulation, "t_end": T_END, "event": [{"of": "limit"}]})
     assert run.status == "done"
     for name, function in beyond.items():
-        wanted = _roots(function)
-        assert wanted, name
-        assert_close(_times(run, coordinate=name), wanted, 1e-10)
+        expected = _roots(function)
+        assert expected, name
+        assert_close(_times(run, coordinate=name), expected, 1e-10)
         for event in run.events:
             if event["coordinate"] == name:
                 assert event["of"] == "limit"
@@ -289,9 +291,9 @@ def test_events_have_directions_and_are_ordered() -> None:
         return float(np.sin(20 * t + 0.1))
 
     both = [(k * np.pi - 0.1) / 20 for k in range(1, 4)]
-    for direction, wanted in ((0, both), (1, both[1::2]), (-1, both[::2])):
+    for direction, expected in ((0, both), (1, both[1::2]), (-1, both[::2])):
         run = simulate("five_bar/swing", {"t_end": 0.5, "formulation": "reduced"}, events=[Event(wave, direction)])
-        assert_close(_times(run), wanted, 1e-11)
+        assert_close(_times(run), expected, 1e-11)
     stopping = [Event(wave, name="a"), Event(wave, -1, True, "b"), Event(wave, name="c")]
     run = simulate("five_bar/swing", {"t_end": 0.5, "formulation": "reduced"}, events=stopping)
     assert [event["name"] for event in run.events] == ["a", "b", "c"], "all that happen at the instant of the stop"
@@ -333,7 +335,7 @@ def test_simulator_reports_events_within_its_steps(formulation: str) -> None:
         "event": [{"coordinate": "theta_2", "value": 0.5}],
     }
     bell = Event(lambda t, terms: t - 0.1, stop=True, name="bell")
-    wanted = simulate("five_bar/swing", overrides, events=[Event(lambda t, terms: t - 0.1)]).events
+    expected = simulate("five_bar/swing", overrides, events=[Event(lambda t, terms: t - 0.1)]).events
     simulator = Simulator("five_bar/swing", overrides, events=[bell])
     stops = []
     while simulator.state.t < 0.5:
@@ -341,7 +343,7 @@ def test_simulator_reports_events_within_its_steps(formulation: str) -> None:
         if simulator.step(None, 0.03).t < end - 1e-9:
             stops.append(simulator.state.t)
     assert stops == [pytest.approx(0.1, abs=1e-11)]
-    assert_close([event["t"] for event in simulator.events][: len(wanted)], [event["t"] for event in wanted], 1e-8)
+    assert_close([event["t"] for event in simulator.events][: len(expected)], [event["t"] for event in expected], 1e-8)
     simulator.reset()
     assert simulator.events == []
     assert simulator.step(None, 0.2).t == pytest.approx(0.1, abs=1e-11)

@@ -39,9 +39,9 @@ def test_invalid_number_of_links_is_rejected(case: Bad, bar: Path) -> None:
 
 
 def test_generator_by_name_has_default_size() -> None:
-    found = ckc("check", "n_four_bar", "--json").json
-    assert (found["n"], found["d"], found["rows"]) == (9, 1, 8)
-    assert found["independent"] == ["theta_0"]
+    result = ckc("check", "n_four_bar", "--json").json
+    assert (result["n"], result["d"], result["rows"]) == (9, 1, 8)
+    assert result["independent"] == ["theta_0"]
     assert ckc("check", "n_four_bar/default", "--json").json["n"] == 9
     terms = ckc("terms", "n_four_bar", "--q", '{"theta_0": 1.0}', "--json").json
     assert terms["D"] == [[pytest.approx((5 + 4 * 3) / 3)]]  # N + 1 rods turn about an end, N bars do not turn
@@ -49,9 +49,9 @@ def test_generator_by_name_has_default_size() -> None:
 
 @pytest.mark.parametrize("N", [1, 2, 13])
 def test_generator_builds_any_size(N: int) -> None:
-    found = check(load_scene("n_four_bar", {"mechanism.N": N}))
-    assert (found.n, found.d, found.rows, found.rank) == (2 * N + 1, 1, 2 * N, 2 * N)
-    assert found.warnings == ()
+    result = check(load_scene("n_four_bar", {"mechanism.N": N}))
+    assert (result.n, result.d, result.rows, result.rank) == (2 * N + 1, 1, 2 * N, 2 * N)
+    assert result.warnings == ()
 
 
 def test_users_scene_of_a_generator_runs(tmp_path: Path) -> None:

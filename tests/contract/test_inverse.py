@@ -20,7 +20,7 @@ from tests.contract.test_mechanism_keys import write
 
 KEYS = """t coordinates q_tree v_tree a_tree actuated tau loop_forces joint_forces exceeded redundant status
           message"""
-SHORT = ("--set", "t_end=0.2")
+SHORT_RUN = ("--set", "t_end=0.2")
 
 
 class Swing:
@@ -29,67 +29,67 @@ class Swing:
 
 
 def test_json() -> None:
-    answer = ckc("inverse", "five_bar/tracking", *SHORT, "--json")
+    answer = ckc("inverse", "five_bar/tracking", *SHORT_RUN, "--json")
     assert (answer.code, answer.err) == (0, "")
-    found = answer.json
-    assert sorted(KEYS.split()) == sorted(found)
-    m = len(found["t"])
+    forces = answer.json
+    assert sorted(KEYS.split()) == sorted(forces)
+    m = len(forces["t"])
     assert m > 5
-    assert (found["t"][0], found["t"][-1]) == (0.0, 0.2)
-    assert found["coordinates"] == ["theta_1", "theta_2", "theta_3", "theta_4"]
-    assert found["actuated"] == ["theta_1", "theta_3"]
+    assert (forces["t"][0], forces["t"][-1]) == (0.0, 0.2)
+    assert forces["coordinates"] == ["theta_1", "theta_2", "theta_3", "theta_4"]
+    assert forces["actuated"] == ["theta_1", "theta_3"]
     for key, width in (("q_tree", 4), ("v_tree", 4), ("a_tree", 4), ("tau", 2)):
-        assert np.shape(found[key]) == (m, width)
-    assert set(found["loop_forces"]) == {"elbow"}
-    elbow = found["loop_forces"]["elbow"]
+        assert np.shape(forces[key]) == (m, width)
+    assert set(forces["loop_forces"]) == {"elbow"}
+    elbow = forces["loop_forces"]["elbow"]
     assert elbow["rows"] == ["x", "y"]
     assert np.shape(elbow["multipliers"]) == (m, 2)
     assert np.shape(elbow["force"]) == np.shape(elbow["moment"]) == (m, 3)
-    assert {name: np.shape(x) for name, x in found["joint_forces"].items()} == dict.fromkeys(
-        found["coordinates"], (m, 6)
+    assert {name: np.shape(x) for name, x in forces["joint_forces"].items()} == dict.fromkeys(
+        forces["coordinates"], (m, 6)
     )
-    assert (found["status"], found["exceeded"], found["redundant"]) == ("done", [], [])
+    assert (forces["status"], forces["exceeded"], forces["redundant"]) == ("done", [], [])
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith("| `inverse`"))
     section = page.partition("\n## inverse\n")[2].partition("\n## ")[0]
-    keys = (*found, *elbow, "motor", "t_most")
+    keys = (*forces, *elbow, "motor", "t_most")
     assert [key for key in keys if not re.search(rf"\b{key}\b", row + section)] == []
 
 
 def test_table_names_largest_forces_and_exceeded_limits() -> None:
     answer = ckc("inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_1 = 1.2, theta_3 = 2.0}")
     assert (answer.code, answer.err) == (0, "")
-    found = inverse_dynamics("five_bar/tracking", {"controller.torque_limit": {"theta_1": 1.2, "theta_3": 2.0}})
+    forces = inverse_dynamics("five_bar/tracking", {"controller.torque_limit": {"theta_1": 1.2, "theta_3": 2.0}})
     rows = {line[:14].strip(): line for line in answer.out.splitlines()}
-    for motor, tau in zip(found.actuated, np.abs(found.tau).T, strict=True):
+    for motor, tau in zip(forces.actuated, np.abs(forces.tau).T, strict=True):
         assert f"{tau.max():.4g} N m" in rows[f"motor {motor}"]
-        assert f"{found.t[np.argmax(tau)]:.4g}" in rows[f"motor {motor}"]
-    (entry,) = found.exceeded
+        assert f"{forces.t[np.argmax(tau)]:.4g}" in rows[f"motor {motor}"]
+    (entry,) = forces.exceeded
     assert entry["motor"] == "theta_1"
     assert f"1.2 N m, exceeded from t = {entry['t']:.4g} s on" in rows["motor theta_1"]
     assert rows["motor theta_3"].rstrip().endswith("2 N m")
-    elbow = np.linalg.norm(found.loop_forces["elbow"], axis=1)
+    elbow = np.linalg.norm(forces.loop_forces["elbow"], axis=1)
     assert f"{elbow.max():.4g} N" in rows["loop elbow"]
     assert "moment" not in answer.out
     assert answer.out.splitlines()[0].split() == ["of", "the", "motion", "largest", "at", "t", "(s)", "limit"]
 
 
 def test_files(tmp_path: Path) -> None:
-    answer = ckc("inverse", "delta/circle", *SHORT, "--out", str(tmp_path / "forces"), "--figures")
+    answer = ckc("inverse", "delta/circle", *SHORT_RUN, "--out", str(tmp_path / "forces"), "--figures")
     assert answer.code == 0
     assert (tmp_path / "forces" / "inverse.png").read_bytes().startswith(b"\x89PNG")
-    found = inverse_dynamics("delta/circle", {"t_end": 0.2})
+    forces = inverse_dynamics("delta/circle", {"t_end": 0.2})
     with np.load(tmp_path / "forces" / "inverse.npz", allow_pickle=False) as data:
         saved = {name: data[name] for name in data.files}
-    assert_close(saved["tau"], found.tau, 0)
-    assert saved["actuated"].tolist() == list(found.actuated)
-    assert saved["rows"].tolist() == [".".join(name) for name in found.mechanism.closure.names]
+    assert_close(saved["tau"], forces.tau, 0)
+    assert saved["actuated"].tolist() == list(forces.actuated)
+    assert saved["rows"].tolist() == [".".join(name) for name in forces.mechanism.closure.names]
     for k, loop in enumerate(saved["loops"]):
-        own = [name.startswith(f"{loop}.") for name in saved["rows"].tolist()]
-        assert_close(saved["multipliers"][:, own], found.loop_forces[loop], 0)
-        assert_close(saved["loop_wrenches"][:, k], found.loop_wrenches[loop], 0)
+        of_loop = [name.startswith(f"{loop}.") for name in saved["rows"].tolist()]
+        assert_close(saved["multipliers"][:, of_loop], forces.loop_forces[loop], 0)
+        assert_close(saved["loop_wrenches"][:, k], forces.loop_wrenches[loop], 0)
     for k, joint in enumerate(saved["joints"]):
-        assert_close(saved["joint_forces"][:, k], found.joint_forces[joint], 0)
+        assert_close(saved["joint_forces"][:, k], forces.joint_forces[joint], 0)
     assert json.loads(saved["meta"].tobytes())["status"] == "done"
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "run_file.md").read_text(encoding="utf-8")
     section = page.partition("\n## inverse.npz\n")[2].partition("\n## ")[0]
@@ -102,10 +102,10 @@ def test_inverse_dynamics_of_a_recorded_run_returns_its_torques(
     recorded = run("five_bar/tracking", formulation="reduced")
     recorded.save(tmp_path / "run.npz")
     for what in (str(tmp_path), str(tmp_path / "run.npz")):
-        found = ckc("inverse", what, "--set", "controller.torque_limit=10", "--json").json
-        assert_close(found["t"], recorded.t, 0)
-        assert_close(found["tau"], recorded.tau, 1e-9)
-        assert {entry["motor"] for entry in found["exceeded"]} == {"theta_1", "theta_3"}
+        forces = ckc("inverse", what, "--set", "controller.torque_limit=10", "--json").json
+        assert_close(forces["t"], recorded.t, 0)
+        assert_close(forces["tau"], recorded.tau, 1e-9)
+        assert {entry["motor"] for entry in forces["exceeded"]} == {"theta_1", "theta_3"}
 
 
 # --- along a point's path --------------------------------------------------------------------------
@@ -119,18 +119,18 @@ LINE = (
 
 def test_work_along_a_point_path_equals_the_energy() -> None:
     """The work of the motors equals the change of energy."""
-    found = inverse_dynamics("five_bar/tracking", {"controller.desired": {
+    forces = inverse_dynamics("five_bar/tracking", {"controller.desired": {
         "point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 2.0}
     }, "t_end": 1.0, "solver.output_dt": 0.001})  # fmt: skip
-    assert found.status == "done"
-    mechanism = found.mechanism
-    places = np.array([mechanism.point_positions(q)["tip"] for q in found.q_tree])
+    assert forces.status == "done"
+    mechanism = forces.mechanism
+    places = np.array([mechanism.point_positions(q)["tip"] for q in forces.q_tree])
     assert_close(np.linalg.norm(places - [0.15, -0.42, 0.0], axis=1), 0.06, 1e-9)
     terms = [
-        ckc_pin.Terms(mechanism, mechanism.kinematics(q), v) for q, v in zip(found.q_tree, found.v_tree, strict=True)
+        ckc_pin.Terms(mechanism, mechanism.kinematics(q), v) for q, v in zip(forces.q_tree, forces.v_tree, strict=True)
     ]
-    power = np.sum(found.tau * (found.v_tree @ mechanism.motors.transmission.T), axis=1)
-    work = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(found.t))])
+    power = np.sum(forces.tau * (forces.v_tree @ mechanism.motors.transmission.T), axis=1)
+    work = np.concatenate([[0], np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(forces.t))])
     energy = np.array([at.energy for at in terms])
     assert_close(energy - energy[0], work, 1e-6)
 
@@ -138,13 +138,13 @@ def test_work_along_a_point_path_equals_the_energy() -> None:
 def test_path_is_followed_up_to_the_workspace_boundary() -> None:
     answer = ckc("inverse", "five_bar/tracking", "--set", LINE, "--json")
     assert answer.code == 3
-    found = answer.json
-    assert found["status"] == "stopped"
-    assert found["message"] == answer.err.rstrip("\n")
-    assert "leaves the workspace of its branch at t = " in found["message"]
-    leaves_at = float(re.search(r"branch at t = ([\d.]+)", found["message"])[1])
-    assert found["t"][-1] <= leaves_at < found["t"][-1] + 0.021
-    assert len(found["tau"]) == len(found["t"]) > 10
+    forces = answer.json
+    assert forces["status"] == "stopped"
+    assert forces["message"] == answer.err.rstrip("\n")
+    assert "leaves the workspace of its branch at t = " in forces["message"]
+    leaves_at = float(re.search(r"branch at t = ([\d.]+)", forces["message"])[1])
+    assert forces["t"][-1] <= leaves_at < forces["t"][-1] + 0.021
+    assert len(forces["tau"]) == len(forces["t"]) > 10
 
 
 def test_trajectory_is_followed_up_to_the_workspace_boundary(tmp_path: Path) -> None:
@@ -156,15 +156,15 @@ def test_trajectory_is_followed_up_to_the_workspace_boundary(tmp_path: Path) -> 
 
 
 def test_redundant_rows_are_named() -> None:
-    found = inverse_dynamics("stewart/wave", {"t_end": 0.02})
-    assert found.mechanism.redundant == ()
-    assert "open" not in found.message
+    forces = inverse_dynamics("stewart/wave", {"t_end": 0.02})
+    assert forces.mechanism.redundant == ()
+    assert "open" not in forces.message
 
 
 def test_message_names_redundant_rows(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(text.replace('"point_2d"', '"point"'), encoding="utf-8")
-    answer = ckc("inverse", "bar/tracking.scene.toml", *SHORT, "--json")
+    answer = ckc("inverse", "bar/tracking.scene.toml", *SHORT_RUN, "--json")
     assert answer.json["redundant"] == ["elbow.z"]
     assert "rows elbow.z are redundant" in answer.json["message"]
     assert_close(np.array(answer.json["loop_forces"]["elbow"]["multipliers"])[:, 2], 0, 1e-12)
@@ -177,10 +177,10 @@ def test_interrupted_inverse_dynamics_keeps_its_results() -> None:
         if t > 0.1:
             raise KeyboardInterrupt("SIGTERM")
 
-    found = inverse_dynamics("five_bar/tracking", progress=stop)
-    assert found.status == "interrupted"
-    assert "by SIGTERM" in found.message
-    assert 0.1 < found.t[-1] < 0.15
+    forces = inverse_dynamics("five_bar/tracking", progress=stop)
+    assert forces.status == "interrupted"
+    assert "by SIGTERM" in forces.message
+    assert 0.1 < forces.t[-1] < 0.15
 
 
 # --- what is refused -------------------------------------------------------------------------------
@@ -230,10 +230,10 @@ def test_passive_run_needs_no_motors(bar: Path) -> None:
     text = (bar / "mechanism.toml").read_text(encoding="utf-8")
     (bar / "mechanism.toml").write_text(text.replace('actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'))
     recorded = ckc_pin.simulate(bar / "swing.scene.toml", {"t_end": 0.3})
-    found = inverse_dynamics(recorded)
-    assert found.status == "done"
-    assert_close(found.tau, 0, 1e-12)
-    assert_close(found.loop_forces["elbow"], recorded.loop_forces()["elbow"], 1e-10)
+    forces = inverse_dynamics(recorded)
+    assert forces.status == "done"
+    assert_close(forces.tau, 0, 1e-12)
+    assert_close(forces.loop_forces["elbow"], recorded.loop_forces()["elbow"], 1e-10)
     broken = replace(recorded, v_tree=np.full_like(recorded.v_tree, np.nan))
     with pytest.raises(NumericalError):
         inverse_dynamics(broken)
@@ -251,10 +251,10 @@ def test_free_root_needs_no_motor(tmp_path: Path) -> None:
         '[initial]\nat = "assembled"\n[initial.q_dot]\nroot.rx = 0.4\nroot.y = -0.2\nturn = 0.3\n'
     )
     recorded = ckc_pin.simulate(scene, controller=Swing())
-    found = inverse_dynamics(recorded)
-    assert found.status == "done"
+    forces = inverse_dynamics(recorded)
+    assert forces.status == "done"
     assert np.ptp(recorded.tau) > 0.3
-    assert_close(found.tau, recorded.tau, 1e-12)
+    assert_close(forces.tau, recorded.tau, 1e-12)
 
 
 def test_overrides_need_a_name() -> None:

@@ -48,14 +48,14 @@ def test_loaded_mechanisms_do_not_share_mutable_data(tmp_path: Path) -> None:
     path = mine(tmp_path)
     state = ({"theta_1": -1.2, "theta_3": -1.9}, {"theta_1": 0.4, "theta_3": -0.3})
     first = load(path)
-    known = ckc_pin.terms(first, *state).D.copy()
+    cached = ckc_pin.terms(first, *state).D.copy()
     first.tree.model.inertias[1].mass = 50.0
     first.tree.model.gravity.linear = np.zeros(3)
     first.q_tree[:] = 0.0
     first.springs.joint_stiffness[:] = 1e3
     second = load(path)
     assert second.tree is not first.tree
-    assert np.array_equal(ckc_pin.terms(second, *state).D, known)
+    assert np.array_equal(ckc_pin.terms(second, *state).D, cached)
     assert second.tree.model.gravity.linear[1] != 0.0
     assert second.q_tree.any()
     assert not second.springs.joint_stiffness.any()

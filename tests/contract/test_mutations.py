@@ -59,11 +59,11 @@ def mutated(r: random.Random, data: Any) -> Any:
     return changed
 
 
-def used_or_refused(use: Callable[..., Any], *given: Any) -> None:
+def used_or_refused(use: Callable[..., Any], *arguments: Any) -> None:
     """Any other exception fails the test, with the input in its traceback."""
     said = ""
     try:
-        use(*given)
+        use(*arguments)
     except CkcError as error:
         said = str(error)
     assert said.isprintable()
@@ -76,12 +76,12 @@ SCENES = ["five_bar/tracking", "five_bar/swing", "slider_crank/default", "delta/
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_scenes(name: str) -> None:
     r, (folder, scene) = random.Random(1), name.split("/")
-    given = tomllib.loads((library() / folder / f"{scene}.scene.toml").read_text(encoding="utf-8"))
-    given |= {"t_end": 0.02, "event": [{"of": "sigma_min_J", "value": 1e-3}]}
+    content = tomllib.loads((library() / folder / f"{scene}.scene.toml").read_text(encoding="utf-8"))
+    content |= {"t_end": 0.02, "event": [{"of": "sigma_min_J", "value": 1e-3}]}
     solver = {"rtol": 1e-6, "atol": 1e-8, "max_rhs": 1000, "max_wall_s": 1.0, "output_dt": 0.001, "max_step": 0.01}
     for _ in range(150):
         chosen = {"formulation": r.choice(["dae", "reduced", "spf"]), "solver": dict(solver)}
-        data = mutated(r, given | chosen)
+        data = mutated(r, content | chosen)
         used_or_refused(_simulate, data, name, library() / folder)
 
 
@@ -93,9 +93,9 @@ def _simulate(data: Any, name: str, folder: Path) -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_mechanisms(name: str) -> None:
     r, folder = random.Random(2), library() / name
-    given = tomllib.loads((folder / "mechanism.toml").read_text(encoding="utf-8"))
+    content = tomllib.loads((folder / "mechanism.toml").read_text(encoding="utf-8"))
     for _ in range(60):
-        used_or_refused(_check, mutated(r, given), name, folder)
+        used_or_refused(_check, mutated(r, content), name, folder)
 
 
 def _check(data: Any, name: str, folder: Path) -> None:
@@ -126,10 +126,10 @@ def test_run_files(tmp_path: Path) -> None:
     simulate("five_bar/set_point", {"t_end": 0.03, "event": event}, profile=True).save(path)
     with np.load(path) as data:
         content = {name: data[name] for name in data.files}
-    given = json.loads(content["meta"].tobytes())
-    del given["hashes"]
+    original = json.loads(content["meta"].tobytes())
+    del original["hashes"]
     for _ in range(250):
-        meta = mutated(r, given)
+        meta = mutated(r, original)
         try:
             hashes = hashes_of(msgspec.convert(meta, RunMeta))
         except (msgspec.ValidationError, OverflowError):

@@ -106,13 +106,13 @@ def test_run_is_indexed_by_coordinate_and_array_name(swing: Run) -> None:
 
 
 def test_sel_returns_the_nearest_output(swing: Run) -> None:
-    found = swing.sel(t=0.1234)
-    assert isinstance(found, State)
-    assert found.t == swing.t[12]
-    assert_close(found.q_tree, swing.q_tree[12], 1e-15)
-    reference = Terms(swing.mechanism, found.terms.at, swing.v_tree[12])
-    assert found.terms.energy == pytest.approx(swing.energy[12], abs=1e-12)
-    assert_close(found.terms.C, reference.C, 1e-13)
+    result = swing.sel(t=0.1234)
+    assert isinstance(result, State)
+    assert result.t == swing.t[12]
+    assert_close(result.q_tree, swing.q_tree[12], 1e-15)
+    reference = Terms(swing.mechanism, result.terms.at, swing.v_tree[12])
+    assert result.terms.energy == pytest.approx(swing.energy[12], abs=1e-12)
+    assert_close(result.terms.C, reference.C, 1e-13)
     for t in (-0.1, 0.5, np.nan):
         with pytest.raises(InputError, match=r"the run is from 0 to 0\.4 s"):
             swing.sel(t=t)
@@ -127,11 +127,11 @@ def test_simulator_continues_from_a_state_of_a_run(velocity: str) -> None:
                "t_end": 0.2, "solver.rtol": 1e-10, "solver.output_dt": 0.1}  # fmt: skip
     run = simulate(SWING, overrides)
     simulator = Simulator(SWING, overrides)
-    own, theirs = simulator.step(dt=0.1), run.sel(t=0.1)
+    stepped, theirs = simulator.step(dt=0.1), run.sel(t=0.1)
     assert np.abs(theirs.w).max() > 1e-3
-    assert_close(theirs.q_tree, own.q_tree, 1e-8)
-    assert_close(theirs.v_tree, own.v_tree, 1e-7)
-    assert_close(theirs.terms.C, own.terms.C, 1e-6)
+    assert_close(theirs.q_tree, stepped.q_tree, 1e-8)
+    assert_close(theirs.v_tree, stepped.v_tree, 1e-7)
+    assert_close(theirs.terms.C, stepped.terms.C, 1e-6)
     simulator.reset(theirs)
     assert_close(simulator.step(dt=0.1).q_tree, run.q_tree[-1], 1e-7)
 

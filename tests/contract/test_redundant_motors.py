@@ -34,49 +34,49 @@ def transmission(mechanism: Mechanism, q_tree: Array) -> Array:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Run:
+def unlimited() -> Run:
     return lift()
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_torques_have_minimum_norm(plain: Run, formulation: str) -> None:
-    run = plain if formulation == "spf" else lift(formulation=formulation)
+def test_torques_have_minimum_norm(unlimited: Run, formulation: str) -> None:
+    run = unlimited if formulation == "spf" else lift(formulation=formulation)
     for k, q_tree in enumerate(run.q_tree):
         T = transmission(run.mechanism, q_tree)
         assert T.shape == (6, 12)
         assert_close(run.tau[k], np.linalg.pinv(T) @ run.u[k], 1e-9)
-    assert_close(run.q_tree, plain.q_tree, 1e-8)
+    assert_close(run.q_tree, unlimited.q_tree, 1e-8)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_preload_does_not_change_the_motion(plain: Run, formulation: str) -> None:
+def test_preload_does_not_change_the_motion(unlimited: Run, formulation: str) -> None:
     """tau differs by the projection of the preload on the null space; the motion is the same."""
-    without = plain if formulation == "spf" else lift(formulation=formulation)
+    without = unlimited if formulation == "spf" else lift(formulation=formulation)
     run = lift(controller__allocation__preload=PRELOAD, formulation=formulation)
     assert_close(run.q_tree, without.q_tree, 1e-9)
     assert_close(run.u, without.u, 1e-8)
     preload = np.array([PRELOAD.get(name, 0.0) for name in run.actuated])
     for k, q_tree in enumerate(run.q_tree):
         T = transmission(run.mechanism, q_tree)
-        left = preload - np.linalg.pinv(T) @ (T @ preload)
-        assert np.abs(left).max() > 3.0
-        assert_close(run.tau[k] - without.tau[k], left, 1e-8)
+        null_space_part = preload - np.linalg.pinv(T) @ (T @ preload)
+        assert np.abs(null_space_part).max() > 3.0
+        assert_close(run.tau[k] - without.tau[k], null_space_part, 1e-8)
 
 
-def test_large_weights_reduce_torques(plain: Run) -> None:
+def test_large_weights_reduce_torques(unlimited: Run) -> None:
     """Torques with a weight of 1000 are hardly used, and the motion is the same."""
-    tired = [name for name in plain.actuated if name.startswith("right")]
+    tired = [name for name in unlimited.actuated if name.startswith("right")]
     run = lift(controller__allocation__weights=dict.fromkeys(tired, 1e3))
-    assert_close(run.q_tree, plain.q_tree, 1e-9)
+    assert_close(run.q_tree, unlimited.q_tree, 1e-9)
     scale = np.array([1e3 if name in tired else 1.0 for name in run.actuated]) ** -0.5
     for k, q_tree in enumerate(run.q_tree):
         T = transmission(run.mechanism, q_tree)
         assert_close(run.tau[k], scale * (np.linalg.pinv(T * scale) @ run.u[k]), 1e-8)
-    assert np.abs(run.tau[:, 6:]).max() < 0.05 * np.abs(plain.tau[:, 6:]).max()
+    assert np.abs(run.tau[:, 6:]).max() < 0.05 * np.abs(unlimited.tau[:, 6:]).max()
 
 
 @pytest.mark.parametrize("limit", [21.0, 18.0])
-def test_limited_torques_agree_with_the_reference(plain: Run, limit: float) -> None:
+def test_limited_torques_agree_with_the_reference(unlimited: Run, limit: float) -> None:
     """Compared with the NumPy reference; the motion is unchanged while other motors can compensate."""
     run = lift(controller__torque_limit=limit, controller__allocation__preload=PRELOAD)
     assert run.status == "done"
@@ -86,9 +86,9 @@ def test_limited_torques_agree_with_the_reference(plain: Run, limit: float) -> N
         T = transmission(run.mechanism, q_tree)
         assert_close(T @ run.tau[k], run.u[k], 1e-9)
         if limit == 21.0:
-            tau = allocate(T, plain.u[k], np.full(12, limit), np.ones(12), preload)
+            tau = allocate(T, unlimited.u[k], np.full(12, limit), np.ones(12), preload)
             assert_close(run.tau[k], tau, 1e-7)
-    off = np.abs(run.q_tree - plain.q_tree).max()
+    off = np.abs(run.q_tree - unlimited.q_tree).max()
     assert off < 1e-9 if limit == 21.0 else off > 1e-5
 
 
@@ -100,10 +100,10 @@ def test_unreachable_u_has_minimum_error() -> None:
     assert np.abs(free.tau[0]).max() > 20
     T = transmission(run.mechanism, run.q_tree[0])
     rows = 1 / np.linalg.norm(T, axis=1)
-    found = lsq_linear(T * rows[:, None], free.u[0] * rows, (-limit, limit), method="bvls", tol=1e-15)
-    assert found.cost > 1e-3
+    result = lsq_linear(T * rows[:, None], free.u[0] * rows, (-limit, limit), method="bvls", tol=1e-15)
+    assert result.cost > 1e-3
     missed = 0.5 * np.sum((rows * (T @ run.tau[0] - free.u[0])) ** 2)
-    assert found.cost <= missed < found.cost * (1 + 1e-4)
+    assert result.cost <= missed < result.cost * (1 + 1e-4)
     assert np.all(np.abs(run.tau) <= limit)
     assert_close(run.tau[0], allocate(T, free.u[0], np.full(12, limit), np.ones(12), np.zeros(12)), 1e-7)
 

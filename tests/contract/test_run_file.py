@@ -133,9 +133,9 @@ def test_loop_forces_satisfy_eq_1(tracked: Run, saved: Path) -> None:
     from ckc_pin.dynamics.terms import Terms
 
     terms = Terms(fine.mechanism, at, fine.v_tree[k])
-    left = terms.D_tree @ acceleration + terms.C_tree @ fine.v_tree[k] + terms.h_tree
+    left_side = terms.D_tree @ acceleration + terms.C_tree @ fine.v_tree[k] + terms.h_tree
     right = at.J.T @ forces["elbow"][k]
-    assert_close(left, right, 2e-5)
+    assert_close(left_side, right, 2e-5)
     assert np.abs(forces["elbow"][k]).max() > 0.1
     assert_close(Run.load(saved).loop_forces()["elbow"], tracked.loop_forces()["elbow"], 0.0)
 

@@ -109,10 +109,10 @@ def test_a_sampled_controller_from_python() -> None:
     scene = load_scene("five_bar/tracking")
     inner = build_scene_controller(scene, load_scene_mechanism(scene))
     assert inner is not None
-    own = Sampled(inner, 5e-4, 2e-4)
+    sampled = Sampled(inner, 5e-4, 2e-4)
     shipped = simulate("five_bar/tracking", {**overrides, "controller.sample_time": 5e-4, "controller.delay": 2e-4})
     for _ in range(2):  # a run leaves nothing behind
-        run = simulate("five_bar/tracking", overrides, controller=own)
+        run = simulate("five_bar/tracking", overrides, controller=sampled)
         assert_close(run.q_tree, shipped.q_tree, 1e-9)
         assert_close(run.u, shipped.u, 1e-6)
         assert run.lyapunov is not None
@@ -170,7 +170,7 @@ BAD = [
     (("sample_time=-.1",), "controller.sample_time = -0.1: expected a number greater than 0"),
     (("sample_time=fast",), "controller.sample_time = 'fast': expected a number, got a string"),
     (("sample_time=.1", "delay=-1"), "controller.delay = -1: expected a number of at least 0"),
-    (("delay=.1",), "controller.delay: give sample_time too; what is sampled is delayed"),
+    (("delay=.1",), "controller.delay: it needs a sampled controller; give controller.sample_time too"),
     (("sample_time=1e-300",), "sample_time = 1e-300 gives more than 10000000 samples in 9.5 s"),
 ]
 

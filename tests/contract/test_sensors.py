@@ -73,16 +73,18 @@ class Seen:
         return measured, rate
 
 
-def sent(tau: Array, last: Array, most: Any, step: Any) -> tuple[Array, Array]:
+def sent(tau: Array, last: Array, largest: Any, step: Any) -> tuple[Array, Array]:
     """Return (quantized torques, torques before quantization)."""
-    last = last + np.clip(tau - last, np.negative(most), most)
+    last = last + np.clip(tau - last, np.negative(largest), largest)
     return (np.floor(last / step + 0.5) * step if np.any(step) else last), last
 
 
 Law = Callable[[float, Array, Array], Array]
 
 
-def loop(law: Law, seen: Seen, count: int, late: int = 0, most: Any = np.inf, step: Any = 0.0) -> tuple[Array, Array]:
+def loop(
+    law: Law, seen: Seen, count: int, late: int = 0, largest: Any = np.inf, step: Any = 0.0
+) -> tuple[Array, Array]:
     """Return (q, q_dot) and the applied torque at `count` instants, four per period; `late` is the delay."""
     y, last, waiting, acts = np.concatenate([START, np.zeros(2)]), np.zeros(2), [], np.zeros(2)
     states, torques = [], []
@@ -90,7 +92,7 @@ def loop(law: Law, seen: Seen, count: int, late: int = 0, most: Any = np.inf, st
     for k in range(count):
         if k % 4 == 0:
             q, q_dot = seen(y[:2], y[2:])
-            tau, last = sent(law(k * quarter, FIVE_BAR.sigma(q), q_dot), last, np.multiply(most, seen.period), step)
+            tau, last = sent(law(k * quarter, FIVE_BAR.sigma(q), q_dot), last, np.multiply(largest, seen.period), step)
             waiting.append((k + late, tau))
         if waiting and waiting[0][0] == k:
             acts = waiting.pop(0)[1]
@@ -161,7 +163,7 @@ DRIVES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", DRIVES)
 def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
     keys, period = DRIVES[name], 0.002
-    given = {k: {m: x for m, x in v.items() if x} if isinstance(v, dict) else v for k, v in table(keys).items()}
+    values = {k: {m: x for m, x in v.items() if x} if isinstance(v, dict) else v for k, v in table(keys).items()}
     overrides = {
         "formulation": formulation,
         "t_end": 10 * period,
@@ -169,7 +171,7 @@ def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
         "solver.output_dt": period / 4,
         "controller.sample_time": period,
         "controller.delay": period / 2,
-        "controller.drive": given,
+        "controller.drive": values,
         "controller.sensor": {"resolution": 1e-3},
     }
     run = simulate("five_bar/set_point", overrides)
@@ -183,7 +185,7 @@ def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
     assert np.abs(run.tau).max() > 1.0
 
 
-class Own:
+class CustomController:
     """A controller that uses terms: gravity compensation at the measured configuration, and damping."""
 
     def u(self, t: float, terms: Terms) -> Array:
@@ -199,15 +201,15 @@ class OwnTorques:
     """The same controller with torques by motor."""
 
     def tau(self, t: float, terms: Terms) -> Array:
-        return Own().u(t, terms)
+        return CustomController().u(t, terms)
 
 
-@pytest.mark.parametrize("controller", [Own(), OwnTorques()], ids=["u", "tau"])
+@pytest.mark.parametrize("controller", [CustomController(), OwnTorques()], ids=["u", "tau"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_callers_controller_gets_measured_terms(formulation: str, controller: Any) -> None:
     keys = {"resolution": 1e-3, "rate": "difference", "filter": 0.003}
     period = 0.002
-    own = Sampled(controller, period, period / 4, keys, {"torque_resolution": 1e-3})
+    sampled = Sampled(controller, period, period / 4, keys, {"torque_resolution": 1e-3})
     overrides = {
         "formulation": formulation,
         "t_end": 8 * period,
@@ -217,9 +219,9 @@ def test_callers_controller_gets_measured_terms(formulation: str, controller: An
         "initial.q_dot": {},
         "initial.at": None,
     }
-    states, torques = loop(Own.of, Seen(period, **keys), 33, 1, step=1e-3)
+    states, torques = loop(CustomController.of, Seen(period, **keys), 33, 1, step=1e-3)
     for _ in range(2):  # a run leaves nothing behind
-        assert_is(simulate("five_bar/swing", overrides, controller=own), states, torques)
+        assert_is(simulate("five_bar/swing", overrides, controller=sampled), states, torques)
 
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
@@ -262,17 +264,17 @@ def test_noise_is_normal_and_reproducible() -> None:
         )
         return (np.array(reads.read) - np.concatenate([START, np.zeros(2)])) / [1e-3, 2e-3, 0.5, 0.5]
 
-    found, draw = noise(3), normals(3)
-    assert_close(found[:50].ravel(), [next(draw) for _ in range(200)], 1e-6)
-    count = len(found)
+    result, draw = noise(3), normals(3)
+    assert_close(result[:50].ravel(), [next(draw) for _ in range(200)], 1e-6)
+    count = len(result)
     assert count == 4001
-    assert_close(found.mean(axis=0), 0.0, 4 / np.sqrt(count))
-    assert_close((found**2).mean(axis=0), 1.0, 4 * np.sqrt(2 / count))
-    assert_close((found**4).mean(axis=0), 3.0, 4 * np.sqrt(96 / count))
-    assert_close(found.T @ found / count - np.eye(4), 0.0, 6 / np.sqrt(count))
-    assert_close((found[1:] * found[:-1]).mean(axis=0), 0.0, 4 / np.sqrt(count))
-    assert np.array_equal(found, noise(3))
-    assert np.abs(found - noise(4)).max() > 1.0
+    assert_close(result.mean(axis=0), 0.0, 4 / np.sqrt(count))
+    assert_close((result**2).mean(axis=0), 1.0, 4 * np.sqrt(2 / count))
+    assert_close((result**4).mean(axis=0), 3.0, 4 * np.sqrt(96 / count))
+    assert_close(result.T @ result / count - np.eye(4), 0.0, 6 / np.sqrt(count))
+    assert_close((result[1:] * result[:-1]).mean(axis=0), 0.0, 4 / np.sqrt(count))
+    assert np.array_equal(result, noise(3))
+    assert np.abs(result - noise(4)).max() > 1.0
 
 
 def test_empty_sensor_table_has_no_effect() -> None:
@@ -326,9 +328,9 @@ def test_invalid_sensor_is_rejected(words: tuple[str, ...], says: str, bar: Path
 def test_sensors_and_drives_need_a_sample_time(key: str, bar: Path) -> None:
     entry = {"sensor": "resolution=0.1", "drive": "torque_rate=1.0"}[key]
     words = ("run", "bar/tracking.scene.toml", "--set", f"controller.{key}.{entry}")
-    expect(Bad("clock", words, [f"controller.{key}: give sample_time too"]), bar)
+    expect(Bad("clock", words, [f"controller.{key}: it needs a sampled controller"]), bar)
 
 
 def test_invalid_sensor_table_from_python_is_rejected() -> None:
     with pytest.raises(InputError, match="Sampled: sensor: unknown key 'steps'"):
-        Sampled(Own(), 0.1, sensor={"steps": 1})
+        Sampled(CustomController(), 0.1, sensor={"steps": 1})

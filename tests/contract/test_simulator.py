@@ -58,8 +58,8 @@ def test_steps_off_the_manifold_agree_with_the_run() -> None:
         "solver.output_dt": 0.01,
     }
     for coordinates in ("w", "z"):
-        given = {**overrides, "spf_coordinates": coordinates}
-        run, simulator = simulate("five_bar/swing", given), Simulator("five_bar/swing", given)
+        config = {**overrides, "spf_coordinates": coordinates}
+        run, simulator = simulate("five_bar/swing", config), Simulator("five_bar/swing", config)
         for k in range(1, 11):
             state = simulator.step(None, 0.01)
             assert_close(state.q_tree, run.q_tree[k], 1e-8)
@@ -197,17 +197,17 @@ def test_changing_u_agrees_with_scipy(formulation: str, dt: float) -> None:
 
 
 @pytest.mark.parametrize("dt", [2e-3, 0.05])
-@pytest.mark.parametrize("changing", [False, True])
-def test_steps_over_rank_loss_agree_with_the_pendulum(dt: float, changing: bool) -> None:
+@pytest.mark.parametrize("varying_u", [False, True])
+def test_steps_over_rank_loss_agree_with_the_pendulum(dt: float, varying_u: bool) -> None:
     """A row of parallelograms, flat three times, compared with a pendulum; u is zero, or tiny and changing."""
     simulator, random = Simulator("n_four_bar", {"mechanism.N": 7, "formulation": "dae"}), np.random.default_rng(3)
     for k in range(round(3.0 / dt)):
-        if changing and k % 20 == 0:
+        if varying_u and k % 20 == 0:
             u = 1e-9 * random.standard_normal(1)
-        state = simulator.step(u if changing else None, dt)
+        state = simulator.step(u if varying_u else None, dt)
     place = simulator.mechanism.point_positions(state.terms.q_tree)["B0"]
     assert_close(place[:2], np.array(first_top_pin(7, state.t)), 2e-6)
-    if not changing:
+    if not varying_u:
         plain = simulate("n_four_bar", {"mechanism.N": 7, "formulation": "dae", "t_end": 3.0})
         assert simulator.stats["rhs"] <= 2 * plain.stats["rhs"]
 

@@ -121,10 +121,10 @@ def test_steps_with_tau_agree_with_scipy(geared: Path, formulation: str) -> None
     y = np.concatenate([state.q, state.q_dot])
     for k in range(12):
         tau = rng.uniform(-1, 1, 2) * [0.02, 0.3]  # the belt's is limited
-        given: Any = dict(zip(("left", "belt"), tau, strict=True)) if k % 3 else tau
+        arguments: Any = dict(zip(("left", "belt"), tau, strict=True)) if k % 3 else tau
         if k == 5:
-            given, tau[0] = {"belt": tau[1]}, 0.0
-        state = simulator.step(tau=given, dt=0.01)
+            arguments, tau[0] = {"belt": tau[1]}, 0.0
+        state = simulator.step(tau=arguments, dt=0.01)
         y = motion(y, np.array([0.0, 0.01]), lambda t, q_tree, q_dot, tau=tau: tau)[-1]
         assert_close(np.concatenate([state.q, state.q_dot]), y, 1e-9)
     u = np.array([0.1, -0.2])  # and then a force on q
@@ -194,9 +194,9 @@ def test_torques_from_a_file_agree_with_scipy(geared: Path, formulation: str, in
     assert_close(run.q_tree[:, Q], states[:, :2], 1e-9)
     assert_close(run.v_tree[:, Q], states[:, 2:], 1e-8)
     limits = [np.inf, 0.2]
-    wanted = np.array([np.clip(tau(t, Q, Q), np.negative(limits), limits) for t in run.t])
+    expected = np.array([np.clip(tau(t, Q, Q), np.negative(limits), limits) for t in run.t])
     rows = slice(0, -1) if interpolation == "hold" else slice(None)  # at the end the last row begins
-    assert_close(run.tau[rows], wanted[rows], 1e-12)
+    assert_close(run.tau[rows], expected[rows], 1e-12)
     assert run.stats["python_calls"] == 0
     kept = Run.load(run.save(geared / "run.npz"))
     assert kept.actuated == ("left", "belt")
@@ -206,13 +206,13 @@ def test_torques_from_a_file_agree_with_scipy(geared: Path, formulation: str, in
 def test_csv_names_with_commas_are_quoted(geared: Path) -> None:
     overrides = {"t_end": 0.15, "controller": {"type": "torques", "file": "drive.csv"}, "solver.terms": "pinocchio"}
     csv(geared, VALUES)
-    wanted = simulate(geared / "swing.scene.toml", overrides)
+    expected = simulate(geared / "swing.scene.toml", overrides)
     mechanism, drive = geared / "mechanism.toml", geared / "drive.csv"
     mechanism.write_text(mechanism.read_text("utf-8").replace('"left"', '"left, upper"'), "utf-8")
     drive.write_text(drive.read_text("utf-8").replace("left", '"left, upper"').replace("belt", '"belt"'), "utf-8")
-    found = simulate(geared / "swing.scene.toml", overrides)
-    assert found.actuated == ("left, upper", "belt")
-    assert np.array_equal(found.q_tree, wanted.q_tree)
+    result = simulate(geared / "swing.scene.toml", overrides)
+    assert result.actuated == ("left, upper", "belt")
+    assert np.array_equal(result.q_tree, expected.q_tree)
 
 
 CONTROLLER = '[controller]\ntype = "torques"\nfile = "drive.csv"\n'
@@ -263,7 +263,7 @@ def test_invalid_torque_file_is_rejected(case: Bad, bar: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("arguments", "says"),
     [
         ({"tau": {"x": 1.0}}, "tau: no motor 'x'; there are left, belt"),
         ({"tau": {"left": "strong"}}, "tau: expected a table of numbers by motor, got"),
@@ -272,11 +272,11 @@ def test_invalid_torque_file_is_rejected(case: Bad, bar: Path) -> None:
         ({"tau": [0.0, 0.0], "u": [0.0, 0.0]}, "give either u or tau, not both"),
     ],
 )
-def test_invalid_tau_is_rejected(geared: Path, given: dict[str, Any], says: str) -> None:
+def test_invalid_tau_is_rejected(geared: Path, arguments: dict[str, Any], says: str) -> None:
     simulator = Simulator(geared / "swing.scene.toml")
     before = simulator.step(tau={"belt": 0.1}, dt=0.01)
     with pytest.raises(InputError, match=says):
-        simulator.step(dt=0.01, **given)
+        simulator.step(dt=0.01, **arguments)
     assert simulator.state is before
 
 
@@ -296,7 +296,7 @@ def test_invalid_allocation_is_rejected(allocation: dict[str, Any], says: str) -
 
 
 class Both(Spring):
-    """An unknown controller method is rejected."""
+    """A controller with both methods, u and tau."""
 
     def u(self, t: float, terms: Terms) -> Array:
         return np.zeros(2)

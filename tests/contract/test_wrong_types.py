@@ -13,11 +13,11 @@ import ckc_pin
 from ckc_pin import Event, InputError, Run, Sampled, SetPoint, Simulator, Terms, Tracking, load, load_scene, simulate
 
 MASS = "link.link_2.mass"
-SWING, SHORT = "five_bar/swing", {"t_end": 0.01}
+SWING, SHORT_RUN = "five_bar/swing", {"t_end": 0.01}
 Q = {"theta_1": -1.2, "theta_3": -1.9}
 
 
-class Own:
+class CustomController:
     def u(self, t: float, terms: Terms) -> Any:
         return -terms.q_dot
 
@@ -36,26 +36,26 @@ def trajectory(t: float) -> tuple[Any, Any, Any]:
 
 
 def run() -> Run:
-    return simulate(SWING, SHORT)
+    return simulate(SWING, SHORT_RUN)
 
 
 def of(controller: Any) -> Callable[[], Any]:
-    return lambda: simulate(SWING, SHORT, controller=controller)
+    return lambda: simulate(SWING, SHORT_RUN, controller=controller)
 
 
 def five_bar() -> ckc_pin.Mechanism:
     return load("five_bar")
 
 
-def with_attributes(given: Any, **attributes: Any) -> Any:
+def with_attributes(subject: Any, **attributes: Any) -> Any:
     for name, value in attributes.items():
-        setattr(given, name, value)
-    return given
+        setattr(subject, name, value)
+    return subject
 
 
-def own_with(**attributes: Any) -> Own:
-    own: Own = with_attributes(Own(), **attributes)
-    return own
+def own_with(**attributes: Any) -> CustomController:
+    controller: CustomController = with_attributes(CustomController(), **attributes)
+    return controller
 
 
 def set_point() -> SetPoint:
@@ -72,7 +72,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "overrides as a string": (lambda: simulate(SWING, "t_end=1"), "simulate: overrides: expected .*, got 't_end=1'"),
     "overrides by number": (lambda: simulate(SWING, {3: 4}), "overrides, a key: expected a table.*, got 3"),
     "progress of nothing": (
-        lambda: simulate(SWING, SHORT, progress=lambda: None),
+        lambda: simulate(SWING, SHORT_RUN, progress=lambda: None),
         r"simulate: progress: expected a function of \(t, t_end\).*, got a function of other arguments",
     ),
     "a trajectory of nothing": (
@@ -95,13 +95,13 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: ckc_pin.as_ivp(SWING).terms("now", np.zeros(8)),
         "as_ivp: t: expected a number, s.*, got 'now'",
     ),
-    "a class as a controller": (of(Own), r"expected an object, got the class Own"),
+    "a class as a controller": (of(CustomController), r"expected an object, got the class CustomController"),
     "a function of one": (of(lambda t: t), r"controller: expected a function of \(t, terms\), got <lambda>\(t\)"),
     "a method of one": (of(OfOne()), r"controller: expected a function of \(t, terms\), got u\(t\)"),
     "a forgotten return": (of(lambda t, terms: None), r"u: expected 2 numbers .*, got None; is a return missing"),
     "a string as a controller": (of("pd"), r"controller: expected an object with one of the methods.*, got 'pd'"),
     "an object as a controller": (of(object()), r"controller: expected .*or a function u\(t, terms\).*, got an object"),
-    "a class that is sampled": (lambda: Sampled(Own, 0.1), "expected .*, got the class Own"),
+    "a class that is sampled": (lambda: Sampled(CustomController, 0.1), "expected .*, got the class CustomController"),
     "a number as lyapunov": (
         of(own_with(lyapunov=3)), r"^controller: lyapunov: expected a function of \(t, terms, w\).*, got 3"
     ),
@@ -139,11 +139,13 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a model that was replaced": (
         of(with_attributes(Tracking(1.0, 1.0, trajectory), model="five_bar")), "^Tracking: model: .*got 'five_bar'"
     ),
-    "a sensor": (lambda: Sampled(Own(), 0.1, sensor=3), r"Sampled: sensor: expected .*\[controller.sensor\].*, got 3"),
-    "one event": (lambda: simulate(SWING, SHORT, events=Event(law)), "events: expected a list of.*, got an Event"),
-    "progress": (lambda: simulate(SWING, SHORT, progress=True), r"progress: expected .* \(t, t_end\).*, got True"),
-    "on_output": (lambda: simulate(SWING, SHORT, on_output=3), r"on_output: expected .* \(t, q_tree\).*, got 3"),
-    "profile": (lambda: simulate(SWING, SHORT, profile="no"), "profile: expected True or False.*, got 'no'"),
+    "a sensor": (
+        lambda: Sampled(CustomController(), 0.1, sensor=3),
+        r"Sampled: sensor: expected .*\[controller.sensor\].*, got 3"),
+    "one event": (lambda: simulate(SWING, SHORT_RUN, events=Event(law)), "events: expected a list of.*, got an Event"),
+    "progress": (lambda: simulate(SWING, SHORT_RUN, progress=True), r"progress: expected .* \(t, t_end\).*, got True"),
+    "on_output": (lambda: simulate(SWING, SHORT_RUN, on_output=3), r"on_output: expected .* \(t, q_tree\).*, got 3"),
+    "profile": (lambda: simulate(SWING, SHORT_RUN, profile="no"), "profile: expected True or False.*, got 'no'"),
     "load": (lambda: load(None), "load: name: expected a mechanism's shipped name or its path.*, got None"),
     "load with words": (lambda: load("five_bar", {MASS: "x"}), "load: overrides: link.link_2.mass = 'x': expected"),
     "load with a flag": (lambda: load("five_bar", {MASS: True}), "load: overrides: link.link_2.mass = True: expected"),
@@ -209,10 +211,10 @@ def test_wrong_argument_is_named_with_the_expected_type(name: str) -> None:
 
 
 def test_numpy_numbers_and_lists_are_accepted() -> None:
-    wanted = load("five_bar", {MASS: 0.3, "gravity": (0.0, -5.0, 0.0)}).tree.model
+    expected = load("five_bar", {MASS: 0.3, "gravity": (0.0, -5.0, 0.0)}).tree.model
     for mass, gravity in ((np.float64(0.3), np.array([0, -5.0, 0])), (np.array(0.3), [0, -5, 0])):
-        found = load("five_bar", {MASS: mass, "gravity": gravity}).tree.model
-        assert found == wanted
+        result = load("five_bar", {MASS: mass, "gravity": gravity}).tree.model
+        assert result == expected
     pair = np.array([-1.5, -1.0])
     taken = ckc_pin.ensemble(
         SWING, {"initial.q.theta_1": {"uniform": pair}}, {"e": "energy"}, members=np.int64(2), seed=np.int32(3),
@@ -230,12 +232,12 @@ def test_function_and_object_controllers_give_the_same_run() -> None:
             return law(t, terms)
 
     overrides = {"t_end": 0.3, "formulation": "reduced"}
-    wanted = simulate(SWING, overrides, controller=Own())
-    for own in (law, lambda t, terms: -terms.q_dot, Called()):
-        found = simulate(SWING, overrides, controller=own)
-        assert np.array_equal(found.q_tree, wanted.q_tree)
-        assert np.array_equal(found.u, wanted.u)
-    sampled = [simulate(SWING, overrides, controller=Sampled(own, 0.01)) for own in (Own(), law)]
+    expected = simulate(SWING, overrides, controller=CustomController())
+    for function in (law, lambda t, terms: -terms.q_dot, Called()):
+        result = simulate(SWING, overrides, controller=function)
+        assert np.array_equal(result.q_tree, expected.q_tree)
+        assert np.array_equal(result.u, expected.u)
+    sampled = [simulate(SWING, overrides, controller=Sampled(function, 0.01)) for function in (CustomController(), law)]
     assert np.array_equal(sampled[0].q_tree, sampled[1].q_tree)
     assert np.abs(sampled[0].u[-1]).max() > 1e-3
 
@@ -252,7 +254,7 @@ def test_controllers_accept_gains_like_scenes() -> None:
 
 
 def test_runs_of_two_mechanisms_are_not_drawn_together() -> None:
-    runs = [simulate(name, SHORT) for name in (SWING, "four_bar")]
+    runs = [simulate(name, SHORT_RUN) for name in (SWING, "four_bar")]
     for pair in (runs, runs[::-1]):
         with pytest.raises(InputError, match="other coordinates; play runs of different mechanisms one by one"):
             ckc_pin.play(*pair)

@@ -53,14 +53,14 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
     starts = np.concatenate([[0.0], ends[:-1]])
     long_enough = ends - starts > SHORTEST
     within = np.sort(np.concatenate([(starts + x * (ends - starts))[long_enough] for x in (0.25, 0.5, 0.75)]))
-    found = []
+    largest = []
     for times in (ends, within):
         rows = np.empty((len(times) + 1, ready.loop.width))
         ready.begin()
         ready.loop.record(times, rows)
         assert ready.loop.advance(T_END, True, math.inf, math.inf)[0] == "end"
-        found.append(np.max([error(row[0], row[1:5], row[5:9]) for row in rows[: len(times)]], axis=0))
-    return found[0], found[1]
+        largest.append(np.max([error(row[0], row[1:5], row[5:9]) for row in rows[: len(times)]], axis=0))
+    return largest[0], largest[1]
 
 
 @formulations
@@ -68,11 +68,11 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
 def test_errors_decrease_with_rtol(exact: Exact, formulation: str, method: str) -> None:
     """Errors decrease by more than half the decades of rtol and stay below a multiple of rtol, also between steps."""
     tolerances = np.array([1e-4, 1e-6, 1e-8, 1e-10])
-    found = np.array([errors(exact, formulation, method=method, rtol=rtol) for rtol in tolerances])
-    for of_q, of_q_dot in found.transpose(1, 2, 0):
+    largest = np.array([errors(exact, formulation, method=method, rtol=rtol) for rtol in tolerances])
+    for of_q, of_q_dot in largest.transpose(1, 2, 0):
         assert np.all(of_q <= 3 * tolerances)
         assert np.all(of_q_dot <= 20 * tolerances)  # rates reach 4 rad/s
-    along = found.max(axis=1)
+    along = largest.max(axis=1)
     assert np.all(along[1:] < 0.1 * along[:-1])
 
 

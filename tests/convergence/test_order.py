@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.run import loop_tables
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
@@ -24,7 +23,7 @@ T_END = 0.5  # s, and steps by powers of two, so that they add up without roundi
 START, RATE = FIVE_BAR.equilibrium()[Q], np.array([1.0, 1.0])
 EPSILON = 0.2  # s: slow, so that explicit methods show their order on eq. 8 too
 W = np.array([0.03, 0.0])  # a base longer by that much
-OFF = {"reduced": False, "dae": False, "eq. 17": True, "eq. 8": True}  # formulations, whether off the manifold
+OFF_MANIFOLD = {"reduced": False, "dae": False, "eq. 17": True, "eq. 8": True}  # formulations, whether off the manifold
 
 # name, an rtol that chooses the number of stages, its order, that of its output between steps (at least), steps
 METHODS = {
@@ -57,13 +56,13 @@ def exact() -> dict[bool, Exact]:
 
 def ready_at(formulation: str, **solver: Any) -> Prepared:
     """A native loop that closes the kinematic loops to rounding at every rtol."""
-    overrides: dict[str, Any] = {"formulation": "spf" if OFF[formulation] else formulation, "epsilon": EPSILON}
-    if OFF[formulation]:
+    overrides: dict[str, Any] = {"formulation": "spf" if OFF_MANIFOLD[formulation] else formulation, "epsilon": EPSILON}
+    if OFF_MANIFOLD[formulation]:
         overrides |= {"initial.w": W.tolist(), "spf_coordinates": "z" if formulation == "eq. 8" else "w"}
     q, q_dot = ({"theta_1": float(x[0]), "theta_3": float(x[1])} for x in (START, RATE))
     overrides |= {"initial.q": q, "initial.q_dot": q_dot, **{f"solver.{key}": value for key, value in solver.items()}}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop_tables, "SLACK", 0.0)
+        patch.setattr("ckc_pin.run.prepare.CLOSURE_TOLERANCE", 0.0)
         return prepare(load_scene("five_bar/swing", overrides))
 
 
@@ -80,22 +79,22 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
     ends = steps_of(ready.loop, begin, T_END)
     assert ends == pytest.approx(h * np.arange(1, steps + 1), rel=1e-12)
     within = np.sort(np.concatenate([ends - x * h for x in (0.1, 0.4, 0.7)]))
-    found = []
+    largest = []
     for times in (ends, within):
         rows = np.empty((len(times) + 1, ready.loop.width))
         begin()
         ready.loop.record(times, rows)
         assert ready.loop.advance(T_END, True, math.inf, math.inf)[0] == "end"
-        found.append(max(np.abs(row[[1, 3, 5, 7]] - exact(row[0])).max() for row in rows[: len(times)]))
-    return found[0], found[1]
+        largest.append(max(np.abs(row[[1, 3, 5, 7]] - exact(row[0])).max() for row in rows[: len(times)]))
+    return largest[0], largest[1]
 
 
-@pytest.mark.parametrize("formulation", OFF)
+@pytest.mark.parametrize("formulation", OFF_MANIFOLD)
 @pytest.mark.parametrize("method", METHODS)
 def test_method_has_its_order_of_convergence(exact: dict[bool, Exact], formulation: str, method: str) -> None:
     """Projection, the Newton iteration on z and w do not change the order."""
     name, rtol, order, order_between, steps = METHODS[method]
-    coarse, fine = (errors(exact[OFF[formulation]], formulation, name, rtol, n) for n in (steps, 2 * steps))
+    coarse, fine = (errors(exact[OFF_MANIFOLD[formulation]], formulation, name, rtol, n) for n in (steps, 2 * steps))
     at_ends, between = np.log2(np.array(coarse) / np.array(fine))
     assert at_ends == pytest.approx(order, rel=0.06) or fine[0] < ROUNDING
     assert between > order_between - 0.3

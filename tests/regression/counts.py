@@ -48,14 +48,16 @@ def measured(name: str) -> dict[str, int]:
 
 def recorded() -> dict[str, dict[str, int]]:
     """Return the counts on file, by run."""
-    found: dict[str, dict[str, int]] = json.loads(FILE.read_text(encoding="utf-8"))
-    return found
+    counts: dict[str, dict[str, int]] = json.loads(FILE.read_text(encoding="utf-8"))
+    return counts
 
 
-def changed(found: dict[str, int], known: dict[str, int]) -> dict[str, tuple[int, int]]:
+def changed(counts: dict[str, int], recorded_counts: dict[str, int]) -> dict[str, tuple[int, int]]:
     """Return the counts that are off by more than 2 %, up or down: what was found, what is known."""
     return {
-        name: (found[name], known[name]) for name in known if abs(found[name] - known[name]) > TOLERANCE * known[name]
+        name: (counts[name], recorded_counts[name])
+        for name in recorded_counts
+        if abs(counts[name] - recorded_counts[name]) > TOLERANCE * recorded_counts[name]
     }
 
 

@@ -48,6 +48,6 @@ def governor(t_end: float, rtol: float) -> dict[str, float]:
         torque = slope * spin**2 / 4 + (ROD / 2 + ENDS) * G * cos - pull * (along @ up)  # of one rod
         return [z_dot, angle_dot, spin, z_ddot, torque / ABOUT_HINGE]
 
-    found = solve_ivp(f, (0.0, t_end), start, "LSODA", rtol=rtol, atol=rtol)
-    z, angle, shaft = found.y[:3, -1]
+    result = solve_ivp(f, (0.0, t_end), start, "LSODA", rtol=rtol, atol=rtol)
+    z, angle, shaft = result.y[:3, -1]
     return {"shaft": shaft, "slider": z, "rod_1": angle, "rod_2": angle}

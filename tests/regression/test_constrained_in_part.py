@@ -68,9 +68,9 @@ def test_formulations_and_starts_that_need_q_are_rejected(top: Path, overrides: 
 
 
 def test_check_reports_the_partly_constrained_root(top: Path) -> None:
-    found = check(top / "mechanism.toml")
-    assert (found.d, found.rank) == (3, 3)
-    assert any("constrain a free root in part" in warning for warning in found.warnings)
+    result = check(top / "mechanism.toml")
+    assert (result.d, result.rank) == (3, 3)
+    assert any("constrain a free root in part" in warning for warning in result.warnings)
     with pytest.raises(InputError, match="constrain a free root in part"):
         terms(load(top / "mechanism.toml"), {"root.rx": 0.1, "root.ry": 0.0, "root.rz": 0.0})
 

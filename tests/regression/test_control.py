@@ -118,17 +118,17 @@ def test_tracking_with_too_large_masses_matches_the_reference(run: Callable[...,
 
 
 def test_printed_trajectory_leaves_the_workspace() -> None:
-    found = check("five_bar_as_printed/tracking")
-    assert found.desired is not None
-    assert_close(found.desired.leaves_at, 4.39313, 5.1e-6)
-    assert "leaves the workspace at t = 4.39313 s" in " ".join(found.warnings)
+    result = check("five_bar_as_printed/tracking")
+    assert result.desired is not None
+    assert_close(result.desired.leaves_at, 4.39313, 5.1e-6)
+    assert "leaves the workspace at t = 4.39313 s" in " ".join(result.warnings)
 
 
 def test_default_trajectory_stays_in_the_workspace() -> None:
-    found = check("five_bar/tracking")
-    assert found.desired is not None
-    assert found.desired.leaves_at is None
-    assert not [warning for warning in found.warnings if "desired" in warning]
+    result = check("five_bar/tracking")
+    assert result.desired is not None
+    assert result.desired.leaves_at is None
+    assert not [warning for warning in result.warnings if "desired" in warning]
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])

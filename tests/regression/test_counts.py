@@ -30,14 +30,16 @@ def test_evaluation_counts_match_the_recorded_ones(name: str) -> None:
 
 
 def test_count_change_above_two_percent_is_detected() -> None:
-    for name, known in recorded().items():
-        assert set(known) == set(COUNTED)
-        assert changed(known, known) == {}
-        for count, number in known.items():
-            for found in (number - int(0.02 * number), number + int(0.02 * number)):
-                assert changed(known | {count: found}, known) == {}
-            for found in (number - int(0.02 * number) - 1, number + int(0.02 * number) + 1):
-                assert changed(known | {count: found}, known) == {count: (found, number)}, name
+    for name, recorded_counts in recorded().items():
+        assert set(recorded_counts) == set(COUNTED)
+        assert changed(recorded_counts, recorded_counts) == {}
+        for count, number in recorded_counts.items():
+            for count_now in (number - int(0.02 * number), number + int(0.02 * number)):
+                assert changed(recorded_counts | {count: count_now}, recorded_counts) == {}
+            for count_now in (number - int(0.02 * number) - 1, number + int(0.02 * number) + 1):
+                assert changed(recorded_counts | {count: count_now}, recorded_counts) == {count: (count_now, number)}, (
+                    name
+                )
 
 
 @pytest.mark.parametrize(("scene", "formulation"), LIMITS)

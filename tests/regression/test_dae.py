@@ -31,10 +31,10 @@ def ida(scene: str, overrides: dict[str, Any], rtol: float, times: Array) -> tup
     form = Stabilised(problem)
     form.begin(math.inf)
     solver = IDA(form.residual, **form.options(rtol))
-    found = solver.solve(times, *form.start)
-    assert found.success, found.message
+    solution = solver.solve(times, *form.start)
+    assert solution.success, solution.message
     n = problem.mechanism.n
-    return found.y[:, :n], found.y[:, n : 2 * n]
+    return solution.y[:, :n], solution.y[:, n : 2 * n]
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,9 @@ def test_equilibrium_search_converges_from_far_configurations(
     assert best is not None
     here = Kinematics(tree, model.closure, best, at.q_tree)
     for _ in range(50):
-        near = newton(predict(here, random.normal(size=model.d) * 1e-3), 0.0, model.tolerance)
-        assert near.converged
-        assert Terms(model, near.at, np.zeros(model.n)).potential_energy >= lowest - 1e-12 * abs(lowest)
+        reference = newton(predict(here, random.normal(size=model.d) * 1e-3), 0.0, model.tolerance)
+        assert reference.converged
+        assert Terms(model, reference.at, np.zeros(model.n)).potential_energy >= lowest - 1e-12 * abs(lowest)
     if name == "flyball":
         q = tree.named(tree.to_coordinates(at.q_tree))
         assert [q["rod_1"], q["rod_2"]] == pytest.approx([np.pi / 2, np.pi / 2], abs=1e-9)

@@ -58,15 +58,15 @@ def forward(mechanism: Mechanism, terms: Terms, tau: Array) -> Array:
     size = np.linalg.norm(J, axis=1, keepdims=True)
     size = np.where(size > ROUNDED * size.max(initial=0.0), size, 1.0)
     rows = J / size
-    left = np.block([[terms.D_tree / unit**2, -rows.T], [rows, np.zeros((len(J), len(J)))]])
+    left_side = np.block([[terms.D_tree / unit**2, -rows.T], [rows, np.zeros((len(J), len(J)))]])
     closing = -(terms.J_dot @ terms.v_tree)[:, None] / size
-    return np.linalg.lstsq(left, np.concatenate([force / unit**2, closing[:, 0]]), rcond=1e-13)[0][:n]
+    return np.linalg.lstsq(left_side, np.concatenate([force / unit**2, closing[:, 0]]), rcond=1e-13)[0][:n]
 
 
-def assert_gives_back(found: MotionForces) -> None:
+def assert_gives_back(forces: MotionForces) -> None:
     """Check that eq. 1 with the computed forces has the given acceleration at each instant."""
-    mechanism = found.mechanism
-    for q, v, a, tau in zip(found.q_tree, found.v_tree, found.a_tree, found.tau, strict=True):
+    mechanism = forces.mechanism
+    for q, v, a, tau in zip(forces.q_tree, forces.v_tree, forces.a_tree, forces.tau, strict=True):
         terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q)), v)
         assert_close(terms.at.J @ v, 0, 1e-10 * max(1.0, np.abs(v).max() * np.abs(terms.at.J).max(initial=0.0)))
         assert_close(forward(mechanism, terms, tau), a, 1e-9 * max(1.0, np.abs(a).max()))
@@ -75,42 +75,42 @@ def assert_gives_back(found: MotionForces) -> None:
 class Prescribed:
     """u of eq. 6 as a function of time only."""
 
-    def __init__(self, found: MotionForces) -> None:
-        mechanism, u = found.mechanism, []
-        for q, tau in zip(found.q_tree, found.tau, strict=True):
+    def __init__(self, forces: MotionForces) -> None:
+        mechanism, u = forces.mechanism, []
+        for q, tau in zip(forces.q_tree, forces.tau, strict=True):
             rho = mechanism.kinematics(mechanism.tree.from_coordinates(q)).rho
             u.append(rho.T @ mechanism.motors.force(tau))
-        self.table = Table(found.t, np.array(u))
+        self.table = Table(forces.t, np.array(u))
 
     def u(self, t: float, terms: Terms) -> Array:
         return self.table(t)[0]
 
 
-def assert_integrates_back(scene: str | Path, overrides: dict[str, Any], found: MotionForces) -> None:
+def assert_integrates_back(scene: str | Path, overrides: dict[str, Any], forces: MotionForces) -> None:
     """Check that an open-loop run with the computed torques has the prescribed motion."""
-    run = ckc_pin.simulate(scene, overrides, controller=Prescribed(found))
+    run = ckc_pin.simulate(scene, overrides, controller=Prescribed(forces))
     assert run.status == "done", run.message
-    assert_close(run.t, found.t, 0)
-    for ours, theirs in ((run.q_tree, found.q_tree), (run.v_tree, found.v_tree)):
+    assert_close(run.t, forces.t, 0)
+    for ours, theirs in ((run.q_tree, forces.q_tree), (run.v_tree, forces.v_tree)):
         assert_close(ours, theirs, 1e-9 * max(1.0, np.abs(theirs).max()))
 
 
 @pytest.mark.parametrize("scene", CONTROLLED)
 def test_inverse_dynamics_of_shipped_scenes_satisfies_eq_1(scene: str) -> None:
     assert len(CONTROLLED) >= 10
-    found = inverse_dynamics(scene, {"t_end": 1.0, "solver.output_dt": 0.05})
-    assert found.status == "done"
-    assert len(found.t) == 21
-    assert_gives_back(found)
+    forces = inverse_dynamics(scene, {"t_end": 1.0, "solver.output_dt": 0.05})
+    assert forces.status == "done"
+    assert len(forces.t) == 21
+    assert_gives_back(forces)
 
 
 @pytest.mark.parametrize("name", shipped())
 def test_inverse_dynamics_reproduces_motion_of_shipped_mechanisms(name: str) -> None:
     overrides = waves(load_scene_mechanism(ckc_pin.load_scene(name)), T_END.get(name, 0.1))
-    found = inverse_dynamics(name, overrides)
-    assert found.status == "done"
-    assert_gives_back(found)
-    assert_integrates_back(name, overrides, found)
+    forces = inverse_dynamics(name, overrides)
+    assert forces.status == "done"
+    assert_gives_back(forces)
+    assert_integrates_back(name, overrides, forces)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -128,7 +128,7 @@ def test_inverse_dynamics_reproduces_motion_of_random_mechanisms(seed: int, tmp_
         with pytest.raises(InputError, match=says):
             inverse_dynamics(scene, overrides)
         return
-    found = inverse_dynamics(scene, overrides)
-    assert found.status == "done"
-    assert_gives_back(found)
-    assert_integrates_back(scene, overrides, found)
+    forces = inverse_dynamics(scene, overrides)
+    assert forces.status == "done"
+    assert_gives_back(forces)
+    assert_integrates_back(scene, overrides, forces)

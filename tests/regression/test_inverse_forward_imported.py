@@ -69,11 +69,11 @@ def written(draft: Draft, folder: Path) -> Path:
 def assert_swings_as_it_should(draft: Draft, folder: Path) -> None:
     scene = written(draft, folder)
     overrides = waves(load(folder / "mechanism.toml"), 0.1)
-    found = inverse_dynamics(scene, overrides)
-    assert found.status == "done"
-    assert abs(found.tau).max() > 0.0
-    assert_gives_back(found)
-    assert_integrates_back(scene, overrides, found)
+    forces = inverse_dynamics(scene, overrides)
+    assert forces.status == "done"
+    assert abs(forces.tau).max() > 0.0
+    assert_gives_back(forces)
+    assert_integrates_back(scene, overrides, forces)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -54,19 +54,19 @@ def test_run_agrees_with_its_equations_integrated_by_scipy(scene, overrides):
     problem = as_ivp(scene, overrides)
     times = run.t[:: len(run.t) // 4]
     method = "Radau" if overrides.get("spf_coordinates") == "z" else "DOP853"
-    found = solve_ivp(problem.f, problem.t_span, problem.y0, method, times, rtol=TIGHT, atol=TIGHT / 100)
-    assert found.success
-    for t, y in zip(times, found.y.T, strict=True):
+    solution = solve_ivp(problem.f, problem.t_span, problem.y0, method, times, rtol=TIGHT, atol=TIGHT / 100)
+    assert solution.success
+    for t, y in zip(times, solution.y.T, strict=True):
         row, terms = int(np.searchsorted(run.t, t)), problem.terms(t, y)
-        wanted = problem.mechanism.tree.to_coordinates(terms.q_tree)
-        _near(run.q_tree[row], wanted)
+        expected = problem.mechanism.tree.to_coordinates(terms.q_tree)
+        _near(run.q_tree[row], expected)
         _near(run.v_tree[row], problem.velocity(t, y))
         _near(run.phi[row], terms.phi)
 
 
-def _near(found, wanted):
+def _near(solution, expected):
     """The global error of a run stays within a hundred times the tolerance of a step."""
-    assert np.abs(found - wanted).max() <= 100 * 1e-8 * max(1.0, np.abs(wanted).max())
+    assert np.abs(solution - expected).max() <= 100 * 1e-8 * max(1.0, np.abs(expected).max())
 
 
 def test_as_ivp_rejects_a_sampled_controller():

@@ -64,13 +64,13 @@ def test_crank_turns_accurately_after_many_turns(scene: str, formulation: str) -
 def test_motion_does_not_depend_on_initial_turns(turns: int, formulation: str) -> None:
     overrides = {"formulation": formulation, "t_end": 2.0, "solver.rtol": 1e-8}
     at, more = np.pi / 2, 2 * np.pi * turns
-    wanted = ckc_pin.simulate("four_bar/turning", overrides)
-    given = dict(zip(wanted.coordinates, wanted.q_tree[0], strict=True)) | {"crank": at + more}
-    found = ckc_pin.simulate("four_bar/turning", overrides | {"initial": {"q": given, "q_dot": {"crank": 12.0}}})
-    assert found.status == "done", found.message
+    expected = ckc_pin.simulate("four_bar/turning", overrides)
+    q = dict(zip(expected.coordinates, expected.q_tree[0], strict=True)) | {"crank": at + more}
+    turned = ckc_pin.simulate("four_bar/turning", overrides | {"initial": {"q": q, "q_dot": {"crank": 12.0}}})
+    assert turned.status == "done", turned.message
     rounded = 1e-5 * turns / TURNS[-1]  # what an angle of so many turns is rounded to, magnified by the motion
-    assert abs(found["crank"][-1] - more - wanted["crank"][-1]) < 1e-6 + rounded
-    assert abs(found["rocker"][-1] - wanted["rocker"][-1]) < 1e-6 + rounded
+    assert abs(turned["crank"][-1] - more - expected["crank"][-1]) < 1e-6 + rounded
+    assert abs(turned["rocker"][-1] - expected["rocker"][-1]) < 1e-6 + rounded
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
@@ -84,13 +84,13 @@ def test_free_fall_does_not_depend_on_position(falling: str, formulation: str) -
         "initial.at": None,
         "initial.q_dot.a": 5.0,
     }
-    near, far = (
+    reference, far = (
         ckc_pin.simulate(falling, overrides | {"initial.q": start | {"root.x": x, "root.y": x}}) for x in (0.0, 3000.0)
     )
-    assert (near.status, far.status) == ("done", "done"), far.message
+    assert (reference.status, far.status) == ("done", "done"), far.message
     for name in ("a", "b", "c", "root.rz"):
-        assert abs(near[name][-1] - far[name][-1]) < 1e-6
-    assert abs(far["root.y"][-1] - near["root.y"][-1] - 3000.0) < 1e-6
+        assert abs(reference[name][-1] - far[name][-1]) < 1e-6
+    assert abs(far["root.y"][-1] - reference["root.y"][-1] - 3000.0) < 1e-6
     long = ckc_pin.simulate(falling, overrides | {"initial.q": start, "t_end": 30.0, "solver.output_dt": 1.0})
     assert long.status == "done", long.message
     assert long["root.y"][-1] < -4000
@@ -98,7 +98,7 @@ def test_free_fall_does_not_depend_on_position(falling: str, formulation: str) -
 
 def test_too_large_angle_stops_the_run() -> None:
     """An angle of 6e9 rad has a rounding error of 1e-6, so the loops do not close."""
-    given = {"initial": {"q": {"crank": 2e9 * np.pi + np.pi / 2}, "q_dot": {"crank": 12.0}}, "t_end": 0.1}
-    run = ckc_pin.simulate("four_bar/turning", given)
+    q = {"initial": {"q": {"crank": 2e9 * np.pi + np.pi / 2}, "q_dot": {"crank": 12.0}}, "t_end": 0.1}
+    run = ckc_pin.simulate("four_bar/turning", q)
     assert run.status == "stopped"
     assert "nearly singular" in run.message

@@ -32,11 +32,11 @@ def test_crossings_of_rank_loss_stay_on_the_branch(N: int, rtol: float) -> None:
 @pytest.mark.parametrize("N", [2, 7])
 def test_step_size_growth_is_limited(N: int) -> None:
     """With SciPy's step size growth of up to ten, one in ten of these runs has an error of 1,000 to 12,000 rtol."""
-    wanted = [first_top_pin(N, float(t)) for t in range(11)]
+    expected = [first_top_pin(N, float(t)) for t in range(11)]
     for rtol in np.geomspace(3e-9, 6e-8, 14).tolist():
         run = n_four_bar(N, rtol, solver__output_dt=1.0)
         assert run.status == "done", run.message
-        assert np.abs(run.points["B0"][:, :2] - wanted).max() < 500 * rtol
+        assert np.abs(run.points["B0"][:, :2] - expected).max() < 500 * rtol
 
 
 @pytest.mark.parametrize("t_end", [0.7, 0.7084500152, 0.75])

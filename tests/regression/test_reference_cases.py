@@ -43,8 +43,8 @@ ANDREWS = {
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_andrews_squeezer(formulation: str) -> None:
-    found = command("andrews", "--set", f"formulation={formulation}")
-    q = dict(zip(found["coordinates"], found["q_tree"], strict=True))
+    run_json = command("andrews", "--set", f"formulation={formulation}")
+    q = dict(zip(run_json["coordinates"], run_json["q_tree"], strict=True))
     assert set(q) == set(ANDREWS)
     for name, expected in ANDREWS.items():
         assert abs(q[name] - expected) <= 1e-8, name  # asked for: 1e-7
@@ -57,9 +57,9 @@ BRICARD_PERIOD = 4.99171151369
 
 
 def test_bricard_from_the_command_line() -> None:
-    found = command("bricard")
-    assert found["t"] == 1.0
-    np.testing.assert_allclose(found["points"]["P3"], P3_AT_1, rtol=0, atol=1e-8)
+    run_json = command("bricard")
+    assert run_json["t"] == 1.0
+    np.testing.assert_allclose(run_json["points"]["P3"], P3_AT_1, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -110,9 +110,9 @@ def test_stiff_flyball_governor(formulation: str) -> None:
     assert run.stats["rhs"] <= 6000
     by_hand = flyball.governor(run.t[-1], 1e-12)
     for name, expected in A05.items():
-        found = run.q_tree[-1, run.column(name)]
-        assert abs(found - expected) <= 2e-8, name
-        assert abs(found - by_hand[name]) <= 1e-8, name
+        run_json = run.q_tree[-1, run.column(name)]
+        assert abs(run_json - expected) <= 2e-8, name
+        assert abs(run_json - by_hand[name]) <= 1e-8, name
 
 
 # --- N-four-bar ----------------------------------------------------------------------------------
@@ -129,9 +129,9 @@ def first_top_pin(N: int, t: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize("N", [1, 7, 40])
 def test_n_four_bar(N: int) -> None:
-    found = command("n_four_bar", "--set", f"mechanism.N={N}", "--set", "t_end=0.6")
-    assert len(found["coordinates"]) == 2 * N + 1
-    assert found["points"]["B0"] == pytest.approx([*first_top_pin(N, 0.6), 0.0], abs=1e-8)
+    run_json = command("n_four_bar", "--set", f"mechanism.N={N}", "--set", "t_end=0.6")
+    assert len(run_json["coordinates"]) == 2 * N + 1
+    assert run_json["points"]["B0"] == pytest.approx([*first_top_pin(N, 0.6), 0.0], abs=1e-8)
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf"])

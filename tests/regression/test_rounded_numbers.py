@@ -50,13 +50,13 @@ def bennett(folder: Path, digits: int) -> Path:
 @pytest.mark.parametrize("digits", [8, 7, 6])
 def test_rounded_mechanism_assembles_like_the_exact_one(digits: int, tmp_path: Path) -> None:
     """Another start with a slightly smaller residual lies on the other side of a folded configuration."""
-    exact, found = load(bennett(tmp_path / "exact", 17)), load(bennett(tmp_path / "rounded", digits))
+    exact, result = load(bennett(tmp_path / "exact", 17)), load(bennett(tmp_path / "rounded", digits))
     assert np.abs(exact.assembled.phi).max() < 1e-12
     assert np.abs(exact.q_tree - GUESS).max() < 0.2
-    assert found.d == exact.d == 1
-    assert 1e-11 < np.abs(found.assembled.phi).max() < 10.0**-digits
-    assert any("numbers in the files are rounded" in warning for warning in found.warnings)
-    assert np.abs(found.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
+    assert result.d == exact.d == 1
+    assert 1e-11 < np.abs(result.assembled.phi).max() < 10.0**-digits
+    assert any("numbers in the files are rounded" in warning for warning in result.warnings)
+    assert np.abs(result.q_tree - exact.q_tree).max() < 1e4 * 10.0**-digits
 
 
 def test_sigma_does_not_depend_on_the_path(tmp_path: Path) -> None:

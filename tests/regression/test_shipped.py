@@ -60,10 +60,10 @@ def test_all_shipped_mechanisms_are_covered() -> None:
 
 @pytest.mark.parametrize("name", MOBILITY)
 def test_number_of_freedoms_is_correct(name: str) -> None:
-    found = check(mechanism(name))
-    assert (found.n, found.d, found.rows, found.rank) == MOBILITY[name]
-    assert len(found.redundant) == found.rows - found.rank
-    assert found.cond_phi_z < 100
+    result = check(mechanism(name))
+    assert (result.n, result.d, result.rows, result.rank) == MOBILITY[name]
+    assert len(result.redundant) == result.rows - result.rank
+    assert result.cond_phi_z < 100
     assert not mechanism(name).freedoms.singular
     assert mechanism(name).residual <= 1e-10
 
@@ -214,8 +214,8 @@ def test_loop_cut_at_the_rail_gives_the_same_motion(
         element.set(key, value)
     tree.write(tmp_path / "slider_crank.urdf")
     (tmp_path / "mechanism.toml").write_text(RAIL.format(type=kind, a=ends[0], b=ends[1]))
-    found = check(tmp_path / "mechanism.toml")
-    assert (found.n, found.d, found.rows, found.rank) == (3, 1, rows, 2)
+    result = check(tmp_path / "mechanism.toml")
+    assert (result.n, result.d, result.rows, result.rank) == (3, 1, rows, 2)
     assert_same_motion(tmp_path)
 
 
@@ -232,8 +232,8 @@ def test_redundant_loop_types_give_the_same_motion(tmp_path: Path, loop: str, ro
     (tmp_path / "slider_crank.urdf").write_text((SLIDER_CRANK / "slider_crank.urdf").read_text())
     text = (SLIDER_CRANK / "mechanism.toml").read_text()
     (tmp_path / "mechanism.toml").write_text(text.replace('type = "point_2d"', loop))
-    found = check(tmp_path / "mechanism.toml")
-    assert (found.n, found.d, found.rows, found.rank) == (3, 1, rows, 2)
+    result = check(tmp_path / "mechanism.toml")
+    assert (result.n, result.d, result.rows, result.rank) == (3, 1, rows, 2)
     assert_same_motion(tmp_path)
 
 

@@ -69,17 +69,17 @@ def test_auto_detects_stiffness_during_the_run() -> None:
 def test_callers_controller_costs_as_many_right_hand_sides() -> None:
     """Its gradient is unknown, so the Jacobian is computed by finite differences."""
     overrides = {"formulation": "reduced", "t_end": 3.0}
-    known = simulate("five_bar/set_point", overrides)
+    built_in = simulate("five_bar/set_point", overrides)
 
-    class Own:
+    class CustomController:
         def u(self, t: float, terms: Terms) -> Array:
             return terms.h - 10.0 * (terms.q - TARGET) - 10.0 * terms.q_dot
 
-    own = simulate("five_bar/set_point", overrides, controller=Own())
-    assert known.status == own.status == "done"
-    assert known.stats["method"] == own.stats["method"] == "Radau"
-    assert own.stats["rhs"] <= 1.2 * known.stats["rhs"]
-    assert own.stats["rhs"] <= own.stats["python_calls"] <= own.stats["rhs"] + len(own.t) + 10
+    callers = simulate("five_bar/set_point", overrides, controller=CustomController())
+    assert built_in.status == callers.status == "done"
+    assert built_in.stats["method"] == callers.stats["method"] == "Radau"
+    assert callers.stats["rhs"] <= 1.2 * built_in.stats["rhs"]
+    assert callers.stats["rhs"] <= callers.stats["python_calls"] <= callers.stats["rhs"] + len(callers.t) + 10
 
 
 TARGET = FIVE_BAR.equilibrium()[Q] + [0.2, 0.1]
