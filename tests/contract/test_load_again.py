@@ -83,7 +83,7 @@ def test_workspace_is_allocated_on_demand() -> None:
 
 
 def test_cache_has_a_limited_size(tmp_path: Path, monkeypatch) -> None:
-    """What was loaded long ago is built again, what was loaded lately is copied."""
+    """Mechanisms loaded long ago are rebuilt; recent ones are copied."""
     paths = [mine(tmp_path / str(k), "slider_crank") for k in range(loading.cache.capacity + 3)]
     for path in paths:
         load(path)
